@@ -1,0 +1,55 @@
+"""The two process-wide settings that jaxid needs: float64, and XLA's loop flag.
+
+Both are made through the environment, so that importing jaxid does not import JAX; where JAX is
+already imported its configuration is updated instead. What the user had set is kept.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+
+# XLA on CPU runs a scan as one native kernel only if the loop body touches few bytes; past that
+# it dispatches op by op, which makes gradients of small systems 2 to 50 times slower. The option
+# is undocumented: benchmarks/ keeps a measurement on it, because a new jaxlib may drop it.
+LOOP_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+LOOP_FLAG = f"--xla_backend_extra_options={LOOP_OPTION}=1000000000"
+
+
+def configure() -> None:
+    """Enable float64 and the loop flag; warn once if JAX's backend is already running."""
+    os.environ["JAX_ENABLE_X64"] = "1"
+    jax = sys.modules.get("jax")
+    if jax is not None:
+        jax.config.update("jax_enable_x64", True)
+    flags = os.environ.get("XLA_FLAGS", "")
+    if LOOP_OPTION in flags:
+        return
+    if jax is not None and _backend_is_up():
+        warnings.warn(
+            "jaxid was imported after JAX had started its backend: gradients through simulations "
+            "will be several times slower. Import jaxid before the first JAX computation.",
+            stacklevel=3,
+        )
+        return
+    os.environ["XLA_FLAGS"] = _with_loop_flag(flags)
+
+
+def _with_loop_flag(flags: str) -> str:
+    """Append the option, inside the user's own xla_backend_extra_options where there is one.
+
+    XLA keeps only the last occurrence of a flag, so a second one would undo the user's.
+    """
+    key = "--xla_backend_extra_options="
+    words = flags.split()
+    for i, word in enumerate(words):
+        if word.startswith(key):
+            words[i] = f"{word},{LOOP_FLAG[len(key):]}"
+            return " ".join(words)
+    return " ".join([*words, LOOP_FLAG])
+
+
+def _backend_is_up() -> bool:
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    return bool(bridge is not None and bridge.backends_are_initialized())

@@ -1,0 +1,10 @@
+"""Sampled controllers, by the names of the case file.
+
+To add one: write its class and register it here.
+"""
+
+from jaxid.controllers.base import Controller as Controller
+from jaxid.controllers.base import Tick as Tick
+from jaxid.controllers.linear import CascadePD, PD, PID
+
+CONTROLLERS: dict[str, type[Controller]] = {"cascade_pd": CascadePD, "pd": PD, "pid": PID}

@@ -1,0 +1,67 @@
+"""Linear sampled laws: cascade PD, PD, PID."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxid.controllers.base import Controller, Tick
+
+
+class CascadePD(Controller):
+    """u = kv (kp (reference - q) - dq): a position loop around a velocity loop."""
+
+    kp: Array
+    kv: Array
+
+    def law(self, tick: Tick, velocity: Array, memory: None, disturbance: Array) -> tuple:
+        return self.kv * (self.kp * (tick.reference - tick.position) - velocity), None
+
+
+class PD(Controller):
+    """u = kp (reference - q) + kd (d reference - dq), the reference differenced backwards."""
+
+    kp: Array
+    kd: Array
+
+    def start_law(self, reference: Array) -> Array:
+        return reference
+
+    def law(self, tick: Tick, velocity: Array, memory: Array, disturbance: Array) -> tuple:
+        slope = (tick.reference - memory) / self.period
+        error = tick.reference - tick.position
+        return self.kp * error + self.kd * (slope - velocity), tick.reference
+
+
+class PID(Controller):
+    """u = kp e + ki sum(e) period + kd de, de low-passed with time constant `derivative_filter`.
+
+    With `anti_windup` the integral stands still while the command is at its limit and the error
+    would drive it further out.
+    """
+
+    kp: Array
+    ki: Array
+    kd: Array
+    derivative_filter: Array = eqx.field(default=0.0, kw_only=True)
+    anti_windup: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def start_law(self, reference: Array) -> tuple:
+        return reference, jnp.zeros_like(reference), jnp.zeros_like(reference)
+
+    def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
+        last, integral, slope = memory
+        error = tick.reference - tick.position
+        raw = (tick.reference - last) / self.period - velocity
+        # Backward Euler, so that a filter faster than the sampling only passes the difference.
+        slope = slope + (raw - slope) * self.period / (self.period + self.derivative_filter)
+        grown = integral + error * self.period
+        u = self.kp * error + self.ki * grown + self.kd * slope
+        if self.anti_windup and self.limit is not None:
+            outward = (jnp.abs(u + disturbance) > self.limit) & (error * u > 0)
+            grown = jnp.where(outward, integral, grown)
+            u = self.kp * error + self.ki * grown + self.kd * slope
+        return u, (tick.reference, grown, slope)

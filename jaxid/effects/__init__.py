@@ -1,0 +1,14 @@
+"""The effects that can be added to a plant, by the names of the case file.
+
+To add one: write its class in the file of its family, decorate it with `register`, and give it a
+row in `tests/effect_cases.py`. A user's own effect needs no more than the class and the decorator.
+"""
+
+from jaxid.effects.registry import EFFECTS as EFFECTS
+from jaxid.effects.registry import register as register
+
+from jaxid.effects import actuator as actuator  # isort: skip
+from jaxid.effects import friction as friction  # isort: skip
+from jaxid.effects import hysteresis as hysteresis  # isort: skip
+from jaxid.effects import inertia as inertia  # isort: skip
+from jaxid.effects import position as position  # isort: skip

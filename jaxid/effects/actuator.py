@@ -1,0 +1,78 @@
+"""What happens between the declared force and the force at the load."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxid import smooth
+from jaxid.effects.registry import register
+from jaxid.model import Action, Effect, Scales, Signals, parameter
+
+# Corner of the saturation, relative to its limit: 0.7e-3 of the limit is missing at the corner.
+_CORNER = 1e-3
+
+
+@register("actuator_gain")
+class ActuatorGain(Effect):
+    """The force is gain times the declared one."""
+
+    gain: Array = parameter("1", "positive", "applied over declared force")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(drive=self.gain * x.u)
+
+    def static_gain(self) -> Array:
+        return self.gain
+
+    @classmethod
+    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+        return {"gain": [1.0]}
+
+
+@register("actuator_lag")
+class ActuatorLag(Effect):
+    """First-order lag between declared and applied force: T df/dt = u - f."""
+
+    time_constant: Array = parameter("time", "positive", "T")
+
+    def act(self, x: Signals, state: Array) -> Action:
+        return Action(drive=state, rate=(x.u - state) / self.time_constant)
+
+    def initial_state(self, u: Array) -> Array:
+        return u
+
+    @classmethod
+    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+        return {"time_constant": [scales.period * s for s in (1.0, 3.0, 10.0)]}
+
+
+@register("input_delay")
+class InputDelay(Effect):
+    """The declared force acts later."""
+
+    delay: Array = parameter("time", "nonnegative", "delay")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action()
+
+    def command_delay(self) -> Array:
+        return self.delay
+
+    @classmethod
+    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+        return {"delay": [scales.period * s for s in (0.7, 2.0, 5.0)]}
+
+
+@register("saturation")
+class Saturation(Effect):
+    """The force at the load is clipped to plus or minus limit."""
+
+    limit: Array = parameter("force", "positive", "largest force")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(drive=smooth.clip(x.u, self.limit, _CORNER * self.limit))
+
+    @classmethod
+    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+        return {"limit": [scales.peak_force * s for s in (0.95, 0.85, 0.7, 0.5, 0.35)]}

@@ -1,0 +1,117 @@
+"""Friction as a function of velocity: dry (set-valued at rest) and viscous laws."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxid import smooth
+from jaxid.effects.registry import register
+from jaxid.model import Action, Effect, Scales, Signals, parameter
+
+
+@register("viscous_friction")
+class ViscousFriction(Effect):
+    """-c v."""
+
+    coefficient: Array = parameter("force*time/position", "nonnegative", "c, drag per velocity")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.yd)
+
+
+@register("coulomb_friction")
+class CoulombFriction(Effect):
+    """-F sign v, set-valued at rest; F is `level`, or `friction_coefficient` times normal force."""
+
+    level: Array | None = parameter("force", "nonnegative", "F, sliding friction", optional=True)
+    friction_coefficient: Array | None = parameter(
+        "1", "nonnegative", "mu, in place of the level: F = mu m g", optional=True
+    )
+
+    def __check_init__(self) -> None:
+        if (self.level is None) == (self.friction_coefficient is None):
+            raise ValueError("coulomb_friction takes either level or friction_coefficient.")
+
+    def act(self, x: Signals, state: None) -> Action:
+        if self.level is not None:
+            return Action(dry=self.level)
+        return Action(dry=self.friction_coefficient * x.normal)
+
+
+@register("static_friction")
+class StaticFriction(Effect):
+    """Break-away force above the sliding friction, at rest only."""
+
+    level: Array = parameter("force", "nonnegative", "break-away force above Coulomb's")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(stick=self.level)
+
+
+@register("stribeck_friction")
+class StribeckFriction(Effect):
+    """-F_s exp(-(v/v_s)^2) sign v: the part above Coulomb friction at low velocity."""
+
+    level: Array = parameter("force", "nonnegative", "F_s, excess at low velocity")
+    velocity: Array = parameter("position/time", "positive", "v_s, where the excess fades")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(dry=self.level * jnp.exp(-((x.yd / self.velocity) ** 2)))
+
+    @classmethod
+    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+        return {"velocity": [scales.velocity * s for s in (0.03, 0.07, 0.15, 0.3, 0.6)]}
+
+
+@register("asymmetric_viscous")
+class AsymmetricViscous(Effect):
+    """-c |v|: viscous friction that differs by direction."""
+
+    coefficient: Array = parameter("force*time/position", "free", "c, half the difference")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * smooth.absolute(x.yd, x.width))
+
+
+@register("quadratic_drag")
+class QuadraticDrag(Effect):
+    """-c v |v|."""
+
+    coefficient: Array = parameter("force*time2/position2", "free", "c")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.yd * smooth.absolute(x.yd, x.width))
+
+
+@register("cubic_friction")
+class CubicFriction(Effect):
+    """-c v^3."""
+
+    coefficient: Array = parameter("force*time3/position3", "free", "c")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.yd**3)
+
+
+@register("quartic_friction")
+class QuarticFriction(Effect):
+    """-c v^3 |v|."""
+
+    coefficient: Array = parameter("force*time4/position4", "free", "c")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.yd**3 * smooth.absolute(x.yd, x.width))
+
+
+@register("friction_drift")
+class FrictionDrift(Effect):
+    """Every dry-friction level times (1 + rate t), t from the start of the log."""
+
+    rate: Array = parameter("1/time", "free", "relative change of the levels")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action()
+
+    def dry_drift(self, t: Array) -> Array:
+        return self.rate * t

@@ -1,0 +1,18 @@
+"""Effects that add to the inertia."""
+
+from __future__ import annotations
+
+from jaxtyping import Array
+
+from jaxid.effects.registry import register
+from jaxid.model import Action, Effect, Signals, parameter
+
+
+@register("added_mass")
+class AddedMass(Effect):
+    """-m (a + g): extra inertia, and its weight where gravity acts along the joint."""
+
+    mass: Array = parameter("inertia", "free", "m")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.mass * (x.ydd + x.gravity))

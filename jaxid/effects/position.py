@@ -1,0 +1,74 @@
+"""Forces that depend on position alone, and constant ones."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxid.effects.registry import register
+from jaxid.model import Action, Effect, Scales, Signals, parameter
+
+
+@register("constant_force")
+class ConstantForce(Effect):
+    """F0: an offset of the drive, or Coulomb levels that differ by direction."""
+
+    level: Array = parameter("force", "free", "F0")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=self.level)
+
+
+@register("linear_stiffness")
+class LinearStiffness(Effect):
+    """-k q."""
+
+    coefficient: Array = parameter("force/position", "free", "k")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.y)
+
+
+@register("quadratic_stiffness")
+class QuadraticStiffness(Effect):
+    """-k2 q^2."""
+
+    coefficient: Array = parameter("force/position2", "free", "k2")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.y**2)
+
+
+@register("cubic_stiffness")
+class CubicStiffness(Effect):
+    """-k3 q^3."""
+
+    coefficient: Array = parameter("force/position3", "free", "k3")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.y**3)
+
+
+@register("cogging")
+class Cogging(Effect):
+    """-A cos(2 pi q / period + phase): a force periodic in position."""
+
+    amplitude: Array = parameter("force", "positive", "A")
+    period: Array = parameter("position", "positive", "pitch of the ripple")
+    phase: Array = parameter("1", "free", "rad, at q = 0")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(
+            force=-self.amplitude * jnp.cos(2 * jnp.pi * x.y / self.period + self.phase)
+        )
+
+    @classmethod
+    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+        # Two neighbouring periods must not lose a quarter turn over the stroke, or a true ripple
+        # falls between them: the grid is uniform in turns per stroke.
+        turns = np.arange(1.0, 60.0, 0.4)
+        return {
+            "period": list(2 * scales.position / turns),
+            "phase": [0.0, 0.5 * np.pi, np.pi, 1.5 * np.pi],
+        }

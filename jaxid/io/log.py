@@ -1,0 +1,260 @@
+"""Measured logs: the columns that a case names, checked and in SI units."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError, suggest
+from jaxid.io.timebase import sound_time
+from jaxid.tables import read_columns
+
+HOLDS = ("zero_order", "linear", "band_limited")
+OPTIONAL_COLUMNS = (
+    "velocity",
+    "acceleration",
+    "reference",
+    "load_position",
+    "load_acceleration",
+    "temperature",
+)
+LOG_KEYS = ("time", "sample_rate", "position", "force", "hold", "rows", *OPTIONAL_COLUMNS)
+# Chosen: fewer samples than this leave nothing after filtering and trimming.
+MINIMUM_SAMPLES = 50
+Column = Float[np.ndarray, "samples _"]
+
+
+@dataclass(frozen=True)
+class Log:
+    """One measured or simulated log; its arrays are float64 copies that cannot be written.
+
+    One-dimensional columns may be given; they are kept as (samples, 1).
+
+    Attributes:
+        time: Time [s], from where the file starts.
+        position: Positions [m or rad], a column a joint.
+        force: The logged command, before the known gain of the actuator.
+        velocity: Measured velocity [m/s or rad/s].
+        acceleration: Measured acceleration [m/s^2 or rad/s^2].
+        reference: What the controller was asked to follow [m or rad].
+        load_position: Position behind a flexible coupling [m or rad].
+        load_acceleration: Acceleration behind a flexible coupling [m/s^2 or rad/s^2].
+        temperature: Temperature, in the unit of the file.
+        hold: How the command runs between samples, one of `HOLDS`.
+        rows: Rows of the file, 0-based and half open; (0, 0) stands for all.
+        source: Where the log came from, for messages.
+    """
+
+    time: Float[np.ndarray, " samples"]
+    position: Column
+    force: Column
+    velocity: Column | None = None
+    acceleration: Column | None = None
+    reference: Column | None = None
+    load_position: Column | None = None
+    load_acceleration: Column | None = None
+    temperature: Column | None = None
+    hold: str = "zero_order"
+    rows: tuple[int, int] = (0, 0)
+    source: str = "log"
+
+    def __post_init__(self):
+        """Copy the arrays, freeze them and check that they belong together.
+
+        Raises:
+            InputError: If lengths differ or `hold` is unknown.
+        """
+        time = _frozen(np.ravel(self.time))
+        object.__setattr__(self, "time", time)
+        for name in ("position", "force", *OPTIONAL_COLUMNS):
+            given = getattr(self, name)
+            if given is None:
+                continue
+            values = np.asarray(given, dtype=np.float64)
+            values = _frozen(values[:, None] if values.ndim == 1 else values)
+            if len(values) != time.size:
+                what = f"unequal lengths: time {time.size}, {name} {len(values)}"
+                raise InputError(what, where=self.source, mend="cut them to the same samples")
+            object.__setattr__(self, name, values)
+        if self.hold not in HOLDS:
+            what, mend = f"hold = '{self.hold}' is unknown", suggest(self.hold, HOLDS)
+            raise InputError(what, where=self.source, mend=mend)
+        if self.rows == (0, 0):
+            object.__setattr__(self, "rows", (0, time.size))
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.time.size
+
+    @property
+    def period(self) -> float:
+        """Sampling period [s].
+
+        The mean step, which for the even sampling that `read_log` insists on is the
+        median without its rounding (2e-5 on the time stamps of one real log).
+        """
+        return float((self.time[-1] - self.time[0]) / (self.samples - 1))
+
+    @property
+    def rate_hz(self) -> float:
+        """Sampling rate [Hz]."""
+        return 1.0 / self.period
+
+
+def _frozen(values: Any) -> np.ndarray:
+    copy = np.array(values, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy
+
+
+def read_log(path: str | Path, columns: dict[str, Any], *, joints: int | None = 1) -> Log:
+    """Read a log and refuse what no estimator could use.
+
+    Args:
+        path: A `.csv`, `.npz`, `.mat` or `.parquet` file.
+        columns: The `[log]` table of a case: names of columns by quantity, and
+            `sample_rate` [Hz] where there is no time, `hold`, `rows`.
+        joints: Number of positions expected; None takes what there is.
+
+    Returns:
+        The log.
+
+    Raises:
+        InputError: If a key, the file, a column, a cell or the time base is unsound.
+    """
+    path = Path(path)
+    _check_keys(columns)
+    names = {key: _names(columns, key) for key in _wanted(columns)}
+    _check_distinct(names)
+    rows = _rows(columns)
+    data, rows = read_columns(path, [name for group in names.values() for name in group], rows)
+    _check_finite(data, rows[0], path)
+    groups = {
+        key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()
+    }
+    _check_widths(groups, names, joints, path)
+    samples = rows[1] - rows[0]
+    if samples < MINIMUM_SAMPLES:
+        mend = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
+        raise InputError(f"is too short: {samples} samples", where=str(path), mend=mend)
+    time = _time(groups.pop("time", None), columns, rows, path)
+    hold = columns.get("hold", "zero_order")
+    return Log(time=time, hold=hold, rows=rows, source=str(path), **groups)
+
+
+def _check_keys(columns: dict[str, Any]) -> None:
+    for key in columns:
+        if key not in LOG_KEYS:
+            raise InputError(f"unknown key '{key}'", where="[log]", mend=suggest(key, LOG_KEYS))
+    for key in ("position", "force"):
+        if not columns.get(key):
+            mend = f'add {key} = "<name of the column>"'
+            raise InputError(f"'{key}' is missing", where="[log]", mend=mend)
+    hold = columns.get("hold", "zero_order")
+    if hold not in HOLDS:
+        raise InputError(
+            f"hold = {hold!r} is unknown", where="[log]", mend=suggest(str(hold), HOLDS)
+        )
+    rate = columns.get("sample_rate")
+    if rate is None and not columns.get("time"):
+        mend = 'add time = "<name of the column>", or sample_rate = <Hz>'
+        raise InputError("neither time nor sample_rate is given", where="[log]", mend=mend)
+    if rate is not None and not (_is_number(rate) and 0 < rate < np.inf):
+        mend = "give the samples per second, e.g. sample_rate = 1000.0"
+        raise InputError(f"sample_rate = {rate!r} is not a rate in Hz", where="[log]", mend=mend)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _wanted(columns: dict[str, Any]) -> list[str]:
+    quantities = ("time", "position", "force", *OPTIONAL_COLUMNS)
+    return [key for key in quantities if columns.get(key) is not None]
+
+
+def _names(columns: dict[str, Any], key: str) -> list[str]:
+    given = columns[key]
+    names = given if isinstance(given, list | tuple) else [given]
+    if not names or not all(isinstance(name, str) for name in names):
+        mend = "give the name of a column, or a list of names"
+        raise InputError(f"{key} = {given!r} names no column", where="[log]", mend=mend)
+    if len(set(names)) < len(names):
+        mend = "name one column a joint"
+        raise InputError(f"{key} names a column twice: {names}", where="[log]", mend=mend)
+    return list(names)
+
+
+def _check_distinct(names: dict[str, list[str]]) -> None:
+    """Refuse one column for two quantities; a reference may be what was measured elsewhere."""
+    for one, other in (("time", "position"), ("time", "force"), ("force", "position")):
+        if set(names.get(one, ())) & set(names.get(other, ())):
+            mend = "each quantity has a column of its own"
+            raise InputError(f"{one} and {other} are the same column", where="[log]", mend=mend)
+
+
+def _rows(columns: dict[str, Any]) -> tuple[int, int] | None:
+    rows = columns.get("rows")
+    if rows is None:
+        return None
+    if (
+        not isinstance(rows, list | tuple)
+        or len(rows) != 2
+        or not all(isinstance(row, int) and not isinstance(row, bool) for row in rows)
+    ):
+        mend = "give two whole numbers, first and end (0-based, half open): rows = [0, 25000]"
+        raise InputError(f"rows = {rows!r} is no range", where="[log]", mend=mend)
+    return (rows[0], rows[1])
+
+
+def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
+    for name, values in data.items():
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if not bad.size:
+            continue
+        kind = "NaN" if np.isnan(values[bad[0]]).any() else "infinite"
+        mend = "cut these rows out with rows = [first, end], or interpolate before"
+        where = f"{path}, column '{name}'"
+        what = f"{bad.size} row(s) are NaN or infinite, the first is row {first + bad[0]} ({kind})"
+        raise InputError(what, where=where, mend=mend)
+
+
+def _check_widths(
+    groups: dict[str, np.ndarray], names: dict[str, list[str]], joints: int | None, path: Path
+) -> None:
+    """One time, as many positions as joints, and no more forces than those."""
+    expected = groups["position"].shape[1] if joints is None else joints
+    for key, values in groups.items():
+        width = values.shape[1]
+        wrong = {
+            "time": width != 1,
+            "position": width != expected,
+            "force": width > expected,
+            "velocity": width != expected,
+            "acceleration": width != expected,
+            "reference": width > expected,
+        }.get(key, False)
+        if wrong:
+            needed = 1 if key == "time" else expected
+            where = f"{path}, [log] {key} = {names[key]}"
+            mend = "name one column a joint, in the order of the joints"
+            raise InputError(f"{width} column(s) where {needed} belong", where=where, mend=mend)
+
+
+def _time(
+    column: np.ndarray | None, columns: dict[str, Any], rows: tuple[int, int], path: Path
+) -> Float[np.ndarray, " samples"]:
+    rate = columns.get("sample_rate")
+    if column is None:
+        return np.arange(*rows) / float(columns["sample_rate"])
+    where = f"{path}, column '{columns['time']}'"
+    time = sound_time(column[:, 0], rows[0], where)
+    logged = (time.size - 1) / (time[-1] - time[0])
+    if rate is not None and abs(logged / rate - 1) > 0.01:
+        what = f"the time column says {logged:.6g} Hz, sample_rate says {rate:.6g} Hz"
+        mend = "leave one of them out; is time in seconds?"
+        raise InputError(what, where=where, mend=mend)
+    return time

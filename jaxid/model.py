@@ -1,0 +1,310 @@
+"""One statement of the physics: the balance of generalized forces.
+
+A plant states `M(q) qdd + h(q, qd)` and carries effects; `Plant.balance` puts them together. All
+else (right-hand side, regressor, iterated integrals, set-valued step) reads that one statement and
+lives in `jaxid.readings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxid import smooth
+
+SIGNS = ("free", "nonnegative", "positive")
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """What is known of a parameter before any data.
+
+    Args:
+        dimension: For example "force*time/position"; see `jaxid.units`.
+        sign: "free", "nonnegative" or "positive".
+        doc: One line for the tables.
+        optional: May be absent (None).
+    """
+
+    dimension: str
+    sign: str
+    doc: str
+    optional: bool = False
+
+
+def parameter(dimension: str, sign: str, doc: str, *, optional: bool = False) -> Any:
+    """Declare a field of a plant or effect as a physical parameter, a float64 array leaf.
+
+    The conversion matters: a Python float is no array leaf and would silently count as known.
+    """
+    info = ParameterInfo(dimension, sign, doc, optional)
+    convert = _optional_array if optional else as_array
+    if optional:
+        return eqx.field(converter=convert, metadata={"parameter": info}, default=None)
+    return eqx.field(converter=convert, metadata={"parameter": info})
+
+
+def as_array(value: Any) -> Any:
+    # Anything that is neither number nor list passes: JAX fills trees with markers of its own.
+    if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool):
+        return jnp.asarray(value, dtype=jnp.float64)
+    return value
+
+
+def _optional_array(value: Any) -> Any:
+    return None if value is None else as_array(value)
+
+
+def parameters_of(cls: type) -> dict[str, ParameterInfo]:
+    """Name to `ParameterInfo` of every parameter that a plant or effect class declares."""
+    fields = cls.__dataclass_fields__.values()
+    return {f.name: f.metadata["parameter"] for f in fields if "parameter" in f.metadata}
+
+
+class Signals(eqx.Module):
+    """All that an effect may look at, in the coordinate of its port.
+
+    Args:
+        y: Coordinate [m or rad].
+        yd: Its velocity.
+        ydd: Its acceleration.
+        u: Force of the drive after the effects declared before this one [N or N m].
+        t: Time from the start of the log [s].
+        width: Velocity over which the sign is smoothed.
+        dry_scale: Factor on every level of dry friction (drift).
+        gravity: Acceleration of gravity along the port; zero on a horizontal axis [m/s^2].
+        normal: Force that presses the sliding surfaces together [N].
+    """
+
+    y: Array
+    yd: Array
+    ydd: Array
+    u: Array
+    t: Array
+    width: Array
+    dry_scale: Array
+    gravity: Array
+    normal: Array
+
+
+class Action(eqx.Module):
+    """All that an effect may do; every entry may be left out.
+
+    Args:
+        force: On the port [N or N m]; may depend on the acceleration (added mass).
+        dry: Level of set-valued friction; its force is -dry times a direction in [-1, 1].
+        stick: Level above `dry` that must be overcome to leave rest.
+        drive: What leaves the actuator path in place of `Signals.u`.
+        rate: Time derivative of the effect's own state; affine in that state.
+    """
+
+    force: Array | float = 0.0
+    dry: Array | float = 0.0
+    stick: Array | float = 0.0
+    drive: Array | None = None
+    rate: Array | None = None
+
+
+@dataclass(frozen=True)
+class Scales:
+    """How large the quantities of a log are; where a search starts, never what it finds.
+
+    Args:
+        position: Half the stroke. velocity, acceleration, force: root mean squares while moving.
+        peak_velocity, peak_force: Largest absolute values.
+        period: Sampling time [s].
+        duration: Length of the log [s].
+    """
+
+    position: float
+    velocity: float
+    acceleration: float
+    force: float
+    peak_velocity: float
+    peak_force: float
+    period: float
+    duration: float
+
+
+class Effect(eqx.Module):
+    """A physical effect that can be added to a plant.
+
+    A subclass declares its parameters with `parameter`, implements `act`, and is registered with
+    `jaxid.effects.register`. Nothing else is needed for the command line, the regressor, the
+    search and the tables to know it.
+    """
+
+    kind: ClassVar[str]
+    port: int = eqx.field(static=True, default=0, kw_only=True)
+
+    def act(self, x: Signals, state: Array | None) -> Action:
+        """What the effect does at one instant."""
+        raise NotImplementedError
+
+    def initial_state(self, u: Array) -> Array | None:
+        """Own state at the start, where the drive has long been at `u`; None without memory."""
+        return None
+
+    def command_delay(self) -> Array | float:
+        """By how much the effect delays the command [s]."""
+        return 0.0
+
+    def dry_drift(self, t: Array) -> Array | float:
+        """Relative change of every dry-friction level at time t."""
+        return 0.0
+
+    def static_gain(self) -> Array | float:
+        """Applied force over declared force; the residual is stated in declared units."""
+        return 1.0
+
+    @classmethod
+    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+        """Values from which a search starts: a grid for what enters nonlinearly, one for the rest.
+
+        A parameter left out enters linearly and starts from a least-squares fit.
+        """
+        return {}
+
+
+class Balance(eqx.Module):
+    """What `Plant.balance` returns.
+
+    Args:
+        residual: Force that is missing for equilibrium, by coordinate [N or N m].
+        dry: Level of dry friction, by port.
+        stick: Level above it at rest, by port.
+        rates: Time derivatives of the effects' own states.
+    """
+
+    residual: Array
+    dry: Array
+    stick: Array
+    rates: tuple
+
+
+class Plant(eqx.Module):
+    """A machine: inertial forces and the effects beside them.
+
+    Fields of every plant: `effects`, a tuple in the order of the drive; `sharpness`, the
+    dimensionless width of the smoothed sign; `velocity_scale`, the velocity that it multiplies.
+    """
+
+    kind: ClassVar[str]
+    effects: eqx.AbstractVar[tuple[Effect, ...]]
+    sharpness: eqx.AbstractVar[Array]
+    velocity_scale: eqx.AbstractVar[Array]
+
+    def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """M(q) qdd + h(q, qd), weight included."""
+        raise NotImplementedError
+
+    def ports(self, q: Array) -> Array:
+        """Coordinates on which effects act; joints by default."""
+        return q
+
+    def applied(self, u: Array, coordinates: int) -> Array:
+        """Generalized forces of the drives: one for each of the first coordinates by default."""
+        return jnp.zeros(coordinates, u.dtype).at[: u.size].add(u)
+
+    def port_gravity(self, q: Array) -> Array:
+        """Acceleration of gravity along each port [m/s^2]."""
+        return jnp.zeros_like(self.ports(q))
+
+    def port_normal(self, q: Array) -> Array:
+        """Force that presses the sliding surfaces of each port together [N]."""
+        return jnp.zeros_like(self.ports(q))
+
+    @property
+    def width(self) -> Array:
+        """Velocity over which the sign is smoothed."""
+        return self.sharpness * self.velocity_scale
+
+    def command_delay(self) -> Array:
+        """Total delay of the command [s]."""
+        return jnp.asarray(sum((e.command_delay() for e in self.effects), 0.0))
+
+    def static_gain(self) -> Array:
+        """Applied over declared force at rest, all effects together."""
+        gain = jnp.asarray(1.0)
+        for effect in self.effects:
+            gain = gain * effect.static_gain()
+        return gain
+
+    def initial_states(self, u: Array) -> tuple:
+        """Own states of the effects where the drive has long been at `u`."""
+        return tuple(e.initial_state(u[min(e.port, u.size - 1)]) for e in self.effects)
+
+    def with_effect(self, effect: Effect) -> Plant:
+        """The same plant with one effect more, last on the drive."""
+        return eqx.tree_at(lambda p: p.effects, self, (*self.effects, effect))
+
+    def balance(
+        self,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        qdd: Float[Array, " n"],
+        u: Float[Array, " m"],
+        t: Float[Array, ""],
+        states: tuple,
+        reaction: Float[Array, " ports"] | None = None,
+    ) -> Balance:
+        """State the balance of forces at one instant.
+
+        Args:
+            q: Coordinates [m or rad].
+            qd: Velocities.
+            qdd: Accelerations.
+            u: Declared force of each drive, delay already applied [N or N m].
+            t: Time from the start of the log [s].
+            states: Own state of each effect (None where it has none).
+            reaction: Force of dry friction by port, where a set-valued step has found it. Absent:
+                smoothed, -level tanh(yd / width).
+
+        Returns:
+            Residual `M qdd + h - effects - drive`, levels of dry friction, rates of the states.
+        """
+        y, yd, ydd = port_motion(self.ports, q, qd, qdd)
+        gravity, normal = self.port_gravity(q), self.port_normal(q)
+        dry_scale = jnp.asarray(1.0 + sum((e.dry_drift(t) for e in self.effects), 0.0))
+        force, dry, stick = jnp.zeros_like(y), jnp.zeros_like(y), jnp.zeros_like(y)
+        rates = []
+        for effect, state in zip(self.effects, states, strict=True):
+            i, j = effect.port, min(effect.port, u.size - 1)
+            x = Signals(
+                y[i], yd[i], ydd[i], u[j], t, self.width, dry_scale, gravity[i], normal[i]
+            )
+            action = effect.act(x, state)
+            force = force.at[i].add(action.force)
+            dry, stick = dry.at[i].add(action.dry), stick.at[i].add(action.stick)
+            u = u if action.drive is None else u.at[j].set(action.drive)
+            rates.append(action.rate)
+        dry, stick = dry * dry_scale, stick * dry_scale
+        if reaction is None:
+            at_rest = smooth.at_rest(yd, self.width) / smooth.REST_PEAK
+            reaction = -(dry + stick * at_rest) * smooth.sign(yd, self.width)
+        react = _pull_back(self.ports, q, force + reaction)
+        residual = self.inertial(q, qd, qdd) - react - self.applied(u, q.size)
+        return Balance(residual, dry, stick, tuple(rates))
+
+
+def port_motion(
+    ports: Callable[[Array], Array], q: Array, qd: Array, qdd: Array
+) -> tuple[Array, Array, Array]:
+    """Coordinate, velocity and acceleration of the ports by forward-mode differentiation."""
+
+    def velocity(q: Array, qd: Array) -> tuple[Array, Array]:
+        return jax.jvp(ports, (q,), (qd,))
+
+    (y, yd), (_, ydd) = jax.jvp(velocity, (q, qd), (qd, qdd))
+    return y, yd, ydd
+
+
+def _pull_back(ports: Callable[[Array], Array], q: Array, force: Array) -> Array:
+    """Generalized force of forces on the ports: the transposed Jacobian."""
+    return jax.vjp(ports, q)[1](force)[0]

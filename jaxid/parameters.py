@@ -1,0 +1,134 @@
+"""Which leaves of a plant are unknown, and how a vector of them goes in and comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.model import Effect, Plant, parameters_of
+from jaxid.units import Units
+
+# Lower bound of what must be positive, relative to its guess: keeps a solver off zero, far below
+# anything that a log can tell.
+_POSITIVE_FLOOR = 1e-9
+
+
+@dataclass(frozen=True)
+class Free:
+    """One unknown number.
+
+    Args:
+        name: As in results: `inertia`, `viscous_friction.coefficient`.
+        path: Attributes and indices from the plant to the leaf.
+        unit: Label.
+        sign: "free", "nonnegative" or "positive".
+        guess: Where a fit starts.
+        lower, upper: Bounds.
+        index: Entry of the leaf, where the leaf is a list.
+        true: Value for simulation and studies, where it differs from the guess.
+    """
+
+    name: str
+    path: tuple[str | int, ...]
+    unit: str
+    sign: str
+    guess: float
+    lower: float = -np.inf
+    upper: float = np.inf
+    index: int | None = None
+    true: float | None = None
+
+    def get(self, plant: Plant) -> Array:
+        """The leaf that holds this unknown."""
+        node = plant
+        for step in self.path:
+            node = node[step] if isinstance(step, int) else getattr(node, step)
+        return node
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The unknowns of a plant, in a fixed order: one scatter, one gather."""
+
+    free: tuple[Free, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each unknown."""
+        return [f.name for f in self.free]
+
+    @property
+    def guess(self) -> Float[Array, " p"]:
+        """Where a fit starts."""
+        return jnp.asarray([f.guess for f in self.free], dtype=jnp.float64)
+
+    @property
+    def bounds(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Lower and upper bounds: the user's, and what the signs demand."""
+        lower = [max(f.lower, _sign_floor(f)) for f in self.free]
+        upper = [f.upper for f in self.free]
+        return jnp.asarray(lower, dtype=jnp.float64), jnp.asarray(upper, dtype=jnp.float64)
+
+    def insert(self, plant: Plant, theta: Float[Array, " p"]) -> Plant:
+        """The plant with the unknowns set."""
+        leaves: dict[tuple, Array] = {}
+        for k, f in enumerate(self.free):
+            old = leaves.get(f.path, f.get(plant))
+            leaves[f.path] = theta[k] if f.index is None else old.at[f.index].set(theta[k])
+        if not leaves:
+            return plant
+        at = {f.path: f for f in self.free}
+        return eqx.tree_at(lambda p: [at[path].get(p) for path in leaves], plant, [*leaves.values()])
+
+    def extract(self, plant: Plant) -> Float[Array, " p"]:
+        """The unknowns' values in a plant."""
+        values = [f.get(plant) if f.index is None else f.get(plant)[f.index] for f in self.free]
+        return jnp.asarray(values, dtype=jnp.float64)
+
+    def with_guess(self, theta: Sequence[float]) -> Parameters:
+        """The same unknowns, starting elsewhere."""
+        return Parameters(
+            tuple(replace(f, guess=float(v)) for f, v in zip(self.free, theta, strict=True))
+        )
+
+    def extended(self, more: Sequence[Free]) -> Parameters:
+        """These unknowns and more."""
+        return Parameters((*self.free, *more))
+
+
+def _sign_floor(f: Free) -> float:
+    if f.sign == "free":
+        return -np.inf
+    return 0.0 if f.sign == "nonnegative" else _POSITIVE_FLOOR * abs(f.guess)
+
+
+def free_effect(
+    plant: Plant, effect: Effect, units: Units, name: str | None = None
+) -> tuple[Plant, list[Free]]:
+    """Add an effect to a plant with all its parameters unknown, starting from their values."""
+    name = name or effect_name(plant, effect)
+    added = plant.with_effect(effect)
+    position = len(plant.effects)
+    free = [
+        Free(
+            name=f"{name}.{field}",
+            path=("effects", position, field),
+            unit=units.label(info.dimension),
+            sign=info.sign,
+            guess=float(getattr(effect, field)),
+        )
+        for field, info in parameters_of(type(effect)).items()
+        if getattr(effect, field) is not None
+    ]
+    return added, free
+
+
+def effect_name(plant: Plant, effect: Effect) -> str:
+    """Key of an effect in results: its kind, numbered where the plant already has one there."""
+    same = sum(e.kind == effect.kind and e.port == effect.port for e in plant.effects)
+    return effect.kind if same == 0 else f"{effect.kind}#{same + 1}"

@@ -1,0 +1,9 @@
+"""The plants, by the names of the case file.
+
+To add one: write its class in a file of its own and register it here.
+"""
+
+from jaxid.model import Plant
+from jaxid.plants.axis import Axis as Axis
+
+PLANTS: dict[str, type[Plant]] = {"axis": Axis}

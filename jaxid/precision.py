@@ -1,0 +1,206 @@
+"""How well a log tells its parameters: covariance under coloured noise, and what it cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+import scipy.signal
+from jaxtyping import Array, Bool, Float
+
+# A combination of parameters counts as untold where its standard deviation, seen as force or
+# position, exceeds this part of the measured signal itself.
+_UNTOLD = 0.5
+# Relative to the largest, below this an eigenvalue of the scaled information is rounding.
+_ROUNDING = 1e-12
+# Entries of a combination below this are left out when it is named.
+_NEGLIGIBLE = 0.1
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Autoregressive model of a residual: e[k] = sum a[i] e[k-i] + innovation.
+
+    Args:
+        coefficients: a, (order,).
+        innovation: Standard deviation of the innovation.
+    """
+
+    coefficients: Float[np.ndarray, " order"]
+    innovation: float
+
+    @classmethod
+    def fit(
+        cls, e: Float[np.ndarray, " time"], counts: Bool[np.ndarray, " time"], largest: int = 40
+    ) -> NoiseModel:
+        """Yule-Walker fit to the samples that count, order by Akaike's criterion.
+
+        Args:
+            e: Residual; entries that do not count are ignored.
+            counts: Which samples count; lags across gaps are estimated from pairs that both do.
+            largest: Highest order tried.
+        """
+        e = np.where(counts, e, 0.0)
+        samples = max(int(counts.sum()), 1)
+        largest = int(min(largest, samples // 10))
+        products = _lagged(e, largest)
+        pairs = np.maximum(_lagged(counts.astype(float), largest), 1.0)
+        r = products / pairs
+        if r[0] <= 0:
+            return cls(np.zeros(0), 0.0)
+        # Taper: long lags are few pairs, and an untapered estimate need not be a covariance.
+        r = r * (1 - np.arange(largest + 1) / (largest + 1) * 1e-3)
+        best, best_score = cls(np.zeros(0), float(np.sqrt(r[0]))), samples * np.log(r[0])
+        a, variance = np.zeros(0), r[0]
+        for order in range(1, largest + 1):
+            k = (r[order] - a @ r[order - 1 : 0 : -1]) / variance
+            if abs(k) >= 1:
+                break
+            a = np.append(a - k * a[::-1], k)
+            variance *= 1 - k**2
+            score = samples * np.log(variance) + 2 * order
+            if score < best_score:
+                best, best_score = cls(a, float(np.sqrt(variance))), score
+        return best
+
+    def whiten(self, x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, "time k"]:
+        """Innovation of each column, over its standard deviation."""
+        out = x.copy()
+        for i, a in enumerate(self.coefficients, start=1):
+            out[i:] -= a * x[:-i]
+        return out / self.innovation
+
+    def whitened_counts(self, counts: Bool[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
+        """Samples whose whole past, as far as the model reaches, counts."""
+        out = counts.copy()
+        for i in range(1, len(self.coefficients) + 1):
+            out[i:] &= counts[:-i]
+            out[:i] = False
+        return out
+
+    def density(self, size: int) -> Float[np.ndarray, " frequency"]:
+        """Variance per rfft bin of a unit-normalised transform of length `size`."""
+        a = np.concatenate([[1.0], -self.coefficients])
+        return self.innovation**2 / np.abs(np.fft.rfft(a, size)) ** 2
+
+    def sample(self, rng: np.random.Generator, size: int, runs: int) -> np.ndarray:
+        """Draw residuals of this colour, (runs, size)."""
+        burn = 20 * (len(self.coefficients) + 5)
+        white = self.innovation * rng.standard_normal((runs, size + burn))
+        a = np.concatenate([[1.0], -self.coefficients])
+        return scipy.signal.lfilter([1.0], a, white, axis=1)[:, burn:]
+
+
+def _lagged(x: np.ndarray, largest: int) -> np.ndarray:
+    """Sums of x[k] x[k + lag] for lags up to `largest`."""
+    size = scipy.fft.next_fast_len(len(x) + largest + 1, real=True)
+    return scipy.fft.irfft(np.abs(scipy.fft.rfft(x, size)) ** 2, size)[: largest + 1]
+
+
+def sandwich(
+    jacobian: Float[np.ndarray, "time p"], noise: NoiseModel
+) -> Float[np.ndarray, "p p"]:
+    """J' R J with R the covariance of the residual: its colour seen through the regressor."""
+    size = scipy.fft.next_fast_len(2 * len(jacobian), real=True)
+    spectrum = np.fft.rfft(jacobian, size, axis=0)
+    weight = noise.density(size)[:, None] * np.ones((size // 2 + 1, 1))
+    weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
+    return np.real(spectrum.conj().T @ (weight * spectrum)) / size
+
+
+@dataclass(frozen=True)
+class Precision:
+    """What a Jacobian and a residual say of the parameters.
+
+    Args:
+        covariance: (p, p), of the parameters that can be told; rows of the others are NaN.
+        identifiable: (p,).
+        unidentifiable: Combinations that cannot be told, each a dictionary from name to weight
+            in the scaled parameters.
+        information: Eigenvalues of the scaled information, relative to the largest.
+    """
+
+    covariance: Float[np.ndarray, "p p"]
+    identifiable: Bool[np.ndarray, " p"]
+    unidentifiable: list[dict[str, float]]
+    information: Float[np.ndarray, " p"]
+
+    @property
+    def std(self) -> Float[np.ndarray, " p"]:
+        """Standard deviations; NaN where not identifiable."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def assess(
+    names: list[str],
+    jacobian: Float[np.ndarray, "time n p"],
+    residual: Float[np.ndarray, "time n"],
+    counts: Bool[np.ndarray, "time n"],
+    signal: float,
+    scale: Float[np.ndarray, " p"],
+    hessian: Float[np.ndarray, "p p"] | None = None,
+) -> Precision:
+    """Covariance of a least-squares fit under coloured noise, and its blind directions.
+
+    Args:
+        names: Of the parameters.
+        jacobian: Of the residual.
+        residual: At the fit.
+        counts: Which samples count.
+        signal: 2-norm of the measured signal that the residual belongs to.
+        scale: Natural size of each parameter, where its column vanishes.
+        hessian: In place of J'J, for the full-Hessian form.
+
+    Returns:
+        The precision. The residual's colour is an autoregressive model, by column of the residual.
+    """
+    rows = np.where(counts[..., None], jacobian, 0.0)
+    flat = rows.reshape(-1, len(names))
+    norm = np.linalg.norm(flat, axis=0)
+    dead = norm * np.abs(scale) < 1e-9 * signal
+    norm = np.where(dead, 1.0, norm)
+    normal = (flat.T @ flat if hessian is None else hessian) / np.outer(norm, norm)
+    normal[dead] = 0.0
+    normal[:, dead] = 0.0
+    meat = np.zeros_like(normal)
+    for i in range(residual.shape[1]):
+        noise = NoiseModel.fit(residual[:, i], counts[:, i])
+        meat += sandwich(rows[:, i] / norm, noise)
+    values, vectors = np.linalg.eigh(normal)
+    spread = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", vectors, meat, vectors), 0.0))
+    safe = np.maximum(values, 1e-300)
+    blind = (values < _ROUNDING * values[-1]) | (spread / safe > _UNTOLD * signal)
+    seen = vectors[:, ~blind]
+    inverse = seen @ np.diag(1 / values[~blind]) @ seen.T if (~blind).any() else 0 * normal
+    covariance = inverse @ meat @ inverse / np.outer(norm, norm)
+    weight = np.abs(vectors[:, blind])
+    identifiable = ~np.any(weight > _NEGLIGIBLE, axis=1)
+    covariance[~identifiable] = np.nan
+    covariance[:, ~identifiable] = np.nan
+    combinations = [
+        {n: float(w) for n, w in zip(names, _signed(v), strict=True) if abs(w) > _NEGLIGIBLE}
+        for v in vectors[:, blind].T
+    ]
+    return Precision(covariance, identifiable, combinations, values / max(values[-1], 1e-300))
+
+
+def _signed(v: np.ndarray) -> np.ndarray:
+    """The direction with its largest entry positive: eigenvectors come with either sign."""
+    return v if v[np.argmax(np.abs(v))] > 0 else -v
+
+
+def full_hessian(
+    residual: Callable[[Float[Array, " p"]], Float[Array, "..."]], theta: Float[Array, " p"]
+) -> Float[Array, "p p"]:
+    """Hessian of half the sum of squares, curvature of the residual included."""
+
+    def gradient(theta: Array) -> Array:
+        e, push = jax.linearize(residual, theta)
+        basis = jnp.eye(theta.size)
+        return jnp.stack([jnp.vdot(push(b), e) for b in basis])
+
+    return jax.jacfwd(gradient)(theta)

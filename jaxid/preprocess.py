@@ -1,0 +1,162 @@
+"""From a log to the motion and force that inverse dynamics compares, and the choice of how.
+
+A stated recipe is applied to the letter. Where none is stated, cut-off, decimation and rest
+velocity follow from the log's own noise, and are reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.signal
+from jaxtyping import Bool, Float
+
+from jaxid import signals
+from jaxid.io.log import Log
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a log is filtered.
+
+    Args:
+        cutoff_hz: Of the zero-phase low-pass on the position.
+        order: Of the Butterworth filter, which is run twice.
+        decimation: One sample in so many is kept, after the parallel filter.
+        trim: Samples left out at each end, after decimation.
+        rest_velocity: Below it a sample counts as at rest [m/s or rad/s], by joint.
+        align_hold: Whether the command is seen as it acts, half a sample late where it is held,
+            instead of at the instants at which it was logged.
+        derivatives: "central" (differences) or "spectral" (exact in the band).
+    """
+
+    cutoff_hz: float
+    order: int
+    decimation: int
+    trim: int
+    rest_velocity: tuple[float, ...]
+    align_hold: bool
+    derivatives: str
+
+    def band_hz(self, rate_hz: float) -> float:
+        """Edge of the band in which forces are compared."""
+        return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
+
+    @property
+    def decimator(self) -> signals.Decimator:
+        """The parallel filter."""
+        return signals.Decimator(self.decimation, self.trim)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A log made ready for inverse dynamics.
+
+    Args:
+        q, qd, qdd: Filtered motion at the log's rate, (time, n).
+        force: Declared force, (time, m) [N or N m].
+        period: Sampling time of the log [s].
+        held: Whether `force` acts held from its sample on (see `Recipe.align_hold`).
+        recipe: How it was filtered.
+        moving: Which kept samples count, (kept, n): not at rest.
+        kept: Their indices in the log.
+    """
+
+    q: Float[np.ndarray, "time n"]
+    qd: Float[np.ndarray, "time n"]
+    qdd: Float[np.ndarray, "time n"]
+    force: Float[np.ndarray, "time m"]
+    period: float
+    held: bool
+    recipe: Recipe
+    moving: Bool[np.ndarray, "kept n"]
+    kept: np.ndarray
+
+    def at_kept(self, x: np.ndarray) -> np.ndarray:
+        """Values of a signal of the log at the kept samples."""
+        return x[self.kept]
+
+
+def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
+    """Complete a stated recipe from the log, or choose all of it.
+
+    The cut-off is the highest frequency at which the position still stands four times above its
+    noise floor in power, at most 0.3 of the sampling rate. The rest velocity is five standard
+    deviations of the velocity's noise in that band, at least half a percent of the RMS velocity.
+
+    Args:
+        log: The log.
+        stated: The case's `[preprocess]`; its entries win.
+    """
+    stated = dict(stated or {})
+    rate = log.rate_hz
+    literal = "cutoff_hz" in stated
+    cutoff = float(stated.get("cutoff_hz", _noise_cutoff(log)))
+    room = max(1, int(0.4 * rate / cutoff))
+    decimation = int(stated.get("decimation", room))
+    q, qd, _ = differentiate(log.position, log.period, cutoff, 4, "central" if literal else "spectral")
+    noise = signals.high_band_std(log.position, rate)
+    # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
+    velocity_noise = noise * 2 * np.pi * np.sqrt(2 * cutoff**3 / (3 * rate))
+    rest = np.maximum(5 * velocity_noise, 5e-3 * np.sqrt(np.mean(qd**2, axis=0)))
+    if "rest_velocity" in stated:
+        rest = np.full(q.shape[1], stated["rest_velocity"], float)
+    return Recipe(
+        cutoff_hz=cutoff,
+        order=int(stated.get("order", 4)),
+        decimation=decimation,
+        # Two periods of the band edge: as far as the ends of filters reach.
+        trim=int(stated.get("trim", np.ceil(2 * rate / (cutoff * decimation)))),
+        rest_velocity=tuple(float(r) for r in rest),
+        align_hold=bool(stated.get("align_hold", not literal)),
+        derivatives="central" if literal else "spectral",
+    )
+
+
+def _noise_cutoff(log: Log) -> float:
+    """Highest frequency at which every joint's position stands above its noise [Hz]."""
+    rate = log.rate_hz
+    # Two seconds a segment: friction's corners recur over seconds, noise everywhere.
+    length = int(min(len(log.position), max(256, 2 * rate)))
+    f, p = scipy.signal.welch(
+        log.position, rate, window="hann", nperseg=length, detrend="linear", axis=0
+    )
+    floor = 2 * signals.high_band_std(log.position, rate) ** 2 / rate
+    above = np.all(p > 4 * floor, axis=1) & (f < 0.3 * rate)
+    first_lost = np.argmax(~above[1:]) + 1 if np.any(~above[1:]) else len(f) - 1
+    lowest = 8.0 / (len(log.position) * log.period)
+    return float(np.clip(f[first_lost], lowest, 0.3 * rate))
+
+
+def differentiate(
+    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Filtered signal and its two derivatives, by "central" differences or "spectral"."""
+    if how == "spectral":
+        return signals.spectral_derivatives(x, period, cutoff_hz)
+    q = signals.butterworth_zero_phase(x, cutoff_hz, order, 1 / period)
+    qd = signals.central_difference(q, period)
+    return q, qd, signals.central_difference(qd, period)
+
+
+def prepare(log: Log, gain: np.ndarray, recipe: Recipe) -> Prepared:
+    """Filter a log and mark the samples that count.
+
+    Args:
+        log: The log.
+        gain: Declared force per unit of command, (m,).
+        recipe: How to filter it.
+    """
+    q, qd, qdd = differentiate(
+        log.position, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives
+    )
+    kept = recipe.decimator.kept(len(q))
+    at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
+    # The parallel filter smears a stop over its neighbours: they go with it.
+    reach = np.ones(2 * recipe.decimation - 1)
+    smeared = np.stack([np.convolve(r, reach, mode="same") > 0.5 for r in at_rest.T], axis=1)
+    return Prepared(
+        q, qd, qdd, log.force * gain, log.period,
+        recipe.align_hold and log.hold == "zero_order", recipe, ~smeared[kept], kept,
+    )

@@ -1,0 +1,297 @@
+"""What is read from a plant's one balance: accelerations, steps, residuals, regressors.
+
+The smoothed reading serves gradients and the regressor; the set-valued step serves replay, where
+the axis must stick exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxid.model import Plant, port_motion
+
+
+class State(eqx.Module):
+    """Motion and memory: coordinates, velocities, the effects' own states (None where none)."""
+
+    q: Float[Array, " n"]
+    qd: Float[Array, " n"]
+    own: tuple
+
+
+def small_solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solve a x = b by unrolled elimination, for the small mass matrices inside loops.
+
+    A LAPACK call inside a scan would defeat the loop flag (see `jaxid._platform`), 60 times slower.
+    No pivoting: a mass matrix is positive definite.
+    """
+    n = b.size
+    rows = [[a[i, j] for j in range(n)] + [b[i]] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k], strict=True)]
+    x: list[Array] = [jnp.zeros(())] * n
+    for k in reversed(range(n)):
+        known = sum((rows[k][j] * x[j] for j in range(k + 1, n)), jnp.zeros(()))
+        x[k] = (rows[k][n] - known) / rows[k][k]
+    return jnp.stack(x)
+
+
+def mass_matrix(plant: Plant, x: State, u: Array, t: Array) -> Float[Array, "n n"]:
+    """Derivative of the balance with respect to the accelerations."""
+    zero = jnp.zeros_like(x.q)
+    no_friction = jnp.zeros_like(plant.ports(x.q))
+
+    def residual(qdd: Array) -> Array:
+        return plant.balance(x.q, x.qd, qdd, u, t, x.own, no_friction).residual
+
+    return jax.jacfwd(residual)(zero)
+
+
+def acceleration(
+    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None
+) -> Float[Array, " n"]:
+    """Solve the balance, affine in the acceleration, for it.
+
+    Args:
+        plant: The plant.
+        x: State.
+        u: Declared force of each drive, delay applied [N or N m].
+        t: Time [s].
+        reaction: Dry-friction force by port from a set-valued step; absent: smoothed.
+    """
+    residual = plant.balance(x.q, x.qd, jnp.zeros_like(x.q), u, t, x.own, reaction).residual
+    return small_solve(mass_matrix(plant, x, u, t), -residual)
+
+
+def derivative(
+    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None
+) -> State:
+    """Time derivative of the state: the right-hand side."""
+    qdd = acceleration(plant, x, u, t, reaction)
+    rates = plant.balance(x.q, x.qd, qdd, u, t, x.own, reaction).rates
+    return State(x.qd, qdd, rates)
+
+
+def vector_field(t: Array, x: State, args: tuple[Plant, Callable[[Array], Array]]) -> State:
+    """Right-hand side in diffrax's form: args are the plant and the force as function of time."""
+    plant, force = args
+    return derivative(plant, x, force(t - plant.command_delay()), t)
+
+
+def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
+    """Decay rate of each own state, as a tree like the state; zero for the motion.
+
+    The rate of an own state is affine in it, so that its slope is the decay; a lag far shorter
+    than the step, or a presliding spring at speed, is then stepped exactly instead of blowing up.
+    """
+
+    def rates(own: tuple) -> tuple:
+        return plant.balance(x.q, x.qd, jnp.zeros_like(x.q), u, t, own).rates
+
+    slopes = jax.jvp(rates, (x.own,), (jax.tree.map(jnp.ones_like, x.own),))[1]
+    zero = jnp.zeros_like(x.q)
+    return State(zero, zero, slopes)
+
+
+def _phi(x: Array) -> tuple[Array, Array, Array]:
+    """(e^x - 1)/x and the next two of that family; series near zero, where they cancel."""
+    small = jnp.abs(x) < 0.3
+    safe = jnp.where(small, 1.0, x)
+    one = jnp.expm1(safe) / safe
+    two = (one - 1.0) / safe
+    three = (two - 0.5) / safe
+    s1 = s2 = s3 = jnp.zeros_like(x)
+    # Coefficients 1/(k+1)!, 1/(k+2)!, 1/(k+3)!; ten terms leave 1e-16 at 0.3.
+    factorial = [1.0]
+    for k in range(1, 14):
+        factorial.append(factorial[-1] * k)
+    for k in reversed(range(10)):
+        s1 = s1 * x + 1.0 / factorial[k + 1]
+        s2 = s2 * x + 1.0 / factorial[k + 2]
+        s3 = s3 * x + 1.0 / factorial[k + 3]
+    return jnp.where(small, s1, one), jnp.where(small, s2, two), jnp.where(small, s3, three)
+
+
+def step(
+    plant: Plant,
+    x: State,
+    u: Callable[[Array], Array],
+    t: Array,
+    h: Array,
+    reaction: Array | None = None,
+) -> State:
+    """One fourth-order step: Runge-Kutta for the motion, its exponential form for own states.
+
+    Args:
+        plant: The plant.
+        x: State at t.
+        u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
+        t: Time [s].
+        h: Step [s].
+        reaction: Dry-friction force by port, constant over the step; absent: smoothed.
+
+    Source:
+        Cox and Matthews (2002), J. Comput. Phys. 176, ETDRK4, with a diagonal linear part that
+        is zero for the motion: there it is the classical method.
+    """
+    if not jax.tree.leaves(x.own):
+        return _classical_step(plant, x, u, t, h, reaction)
+    start, middle, end = u(jnp.asarray(0.0)), u(jnp.asarray(0.5)), u(jnp.asarray(1.0))
+    flat, back = ravel_pytree(x)
+    slope = ravel_pytree(_own_decay(plant, x, start, t))[0]
+
+    def rest(y: Array, u: Array, t: Array) -> Array:
+        return ravel_pytree(derivative(plant, back(y), u, t, reaction))[0] - slope * y
+
+    half = 0.5 * h
+    e_half, e_full = jnp.exp(slope * half), jnp.exp(slope * h)
+    p_half = half * _phi(slope * half)[0]
+    p1, p2, p3 = _phi(slope * h)
+    n0 = rest(flat, start, t)
+    a = e_half * flat + p_half * n0
+    na = rest(a, middle, t + half)
+    b = e_half * flat + p_half * na
+    nb = rest(b, middle, t + half)
+    c = e_half * a + p_half * (2 * nb - n0)
+    nc = rest(c, end, t + h)
+    change = (p1 - 3 * p2 + 4 * p3) * n0 + (2 * p2 - 4 * p3) * (na + nb) + (4 * p3 - p2) * nc
+    return back(e_full * flat + h * change)
+
+
+def _classical_step(
+    plant: Plant,
+    x: State,
+    u: Callable[[Array], Array],
+    t: Array,
+    h: Array,
+    reaction: Array | None,
+) -> State:
+    q, v = x.q, x.qd
+    half = 0.5 * h
+
+    def acc(q: Array, v: Array, s: float) -> Array:
+        s = jnp.asarray(s)
+        return acceleration(plant, State(q, v, x.own), u(s), t + s * h, reaction)
+
+    a1 = acc(q, v, 0.0)
+    v2 = v + half * a1
+    a2 = acc(q + half * v, v2, 0.5)
+    v3 = v + half * a2
+    a3 = acc(q + half * v2, v3, 0.5)
+    v4 = v + h * a3
+    a4 = acc(q + h * v3, v4, 1.0)
+    q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
+    v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+    return State(q, v, x.own)
+
+
+def set_valued_step(
+    plant: Plant, x: State, u: Callable[[Array], Array], t: Array, h: Array
+) -> State:
+    """One step under set-valued friction: flow without it, then the reaction that stops or drags.
+
+    The reaction of each port is the force, constant over the step, that brings the port to rest
+    at the step's end, clipped to the level of dry friction there (plus the break-away level where
+    the port was at rest). Ports that are coupled through the mass matrix share their reactions by
+    projected Gauss-Seidel sweeps; one port needs one.
+    """
+    free = step(plant, x, u, t, h, jnp.zeros_like(plant.ports(x.q)))
+    _, speed, _ = port_motion(plant.ports, free.q, free.qd, jnp.zeros_like(free.q))
+    _, before, _ = port_motion(plant.ports, x.q, x.qd, jnp.zeros_like(x.q))
+    end = u(jnp.asarray(1.0))
+    levels = plant.balance(
+        x.q, 0.5 * (x.qd + free.qd), jnp.zeros_like(x.q), end, t, x.own, jnp.zeros_like(speed)
+    )
+    bound = levels.dry + jnp.where(before == 0.0, levels.stick, 0.0)
+    jacobian = jax.jacfwd(plant.ports)(x.q)
+    mass = mass_matrix(plant, x, end, t)
+    columns = [small_solve(mass, jacobian[i]) for i in range(speed.size)]
+    mobility = h * jnp.stack([jacobian @ c for c in columns], axis=1)
+    reaction = _box_reaction(mobility, speed, bound)
+    slid = step(plant, x, u, t, h, reaction)
+    return _rest_exactly(plant, slid, jnp.abs(reaction) < bound)
+
+
+def _box_reaction(mobility: Array, speed: Array, bound: Array) -> Array:
+    """Reaction within plus or minus bound that leaves `speed + mobility @ reaction` complementary."""
+    n = speed.size
+    reaction = jnp.zeros(n)
+    for _ in range(1 if n == 1 else 20):
+        for i in range(n):
+            slip = speed[i] + mobility[i] @ reaction
+            wanted = reaction[i] - slip / mobility[i, i]
+            reaction = reaction.at[i].set(jnp.clip(wanted, -bound[i], bound[i]))
+    return reaction
+
+
+def _rest_exactly(plant: Plant, x: State, stuck: Array) -> State:
+    """Take the rounding off the velocity of ports that stick, where the ports are the joints."""
+    if stuck.size != x.qd.size:
+        return x
+    return State(x.q, jnp.where(stuck, 0.0, x.qd), x.own)
+
+
+def drive_own_states(
+    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array
+) -> tuple:
+    """Drive the effects' own states along a measured motion.
+
+    Args:
+        plant: The plant.
+        q, qd, qdd: Motion, (time, n).
+        u: Declared force at the samples, delay applied, (time, m).
+        period: Sampling time [s].
+
+    Returns:
+        The own states at every sample; exponential midpoint rule, second order.
+    """
+    own = plant.initial_states(u[0])
+    if not jax.tree.leaves(own):
+        return own
+    middle = [0.5 * (x[1:] + x[:-1]) for x in (q, qd, qdd, u)]
+    times = period * (jnp.arange(q.shape[0] - 1) + 0.5)
+
+    def advance(own: tuple, now: tuple) -> tuple[tuple, tuple]:
+        q, qd, qdd, u, t = now
+        x = State(q, qd, own)
+        slope = _own_decay(plant, x, u, t).own
+        rates = plant.balance(q, qd, qdd, u, t, own).rates
+        new = jax.tree.map(
+            lambda z, r, s: z + period * _phi(s * period)[0] * r, own, rates, slope
+        )
+        return new, new
+
+    _, rest = jax.lax.scan(advance, own, (*middle, times))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), own, rest)
+
+
+def residual_along(
+    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array
+) -> Float[Array, "time n"]:
+    """Residual of the balance at every sample of a motion [N or N m, declared units].
+
+    Args:
+        plant: The plant; its effects' own states are driven along the motion.
+        q, qd, qdd: Motion, (time, n).
+        u: Declared force at the samples, delay applied, (time, m).
+        period: Sampling time [s].
+
+    Returns:
+        Inverse dynamics minus declared force, over the static gain of the drive: in a residual
+        left in units of the load, a drive gain of zero would be a perfect fit.
+    """
+    own = drive_own_states(plant, q, qd, qdd, u, period)
+    times = period * jnp.arange(q.shape[0])
+
+    def at(q: Array, qd: Array, qdd: Array, u: Array, t: Array, own: tuple) -> Array:
+        return plant.balance(q, qd, qdd, u, t, own).residual
+
+    return jax.vmap(at)(q, qd, qdd, u, times, own) / plant.static_gain()

@@ -1,0 +1,68 @@
+"""References for a loop and inputs for open loop: one family a file."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError, suggest
+from jaxid.references.bezier import BEZIER
+from jaxid.references.csv import CSV
+from jaxid.references.family import Family, Grid, Key
+from jaxid.references.fourier import FOURIER
+from jaxid.references.moves import POINT_TO_POINT, TRAPEZOID
+from jaxid.references.multisine import MULTISINE
+
+__all__ = ["REFERENCES", "Family", "Key", "make_reference"]
+
+REFERENCES: dict[str, Family] = {
+    family.kind: family for family in (CSV, TRAPEZOID, BEZIER, FOURIER, MULTISINE, POINT_TO_POINT)
+}
+
+
+def make_reference(
+    table: Mapping[str, Any],
+    rate_hz: float,
+    duration: float,
+    base_dir: str | Path = ".",
+    *,
+    where: str = "reference",
+) -> Float[np.ndarray, "samples joints"]:
+    """Sample the reference that a table of a case describes.
+
+    Args:
+        table: `kind` and the family's keys; a list in place of a value goes by joint.
+        rate_hz: Samples per second [Hz].
+        duration: Length [s]; round(duration * rate_hz) samples, the first at time zero.
+        base_dir: Folder that relative file names start from: the case's own.
+        where: Name of the table, for messages.
+
+    Returns:
+        The position (or, for an input, the command) of each joint [unit of the axis].
+
+    Raises:
+        InputError: If the table cannot be met.
+    """
+    place = f"[{where}]"
+    kind = table.get("kind")
+    if kind not in REFERENCES:
+        mend = suggest(str(kind), REFERENCES)
+        what = "kind is missing" if kind is None else f"kind = {kind!r} is unknown"
+        raise InputError(what, where=place, mend=mend)
+    for name, value, unit in (("sample_rate", rate_hz, "Hz"), ("duration", duration, "s")):
+        if not 0 < value < math.inf:
+            mend = f"give a positive number of {unit}"
+            raise InputError(f"{name} = {value} {unit}", where="[simulation]", mend=mend)
+    samples = round(duration * rate_hz)
+    if samples < 2:
+        mend = "raise duration or sample_rate"
+        raise InputError(f"only {samples} sample(s)", where="[simulation]", mend=mend)
+    family = REFERENCES[kind]
+    columns = [
+        family.sample(values, Grid(rate_hz, samples, Path(base_dir), joint, place))
+        for joint, values in enumerate(family.read(table, where))
+    ]
+    return np.stack(columns, axis=1)

@@ -1,0 +1,62 @@
+"""Polynomials in Bernstein form over one stretch of time."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.references.family import Family, Grid, Key
+
+# Two points stand for a move from rest to rest: five control points at the start and six at the
+# end, which is z^5 (252 - 1050 z + 1800 z^2 - 1575 z^3 + 700 z^4 - 126 z^5), the profile of
+# flatness-based control: derivatives up to the fourth vanish at the start, the fifth at the end.
+_AT_START, _AT_END = 5, 6
+
+
+def bezier_curve(
+    points: Float[np.ndarray, " points"], z: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, " samples"]:
+    """Evaluate a Bezier curve by de Casteljau's scheme, which stays accurate at any order.
+
+    Args:
+        points: Control points, one more than the order [position].
+        z: Normalised time from 0 to 1.
+
+    Returns:
+        The curve [position].
+    """
+    levels = [np.full_like(z, point) for point in points]
+    while len(levels) > 1:
+        levels = [
+            (1.0 - z) * one + z * other for one, other in zip(levels[:-1], levels[1:], strict=True)
+        ]
+    return levels[0]
+
+
+def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
+    points = values["points"]
+    if len(points) == 2:
+        points = np.repeat(points, [_AT_START, _AT_END])
+    rest = grid.duration - values["start_time"]
+    if rest <= 0:
+        mend = f"start before {grid.duration:g} s"
+        raise grid.fault(f"start_time = {values['start_time']:g} s is past the end", mend)
+    duration = values["duration"] or rest
+    z = (grid.time - values["start_time"]) / duration
+    if values["repeat"]:
+        # To and fro: the way back is the same curve, run backwards.
+        z = np.where(z > 0, 1.0 - np.abs(1.0 - np.mod(z, 2.0)), 0.0)
+    return bezier_curve(points, np.clip(z, 0.0, 1.0))
+
+
+BEZIER = Family(
+    kind="bezier",
+    doc="a Bezier polynomial; between two points a move from rest to rest",
+    keys={
+        "points": Key("control points, the order plus one", "position", shape="list", shortest=2),
+        "duration": Key("of the curve; absent: to the end", "s", default=None, positive=True),
+        "start_time": Key("rest before it", "s", default=0.0, minimum=0.0),
+        "repeat": Key("run it to and fro until the end", shape="flag", default=False),
+    },
+    sample=_sample,
+)

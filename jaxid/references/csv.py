@@ -1,0 +1,54 @@
+"""References that stand in a file."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxid.references.family import Family, Grid, Key
+from jaxid.tables import read_columns
+
+
+def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
+    path = grid.base_dir / values["file"]
+    names = [values["column"]] + ([values["time"]] if values["time"] else [])
+    data, _ = read_columns(path, names)
+    for name in names:
+        bad = np.flatnonzero(~np.isfinite(data[name]).all(axis=1))
+        if bad.size:
+            raise grid.fault(f"{path}, column '{name}', row {bad[0]} is no number", "mend the row")
+    position = data[values["column"]]
+    if position.shape[1] > 1:
+        mend = f"name one of its columns: '{values['column']}[1]'"
+        raise grid.fault(f"{path}: '{values['column']}' is a matrix", mend)
+    if not values["time"]:
+        rate = values["sample_rate"] or grid.rate_hz
+        return _resample(np.arange(len(position)) / rate, position[:, 0], grid)
+    time = data[values["time"]][:, 0]
+    wrong = np.flatnonzero(np.diff(time) <= 0)
+    if wrong.size:
+        what = f"{path}: time does not run forward in row {wrong[0] + 1}"
+        raise grid.fault(what, "sort the rows and remove doubled ones")
+    return _resample(time - time[0], position[:, 0], grid)
+
+
+def _resample(time: np.ndarray, position: np.ndarray, grid: Grid) -> np.ndarray:
+    """Straight lines between the rows; past the last row it holds."""
+    return np.interp(grid.time, time, position)
+
+
+CSV = Family(
+    kind="csv",
+    doc="a column of a file, from its first row on; past the last one it holds",
+    keys={
+        "file": Key("the file, relative to the case", shape="text"),
+        "column": Key("the column with the reference", shape="text"),
+        "time": Key("the column with its time", "s", shape="text", default=None),
+        "sample_rate": Key(
+            "of its rows, where it has no time; absent: the simulation's",
+            "Hz",
+            default=None,
+            positive=True,
+        ),
+    },
+    sample=_sample,
+)

@@ -1,0 +1,168 @@
+"""What a family of references declares, and how a table of the case is read against it."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxid.errors import InputError, suggest
+
+REQUIRED = object()
+Shape = Literal["number", "whole", "flag", "text", "list"]
+
+
+@dataclass(frozen=True)
+class Key:
+    """One parameter of a family.
+
+    Attributes:
+        doc: What it means.
+        unit: Its unit; "position" stands for that of the axis.
+        default: Taken where the table has none; `REQUIRED` where it must be given.
+        shape: A number, a whole number, a flag, text, or a list of numbers.
+        minimum: Smallest value allowed.
+        positive: Whether zero is refused as well.
+        choices: The texts allowed; empty for any.
+        shortest: Fewest entries of a list.
+    """
+
+    doc: str
+    unit: str = ""
+    default: Any = REQUIRED
+    shape: Shape = "number"
+    minimum: float = -math.inf
+    positive: bool = False
+    choices: tuple[str, ...] = ()
+    shortest: int = 1
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The instants at which a reference is wanted, and what else a family may need.
+
+    Attributes:
+        rate_hz: Samples per second.
+        samples: Number of samples; the first is at time zero.
+        base_dir: Folder that relative file names start from.
+        joint: 0-based joint, so that random ones differ.
+        where: Name of the table, for messages.
+    """
+
+    rate_hz: float
+    samples: int
+    base_dir: Path
+    joint: int
+    where: str
+
+    @property
+    def time(self) -> np.ndarray:
+        """The instants [s]."""
+        return np.arange(self.samples) / self.rate_hz
+
+    @property
+    def duration(self) -> float:
+        """Time that the samples stand for [s], the last period included."""
+        return self.samples / self.rate_hz
+
+    def fault(self, what: str, mend: str) -> InputError:
+        """An error that names the table."""
+        return InputError(what, where=self.where, mend=mend)
+
+
+@dataclass(frozen=True)
+class Family:
+    """One kind of reference.
+
+    Attributes:
+        kind: Its name in a case.
+        doc: One line for the user.
+        keys: Every parameter allowed, by name.
+        sample: From the values of one joint to its positions at the grid's instants.
+    """
+
+    kind: str
+    doc: str
+    keys: Mapping[str, Key]
+    sample: Callable[[dict[str, Any], Grid], np.ndarray]
+
+    def read(self, table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
+        """Check a table and spread it over the joints.
+
+        Args:
+            table: The table of the case; `kind` is passed over.
+            where: Name of the table, for messages.
+
+        Returns:
+            The values of each joint, defaults filled in.
+
+        Raises:
+            InputError: If a key is unknown, missing or has a value that cannot be.
+        """
+        given = {name: value for name, value in table.items() if name != "kind"}
+        place = f"[{where}] kind = '{self.kind}'"
+        for name in given:
+            if name not in self.keys:
+                mend = suggest(name, self.keys)
+                raise InputError(f"unknown key '{name}'", where=place, mend=mend)
+        spread = {}
+        for name, key in self.keys.items():
+            if name in given:
+                spread[name] = _by_joint(name, key, given[name], place)
+            elif key.default is REQUIRED:
+                mend = f"add {name}" + (f" [{key.unit}]" if key.unit else "") + f": {key.doc}"
+                raise InputError(f"'{name}' is missing", where=place, mend=mend)
+            else:
+                spread[name] = [key.default]
+        joints = max(len(values) for values in spread.values())
+        for name, values in spread.items():
+            if len(values) not in (1, joints):
+                mend = f"one value for all, or {joints} as in the longest list"
+                raise InputError(f"'{name}' has {len(values)} joints", where=place, mend=mend)
+        return [
+            {name: values[joint % len(values)] for name, values in spread.items()}
+            for joint in range(joints)
+        ]
+
+
+def _by_joint(name: str, key: Key, value: Any, place: str) -> list[Any]:
+    """One checked value a joint; a list (of lists, where the key is a list) holds several."""
+    several = isinstance(value, list | tuple) and len(value) > 0
+    if key.shape == "list":
+        several = several and all(isinstance(entry, list | tuple) for entry in value)
+    return [_checked(name, key, one, place) for one in (value if several else [value])]
+
+
+def _checked(name: str, key: Key, value: Any, place: str) -> Any:
+    if key.shape == "list":
+        if not isinstance(value, list | tuple) or len(value) < key.shortest:
+            mend = f"give a list of at least {key.shortest}, or a list of such lists by joint"
+            raise InputError(f"{name} = {value!r} is too short", where=place, mend=mend)
+        return np.array([_number(name, key, one, place) for one in value])
+    if key.shape == "flag":
+        if not isinstance(value, bool):
+            raise InputError(f"{name} = {value!r} is no flag", where=place, mend="true or false")
+        return value
+    if key.shape == "text":
+        if not isinstance(value, str) or not value:
+            raise InputError(f"{name} = {value!r} is no text", where=place, mend=key.doc)
+        if key.choices and value not in key.choices:
+            mend = suggest(value, key.choices)
+            raise InputError(f"{name} = '{value}' is unknown", where=place, mend=mend)
+        return value
+    return _number(name, key, value, place)
+
+
+def _number(name: str, key: Key, value: Any, place: str) -> float | int:
+    unit = f" {key.unit}" if key.unit else ""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        mend = f"give a finite number [{key.unit or '1'}]"
+        raise InputError(f"{name} = {value!r} is not a number", where=place, mend=mend)
+    if key.shape == "whole" and value != int(value):
+        raise InputError(f"{name} = {value!r} is not whole", where=place, mend="round it")
+    if value < key.minimum or (key.positive and value <= 0):
+        bound = "positive" if key.positive else f"at least {key.minimum:g}{unit}"
+        raise InputError(f"{name} = {value:g}{unit}", where=place, mend=f"it must be {bound}")
+    return int(value) if key.shape == "whole" else float(value)

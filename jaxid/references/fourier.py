@@ -1,0 +1,41 @@
+"""Finite Fourier series."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxid.references.family import Family, Grid, Key
+
+
+def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
+    sine, cosine = values["sine"], values["cosine"]
+    harmonics = max(len(sine), len(cosine))
+    if not harmonics:
+        raise grid.fault("neither sine nor cosine is given", "give the coefficients of one of them")
+    highest = harmonics * values["base_frequency_hz"]
+    if highest >= grid.rate_hz / 2.0:
+        mend = "lower base_frequency_hz, give fewer coefficients or raise the sampling rate"
+        what = f"harmonic {harmonics} at {highest:g} Hz is beyond half the sampling rate"
+        raise grid.fault(what, mend)
+    angle = 2.0 * np.pi * values["base_frequency_hz"] * grid.time
+    position = np.full(grid.samples, values["offset"])
+    for k, coefficient in enumerate(sine, start=1):
+        position += coefficient * np.sin(k * angle)
+    for k, coefficient in enumerate(cosine, start=1):
+        position += coefficient * np.cos(k * angle)
+    return position
+
+
+FOURIER = Family(
+    kind="fourier",
+    doc="offset + sum over k of sine[k] sin(2 pi k f t) + cosine[k] cos(2 pi k f t)",
+    keys={
+        "base_frequency_hz": Key("frequency of the first harmonic", "Hz", positive=True),
+        "sine": Key(
+            "coefficients by harmonic", "position", shape="list", default=()
+        ),
+        "cosine": Key("likewise", "position", shape="list", default=()),
+        "offset": Key("mean", "position", default=0.0),
+    },
+    sample=_sample,
+)

@@ -1,0 +1,181 @@
+"""Moves from rest to rest, strung together: trapezoids of velocity and S-curves."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.references.family import Family, Grid, Key
+
+
+@dataclass(frozen=True)
+class Move:
+    """A time-optimal move from rest to rest under limits of speed, acceleration and jerk.
+
+    Seven phases that mirror at half time: the jerk rises for `jerk_time`, acceleration holds
+    until `ramp_time - jerk_time`, then the jerk falls; after `ramp_time` the speed holds for
+    `cruise_time`. Without a limit of jerk its phases have no length: a trapezoid.
+
+    Attributes:
+        distance: Way, with its sign [position].
+        jerk_time: Length of one jerk phase [s].
+        ramp_time: From rest to the peak speed [s].
+        cruise_time: At the peak speed [s].
+    """
+
+    distance: float
+    jerk_time: float
+    ramp_time: float
+    cruise_time: float
+
+    @property
+    def duration(self) -> float:
+        """Length of the move [s]."""
+        return 2.0 * self.ramp_time + self.cruise_time
+
+    def position(self, time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+        """Way covered [position] at instants from the start of the move [s]; rest outside."""
+        if self.duration == 0.0:
+            return np.where(time > 0, self.distance, 0.0)
+        peak = self.distance / (self.ramp_time + self.cruise_time)
+        clipped = np.clip(time, 0.0, self.duration)
+        # Later than half time the move is itself, reversed in time and direction.
+        early = np.minimum(clipped, self.duration - clipped)
+        covered = self._ramp(np.minimum(early, self.ramp_time), peak)
+        covered += peak * np.maximum(early - self.ramp_time, 0.0)
+        return np.where(clipped <= self.duration / 2.0, covered, self.distance - covered)
+
+    def _ramp(self, t: np.ndarray, peak: float) -> np.ndarray:
+        jerk_time, ramp_time = self.jerk_time, self.ramp_time
+        acceleration = peak / (ramp_time - jerk_time)
+        held = acceleration * (t**2 / 2.0 - t * jerk_time / 2.0 + jerk_time**2 / 6.0)
+        if jerk_time == 0.0:
+            return held
+        jerk = acceleration / jerk_time
+        left = ramp_time - t
+        falling = peak * ramp_time / 2.0 - peak * left + jerk * left**3 / 6.0
+        return np.where(t < jerk_time, jerk * t**3 / 6.0, np.where(left < jerk_time, falling, held))
+
+
+def plan_move(distance: float, speed: float, acceleration: float, jerk: float = math.inf) -> Move:
+    """Find the fastest move from rest to rest within limits.
+
+    Args:
+        distance: Way, with its sign [position].
+        speed: Limit [position/s].
+        acceleration: Limit [position/s^2].
+        jerk: Limit [position/s^3]; infinite for a trapezoid of velocity.
+
+    Returns:
+        The move.
+
+    Source:
+        Biagiotti & Melchiorri, Trajectory Planning for Automatic Machines and Robots
+        (2008), section 3.4, for the cases in which a limit is not reached.
+    """
+    way = abs(distance)
+    if way == 0.0:
+        return Move(0.0, 0.0, 0.0, 0.0)
+    jerk_time = acceleration / jerk
+    if speed * jerk < acceleration**2:
+        jerk_time = math.sqrt(speed / jerk)
+        ramp_time = 2.0 * jerk_time
+    else:
+        ramp_time = jerk_time + speed / acceleration
+    cruise_time = way / speed - ramp_time
+    if cruise_time < 0.0:
+        # The speed limit is out of reach, perhaps the acceleration limit as well.
+        cruise_time = 0.0
+        jerk_time = min(acceleration / jerk, (way / (2.0 * jerk)) ** (1.0 / 3.0))
+        ramp_time = jerk_time / 2.0 + math.sqrt(jerk_time**2 / 4.0 + way / acceleration)
+        if jerk_time < acceleration / jerk:
+            ramp_time = 2.0 * jerk_time
+    return Move(distance, jerk_time, ramp_time, cruise_time)
+
+
+def string_moves(
+    start: float, targets: list[float], limits: dict[str, float], values: dict[str, Any], grid: Grid
+) -> Float[np.ndarray, " samples"]:
+    """Visit targets one after the other.
+
+    Args:
+        start: Where the axis stands at time zero [position].
+        targets: Where it goes, in turn [position].
+        limits: Speed, acceleration and perhaps jerk, for `plan_move`.
+        values: Holds `dwell` [s] at each target and `repeat`: whether the targets are
+            visited anew until the grid ends, or the last one is held.
+        grid: The instants wanted.
+
+    Returns:
+        The position at each instant.
+
+    Raises:
+        InputError: If the moves are too short for the sampling rate to show.
+    """
+    time, position = grid.time, np.full(grid.samples, start)
+    now, here, turn, round_start = 0.0, start, 0, 0.0
+    while now < time[-1] and (values["repeat"] or turn < len(targets)):
+        target = targets[turn % len(targets)]
+        move = plan_move(target - here, **limits)
+        first = int(np.searchsorted(time, now))
+        last = int(np.searchsorted(time, now + move.duration, side="right"))
+        position[first:last] = here + move.position(time[first:last] - now)
+        position[last:] = target
+        now, here, turn = now + move.duration + values["dwell"], target, turn + 1
+        if turn % len(targets) == 0:
+            if now == round_start:
+                break  # Nowhere to go: it stands at its only target.
+            if now - round_start < 2.0 / grid.rate_hz:
+                mend = "move further, more slowly, or raise the sampling rate"
+                raise grid.fault("a round of the targets takes less than two samples", mend)
+            round_start = now
+    return position
+
+
+def _trapezoid(values: dict[str, Any], grid: Grid) -> np.ndarray:
+    limits = {name: values[name] for name in ("speed", "acceleration")}
+    return string_moves(values["start"], list(values["targets"]), limits, values, grid)
+
+
+def _point_to_point(values: dict[str, Any], grid: Grid) -> np.ndarray:
+    start, end = values["start"], values["end"]
+    if start == end:
+        raise grid.fault(f"start and end are both {start:g}", "give two different points")
+    limits = {name: values[name] for name in ("speed", "acceleration", "jerk")}
+    return string_moves(start, [end, start] if values["repeat"] else [end], limits, values, grid)
+
+
+_START = Key("where it stands at time zero", "position", default=0.0)
+_SPEED = Key("limit of speed", "position/s", positive=True)
+_ACCELERATION = Key("limit of acceleration", "position/s^2", positive=True)
+_DWELL = Key("rest at each target", "s", default=0.0, minimum=0.0)
+
+TRAPEZOID = Family(
+    kind="trapezoid",
+    doc="from target to target with trapezoids of velocity",
+    keys={
+        "start": _START,
+        "targets": Key("positions to visit in turn", "position", shape="list"),
+        "speed": _SPEED,
+        "acceleration": _ACCELERATION,
+        "dwell": _DWELL,
+        "repeat": Key("visit the targets anew until the end", shape="flag", default=True),
+    },
+    sample=_trapezoid,
+)
+POINT_TO_POINT = Family(
+    kind="point_to_point",
+    doc="time-optimal moves between two points, limited in jerk (S-curve)",
+    keys={
+        "start": _START,
+        "end": Key("where it goes", "position"),
+        "speed": _SPEED,
+        "acceleration": _ACCELERATION,
+        "jerk": Key("limit of jerk", "position/s^3", positive=True),
+        "dwell": _DWELL,
+        "repeat": Key("go to and fro until the end", shape="flag", default=True),
+    },
+    sample=_point_to_point,
+)

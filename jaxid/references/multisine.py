@@ -1,0 +1,73 @@
+"""Periodic sums of sines with a flat spectrum."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.references.family import Family, Grid, Key
+
+
+def _lines(values: dict[str, Any], samples: int, grid: Grid) -> np.ndarray:
+    """Harmonics of the period that lie in the band."""
+    if len(values["band_hz"]) != 2:
+        raise grid.fault("band_hz must hold two frequencies", "band_hz = [lowest, highest]")
+    low, high = values["band_hz"]
+    if not 0 <= low < high < grid.rate_hz / 2.0:
+        mend = f"0 <= lowest < highest < {grid.rate_hz / 2.0:g} Hz, half the sampling rate"
+        raise grid.fault(f"band_hz = [{low:g}, {high:g}] Hz is no band", mend)
+    spacing = grid.rate_hz / samples
+    # A bound that is meant to be a line stays one despite its rounding.
+    first = max(1, int(np.ceil(low / spacing - 1e-9)))
+    harmonics = np.arange(first, int(np.floor(high / spacing + 1e-9)) + 1)
+    harmonics = harmonics[harmonics % 2 == 1] if values["odd"] else harmonics
+    if not harmonics.size:
+        mend = "widen band_hz or lengthen period"
+        raise grid.fault(f"no line in the band: they are {spacing:g} Hz apart", mend)
+    return harmonics
+
+
+def _phases(count: int, values: dict[str, Any], joint: int) -> Float[np.ndarray, " lines"]:
+    if values["phases"] == "schroeder":
+        k = np.arange(1, count + 1)
+        return -np.pi * k * (k - 1) / count
+    # The joint is part of the seed: joints that move alike could not be told apart.
+    return np.random.default_rng([values["seed"], joint]).uniform(0.0, 2.0 * np.pi, count)
+
+
+def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
+    samples = round((values["period"] or grid.duration) * grid.rate_hz)
+    if samples < 4:
+        raise grid.fault("period is shorter than four samples", "lengthen period")
+    harmonics = _lines(values, samples, grid)
+    spectrum = np.zeros(samples // 2 + 1, dtype=complex)
+    spectrum[harmonics] = np.exp(1j * _phases(harmonics.size, values, grid.joint))
+    one = np.fft.irfft(spectrum, samples)
+    one *= values["amplitude"] / np.abs(one).max()
+    return values["offset"] + one[np.arange(grid.samples) % samples]
+
+
+MULTISINE = Family(
+    kind="multisine",
+    doc="a periodic sum of equally strong sines, at every (odd) line of a band",
+    keys={
+        "band_hz": Key("lowest and highest frequency", "Hz", shape="list", shortest=2),
+        "amplitude": Key("largest excursion from the offset", "position", positive=True),
+        "offset": Key("mean", "position", default=0.0),
+        "period": Key(
+            "of the signal, to a whole sample; absent: the duration",
+            "s",
+            default=None,
+            positive=True,
+        ),
+        "odd": Key("only odd harmonics of the period", shape="flag", default=False),
+        "phases": Key(
+            "random, or schroeder for a low crest",
+            shape="text",
+            default="random",
+            choices=("random", "schroeder"),
+        ),
+        "seed": Key("of the random phases", shape="whole", default=0, minimum=0),
+    },
+    sample=_sample,
+)

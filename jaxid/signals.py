@@ -1,0 +1,184 @@
+"""Filters, derivatives and resampling: what turns a log into signals that physics can read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+import scipy.signal
+from jaxtyping import Array, Float
+
+
+def butterworth_zero_phase(
+    x: Float[np.ndarray, "time k"], cutoff_hz: float, order: int, rate_hz: float
+) -> Float[np.ndarray, "time k"]:
+    """Low-pass forwards and backwards with a Butterworth filter of the given order.
+
+    Run twice, the filter is 6 dB down at the cut-off and has no phase.
+
+    Raises:
+        ValueError: If the cut-off does not lie below half the sampling rate.
+    """
+    if not 0 < cutoff_hz < rate_hz / 2:
+        raise ValueError(
+            f"cutoff_hz = {cutoff_hz:g} must lie between 0 and half the sampling rate, "
+            f"{rate_hz / 2:g} Hz."
+        )
+    sos = scipy.signal.butter(order, cutoff_hz, fs=rate_hz, output="sos")
+    # Odd extension over three periods of the cut-off: shorter ones leave a transient at the ends.
+    pad = min(len(x) - 1, int(3 * rate_hz / cutoff_hz) + 3 * order)
+    return scipy.signal.sosfiltfilt(sos, x, axis=0, padlen=pad)
+
+
+def central_difference(
+    x: Float[np.ndarray, "time k"], period: float
+) -> Float[np.ndarray, "time k"]:
+    """Second-order central difference, one-sided at the two ends."""
+    return np.gradient(x, period, axis=0, edge_order=2)
+
+
+def spectral_derivatives(
+    x: Float[np.ndarray, "time k"], period: float, cutoff_hz: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Band-limit a signal and differentiate it twice, exactly within the band.
+
+    Central differences are 10 % short where ten samples make a period; a resonance near a tenth
+    of the sampling rate needs this instead. A cubic through the ends is taken off first, so that
+    the periodic continuation has neither a jump nor a corner, and the roll-off is a half cosine
+    from 0.8 to 1 of the cut-off.
+
+    Returns:
+        The signal, its first and its second derivative.
+    """
+    n = len(x)
+    s = np.linspace(0.0, 1.0, n)[:, None]
+    slopes = [_end_slope(x, period) * (n - 1) * period, -_end_slope(x[::-1], period) * (n - 1) * period]
+    h00, h10 = 2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s
+    h01, h11 = -2 * s**3 + 3 * s**2, s**3 - s**2
+    trend = h00 * x[0] + h10 * slopes[0] + h01 * x[-1] + h11 * slopes[1]
+    span = (n - 1) * period
+    d_trend = (
+        (6 * s**2 - 6 * s) * (x[0] - x[-1]) + (3 * s**2 - 4 * s + 1) * slopes[0]
+        + (3 * s**2 - 2 * s) * slopes[1]
+    ) / span
+    dd_trend = (
+        (12 * s - 6) * (x[0] - x[-1]) + (6 * s - 4) * slopes[0] + (6 * s - 2) * slopes[1]
+    ) / span**2
+    rest = x - trend
+    odd = np.concatenate([rest, -rest[-2:0:-1]])
+    f = scipy.fft.rfftfreq(len(odd), period)[:, None]
+    window = 0.5 * (1 + np.cos(np.pi * np.clip((f / cutoff_hz - 0.8) / 0.2, 0.0, 1.0)))
+    spectrum = scipy.fft.rfft(odd, axis=0) * window
+    omega = 2j * np.pi * f
+    out = [scipy.fft.irfft(spectrum * omega**k, len(odd), axis=0)[:n] for k in range(3)]
+    return out[0] + trend, out[1] + d_trend, out[2] + dd_trend
+
+
+def _end_slope(x: np.ndarray, period: float) -> np.ndarray:
+    """Slope at the first sample from a line through the first few."""
+    k = min(8, len(x))
+    t = period * np.arange(k)
+    return np.polynomial.polynomial.polyfit(t, x[:k], 1)[1]
+
+
+@dataclass(frozen=True)
+class Decimator:
+    """Low-pass and keep one sample in `factor`: the parallel filter of inverse-dynamics fits.
+
+    Model and measurement pass it alike, so that it biases neither. The filter is the one that is
+    customary for decimation, a Chebyshev low-pass of order eight run forwards and backwards, here
+    applied as its squared magnitude in the frequency domain, so that JAX can differentiate, batch
+    and compile it.
+
+    Args:
+        factor: One sample in so many is kept; 1 keeps all and does not filter.
+        trim: Samples left out at each end, after decimation.
+    """
+
+    factor: int
+    trim: int
+
+    def __call__(self, x: Float[Array, "time k"]) -> Float[Array, "kept k"]:
+        """Filter along the first axis, decimate and trim."""
+        if self.factor > 1:
+            x = self._low_pass(x)[:: self.factor]
+        return x[self.trim : x.shape[0] - self.trim]
+
+    def kept(self, samples: int) -> np.ndarray:
+        """Indices, in the undecimated log, of the samples that remain."""
+        every = np.arange(0, samples, self.factor)
+        return every[self.trim : len(every) - self.trim]
+
+    def band_hz(self, rate_hz: float) -> float:
+        """Edge of the pass band."""
+        return 0.4 * rate_hz / self.factor if self.factor > 1 else 0.5 * rate_hz
+
+    def response(self, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
+        """Gain at each frequency [Hz]."""
+        if self.factor == 1:
+            return np.ones_like(frequency)
+        # 0.05 dB of ripple, pass band to 0.8 of the new Nyquist frequency.
+        sos = scipy.signal.cheby1(8, 0.05, 0.8 / self.factor, output="sos")
+        _, h = scipy.signal.freqz_sos(sos, worN=2 * np.pi * frequency / rate_hz)
+        return np.abs(h) ** 2
+
+    def _low_pass(self, x: Array) -> Array:
+        n = x.shape[0]
+        pad = min(n - 1, 40 * self.factor)
+        # Odd extension at both ends keeps value and slope; the rest of the period joins them.
+        head, tail = 2 * x[0] - x[pad:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
+        size = scipy.fft.next_fast_len(n + 3 * pad, real=True)
+        gap = size - n - 2 * pad
+        s = 0.5 * (1 - jnp.cos(jnp.pi * (jnp.arange(gap) + 1) / (gap + 1)))[:, None]
+        bridge = tail[-1] + s * (head[0] - tail[-1])
+        whole = jnp.concatenate([head, x, tail, bridge])
+        gain = jnp.asarray(self.response(np.fft.rfftfreq(size), 1.0))[:, None]
+        return jnp.fft.irfft(jnp.fft.rfft(whole, axis=0) * gain, size, axis=0)[pad : pad + n]
+
+
+# Weights of four-point Lagrange interpolation at a fraction s beyond the second point.
+def _lagrange(s: Array) -> list[Array]:
+    return [
+        -s * (s - 1) * (s - 2) / 6,
+        (s + 1) * (s - 1) * (s - 2) / 2,
+        -(s + 1) * s * (s - 2) / 2,
+        (s + 1) * s * (s - 1) / 6,
+    ]
+
+
+def delayed(
+    u: Float[Array, "time m"], delay: Array, period: float, *, held: bool
+) -> Float[Array, "time m"]:
+    """Mean force around each sample of a command that acts `delay` later.
+
+    A held command u[k] acts from t[k] to t[k+1]: seen at the samples it lags by half a period.
+    Left out, that half period looks like a delay, and a delay like damping.
+
+    Args:
+        u: Command at the samples, (time, m).
+        delay: Delay [s]; the result is differentiable in it.
+        period: Sampling time [s].
+        held: Whether the command is held between samples (zero order).
+    """
+    shift = delay / period + (0.5 if held else 0.0)
+    whole = jnp.ceil(shift).astype(int)
+    s = whole - shift  # in [0, 1): interpolate between k - whole and k - whole + 1
+    n = u.shape[0]
+    k = jnp.arange(n) - whole
+    # At the whole sample the middle weight is one and the rest vanish: no filtering there.
+    parts = [w * u[jnp.clip(k + i, 0, n - 1)] for i, w in zip(range(-1, 3), _lagrange(s), strict=True)]
+    return sum(parts[1:], parts[0])
+
+
+def high_band_std(x: Float[np.ndarray, "time k"], rate_hz: float) -> Float[np.ndarray, " k"]:
+    """Standard deviation of white noise that would fill the top of the spectrum as x does.
+
+    The median of the periodogram between 0.6 and 0.95 of Nyquist, over the median of an
+    exponential distribution: lines and a few bad frequencies do not move it.
+    """
+    f, p = scipy.signal.periodogram(x, rate_hz, window="hann", detrend="linear", axis=0)
+    band = (f > 0.3 * rate_hz) & (f < 0.475 * rate_hz)
+    density = np.median(p[band], axis=0) / np.log(2.0)
+    return np.sqrt(density * rate_hz / 2)

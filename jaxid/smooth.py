@@ -1,0 +1,50 @@
+"""Smoothed sign, absolute value, clip and dead zone: the only place where corners are rounded.
+
+Each takes the width over which the corner is rounded, in the units of its argument. As the width
+goes to zero each tends to its sharp namesake.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def sign(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Smoothed sign, tanh(x / width)."""
+    return jnp.tanh(x / width)
+
+
+def absolute(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Smoothed |x|, x tanh(x / width): never above |x|, below it by at most 0.28 width."""
+    return x * jnp.tanh(x / width)
+
+
+def at_rest(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Smoothed indicator of x = 0: one at zero, 0.02 two widths away.
+
+    Used for what acts at rest only (break-away friction); its product with the smoothed sign
+    peaks at `REST_PEAK`, so callers that need a peak of one divide by it.
+    """
+    return jnp.exp(-((x / width) ** 2))
+
+
+# max over x of tanh(x) exp(-x**2), at x = 0.6247.
+REST_PEAK = 0.37526
+
+
+def clip(
+    x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Smoothed clip of x to plus or minus limit, corners rounded over `width`."""
+    return x - dead_zone(x, limit, width)
+
+
+def dead_zone(
+    x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Smoothed dead zone: zero inside plus or minus limit, x minus or plus limit outside."""
+    above = jax.nn.softplus((x - limit) / width)
+    below = jax.nn.softplus((-x - limit) / width)
+    return width * (above - below)

@@ -1,0 +1,31 @@
+"""Which rows of a file are meant."""
+
+from pathlib import Path
+
+from jaxid.errors import InputError
+
+# 0-based and half open, as Python slices.
+Rows = tuple[int, int]
+
+
+def resolve_rows(rows: Rows | None, count: int, path: Path) -> Rows:
+    """Check a range of rows against the rows that a file has.
+
+    Args:
+        rows: 0-based, half open; None is all of them.
+        count: Rows in the file.
+        path: The file, for the message.
+
+    Returns:
+        The rows to take.
+
+    Raises:
+        InputError: If the range is empty, reversed or beyond the file.
+    """
+    if rows is None:
+        return (0, count)
+    first, end = rows
+    if not 0 <= first < end <= count:
+        mend = f"the file has {count} rows: give 0 <= first < end <= {count} (0-based, half open)"
+        raise InputError(f"rows = [{first}, {end}] are out of range", where=str(path), mend=mend)
+    return (first, end)

@@ -1,0 +1,283 @@
+"""Compiled loop of the ground-truth axis: set-valued dry friction under a sampled controller.
+
+One kernel holds every effect. One step is drift, kick, drift (second order
+where all is smooth). In the kick the applied force is frozen at mid-step, so
+that a stop, a stick and a break-away inside the step are solved in closed form
+instead of by a smoothed sign. Every quantity is in SI units; for a rotary axis
+read kg m^2, rad, N m.
+"""
+
+import math
+from typing import NamedTuple
+
+from numba import njit
+
+OPEN, CASCADE_PD, PD, PID = 0, 1, 2, 3
+
+
+class Physics(NamedTuple):
+    """What moves and what acts on it; zero (or infinity) switches a term off."""
+
+    mass: float  # kg, added mass included
+    weight: float = 0.0  # N, constant
+    gain: float = 1.0  # N per unit of command, every gain multiplied in
+    lag: float = 0.0  # s
+    delay: float = 0.0  # s
+    clip: float = math.inf  # N
+    viscous: float = 0.0  # N s/m
+    absolute: float = 0.0  # N s/m, force -c |v|
+    quadratic: float = 0.0  # N s^2/m^2
+    cubic: float = 0.0  # N s^3/m^3
+    quartic: float = 0.0  # N s^4/m^4
+    constant: float = 0.0  # N
+    stiffness1: float = 0.0  # N/m
+    stiffness2: float = 0.0  # N/m^2
+    stiffness3: float = 0.0  # N/m^3
+    cogging: float = 0.0  # N
+    cogging_period: float = 1.0  # m
+    cogging_phase: float = 0.0  # rad
+    coulomb: float = 0.0  # N
+    static: float = 0.0  # N, above Coulomb, at rest only
+    stribeck: float = 0.0  # N, above Coulomb
+    stribeck_velocity: float = 1.0  # m/s
+    dahl_stiffness: float = 0.0  # N/m
+    dahl_level: float = 1.0  # N
+    drift: float = 0.0  # 1/s, of every dry level
+    clock: float = 0.0  # N, amplitude of an unlogged sine in time
+    clock_frequency: float = 0.0  # Hz
+
+
+class Law(NamedTuple):
+    """The sampled controller; gains per unit of position, velocity or their integral."""
+
+    kind: int = OPEN
+    kp: float = 0.0
+    kv: float = 0.0
+    ki: float = 0.0
+    kd: float = 0.0
+    average: int = 1  # readings in the mean that is differenced
+    derivative_filter: float = 0.0  # s
+    anti_windup: bool = False
+    limit: float = math.inf  # unit of command
+    level: float = 0.0  # of the square disturbance, unit of command
+    on: float = 1.0  # s
+    off: float = 0.0  # s
+    start: float = 0.0  # s
+
+
+@njit(cache=True)
+def position_force(p, q, z):
+    """Force that depends on position q [m] and the presliding state z [m] alone [N]."""
+    force = p.constant - q * (p.stiffness1 + q * (p.stiffness2 + q * p.stiffness3))
+    if p.cogging != 0.0:
+        force -= p.cogging * math.cos(2.0 * math.pi * q / p.cogging_period + p.cogging_phase)
+    return force - p.dahl_stiffness * z
+
+
+@njit(cache=True)
+def velocity_force(p, v):
+    """Force that is a continuous function of velocity v [m/s], zero at rest [N]."""
+    w = abs(v)
+    return -(p.viscous + p.quadratic * w + (p.cubic + p.quartic * w) * w * w) * v - p.absolute * w
+
+
+@njit(cache=True)
+def slip_level(p, w, scale):
+    """Dry friction while sliding at speed w > 0 [N]."""
+    level = p.coulomb
+    if p.stribeck != 0.0:
+        level += p.stribeck * math.exp(-((w / p.stribeck_velocity) ** 2))
+    return scale * level
+
+
+@njit(cache=True)
+def drift_scale(p, t):
+    """Factor on every dry level at t [s]; a level cannot turn negative."""
+    return max(0.0, 1.0 + p.drift * t)
+
+
+@njit(cache=True)
+def kick(v, h, net, slip, hold, mass):
+    """Velocity after h [s] under a constant force, dry friction solved exactly.
+
+    Slides until it stops; the rest of h is spent at rest if |net| does not
+    exceed `hold`, else it leaves in the direction of `net`.
+    """
+    if v != 0.0:
+        side = 1.0 if v > 0.0 else -1.0
+        rate = (net - side * slip) / mass
+        after = v + h * rate
+        if after * side > 0.0:
+            return after
+        h += v / rate  # rate opposes v here: v / rate is minus the time to stop
+    if abs(net) <= hold:
+        return 0.0
+    return h * (net - math.copysign(slip, net)) / mass
+
+
+@njit(cache=True)
+def dahl(p, z, dx, scale):
+    """Presliding state after a stroke dx [m] in one direction: exact for Dahl's law."""
+    if p.dahl_stiffness == 0.0 or dx == 0.0:
+        return z
+    reach = scale * p.dahl_level / p.dahl_stiffness
+    if reach == 0.0:
+        return 0.0
+    return z - (math.copysign(reach, dx) - z) * math.expm1(-abs(dx) / reach)
+
+
+@njit(cache=True)
+def outside_force(p, bursts, t, h):
+    """Mean over [t, t + h] of the bursts, plus the clock force at mid-step [N].
+
+    Bursts enter by their overlap: their impulse is exact wherever they start.
+    """
+    force = 0.0
+    for i in range(bursts.shape[0]):
+        begin, end = bursts[i, 0], bursts[i, 0] + bursts[i, 1]
+        overlap = min(end, t + h) - max(begin, t)
+        if overlap > 0.0:
+            force += bursts[i, 2] * overlap / h
+    if p.clock != 0.0:
+        force += p.clock * math.sin(2.0 * math.pi * p.clock_frequency * (t + 0.5 * h))
+    return force
+
+
+@njit(cache=True)
+def advance(p, bursts, q, v, z, lagged, target, t, h):
+    """One step of h [s] from t; `target` is gain times the delayed command [N]."""
+    half = 0.5 * h
+    scale = drift_scale(p, t + half)
+    z = dahl(p, z, half * v, scale)
+    q += half * v
+    decay = math.exp(-half / p.lag) if p.lag > 0.0 else 0.0
+    middle = target + (lagged - target) * decay
+    lagged = target + (middle - target) * decay
+    force = min(max(middle, -p.clip), p.clip) + p.weight
+    force += outside_force(p, bursts, t, h) + position_force(p, q, z)
+    hold = scale * (p.coulomb + p.stribeck + p.static)
+    middle = kick(v, half, force + velocity_force(p, v), slip_level(p, abs(v), scale), hold, p.mass)
+    slip = slip_level(p, abs(middle), scale)
+    v = kick(v, h, force + velocity_force(p, middle), slip, hold, p.mass)
+    z = dahl(p, z, half * v, scale)
+    q += half * v
+    return q, v, z, lagged
+
+
+@njit(cache=True)
+def acceleration(p, bursts, q, v, z, drive, t):
+    """Acceleration [m/s^2] just after t, from the balance of forces; 0 where it sticks."""
+    scale = drift_scale(p, t)
+    net = drive + p.weight + position_force(p, q, z) + velocity_force(p, v)
+    net += outside_force(
+        p, bursts, t, 1e-9
+    )  # chosen: 1 ns, short against a step, long against the rounding of t
+    slip = slip_level(p, abs(v), scale)
+    if v != 0.0:
+        return (net - math.copysign(slip, v)) / p.mass
+    if abs(net) <= scale * (p.coulomb + p.stribeck + p.static):
+        return 0.0
+    return (net - math.copysign(slip, net)) / p.mass
+
+
+@njit(cache=True)
+def pulse(law, t):
+    """Square disturbance on the command at t [s]."""
+    since = (
+        t - law.start + 1e-9
+    )  # chosen: a tick that falls on an edge belongs to what begins there
+    if law.level == 0.0 or since < 0.0 or since % (law.on + law.off) >= law.on + 1e-12:
+        return 0.0
+    return law.level
+
+
+@njit(cache=True)
+def pid(law, error, slope, memory, extra, period):
+    """PID command before clipping; memory holds the integral and the filtered slope."""
+    memory[1] += period / (law.derivative_filter + period) * (slope - memory[1])
+    integral = memory[0] + period * error
+    u = law.kp * error + law.ki * integral + law.kd * memory[1] + extra
+    if law.anti_windup and abs(u) > law.limit and u * law.ki * error > 0.0:
+        return u - law.ki * period * error
+    memory[0] = integral
+    return u
+
+
+@njit(cache=True)
+def command(law, k, reference, reading, memory, period):
+    """Command at tick k from the readings up to k; before the log all readings equal the first."""
+    now, before = reading[k], reading[max(k - law.average, 0)]
+    error = reference[k] - now
+    speed = (now - before) / (law.average * period)
+    last = max(k - 1, 0)
+    aim = (reference[k] - reference[last]) / period
+    extra = pulse(law, k * period)
+    if law.kind == CASCADE_PD:
+        u = law.kv * (law.kp * error - speed) + extra
+    elif law.kind == PD:
+        u = law.kp * error + law.kd * (aim - speed) + extra
+    else:
+        u = pid(law, error, aim - speed, memory, extra, period)
+    return min(max(u, -law.limit), law.limit)
+
+
+@njit(cache=True)
+def looked_up(u, i, fraction, linear):
+    """Command a fraction of a period after sample i; nothing was commanded before the log."""
+    if i < 0:
+        return 0.0
+    if not linear:
+        return u[i]
+    return u[i] + fraction * (u[min(i + 1, u.size - 1)] - u[i])
+
+
+@njit(cache=True)
+def run(
+    p,
+    law,
+    u,
+    linear,
+    reference,
+    bursts,
+    noise,
+    resolution,
+    period,
+    step,
+    q,
+    v,
+    reading,
+    truth,
+    memory,
+):
+    """Fill u, reading and truth (position, velocity, acceleration, force) tick by tick.
+
+    The delay is a whole number of ticks and a rest: each period is cut where
+    the delayed command changes, so no step ever straddles that change.
+    """
+    whole = int(math.floor(p.delay / period + 1e-9))
+    rest = p.delay - whole * period
+    if rest < 1e-9 * period:
+        rest = 0.0
+    z, lagged = 0.0, 0.0
+    for k in range(u.size):
+        reading[k] = q + noise[k]
+        if resolution > 0.0:
+            reading[k] = round(reading[k] / resolution) * resolution
+        if law.kind != OPEN:
+            u[k] = command(law, k, reference, reading, memory, period)
+        older = 1 if rest > 0.0 else 0
+        start = looked_up(u, k - whole - older, (older * period - rest) / period, linear)
+        drive = lagged if p.lag > 0.0 else p.gain * start
+        drive = min(max(drive, -p.clip), p.clip)
+        truth[k, 0], truth[k, 1], truth[k, 3] = q, v, drive
+        truth[k, 2] = acceleration(p, bursts, q, v, z, drive, k * period)
+        for part in range(2):
+            begin = 0.0 if part == 0 else rest
+            length = rest if part == 0 else period - rest
+            count = int(math.ceil(length / step - 1e-6))
+            for j in range(count):
+                h = length / count
+                inside = begin + (j + 0.5) * h - rest + (1 - part) * period
+                value = looked_up(u, k - whole - 1 + part, inside / period, linear)
+                t = k * period + begin + j * h
+                q, v, z, lagged = advance(p, bursts, q, v, z, lagged, p.gain * value, t, h)
