@@ -7,6 +7,7 @@ lives in `jaxid.readings`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -131,6 +132,21 @@ class Scales:
     period: float
     duration: float
 
+    def natural(self, dimension: str) -> float:
+        """Size at which a parameter of this dimension would explain all of the force."""
+        if dimension == "inertia":
+            return self.force / self.acceleration
+        base = {
+            "force": self.force, "position": self.position, "time": self.position / self.velocity,
+        }
+        over, _, under = dimension.partition("/")
+        value = 1.0
+        for words, sign in ((over, 1), (under, -1)):
+            for word in words.split("*") if words not in ("", "1") else ():
+                name, power = re.fullmatch(r"([a-z]+)(\d?)", word).groups()
+                value *= base[name] ** (sign * int(power or 1))
+        return value
+
 
 class Effect(eqx.Module):
     """A physical effect that can be added to a plant.
@@ -163,13 +179,35 @@ class Effect(eqx.Module):
         """Applied force over declared force; the residual is stated in declared units."""
         return 1.0
 
-    @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
-        """Values from which a search starts: a grid for what enters nonlinearly, one for the rest.
+    # Whether the effect is a force beside the others, in proportion to those of its parameters
+    # that carry a force. False for what sits in the drive or acts on other effects.
+    adds_force: ClassVar[bool] = True
 
-        A parameter left out enters linearly and starts from a least-squares fit.
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        """Values from which a search starts, one dictionary a start.
+
+        What enters linearly needs one start of natural size. What enters nonlinearly takes a grid,
+        fine enough that least squares closes the rest.
         """
-        return {}
+        own = parameters_of(cls).items()
+        return [{n: scales.natural(i.dimension) for n, i in own if not i.optional}]
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        """Values at which the effect does next to nothing and its derivatives still exist."""
+        return scaled(cls, cls.starts(scales)[0], 1e-9)
+
+
+def carries_force(info: ParameterInfo) -> bool:
+    """Whether an added force is in proportion to a parameter."""
+    return info.dimension.startswith(("force", "inertia"))
+
+
+def scaled(cls: type[Effect], values: dict[str, float], factor: float) -> dict[str, float]:
+    """The same effect, factor times as strong."""
+    infos = parameters_of(cls)
+    return {n: v * factor if carries_force(infos[n]) else v for n, v in values.items()}
 
 
 class Balance(eqx.Module):

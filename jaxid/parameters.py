@@ -45,10 +45,7 @@ class Free:
 
     def get(self, plant: Plant) -> Array:
         """The leaf that holds this unknown."""
-        node = plant
-        for step in self.path:
-            node = node[step] if isinstance(step, int) else getattr(node, step)
-        return node
+        return leaf(plant, self.path)
 
 
 @dataclass(frozen=True)
@@ -76,14 +73,12 @@ class Parameters:
 
     def insert(self, plant: Plant, theta: Float[Array, " p"]) -> Plant:
         """The plant with the unknowns set."""
-        leaves: dict[tuple, Array] = {}
-        for k, f in enumerate(self.free):
-            old = leaves.get(f.path, f.get(plant))
-            leaves[f.path] = theta[k] if f.index is None else old.at[f.index].set(theta[k])
-        if not leaves:
-            return plant
-        at = {f.path: f for f in self.free}
-        return eqx.tree_at(lambda p: [at[path].get(p) for path in leaves], plant, [*leaves.values()])
+        return scatter(self.places, plant, theta)
+
+    @property
+    def places(self) -> tuple[tuple[tuple[str | int, ...], int | None], ...]:
+        """Path and index of each unknown: hashable, so that compiled code can depend on it."""
+        return tuple((f.path, f.index) for f in self.free)
 
     def extract(self, plant: Plant) -> Float[Array, " p"]:
         """The unknowns' values in a plant."""
@@ -99,6 +94,25 @@ class Parameters:
     def extended(self, more: Sequence[Free]) -> Parameters:
         """These unknowns and more."""
         return Parameters((*self.free, *more))
+
+
+def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
+    """The leaf at the end of a path of attributes and indices."""
+    node = plant
+    for step in path:
+        node = node[step] if isinstance(step, int) else getattr(node, step)
+    return node
+
+
+def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
+    """The plant with theta[k] at places[k], each a path and, where the leaf is a list, an index."""
+    leaves: dict[tuple, Array] = {}
+    for k, (path, index) in enumerate(places):
+        old = leaves[path] if path in leaves else leaf(plant, path)
+        leaves[path] = theta[k] if index is None else old.at[index].set(theta[k])
+    if not leaves:
+        return plant
+    return eqx.tree_at(lambda p: [leaf(p, path) for path in leaves], plant, [*leaves.values()])
 
 
 def _sign_floor(f: Free) -> float:

@@ -134,6 +134,12 @@ class Precision:
         """Standard deviations; NaN where not identifiable."""
         return np.sqrt(np.diag(self.covariance))
 
+    def first(self, p: int) -> Precision:
+        """Of the first p parameters: the rest were nuisances."""
+        return Precision(
+            self.covariance[:p, :p], self.identifiable[:p], self.unidentifiable, self.information
+        )
+
 
 def assess(
     names: list[str],

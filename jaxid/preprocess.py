@@ -29,6 +29,7 @@ class Recipe:
         align_hold: Whether the command is seen as it acts, half a sample late where it is held,
             instead of at the instants at which it was logged.
         derivatives: "central" (differences) or "spectral" (exact in the band).
+        keeps_reversals: Whether a fit uses samples that only pass through zero.
     """
 
     cutoff_hz: float
@@ -38,6 +39,7 @@ class Recipe:
     rest_velocity: tuple[float, ...]
     align_hold: bool
     derivatives: str
+    keeps_reversals: bool = False
 
     def band_hz(self, rate_hz: float) -> float:
         """Edge of the band in which forces are compared."""
@@ -59,7 +61,9 @@ class Prepared:
         period: Sampling time of the log [s].
         held: Whether `force` acts held from its sample on (see `Recipe.align_hold`).
         recipe: How it was filtered.
-        moving: Which kept samples count, (kept, n): not at rest.
+        moving: Which kept samples are not at rest, (kept, n).
+        fitted: Which kept samples a fit uses, (kept, n): those that move; under a stated recipe
+            also those that only pass through zero, as the published recipes leave nothing out.
         kept: Their indices in the log.
     """
 
@@ -71,6 +75,7 @@ class Prepared:
     held: bool
     recipe: Recipe
     moving: Bool[np.ndarray, "kept n"]
+    fitted: Bool[np.ndarray, "kept n"]
     kept: np.ndarray
 
     def at_kept(self, x: np.ndarray) -> np.ndarray:
@@ -111,6 +116,7 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         rest_velocity=tuple(float(r) for r in rest),
         align_hold=bool(stated.get("align_hold", not literal)),
         derivatives="central" if literal else "spectral",
+        keeps_reversals=literal,
     )
 
 
@@ -153,10 +159,26 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe) -> Prepared:
     )
     kept = recipe.decimator.kept(len(q))
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
-    # The parallel filter smears a stop over its neighbours: they go with it.
-    reach = np.ones(2 * recipe.decimation - 1)
-    smeared = np.stack([np.convolve(r, reach, mode="same") > 0.5 for r in at_rest.T], axis=1)
+    moving = ~_smeared(at_rest, recipe.decimation)[kept]
+    fitted = ~_smeared(_dwelling(at_rest, 2 * recipe.decimation), recipe.decimation)[kept]
     return Prepared(
         q, qd, qdd, log.force * gain, log.period,
-        recipe.align_hold and log.hold == "zero_order", recipe, ~smeared[kept], kept,
+        recipe.align_hold and log.hold == "zero_order", recipe, moving,
+        fitted if recipe.keeps_reversals else moving, kept,
     )
+
+
+def _smeared(flags: np.ndarray, decimation: int) -> np.ndarray:
+    """Flags and their neighbours: the parallel filter smears a stop, which goes with them."""
+    reach = np.ones(2 * decimation - 1)
+    return np.stack([np.convolve(f, reach, mode="same") > 0.5 for f in flags.T], axis=1)
+
+
+def _dwelling(flags: np.ndarray, length: int) -> np.ndarray:
+    """Only those flags that stand for longer than `length` samples on end."""
+    out = np.zeros_like(flags)
+    for i, f in enumerate(flags.T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], f, [False]]).astype(int)))
+        for start, end in edges.reshape(-1, 2):
+            out[start:end, i] = end - start > length
+    return out

@@ -17,6 +17,8 @@ _CORNER = 1e-3
 class ActuatorGain(Effect):
     """The force is gain times the declared one."""
 
+    adds_force = False
+
     gain: Array = parameter("1", "positive", "applied over declared force")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -26,13 +28,19 @@ class ActuatorGain(Effect):
         return self.gain
 
     @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
-        return {"gain": [1.0]}
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"gain": 1.0}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"gain": 1.0}]
 
 
 @register("actuator_lag")
 class ActuatorLag(Effect):
     """First-order lag between declared and applied force: T df/dt = u - f."""
+
+    adds_force = False
 
     time_constant: Array = parameter("time", "positive", "T")
 
@@ -43,13 +51,19 @@ class ActuatorLag(Effect):
         return u
 
     @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
-        return {"time_constant": [scales.period * s for s in (1.0, 3.0, 10.0)]}
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"time_constant": 1e-4 * scales.period}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"time_constant": scales.period * s} for s in (0.5, 1.0, 2.0, 4.0, 10.0, 25.0)]
 
 
 @register("input_delay")
 class InputDelay(Effect):
     """The declared force acts later."""
+
+    adds_force = False
 
     delay: Array = parameter("time", "nonnegative", "delay")
 
@@ -60,13 +74,19 @@ class InputDelay(Effect):
         return self.delay
 
     @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
-        return {"delay": [scales.period * s for s in (0.7, 2.0, 5.0)]}
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"delay": 0.0}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"delay": scales.period * s} for s in (0.0, 1.0, 2.0, 4.0, 8.0)]
 
 
 @register("saturation")
 class Saturation(Effect):
     """The force at the load is clipped to plus or minus limit."""
+
+    adds_force = False
 
     limit: Array = parameter("force", "positive", "largest force")
 
@@ -74,5 +94,9 @@ class Saturation(Effect):
         return Action(drive=smooth.clip(x.u, self.limit, _CORNER * self.limit))
 
     @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
-        return {"limit": [scales.peak_force * s for s in (0.95, 0.85, 0.7, 0.5, 0.35)]}
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"limit": 10 * scales.peak_force}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"limit": scales.peak_force * s} for s in (0.97, 0.9, 0.8, 0.65, 0.5, 0.35)]

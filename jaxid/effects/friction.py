@@ -38,6 +38,10 @@ class CoulombFriction(Effect):
             return Action(dry=self.level)
         return Action(dry=self.friction_coefficient * x.normal)
 
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"level": scales.force}]
+
 
 @register("static_friction")
 class StaticFriction(Effect):
@@ -60,8 +64,9 @@ class StribeckFriction(Effect):
         return Action(dry=self.level * jnp.exp(-((x.yd / self.velocity) ** 2)))
 
     @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
-        return {"velocity": [scales.velocity * s for s in (0.03, 0.07, 0.15, 0.3, 0.6)]}
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        widths = (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)
+        return [{"level": scales.force, "velocity": scales.velocity * w} for w in widths]
 
 
 @register("asymmetric_viscous")
@@ -108,6 +113,8 @@ class QuarticFriction(Effect):
 class FrictionDrift(Effect):
     """Every dry-friction level times (1 + rate t), t from the start of the log."""
 
+    adds_force = False
+
     rate: Array = parameter("1/time", "free", "relative change of the levels")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -115,3 +122,11 @@ class FrictionDrift(Effect):
 
     def dry_drift(self, t: Array) -> Array:
         return self.rate * t
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"rate": 0.0}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"rate": 0.0}]

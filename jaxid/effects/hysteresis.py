@@ -33,8 +33,10 @@ class Hysteresis(Effect):
         return jnp.zeros_like(u)
 
     @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
         # The presliding distance level / stiffness runs from a thousandth of the stroke to half.
-        level = 0.3 * scales.force
-        slips = [scales.position * s for s in (0.001, 0.004, 0.015, 0.06, 0.25, 0.5)]
-        return {"level": [level], "stiffness": [level / s for s in slips]}
+        slips = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+        return [
+            {"stiffness": scales.force / (scales.position * s), "level": scales.force}
+            for s in slips
+        ]

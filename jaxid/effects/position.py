@@ -64,11 +64,12 @@ class Cogging(Effect):
         )
 
     @classmethod
-    def starts(cls, scales: Scales) -> dict[str, list[float]]:
-        # Two neighbouring periods must not lose a quarter turn over the stroke, or a true ripple
-        # falls between them: the grid is uniform in turns per stroke.
-        turns = np.arange(1.0, 60.0, 0.4)
-        return {
-            "period": list(2 * scales.position / turns),
-            "phase": [0.0, 0.5 * np.pi, np.pi, 1.5 * np.pi],
-        }
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        # Two neighbouring periods must not lose more than half a turn over the stroke, or a true
+        # ripple falls between them: the grid is uniform in turns per stroke. Of three phases one
+        # has at least half of the amplitude with the right sign.
+        return [
+            {"amplitude": scales.force, "period": 2 * scales.position / turns, "phase": phase}
+            for turns in np.arange(1.0, 60.0, 0.5)
+            for phase in (0.0, 2 / 3 * np.pi, 4 / 3 * np.pi)
+        ]

@@ -23,14 +23,15 @@ OPTIONAL_COLUMNS = (
 LOG_KEYS = ("time", "sample_rate", "position", "force", "hold", "rows", *OPTIONAL_COLUMNS)
 # Chosen: fewer samples than this leave nothing after filtering and trimming.
 MINIMUM_SAMPLES = 50
-Column = Float[np.ndarray, "samples _"]
+# No shape here: columns may come flat, and `Log` itself says what does not fit.
+Column = np.ndarray
 
 
 @dataclass(frozen=True)
 class Log:
     """One measured or simulated log; its arrays are float64 copies that cannot be written.
 
-    One-dimensional columns may be given; they are kept as (samples, 1).
+    Time is kept as (samples,), all else as (samples, width); flat columns may be given.
 
     Attributes:
         time: Time [s], from where the file starts.
@@ -47,7 +48,7 @@ class Log:
         source: Where the log came from, for messages.
     """
 
-    time: Float[np.ndarray, " samples"]
+    time: Column
     position: Column
     force: Column
     velocity: Column | None = None

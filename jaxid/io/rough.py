@@ -12,7 +12,7 @@ from jaxtyping import Float
 Signal = Float[np.ndarray, " samples"]
 
 
-def smooth(values: Signal, window: int) -> Signal:
+def smooth(values: Signal, window: int) -> Float[np.ndarray, " fewer"]:
     """Take the running mean three times; whole windows only, so that it gets shorter.
 
     Args:

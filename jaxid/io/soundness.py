@@ -4,7 +4,7 @@
 readable numbers: a machine at rest, a command at its limit, the wrong unit.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.io.finding import Finding
 from jaxid.io.log import Log
-from jaxid.io.units_check import magnitude_findings, plausible_inertia, ratio_findings
+from jaxid.io.units_check import ByJoint, magnitude_findings, plausible_inertia, ratio_findings
 
 __all__ = ["Finding", "check_log", "plausible_inertia", "raise_on_error"]
 
@@ -27,7 +27,7 @@ _OFTEN_SATURATED = 0.05
 def check_log(
     log: Log,
     *,
-    command_limit: float | Sequence[float] | None = None,
+    command_limit: ByJoint | None = None,
     motion: str = "linear",
     units: dict[str, str] | None = None,
     path: str | Path | None = None,
@@ -121,7 +121,7 @@ def _levels(q: np.ndarray) -> tuple[int, float]:
     return gaps.size + 1, float(gaps.min()) if on_grid else 0.0
 
 
-def _force(log: Log, limit: float | Sequence[float] | None, path: str) -> list[Finding]:
+def _force(log: Log, limit: ByJoint | None, path: str) -> list[Finding]:
     """Commands that are constant, or sit at their limit."""
     channels = log.force.T
     constant = np.ptp(log.force, axis=0) == 0

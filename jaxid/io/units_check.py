@@ -14,6 +14,8 @@ from jaxid.io.finding import Finding
 from jaxid.io.log import Log
 from jaxid.io.rough import correlation, implied_inertia, smooth, windows
 
+# One number for all joints or channels, or one each.
+ByJoint = float | int | Sequence[float | int] | np.ndarray
 _DEGREES = 180.0 / math.pi
 _RPM = 30.0 / math.pi
 # Chosen: two columns that correlate less are not the same quantity in two units.
@@ -180,8 +182,8 @@ def _magnitude(q: np.ndarray, period: float, motion: str, where: str) -> Finding
 
 def plausible_inertia(
     log: Log,
-    guess: float | Sequence[float],
-    gain: float | Sequence[float] = 1.0,
+    guess: ByJoint,
+    gain: ByJoint = 1.0,
     *,
     motion: str = "linear",
 ) -> Finding | None:

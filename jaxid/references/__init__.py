@@ -25,8 +25,8 @@ REFERENCES: dict[str, Family] = {
 
 def make_reference(
     table: Mapping[str, Any],
-    rate_hz: float,
-    duration: float,
+    rate_hz: float | int,
+    duration: float | int,
     base_dir: str | Path = ".",
     *,
     where: str = "reference",
@@ -52,6 +52,16 @@ def make_reference(
         mend = suggest(str(kind), REFERENCES)
         what = "kind is missing" if kind is None else f"kind = {kind!r} is unknown"
         raise InputError(what, where=place, mend=mend)
+    samples = _samples(rate_hz, duration)
+    family = REFERENCES[kind]
+    columns = [
+        family.sample(values, Grid(rate_hz, samples, Path(base_dir), joint, place))
+        for joint, values in enumerate(family.read(table, where))
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _samples(rate_hz: float | int, duration: float | int) -> int:
     for name, value, unit in (("sample_rate", rate_hz, "Hz"), ("duration", duration, "s")):
         if not 0 < value < math.inf:
             mend = f"give a positive number of {unit}"
@@ -60,9 +70,4 @@ def make_reference(
     if samples < 2:
         mend = "raise duration or sample_rate"
         raise InputError(f"only {samples} sample(s)", where="[simulation]", mend=mend)
-    family = REFERENCES[kind]
-    columns = [
-        family.sample(values, Grid(rate_hz, samples, Path(base_dir), joint, place))
-        for joint, values in enumerate(family.read(table, where))
-    ]
-    return np.stack(columns, axis=1)
+    return samples

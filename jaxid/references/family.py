@@ -51,7 +51,7 @@ class Grid:
         where: Name of the table, for messages.
     """
 
-    rate_hz: float
+    rate_hz: float | int
     samples: int
     base_dir: Path
     joint: int

@@ -31,9 +31,7 @@ FOURIER = Family(
     doc="offset + sum over k of sine[k] sin(2 pi k f t) + cosine[k] cos(2 pi k f t)",
     keys={
         "base_frequency_hz": Key("frequency of the first harmonic", "Hz", positive=True),
-        "sine": Key(
-            "coefficients by harmonic", "position", shape="list", default=()
-        ),
+        "sine": Key("coefficients by harmonic", "position", shape="list", default=()),
         "cosine": Key("likewise", "position", shape="list", default=()),
         "offset": Key("mean", "position", default=0.0),
     },

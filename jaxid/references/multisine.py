@@ -67,7 +67,7 @@ MULTISINE = Family(
             default="random",
             choices=("random", "schroeder"),
         ),
-        "seed": Key("of the random phases", shape="whole", default=0, minimum=0),
+        "seed": Key("of the random phases", shape="whole", default=0, minimum=0.0),
     },
     sample=_sample,
 )

@@ -1,0 +1,1 @@
+"""Finding the physics that a simulation is missing."""

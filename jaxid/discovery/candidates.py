@@ -1,0 +1,304 @@
+"""The plant with every effect it might be missing, each doing nothing yet.
+
+One union is compiled once; which unknowns move is data. Compiling each candidate by itself would
+take longer than all of the search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Array, Float
+
+from jaxid.effects import EFFECTS
+from jaxid.estimators.inverse_dynamics import ForceData, force_residual, sharpened
+from jaxid.estimators.least_squares import Transform
+from jaxid.machine import Machine
+from jaxid.model import Effect, Plant, Scales, carries_force, parameters_of
+from jaxid.parameters import Free, Parameters, free_effect, scatter
+from jaxid.preprocess import Prepared
+
+# An effect with more starts than this is evaluated on a plant of its own, all starts at once.
+_FEW = 8
+# Strength at which the columns of an added force are taken, relative to the log's force.
+_FAINT = 1e-6
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect in one place that the plant might be missing.
+
+    Args:
+        kind: Its name.
+        port: Index of the joint it acts on.
+        index: Its unknowns in the union's vector.
+        neutral: Values at which it does next to nothing.
+        starts: Values to search from, (starts, parameters).
+        amplitude: Which of its parameters scale with its strength; none for a drive effect.
+    """
+
+    kind: str
+    port: int
+    index: np.ndarray
+    neutral: np.ndarray
+    starts: np.ndarray
+    amplitude: np.ndarray
+
+    @property
+    def many(self) -> bool:
+        """Whether its starts are evaluated on a plant of their own."""
+        return len(self.starts) > _FEW
+
+    def probe(self, start: int) -> np.ndarray:
+        """Values at which its columns are taken: the shape of a start, next to no strength."""
+        return np.where(self.amplitude, _FAINT, 1.0) * self.starts[start]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A candidate at one start: how the residual differs there, and its columns.
+
+    Args:
+        candidate: Which.
+        start: Index of the start.
+        offset: Residual there minus residual of the current model, (kept, n).
+        columns: Derivatives in the candidate's unknowns, (kept, n, parameters).
+    """
+
+    candidate: Candidate
+    start: int
+    offset: Float[np.ndarray, "kept n"]
+    columns: Float[np.ndarray, "kept n k"]
+
+    @property
+    def strength(self) -> Float[np.ndarray, "kept n"] | None:
+        """Residual per unit of the start's strength; None for a drive effect."""
+        c = self.candidate
+        if not c.amplitude.any():
+            return None
+        return self.columns @ np.where(c.amplitude, c.starts[self.start], 0.0)
+
+
+@dataclass(frozen=True)
+class Union:
+    """Machine with all candidates.
+
+    Args:
+        machine: Its plant carries every candidate; its parameters are the case's own, then theirs.
+        base: Indices of the case's own unknowns.
+        candidates: By place and kind.
+        scales: Of the log.
+    """
+
+    machine: Machine
+    base: np.ndarray
+    candidates: tuple[Candidate, ...]
+    scales: Scales
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """The vector at which only the baseline acts."""
+        return np.asarray(self.machine.parameters.guess)
+
+
+def scales_of(data: Prepared) -> Scales:
+    """How large the quantities of a prepared log are."""
+    moving = np.repeat(data.moving.any(axis=1), 1)
+    v, a = data.at_kept(data.qd)[moving], data.at_kept(data.qdd)[moving]
+    force = data.force - np.mean(data.force, axis=0)
+
+    def rms(x: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(x**2)))
+
+    return Scales(
+        position=float(np.ptp(data.q, axis=0).max() / 2),
+        velocity=rms(v),
+        acceleration=rms(a),
+        force=rms(force),
+        peak_velocity=float(np.abs(v).max()),
+        peak_force=float(np.abs(data.force).max()),
+        period=data.period,
+        duration=data.period * len(data.q),
+    )
+
+
+def build_union(machine: Machine, data: Prepared) -> Union:
+    """Add every registered effect that the plant does not have yet, at every joint.
+
+    Args:
+        machine: The baseline.
+        data: The log to be searched, for scales.
+    """
+    scales = scales_of(data)
+    plant, parameters = machine.plant, machine.parameters
+    base = np.arange(len(parameters.free))
+    candidates = []
+    for port in range(data.q.shape[1]):
+        present = {e.kind for e in plant.effects if e.port == port}
+        for kind, cls in EFFECTS.items():
+            if kind in present:
+                continue
+            neutral = cls.neutral(scales)
+            plant, free = free_effect(plant, cls(**neutral, port=port), machine.units)
+            first = len(parameters.free)
+            parameters = parameters.extended(free)
+            candidates.append(_candidate(cls, port, np.arange(first, first + len(free)), scales))
+    union = machine.with_plant(sharpened(plant, data), parameters)
+    return Union(union, base, tuple(candidates), scales)
+
+
+def _candidate(cls: type[Effect], port: int, index: np.ndarray, scales: Scales) -> Candidate:
+    neutral, infos = cls.neutral(scales), parameters_of(cls)
+    names = [n for n in infos if n in neutral]
+    return Candidate(
+        cls.kind, port, index,
+        np.asarray([neutral[n] for n in names], float),
+        np.asarray([[s[n] for n in names] for s in cls.starts(scales)], float),
+        np.asarray([cls.adds_force and carries_force(infos[n]) for n in names]),
+    )
+
+
+@eqx.filter_jit
+def _residual_and_jacobian(
+    plant: Plant, places: tuple, data: ForceData, theta: Array
+) -> tuple[Array, Array]:
+    def residual(theta: Array) -> tuple[Array, Array]:
+        e = force_residual(scatter(places, plant, theta), data)
+        return e, e
+
+    jacobian, e = jax.jacfwd(residual, has_aux=True)(theta)
+    return e, jacobian
+
+
+def evaluate(
+    union: Union, data: ForceData, theta: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
+    """Residual of the union and its Jacobian in all unknowns."""
+    e, jacobian = _residual_and_jacobian(
+        union.machine.plant, union.machine.parameters.places, data, jnp.asarray(theta)
+    )
+    return np.asarray(e), np.asarray(jacobian)
+
+
+def refine(
+    union: Union, data: ForceData, theta: Float[np.ndarray, " p"], moving: np.ndarray
+) -> tuple[Float[np.ndarray, " p"], bool]:
+    """Fit some unknowns of the union in the force domain, the rest held.
+
+    The union's Jacobian is compiled already; driving a host solver with it costs less than
+    compiling a second one inside a loop.
+
+    Args:
+        union: The union.
+        data: The log.
+        theta: Start, all unknowns.
+        moving: Indices of those that move.
+
+    Returns:
+        All unknowns, and whether the solver converged.
+    """
+    few = free_of(union, moving)
+    transform = Transform.of(few)
+    lower, upper = (np.asarray(transform.inward(b)) for b in few.bounds)
+    weight = np.asarray(data.weight)[..., None]
+    latest: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+    def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        key = x.tobytes()
+        if key not in latest:
+            latest.clear()
+            at = theta.copy()
+            at[moving] = np.asarray(transform.outward(jnp.asarray(x)))
+            e, jacobian = evaluate(union, data, at)
+            slope = np.asarray(transform.slope(jnp.asarray(at[moving])))
+            rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))
+            latest[key] = (np.nan_to_num(e * weight[..., 0], nan=1e150).ravel(), np.nan_to_num(rows))
+        return latest[key]
+
+    start = np.clip(np.asarray(transform.inward(jnp.asarray(theta[moving]))), lower, upper)
+    fit = scipy.optimize.least_squares(
+        lambda x: both(x)[0], start, lambda x: both(x)[1], (lower, upper), x_scale="jac",
+        ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=40,
+    )
+    out = theta.copy()
+    out[moving] = np.asarray(transform.outward(jnp.asarray(fit.x)))
+    return out, bool(fit.status > 0)
+
+
+def points(
+    union: Union, rest: list[Candidate], data: ForceData, theta: Float[np.ndarray, " p"],
+    residual: Float[np.ndarray, "kept n"],
+) -> list[Point]:
+    """Every candidate that has few starts at each of them, all together through the union.
+
+    Args:
+        union: The union.
+        rest: Candidates to evaluate.
+        data: The log.
+        theta: Current model, all unknowns.
+        residual: Its residual.
+    """
+    found = []
+    few = [c for c in rest if not c.many]
+    for k in range(max((len(c.starts) for c in few), default=0)):
+        now = [c for c in few if k < len(c.starts)]
+        # Added forces are faint and can share an evaluation; each drive effect shifts the
+        # residual, and has one to itself.
+        forces = [c for c in now if c.amplitude.any() or np.allclose(c.starts[k], c.neutral)]
+        groups = [forces, *[[c] for c in now if all(c is not f for f in forces)]]
+        for group in groups:
+            if not group:
+                continue
+            at = theta.copy()
+            for c in group:
+                at[c.index] = c.probe(k)
+            e, jacobian = evaluate(union, data, at)
+            shift = e - residual if not group[0].amplitude.any() else np.zeros_like(e)
+            found.extend(Point(c, k, shift, jacobian[..., c.index]) for c in group)
+    return found
+
+
+def many_points(union: Union, candidate: Candidate, data: ForceData) -> list[Point]:
+    """A candidate with many starts at each of them, on a plant that has nothing else."""
+    effect: Effect = union.machine.plant.effects[_position(union, candidate)]
+    alone = eqx.tree_at(lambda p: p.effects, union.machine.plant, (effect,))
+    names = [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
+    places = tuple((("effects", 0, n), None) for n in names)
+    probes = np.stack([candidate.probe(k) for k in range(len(candidate.starts))])
+    chunks = [np.asarray(_columns(alone, places, data, jnp.asarray(s))) for s in _chunks(probes)]
+    columns = np.concatenate(chunks)[: len(candidate.starts)]
+    zero = np.zeros(columns.shape[1:3])
+    return [Point(candidate, k, zero, c) for k, c in enumerate(columns)]
+
+
+def _chunks(starts: np.ndarray, size: int = 37) -> Iterator[np.ndarray]:
+    """Equal chunks, the last filled up: one compiled shape, and memory for one chunk only."""
+    for k in range(0, len(starts), size):
+        chunk = starts[k : k + size]
+        fill = np.repeat(chunk[-1:], size - len(chunk), axis=0)
+        yield np.concatenate([chunk, fill])
+
+
+@eqx.filter_jit
+def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array) -> Array:
+    def columns(start: Array) -> Array:
+        return jax.jacfwd(lambda s: force_residual(scatter(places, plant, s), data))(start)
+
+    return jax.lax.map(columns, starts)
+
+
+def _position(union: Union, candidate: Candidate) -> int:
+    path = union.machine.parameters.free[candidate.index[0]].path
+    return int(path[1])
+
+
+def free_of(union: Union, index: np.ndarray) -> Parameters:
+    """Some unknowns of the union."""
+    free: list[Free] = [union.machine.parameters.free[i] for i in index]
+    return Parameters(tuple(free))

@@ -1,0 +1,269 @@
+"""What is missing: score every candidate on held-out time, add the best, refit, repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from jaxid.discovery import candidates as cand
+from jaxid.discovery import evidence as ev
+from jaxid.discovery.screen import Score, Screen, screen_candidates
+from jaxid.estimators.inverse_dynamics import ForceData
+from jaxid.preprocess import Prepared
+
+# So many of the best candidates are refitted; a linear screen at a start is not the last word.
+_REFITTED = 5
+# Two candidates whose evidence differs by less explain the log equally well: a factor of 20 in
+# likelihood, or one percent of a large evidence, which is what filtering and sampling leave
+# uncertain.
+_TIE_NATS = 3.0
+_TIE_PART = 0.01
+# While much is missing, the effect with fewer parameters goes first where it gains this part of
+# the best: a flexible one gains by imitating what is not there yet. What is still missing then
+# shows in the next round, and what has become superfluous is dropped.
+_MODEST = 0.7
+# An effect must lower the held-out RMS residual by this part, whatever its evidence.
+_RELEVANT = 0.005
+# The gain on the validation log must be at least this part of what the log itself promises.
+_CONFIRMED = 0.1
+
+
+@dataclass(frozen=True)
+class Step:
+    """One round of the search.
+
+    Args:
+        added: What it added; None for the baseline and for a drop.
+        dropped: What it dropped.
+        scores: Of all candidates, best first.
+        threshold: Evidence that noise alone exceeds once in a thousand searches.
+        theta: All unknowns of the union after the step.
+        active: Indices of those that are fitted.
+    """
+
+    added: Score | None
+    dropped: cand.Candidate | None
+    scores: tuple[Score, ...]
+    threshold: float
+    theta: np.ndarray
+    active: np.ndarray
+
+
+@dataclass
+class Search:
+    """State of a search: the union, the logs, and what has been added so far.
+
+    Args:
+        union: Machine with all candidates.
+        data: The log to fit, prepared.
+        validation: Logs that must confirm each effect.
+        progress: Called with a line at every stage.
+        added: Effects added, in order.
+    """
+
+    union: cand.Union
+    data: Prepared
+    validation: tuple[Prepared, ...] = ()
+    progress: Callable[[str], None] = lambda text: None
+    added: list[cand.Candidate] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.arrays = ForceData.of(self.data)
+        self.validation_arrays = [ForceData.of(d) for d in self.validation]
+        self.theta = self.union.neutral
+        self._many: dict[tuple[str, int], list[cand.Point]] = {}
+
+    @property
+    def active(self) -> np.ndarray:
+        """Unknowns fitted now: the case's own and those of the effects added."""
+        return self._active(self.added)
+
+    def _active(self, effects: Sequence[cand.Candidate]) -> np.ndarray:
+        return np.concatenate([self.union.base, *[c.index for c in effects]]).astype(int)
+
+    def rest(self) -> list[cand.Candidate]:
+        """Candidates not added yet."""
+        return [c for c in self.union.candidates if all(c is not a for a in self.added)]
+
+    def many(self, candidate: cand.Candidate) -> list[cand.Point]:
+        """A candidate at its many starts, computed once."""
+        key = (candidate.kind, candidate.port)
+        if key not in self._many:
+            self._many[key] = cand.many_points(self.union, candidate, self.arrays)
+        return self._many[key]
+
+    def run(self, most: int) -> list[Step]:
+        """Add effects until none is worth it; drop what becomes superfluous on the way."""
+        self.progress("fitting the baseline")
+        self.theta = self._fit(self.theta, self.active)
+        steps = [Step(None, None, (), 0.0, self.theta, self.active)]
+        tried: set[frozenset[int]] = {frozenset()}
+        while True:
+            best, scores, limit = self.best()
+            if best is None or len(self.added) >= most:
+                steps.append(Step(None, None, scores, limit, self.theta, self.active))
+                return steps
+            self.added = [*self.added, best.candidate]
+            self.theta = best.theta
+            steps.append(Step(best, None, scores, limit, self.theta, self.active))
+            steps.extend(self._drop_superfluous(limit))
+            now = frozenset(id(c) for c in self.added)
+            if now in tried:  # added and dropped in turn
+                return steps
+            tried.add(now)
+
+    def best(self) -> tuple[Score | None, tuple[Score, ...], float]:
+        """Screen all candidates, refit the most promising, choose; and all scores."""
+        self.progress(f"screening {len(self.rest())} effects")
+        screened = screen_candidates(self)
+        promising = [s for s in screened.scores if s.evidence > 0.5 * screened.threshold]
+        refitted = []
+        for score in _few(promising):
+            self.progress(f"refitting with {score.candidate.kind}")
+            refitted.append(self._refit(score, screened))
+        refitted.sort(key=lambda s: -s.total)
+        rest = [s for s in screened.scores if all(s.candidate is not r.candidate for r in refitted)]
+        good = [s for s in refitted if not s.reason and s.evidence > screened.threshold]
+        return _modest(good), (*refitted, *rest), screened.threshold
+
+    def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:
+        """For each effect added, those that could stand in its place without loss.
+
+        Each effect is taken out and all are scored against the rest. A stand-in that is better
+        by more than a tie, or as good with fewer parameters, takes the place for good.
+        """
+        found: dict[int, tuple[Score, ...]] = {}
+        for k in range(len(self.added)):
+            own = self.added[k]
+            self.progress(f"looking for what could replace {own.kind}")
+            kept, theta = list(self.added), self.theta
+            self.added = [c for c in kept if c is not own]
+            self.theta = self._fit(self._without(theta, own), self.active)
+            _, scores, limit = self.best()
+            good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
+            self.added, self.theta = kept, theta
+            mine = next((s for s in scores if s.candidate is own), None)
+            if not good or mine is None:
+                found[k] = ()
+                continue
+            best, ties = _simplest(good)
+            if best.candidate is not own and mine.total < best.total - _margin(best):
+                self.added = [best.candidate if c is own else c for c in kept]
+                self.theta = self._fit(best.theta, self.active)
+                swap = Step(best, own, scores, limit, self.theta, self.active)
+                steps.append(swap)
+            elif best.candidate is not own:
+                ties = tuple(s for s in [best, *ties] if s.candidate is not own)
+            found[k] = tuple(s for s in ties if s.candidate is not self.added[k])
+        return found
+
+    def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
+        return cand.refine(self.union, self.arrays, theta, active)[0]
+
+    def _without(self, theta: np.ndarray, c: cand.Candidate) -> np.ndarray:
+        theta = theta.copy()
+        theta[c.index] = c.neutral
+        return theta
+
+    def _refit(self, score: Score, screened: Screen) -> Score:
+        c = score.candidate
+        active = self._active([*self.added, c])
+        theta = self.theta.copy()
+        theta[c.index] = score.guess
+        theta = self._fit(theta, active)
+        e, jacobian = cand.evaluate(self.union, self.arrays, theta)
+        after = screened.held_out(e, jacobian[..., active])
+        gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
+        validation, confirmed = self._validated(theta)
+        reason = self._objection(c, theta, e, confirmed)
+        return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
+
+    def _validated(self, theta: np.ndarray) -> tuple[float | None, float | None]:
+        """Gain on the validation logs, nothing refitted there.
+
+        Returns:
+            Gain in log-likelihood [nats], each log with its own colour of noise, and the part by
+            which the sum of squared residuals falls, in the worst log.
+        """
+        if not self.validation:
+            return None, None
+        total, worst = 0.0, np.inf
+        for data, arrays in zip(self.validation, self.validation_arrays, strict=True):
+            old, new = (
+                np.where(data.moving, cand.evaluate(self.union, arrays, t)[0], 0.0)
+                for t in (self.theta, theta)
+            )
+            whitener = ev.Whitener.of(new, data.moving)
+            squares = [np.sum(whitener(e[..., None]) ** 2) for e in (old, new)]
+            total += float(ev.log_evidence(int(whitener.rows.sum()), *squares))
+            worst = min(worst, 1 - float(np.sum(new**2) / np.sum(old**2)))
+        return total, worst
+
+    def _objection(
+        self, c: cand.Candidate, theta: np.ndarray, e: np.ndarray, confirmed: float | None
+    ) -> str:
+        """Why a refitted candidate may not be named; empty where it may."""
+        free = self.union.machine.parameters.free
+        for i in c.index:
+            if not np.isfinite(theta[i]):
+                return "its fit diverged"
+            if free[i].sign == "nonnegative" and theta[i] <= 0.0:
+                return f"{free[i].name} would have to be negative"
+        old, _ = cand.evaluate(self.union, self.arrays, self.theta)
+        counts = self.data.moving
+        closed = 1 - float(np.sum(e[counts] ** 2) / np.sum(old[counts] ** 2))
+        if closed < 2 * _RELEVANT:
+            return f"it closes only {100 * max(closed, 0) / 2:.1f} % of the gap"
+        if confirmed is not None and confirmed < _CONFIRMED * closed:
+            return "it does not help on the validation log"
+        return ""
+
+    def _drop_superfluous(self, limit: float) -> list[Step]:
+        """Drop effects whose loss costs less than noise, or less than is relevant."""
+        steps = []
+        for c in self.added[:-1]:
+            without = [a for a in self.added if a is not c]
+            theta = self._fit(self._without(self.theta, c), self._active(without))
+            if not self._costs(theta, self._active(without), limit):
+                self.added, self.theta = without, theta
+                steps.append(Step(None, c, (), limit, theta, self.active))
+        return steps
+
+    def _costs(self, theta: np.ndarray, active: np.ndarray, limit: float) -> bool:
+        """Whether a smaller model is worse by more than noise and by what is relevant."""
+        e, jacobian = cand.evaluate(self.union, self.arrays, self.theta)
+        now = Screen.of(ev.Whitener.of(e, self.data.moving), e, jacobian[..., self.active])
+        less, jacobian = cand.evaluate(self.union, self.arrays, theta)
+        after = now.held_out(less, jacobian[..., active])
+        counts = self.data.moving
+        opened = 1 - float(np.sum(e[counts] ** 2) / np.sum(less[counts] ** 2))
+        lost = float(ev.log_evidence(now.rows, after, now.before)[0])
+        return lost > limit and opened > 2 * _RELEVANT
+
+
+def _few(promising: list[Score]) -> list[Score]:
+    """The best candidates, and the best of those with a single parameter."""
+    few = promising[:_REFITTED]
+    single = [s for s in promising[_REFITTED:] if len(s.candidate.index) == 1]
+    return [*few, *single[:1]]
+
+
+def _margin(score: Score) -> float:
+    return max(_TIE_NATS, _TIE_PART * abs(score.total))
+
+
+def _modest(good: list[Score]) -> Score | None:
+    """The effect to add next: of those that gain most of what the best gains, the simplest."""
+    if not good:
+        return None
+    enough = [s for s in good if s.total > min(_MODEST * good[0].total, good[0].total - _TIE_NATS)]
+    return min(enough, key=lambda s: (len(s.candidate.index), -s.total))
+
+
+def _simplest(good: list[Score]) -> tuple[Score, tuple[Score, ...]]:
+    """Of those that explain the log equally well, the simplest; and the others."""
+    equal = [s for s in good if s.total >= good[0].total - _margin(good[0])]
+    best = min(equal, key=lambda s: (len(s.candidate.index), -s.total))
+    return best, tuple(s for s in equal if s is not best)

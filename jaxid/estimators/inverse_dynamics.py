@@ -1,0 +1,149 @@
+"""Least squares on the filtered balance: the residual of inverse dynamics, fitted by its Jacobian.
+
+The regressor is the Jacobian of the residual with respect to the unknowns, so that what is linear
+is solved in one step and what is not (a Stribeck velocity, a lag) by a few more on the same code.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid import signals
+from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.result import Estimate
+from jaxid.machine import Machine
+from jaxid.model import Plant
+from jaxid.parameters import scatter
+from jaxid.precision import Precision, assess
+from jaxid.preprocess import Prepared
+from jaxid.readings import residual_along
+
+
+class ForceData(eqx.Module):
+    """Arrays of a prepared log, as compiled code takes them.
+
+    Args:
+        q, qd, qdd, force: At the log's rate.
+        weight: Of each kept sample, (kept, n); zero where it does not count.
+    """
+
+    q: Float[Array, "time n"]
+    qd: Float[Array, "time n"]
+    qdd: Float[Array, "time n"]
+    force: Float[Array, "time m"]
+    weight: Float[Array, "kept n"]
+    period: float = eqx.field(static=True)
+    held: bool = eqx.field(static=True)
+    decimator: signals.Decimator = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, data: Prepared, rows: np.ndarray | None = None) -> ForceData:
+        """Arrays of a prepared log; weight one for `rows`, by default every moving sample."""
+        rows = data.moving if rows is None else rows
+        return cls(
+            jnp.asarray(data.q), jnp.asarray(data.qd), jnp.asarray(data.qdd),
+            jnp.asarray(data.force), jnp.asarray(rows, dtype=float), data.period,
+            data.held, data.recipe.decimator,
+        )
+
+
+def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
+    """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
+    u = signals.delayed(data.force, plant.command_delay(), data.period, held=data.held)
+    return data.decimator(residual_along(plant, data.q, data.qd, data.qdd, u, data.period))
+
+
+def measured_force(data: ForceData) -> Float[Array, "kept m"]:
+    """Declared force through the same filter [N or N m]."""
+    u = signals.delayed(data.force, jnp.zeros(()), data.period, held=data.held)
+    return data.decimator(u)
+
+
+def sharpened(plant: Plant, data: Prepared) -> Plant:
+    """The plant with a sign as sharp as its log allows.
+
+    The width is a third of the rest velocity: samples nearer to zero are left out, so that the
+    smoothing biases nothing.
+    """
+    return eqx.tree_at(
+        lambda p: (p.sharpness, p.velocity_scale),
+        plant,
+        (jnp.asarray(1 / 3), jnp.asarray(min(data.recipe.rest_velocity), dtype=float)),
+    )
+
+
+@eqx.filter_jit
+def _solve(
+    plant: Plant, places: tuple, data: ForceData, theta: Array, transform: Transform,
+    bounds: tuple[Array, Array],
+) -> Minimum:
+    def residual(theta: Array) -> Array:
+        return data.weight * force_residual(scatter(places, plant, theta), data)
+
+    return levenberg_marquardt(residual, theta, transform, *bounds)
+
+
+def inverse_dynamics(
+    machine: Machine, data: Prepared, *, reweighted: bool = False, start: Array | None = None
+) -> Estimate:
+    """Fit the unknowns to a prepared log by least squares on the balance of forces.
+
+    Args:
+        machine: The machine; its guesses matter only where the balance is nonlinear.
+        data: The log, prepared.
+        reweighted: Weight samples by a robust (bisquare) weight of their residual, twice over.
+        start: In place of the guesses.
+
+    Returns:
+        The estimate; its covariance takes the residual's colour into account.
+
+    Source:
+        Gautier (1986) and Janot, Vandanjon & Gautier (2014) for filtered inverse dynamics; Tukey's
+        bisquare with constant 4.685 for the weights.
+    """
+    plant = sharpened(machine.plant, data)
+    rows = data.fitted
+    arrays = ForceData.of(data, rows)
+    parameters = machine.parameters
+    theta = parameters.guess if start is None else jnp.asarray(start)
+    places, transform = parameters.places, Transform.of(parameters)
+    fit = _solve(plant, places, arrays, theta, transform, parameters.bounds)
+    for _ in range(2 if reweighted else 0):
+        e = np.asarray(fit.residual).reshape(data.moving.shape)
+        weight = jnp.asarray(np.sqrt(_bisquare(e, rows)) * rows)
+        arrays = eqx.tree_at(lambda a: a.weight, arrays, weight)
+        fit = _solve(plant, places, arrays, fit.theta, transform, parameters.bounds)
+    e = np.asarray(fit.residual).reshape(rows.shape)
+    jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
+    precision = force_precision(machine, arrays, np.asarray(fit.theta), e, jacobian, rows)
+    converged = bool(fit.converged) and bool(np.all(np.isfinite(fit.theta)))
+    return Estimate(
+        method="inverse_dynamics",
+        machine=machine.with_estimate(fit.theta),
+        theta=np.asarray(fit.theta),
+        precision=precision,
+        converged=converged,
+        message="converged" if converged else "no convergence within 60 steps",
+        residual=np.where(rows, e, np.nan),
+        samples=int(rows.sum()),
+        steps=int(fit.steps),
+    )
+
+
+def force_precision(
+    machine: Machine, arrays: ForceData, theta: np.ndarray, e: np.ndarray, jacobian: np.ndarray,
+    rows: np.ndarray,
+) -> Precision:
+    """Precision of a fit in the force domain."""
+    signal = float(np.linalg.norm(np.where(rows, np.asarray(measured_force(arrays)), 0.0)))
+    scale = np.where(theta != 0, theta, 1.0)
+    return assess(machine.parameters.names, jacobian, e, rows, signal, scale)
+
+
+def _bisquare(e: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    spread = 1.4826 * np.median(np.abs(e[counts]))
+    return np.where(np.abs(e) < 4.685 * spread, (1 - (e / (4.685 * spread)) ** 2) ** 2, 0.0)

@@ -1,0 +1,166 @@
+"""Gradient-based fit of the simulated to the measured position.
+
+In the loop where the controller is known; else open loop over the whole log, or, where an error
+would grow without bound, in segments that restart from the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.result import Estimate
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.model import Plant
+from jaxid.parameters import scatter
+from jaxid.precision import assess, full_hessian
+from jaxid.replay import Numerics, Replay, make_replay, needed_steps
+
+# An open-loop run that ends further off than this part of the stroke is cut into segments.
+_LOST = 0.2
+# So many segments then; each long enough to show friction, short enough not to drift away.
+_SEGMENTS = 40
+
+
+def position_residual(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array
+) -> Callable[[Array], Array]:
+    """Measured minus simulated position as a function of the unknowns, (time, n) [m or rad].
+
+    In open loop the start's position and velocity are unknowns too, behind the others.
+    """
+
+    def residual(theta: Array) -> Array:
+        extra = theta[len(places) :]
+        nudge = extra if extra.size else None
+        return weight * (measured - replay(scatter(places, plant, theta), nudge).position)
+
+    return residual
+
+
+@eqx.filter_jit
+def _fit(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array,
+    transform: Transform, bounds: tuple[Array, Array],
+) -> Minimum:
+    residual = position_residual(replay, places, plant, measured, weight)
+    return levenberg_marquardt(residual, theta, transform, *bounds)
+
+
+@eqx.filter_jit
+def _hessian(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array
+) -> Array:
+    return full_hessian(position_residual(replay, places, plant, measured, weight), theta)
+
+
+def output_error(
+    machine: Machine,
+    log: Log,
+    *,
+    start: np.ndarray | None = None,
+    numerics: Numerics | None = None,
+    hessian: bool = False,
+) -> Estimate:
+    """Fit the unknowns so that the simulated position meets the measured one.
+
+    Args:
+        machine: The machine; its controller closes the loop.
+        log: The log.
+        start: In place of the guesses, for example from `inverse_dynamics`.
+        numerics: How to integrate; chosen from plant and log where absent.
+        hessian: Take the covariance from the full Hessian in place of Gauss-Newton's.
+
+    Returns:
+        The estimate; its covariance takes the residual's colour into account.
+    """
+    machine = machine if start is None else machine.with_estimate(start)
+    numerics = numerics or choose_numerics(machine, log)
+    replay = make_replay(machine, log, numerics)
+    nuisance = 0 if replay.controller is not None or numerics.segment else 2 * log.position.shape[1]
+    problem = _problem(machine, replay, log, nuisance)
+    minimum = _fit(*problem)
+    e = np.asarray(minimum.residual).reshape(log.position.shape)
+    jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
+    theta = np.asarray(minimum.theta)
+    p = len(machine.parameters.free)
+    counts = np.ones(e.shape, bool)
+    names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]]
+    precision = assess(
+        names, jacobian, e, counts,
+        float(np.linalg.norm(log.position - log.position.mean(axis=0))),
+        np.where(theta != 0, theta, 1.0),
+        np.asarray(_hessian(*problem[:5], minimum.theta)) if hessian else None,
+    ).first(p)
+    converged = bool(minimum.converged)
+    return Estimate(
+        method="output_error",
+        machine=machine.with_estimate(theta[:p]),
+        theta=theta[:p],
+        precision=precision,
+        converged=converged,
+        message="converged" if converged else _failure(minimum),
+        residual=e,
+        samples=int(e.size),
+        steps=int(minimum.steps),
+        notes=_notes(machine, numerics, log),
+    )
+
+
+def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple:
+    parameters = machine.parameters
+    lower, upper = parameters.bounds
+    free = jnp.full(nuisance, jnp.inf)
+    transform = Transform(
+        jnp.concatenate([Transform.of(parameters).log, jnp.zeros(nuisance, bool)])
+    )
+    return (
+        replay, parameters.places, machine.plant, jnp.asarray(log.position),
+        jnp.ones(log.position.shape), jnp.concatenate([parameters.guess, jnp.zeros(nuisance)]),
+        transform, (jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])),
+    )
+
+
+def choose_numerics(machine: Machine, log: Log) -> Numerics:
+    """Integration that suits a machine and its log.
+
+    Dry friction sticks exactly: its gradient is exact too, because the force is continuous where
+    sliding starts. Break-away friction breaks that, and is smoothed.
+    """
+    kinds = {e.kind for e in machine.plant.effects}
+    numerics = Numerics(
+        set_valued="static_friction" not in kinds,
+        substeps=needed_steps(machine, log),
+        longest_delay=12 if "input_delay" in kinds and machine.controller is not None else 0,
+    )
+    if machine.controller is not None:
+        return numerics
+    run = eqx.filter_jit(lambda r, p: r(p).position)(make_replay(machine, log, numerics), machine.plant)
+    off = np.abs(np.asarray(run) - log.position).max()
+    if np.isfinite(off) and off < _LOST * np.ptp(log.position):
+        return numerics
+    length = max(20, log.samples // _SEGMENTS)
+    return Numerics(numerics.set_valued, numerics.substeps, 0, length)
+
+
+def _failure(minimum: Minimum) -> str:
+    if not np.isfinite(float(minimum.cost)):
+        return "the simulation diverged from these starting values"
+    return f"no convergence within {int(minimum.steps)} steps"
+
+
+def _notes(machine: Machine, numerics: Numerics, log: Log) -> tuple[str, ...]:
+    where = "in the loop" if machine.controller is not None else "open loop"
+    how = "sticks exactly" if numerics.set_valued else "is smoothed"
+    notes = [f"simulated {where}, {numerics.substeps} step(s) a sample; dry friction {how}"]
+    if numerics.segment:
+        seconds = numerics.segment * log.period
+        notes.append(f"restarted from the log every {seconds:.3g} s: it drifts off otherwise")
+    return tuple(notes)

@@ -1,0 +1,147 @@
+"""How far simulation and measurement are apart, and what the sensors' noise alone would leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Array, Float
+
+from jaxid import signals
+from jaxid.estimators.inverse_dynamics import (
+    ForceData,
+    force_residual,
+    measured_force,
+    sharpened,
+)
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.model import Plant
+from jaxid.preprocess import Prepared
+from jaxid.replay import Replay
+
+
+@dataclass(frozen=True)
+class ForceGap:
+    """Force measured minus force by inverse dynamics, at the kept samples.
+
+    Args:
+        residual: (kept, n) [N or N m]; NaN at rest.
+        measured: (kept, m), through the same filter.
+        rms: By joint.
+        relative: 2-norm of the residual over that of the measured force, by joint.
+    """
+
+    residual: Float[np.ndarray, "kept n"]
+    measured: Float[np.ndarray, "kept m"]
+    rms: Float[np.ndarray, " n"]
+    relative: Float[np.ndarray, " n"]
+
+
+@eqx.filter_jit
+def _force_gap(plant: Plant, data: ForceData) -> tuple[Array, Array]:
+    return -force_residual(plant, data), measured_force(data)
+
+
+def force_gap(machine: Machine, data: Prepared) -> ForceGap:
+    """Gap between measured force and inverse dynamics, samples at rest left out."""
+    residual, measured = _force_gap(sharpened(machine.plant, data), ForceData.of(data))
+    residual = np.where(data.moving, np.asarray(residual), np.nan)
+    counted = np.where(data.moving, np.asarray(measured), np.nan)
+    norm = np.sqrt(np.nansum(residual**2, axis=0))
+    return ForceGap(
+        residual, np.asarray(measured), np.sqrt(np.nanmean(residual**2, axis=0)),
+        norm / np.sqrt(np.nansum(counted**2, axis=0)),
+    )
+
+
+@dataclass(frozen=True)
+class SimulationGap:
+    """Measured minus simulated position, and what the simulated loop commanded.
+
+    Args:
+        position: Simulated, (time, n) [m or rad].
+        command: Simulated, (time, m); None in open loop.
+        rms: Of the difference in position, by joint.
+        relative: 2-norm of the difference over that of the measured position, by joint.
+        command_relative: The same of the command; None in open loop.
+    """
+
+    position: Float[np.ndarray, "time n"]
+    command: Float[np.ndarray, "time m"] | None
+    rms: Float[np.ndarray, " n"]
+    relative: Float[np.ndarray, " n"]
+    command_relative: Float[np.ndarray, " m"] | None
+
+
+_run = eqx.filter_jit(lambda replay, plant: replay(plant))
+
+
+def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:
+    """Gap between measured and simulated position."""
+    run = _run(replay, machine.plant)
+    position = np.asarray(run.position)
+    gap = log.position - position
+    closed = replay.controller is not None
+    command = np.asarray(run.command) if closed else None
+    return SimulationGap(
+        position, command, np.sqrt(np.mean(gap**2, axis=0)),
+        np.linalg.norm(gap, axis=0) / np.linalg.norm(log.position, axis=0),
+        np.linalg.norm(log.force - command, axis=0) / np.linalg.norm(log.force, axis=0)
+        if closed else None,
+    )
+
+
+def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray, " n"]:
+    """RMS force that the sensors' noise alone leaves in the band [N or N m], by joint.
+
+    Position noise passes the plant's impedance -M w^2 + i C w + K (linearised at a typical
+    velocity) and both filters; force noise passes the parallel filter. The noise is the case's
+    `[sensor]`; where that is silent, position noise is read off the high band of the log and the
+    logged force counts as exact.
+
+    Args:
+        machine: The machine; its parameters enter through the impedance only.
+        log: The log.
+        data: The same, prepared.
+    """
+    rate, recipe = log.rate_hz, data.recipe
+    f = np.linspace(0, rate / 2, 2049)[1:]
+    sigma = machine.sensor.position_std
+    sigma = signals.high_band_std(log.position, rate) if sigma is None else np.asarray(sigma)
+    mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
+    w = 2 * np.pi * f[:, None, None]
+    impedance = -mass * w**2 + 1j * w * damping + stiffness
+    through = np.abs(_position_filter(f, recipe, rate)) * recipe.decimator.response(f, rate)
+    density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
+    power = np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
+    force_noise = machine.sensor.force_noise
+    if force_noise is not None:
+        white = 2 * np.square(np.asarray(force_noise) * machine.gain) / rate
+        power = power + white * recipe.decimator.response(f, rate)[:, None] ** 2
+    return np.sqrt(np.trapezoid(power, f, axis=0))
+
+
+def _position_filter(f: np.ndarray, recipe: object, rate: float) -> np.ndarray:
+    if recipe.derivatives == "spectral":
+        return 0.5 * (1 + np.cos(np.pi * np.clip((f / recipe.cutoff_hz - 0.8) / 0.2, 0.0, 1.0)))
+    sos = scipy.signal.butter(recipe.order, recipe.cutoff_hz, fs=rate, output="sos")
+    return np.abs(scipy.signal.freqz_sos(sos, worN=f, fs=rate)[1]) ** 2
+
+
+@eqx.filter_jit
+def _impedance(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
+    """Mass, damping and stiffness of the balance at the middle position, at RMS velocity."""
+    q, v = jnp.median(data.q, axis=0), jnp.sqrt(jnp.mean(data.qd**2, axis=0))
+    u = jnp.median(data.force, axis=0)
+    own = plant.initial_states(u)
+
+    def residual(q: Array, v: Array, a: Array) -> Array:
+        return plant.balance(q, v, a, u, jnp.zeros(()), own).residual
+
+    stiffness, damping, mass = jax.jacfwd(residual, argnums=(0, 1, 2))(q, v, jnp.zeros_like(q))
+    return mass, damping, stiffness

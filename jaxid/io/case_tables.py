@@ -1,0 +1,166 @@
+"""What the tables of a case may hold, declared: one line a key."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, fields
+
+from jaxid.controllers import CONTROLLERS, Controller
+from jaxid.io.log import HOLDS, OPTIONAL_COLUMNS
+from jaxid.io.schema import (
+    Key,
+    Keys,
+    by_joint,
+    choice,
+    columns,
+    either_text,
+    flag,
+    inline,
+    number,
+    rows,
+    several,
+    text,
+    whole,
+)
+
+# Names that the case file promises and this version does not have yet.
+PLANNED_PLANTS = ("chain", "flexible_axis", "micropositioning_stage", "serial_arm", "five_bar")
+PLANNED_EFFECTS = ("velocity_hysteresis", "backlash", "joint_flexibility")
+PLANNED_CONTROLLERS = ("flatness", "computed_torque", "adaptive")
+METHODS = (
+    "inverse_dynamics",
+    "instrumental_variable",
+    "algebraic",
+    "recursive",
+    "power",
+    "output_error",
+    "didim",
+)
+# Tables at the top of a case, in the order in which they are checked; [[ ]] where it may recur.
+TOP = {
+    "plant": False,
+    "effects": True,
+    "actuator": False,
+    "log": False,
+    "preprocess": False,
+    "controller": False,
+    "sensor": False,
+    "validation": True,
+    "reference": False,
+    "input": False,
+    "simulation": False,
+    "study": False,
+}
+# Fields of controllers that are bounded; all others may have any sign.
+_CONTROLLER_SIGNS = {"derivative_filter": "nonnegative"}
+
+DISTURBANCE = either_text(
+    inline(
+        {
+            "level": Key(number(), "height of the square wave, in units of the command", True),
+            "on": Key(number("positive"), "how long it is on [s]", True),
+            "off": Key(number("nonnegative"), "how long it is off in between [s]", True),
+            "start": Key(number(), "when it first goes on [s]; default 0"),
+        }
+    )
+)
+
+PLANT: Keys = {
+    "motion": Key(choice(("linear", "rotary"))),
+    "orientation": Key(choice(("horizontal", "vertical"))),
+    "gravity": Key(number("nonnegative")),
+    "units": Key(inline({"position": Key(text), "force": Key(text)})),
+}
+STUDY: Keys = {
+    "estimators": Key(several(choice(METHODS))),
+    "noise": Key(several(number("nonnegative"))),
+    "draw": Key(number("nonnegative")),
+    "start_spread": Key(number("nonnegative")),
+    "runs": Key(whole(1)),
+    "chunk": Key(whole(1)),
+}
+
+
+def log_keys(joints: int) -> Keys:
+    """Keys of [log]."""
+    names = Key(columns(joints), "name of its column")
+    return {
+        "time": Key(text, "name of its column"),
+        "sample_rate": Key(number("positive"), "samples per second"),
+        "position": names,
+        "force": names,
+        "hold": Key(choice(HOLDS)),
+        "rows": Key(rows),
+        **dict.fromkeys(OPTIONAL_COLUMNS, names),
+    }
+
+
+def validation_keys(joints: int) -> Keys:
+    """Keys of [[validation]]."""
+    own = {
+        "name": Key(text, "what it is called in results", required=True),
+        "log": Key(text, "its file, relative to the case"),
+        "disturbance": Key(DISTURBANCE),
+    }
+    return {**own, **log_keys(joints)}
+
+
+def actuator_keys(drives: int) -> Keys:
+    """Keys of [actuator]."""
+    row = several(number(), shortest=drives)
+    return {
+        "gain": Key(by_joint(number("nonzero"), drives)),
+        "transmission": Key(several(row, shortest=drives)),
+    }
+
+
+def preprocess_keys(joints: int) -> Keys:
+    """Keys of [preprocess]."""
+    return {
+        "cutoff_hz": Key(number("positive")),
+        "order": Key(whole(1)),
+        "decimation": Key(whole(1)),
+        "trim": Key(whole(0)),
+        "rest_velocity": Key(by_joint(number("nonnegative"), joints)),
+        "align_hold": Key(flag),
+    }
+
+
+def controller_keys(kind: str, joints: int) -> Keys:
+    """Keys of [controller]: those of every controller, and the fields of the class of this kind."""
+    keys = {
+        "period": Key(number("positive"), "sampling time [s]"),
+        "velocity_average": Key(whole(1), "samples"),
+        "limit": Key(by_joint(number("positive"), joints), "of the command"),
+        "disturbance": Key(DISTURBANCE),
+    }
+    shared = {field.name for field in fields(Controller)}
+    own = {}
+    for field in fields(CONTROLLERS[kind]):
+        if field.name not in shared:
+            required = field.default is MISSING and field.default_factory is MISSING
+            sign = _CONTROLLER_SIGNS.get(field.name, "free")
+            yes_or_no = field.type in (bool, "bool")
+            read = flag if yes_or_no else by_joint(number(sign), joints)
+            own[field.name] = Key(read, f"it belongs to kind = '{kind}'", required)
+    return {**own, **keys}
+
+
+def sensor_keys(joints: int) -> Keys:
+    """Keys of [sensor]."""
+    return {
+        "position_resolution": Key(by_joint(number("positive"), joints)),
+        "position_noise": Key(by_joint(number("nonnegative"), joints)),
+        "force_noise": Key(by_joint(number("nonnegative"), joints)),
+    }
+
+
+def simulation_keys(joints: int) -> Keys:
+    """Keys of [simulation]."""
+    return {
+        "duration": Key(number("positive"), "s"),
+        "sample_rate": Key(number("positive"), "samples per second"),
+        "substeps": Key(whole(1)),
+        "sharpness": Key(number("positive")),
+        "initial_position": Key(by_joint(number(), joints)),
+        "initial_velocity": Key(by_joint(number(), joints)),
+    }

@@ -1,0 +1,273 @@
+"""Readers for the keys of a case file: each checks one value or says what is wrong with it.
+
+A table is declared as names and `Key`s; `read_table` refuses what is not declared.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from jaxid.errors import InputError, suggest
+
+# Chosen: longer values are cut in messages, which stay on one line of a terminal.
+_LONGEST_SHOWN = 60
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where in a case file something stands.
+
+    Args:
+        file: Name of the case file.
+        table: As it is written there: "[plant]", "[[effects]] 2 (cogging)"; empty at the top.
+        key: Name of the key.
+    """
+
+    file: str
+    table: str = ""
+    key: str = ""
+
+    def fault(self, what: str, mend: str) -> InputError:
+        """An error that names file, table and key."""
+        where = f"{self.file}, {self.table}" if self.table else self.file
+        return InputError(f"{self.key} {what}".strip(), where=where, mend=mend)
+
+    def refuse(self, value: Any, what: str, mend: str) -> InputError:
+        """An error that also shows the value."""
+        return self.fault(f"= {shown(value)} {what}", mend)
+
+    def at(self, key: str) -> Spot:
+        """A key of the same table."""
+        return replace(self, key=key)
+
+    def entry(self, index: int) -> Spot:
+        """One entry of a list, counted from 1."""
+        return replace(self, key=f"{self.key}[{index}]")
+
+    def inside(self, key: str) -> Spot:
+        """A key of the table that is this key's value."""
+        return replace(self, key=f"{self.key}.{key}")
+
+
+Reader = Callable[[Any, Spot], Any]
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key of a table.
+
+    Args:
+        read: Checks the value and returns it, or raises `InputError`.
+        doc: What it means, with unit or example; for the mend where it is missing.
+        required: Whether it must be there.
+    """
+
+    read: Reader
+    doc: str = ""
+    required: bool = False
+
+
+Keys = Mapping[str, Key]
+
+
+def read_table(table: Any, keys: Keys, spot: Spot) -> dict[str, Any]:
+    """Check a table against the keys that it may have.
+
+    Args:
+        table: What stands in the file.
+        keys: Every key allowed.
+        spot: Where it stands; with a key where the table is the value of one.
+
+    Returns:
+        The checked values of the keys that are given.
+
+    Raises:
+        InputError: If a key is unknown, missing, or has a value that it cannot have.
+    """
+    at = spot.inside if spot.key else spot.at
+    if not isinstance(table, dict):
+        mend = f"write {{ {', '.join(keys)} }}" if spot.key else "write it as one table"
+        raise spot.fault(f"{'= ' if spot.key else ''}{shown(table)} is not a table", mend)
+    for name in table:
+        if name not in keys:
+            has = "has an " if spot.key else ""
+            raise spot.fault(f"{has}unknown key '{name}'", nearest(name, keys, table))
+    for name, key in keys.items():
+        if key.required and name not in table:
+            raise spot.fault(f"'{name}' is missing", f"add {name}: {key.doc}")
+    return {name: keys[name].read(value, at(name)) for name, value in table.items()}
+
+
+def nearest(name: str, keys: Iterable[str], table: Mapping[str, Any]) -> str:
+    """Help with an unknown key: the nearest one that the table does not have yet, and all keys."""
+    keys = list(keys)
+    absent = [key for key in keys if key not in table]
+    if difflib.get_close_matches(name.casefold(), absent, n=1):
+        return suggest(name, absent + [key for key in keys if key in table], limit=len(keys))
+    return f"there is: {', '.join(keys)}"
+
+
+def shown(value: Any) -> str:
+    """A value as TOML would write it, cut to what fits a message."""
+    text = _toml(value)
+    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {_toml(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    return str(value)
+
+
+_DEMANDS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "free": (lambda x: True, ""),
+    "nonnegative": (lambda x: x >= 0, "is negative; it must be >= 0"),
+    "positive": (lambda x: x > 0, "is not positive; it must be > 0"),
+    "nonzero": (lambda x: x != 0, "is zero; it must not be 0"),
+}
+
+
+def number(sign: str = "free") -> Reader:
+    """A finite number; `sign` is "free", "nonnegative", "positive" or "nonzero"."""
+    holds, demand = _DEMANDS[sign]
+
+    def read(value: Any, spot: Spot) -> float:
+        if isinstance(value, dict):
+            raise spot.refuse(value, "must be a known number", "give the number, without guess")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise spot.refuse(value, "is not a number", f"give a number, e.g. {spot.key} = 1.0")
+        # A whole number of TOML may be too long for a float.
+        if abs(value) > 1e300 or not math.isfinite(value):
+            raise spot.refuse(value, "is not a finite number", "give a finite one, in SI units")
+        if not holds(value):
+            what, mend = demand.split("; ")
+            raise spot.refuse(value, what, mend)
+        return float(value)
+
+    return read
+
+
+def whole(minimum: int) -> Reader:
+    """A whole number of at least `minimum`."""
+
+    def read(value: Any, spot: Spot) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            mend = f"give a whole number, e.g. {spot.key} = {max(minimum, 1)}"
+            raise spot.refuse(value, "is not a whole number", mend)
+        if value < minimum:
+            raise spot.refuse(value, "is too small", f"it must be at least {minimum}")
+        return value
+
+    return read
+
+
+def flag(value: Any, spot: Spot) -> bool:
+    """True or false."""
+    if not isinstance(value, bool):
+        raise spot.refuse(value, "is neither true nor false", "write true or false, without quotes")
+    return value
+
+
+def text(value: Any, spot: Spot) -> str:
+    """Text that is not empty."""
+    if not isinstance(value, str) or not value.strip():
+        raise spot.refuse(value, "is not a text", f'write {spot.key} = "..."')
+    return value
+
+
+def choice(known: Iterable[str], planned: Iterable[str] = ()) -> Reader:
+    """One of some names; the planned ones are refused as not being there yet."""
+    names, later = list(known), set(planned)
+
+    def read(value: Any, spot: Spot) -> str:
+        name = text(value, spot)
+        if name in names:
+            return name
+        if name in later:
+            mend = f"have: {', '.join(names)}"
+            raise spot.refuse(name, "is not available in this version", mend)
+        raise spot.refuse(name, "is unknown", suggest(name, names))
+
+    return read
+
+
+def several(read: Reader, *, shortest: int = 1) -> Reader:
+    """A list of such values, as a tuple."""
+
+    def read_list(value: Any, spot: Spot) -> tuple:
+        if not isinstance(value, list) or len(value) < shortest:
+            mend = f"give a list of at least {shortest} in [ ]"
+            raise spot.refuse(value, "is not a list" if value != [] else "is empty", mend)
+        return tuple(read(v, spot.entry(k)) for k, v in enumerate(value, start=1))
+
+    return read_list
+
+
+def by_joint(read: Reader, joints: int) -> Reader:
+    """One value for all joints, or a list with one a joint (a tuple then)."""
+
+    def read_either(value: Any, spot: Spot) -> Any:
+        if not isinstance(value, list):
+            return read(value, spot)
+        if len(value) != joints:
+            mend = f"give {count(joints, 'value')}, one a joint"
+            raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", mend)
+        return several(read)(value, spot)
+
+    return read_either
+
+
+def columns(joints: int) -> Reader:
+    """Names of columns: one (which may hold a matrix), or one a joint; as they are written."""
+
+    def read(value: Any, spot: Spot) -> str | list[str]:
+        if isinstance(value, list) and value:
+            names = several(text)(value, spot)
+            if len(names) not in (1, joints) or len(set(names)) < len(names):
+                mend = f"name {count(joints, 'column')}, one a joint, each once"
+                raise spot.refuse(value, f"does not fit {count(joints, 'joint')}", mend)
+            return list(names)
+        if not isinstance(value, str) or not value:
+            mend = f'give the name of a column: {spot.key} = "..."'
+            raise spot.refuse(value, "names no column", mend)
+        return value
+
+    return read
+
+
+def rows(value: Any, spot: Spot) -> list[int]:
+    """First row and end: 0-based, half open."""
+    mend = "give two whole numbers, first and end (0-based, half open), e.g. rows = [0, 25000]"
+    if (
+        not isinstance(value, list)
+        or len(value) != 2
+        or not all(isinstance(v, int) and not isinstance(v, bool) for v in value)
+        or not 0 <= value[0] < value[1]
+    ):
+        raise spot.refuse(value, "is not a range of rows", mend)
+    return value
+
+
+def inline(keys: Keys) -> Reader:
+    """A table of its own, with these keys."""
+    return lambda value, spot: read_table(value, keys, spot)
+
+
+def either_text(read: Reader) -> Reader:
+    """Text, or what `read` takes."""
+    return lambda value, spot: (text if isinstance(value, str) else read)(value, spot)
+
+
+def count(number: int, one: str, many: str = "") -> str:
+    """A count and its noun: "1 joint", "2 joints"."""
+    return f"{number} {one}" if number == 1 else f"{number} {many or one + 's'}"

@@ -1,0 +1,235 @@
+"""Everything that a fit or a simulation needs of a case, as arrays and modules."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.controllers import CONTROLLERS, Controller
+from jaxid.errors import InputError
+from jaxid.io.case import Case
+from jaxid.io.case_entries import EffectEntry
+from jaxid.io.case_values import Value
+from jaxid.io.log import Log
+from jaxid.model import ParameterInfo, Plant, as_array, parameters_of
+from jaxid.parameters import Free, Parameters, effect_name
+from jaxid.sensors import Sensor
+from jaxid.tables import read_columns
+from jaxid.units import Units
+
+# A disturbance switches at start + k (on + off); the tick at that very instant still sees the
+# old value, and a time stamp that is off by its rounding must not change that. In parts of
+# on + off: half a microsecond at a usual 0.5 s, far below any tick, above the jitter of logs.
+_SWITCH = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """A plant with what drives, closes and measures it.
+
+    Args:
+        plant: The plant at its guesses (or true values).
+        parameters: Its unknowns.
+        gain: Declared force per unit of the logged command, (m,).
+        units: Labels.
+        controller: The sampled law; None: unknown, only open loop can be simulated.
+        disturbance: Added to the command in the loop: a square wave's level, on, off [s] and
+            start [s], or the name of a column of the log; None: none.
+        sensor: What is known of the measurement.
+        hold: How the command runs between samples.
+    """
+
+    plant: Plant
+    parameters: Parameters
+    gain: Float[np.ndarray, " m"]
+    units: Units
+    controller: Controller | None = None
+    disturbance: Mapping[str, float] | str | None = None
+    sensor: Sensor = Sensor()
+    hold: str = "zero_order"
+
+    def with_plant(self, plant: Plant, parameters: Parameters) -> Machine:
+        """The same machine around another plant and its unknowns."""
+        return replace(self, plant=plant, parameters=parameters)
+
+    def with_estimate(self, theta: Sequence[float]) -> Machine:
+        """The same machine with its unknowns set, which are also the new guesses."""
+        theta = np.asarray(theta, dtype=np.float64)
+        parameters = self.parameters.with_guess(theta)
+        plant = self.parameters.insert(self.plant, parameters.guess)
+        return replace(self, plant=plant, parameters=parameters)
+
+
+def build_machine(case: Case, *, true: bool = False, period: float | None = None) -> Machine:
+    """Make a machine of a case.
+
+    Args:
+        case: The case.
+        true: Take the `true` values where there are any, in place of the guesses.
+        period: Sampling time [s] of the log, which a controller without its own runs at; absent:
+            what [log] or [simulation] give as sample_rate.
+
+    Returns:
+        The machine.
+
+    Raises:
+        InputError: If the controller's period is not to be found, or the case asks for what
+            this version does not have.
+    """
+    if case.transmission is not None:
+        mend = "leave transmission out and log the joints' own positions and forces"
+        what = "transmission is not available in this version"
+        raise InputError(what, where=f"{case.path}, [actuator]", mend=mend)
+    plant, free = _bare_plant(case, true)
+    for entry in case.effects:
+        for at in range(len(entry.joints)):
+            plant, more = _with_effect(plant, entry, at, case, true)
+            free += more
+    gain = np.broadcast_to(np.asarray(case.gain, dtype=np.float64), (case.plant.joints,)).copy()
+    return Machine(
+        plant=plant,
+        parameters=Parameters(tuple(free)),
+        gain=gain,
+        units=case.plant.units,
+        controller=_controller(case, period),
+        disturbance=(case.controller or {}).get("disturbance"),
+        sensor=Sensor(**{name: as_array(value) for name, value in case.sensor.items()}),
+        hold=case.log.get("hold", "zero_order"),
+    )
+
+
+def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
+    """The plant without effects, and its own unknowns."""
+    entry = case.plant
+    known: dict[str, Any] = {"gravity": entry.gravity, "vertical": entry.vertical}
+    known["sharpness"] = case.simulation.get("sharpness")
+    options = {
+        name: value
+        for name, value in known.items()
+        if value is not None and name in entry.cls.__dataclass_fields__
+    }
+    values: dict[str, Any] = {}
+    free: list[Free] = []
+    for name, info in parameters_of(entry.cls).items():
+        given = entry.parameters.get(name)
+        if isinstance(given, tuple):
+            values[name] = [v.start(true) for v in given]
+            for k, v in enumerate(given):
+                free += _free(v, f"{name}[{k + 1}]", (name,), info, case, true, index=k)
+        elif given is not None:
+            values[name] = given.start(true)
+            free += _free(given, name, (name,), info, case, true)
+    return entry.cls(**values, **options), free
+
+
+def _with_effect(
+    plant: Plant, entry: EffectEntry, at: int, case: Case, true: bool
+) -> tuple[Plant, list[Free]]:
+    """The plant with an effect on one of its joints, and the effect's unknowns."""
+    joint = entry.joints[at]
+    values = {name: of_joints[at] for name, of_joints in entry.parameters.items()}
+    effect = entry.cls(port=joint - 1, **{name: v.start(true) for name, v in values.items()})
+    place = f"[{joint}]" if case.plant.joints > 1 else ""
+    number = effect_name(plant, effect).removeprefix(effect.kind)
+    free: list[Free] = []
+    for name, info in parameters_of(entry.cls).items():
+        if name in values:
+            key = f"{effect.kind}{place}{number}.{name}"
+            path = ("effects", len(plant.effects), name)
+            free += _free(values[name], key, path, info, case, true)
+    return plant.with_effect(effect), free
+
+
+def _free(
+    value: Value,
+    name: str,
+    path: tuple[str | int, ...],
+    info: ParameterInfo,
+    case: Case,
+    true: bool,
+    *,
+    index: int | None = None,
+) -> list[Free]:
+    """The unknown that a value is; empty where it is known."""
+    if not value.free:
+        return []
+    unit = case.plant.units.label(info.dimension)
+    guess, bounds = value.start(true), (value.lower, value.upper)
+    return [Free(name, path, unit, info.sign, guess, *bounds, index=index, true=value.true)]
+
+
+def _controller(case: Case, period: float | None) -> Controller | None:
+    if case.controller is None:
+        return None
+    cls = CONTROLLERS[case.controller["kind"]]
+    # Defaults that are plain numbers would be no array leaves, and compile anew where given.
+    values = {
+        field.name: field.default
+        for field in fields(cls)
+        if field.default is not MISSING and isinstance(field.default, float)
+    }
+    given = {k: v for k, v in case.controller.items() if k not in ("kind", "disturbance", "period")}
+    values |= given
+    static = {field.name for field in fields(cls) if field.metadata.get("static")}
+    arrays = {k: v if k in static else as_array(v) for k, v in values.items()}
+    return cls(period=case.controller.get("period") or _log_period(case, period), **arrays)
+
+
+def _log_period(case: Case, period: float | None) -> float:
+    rate = case.log.get("sample_rate") or case.simulation.get("sample_rate")
+    if period is None and rate is None:
+        mend = "add period = <its sampling time in s>"
+        where = f"{case.path}, [controller]"
+        raise InputError("the controller's period is not known", where=where, mend=mend)
+    return period if period is not None else 1.0 / rate
+
+
+def disturbance_at(
+    disturbance: Mapping[str, float] | str | None,
+    times: Float[np.ndarray, " ticks"],
+    log: Log | None = None,
+) -> Float[np.ndarray, "ticks _"]:
+    """Sample what is added to the command in a loop.
+
+    A square wave is on for start < t <= start + on, and so on every on + off: the tick at the
+    very instant of switching still sees the old value, however its time stamp is rounded.
+
+    Args:
+        disturbance: A square wave, the name of a column, or None for zero.
+        times: The ticks [s], on the clock of the log.
+        log: Whose file has the column; its values are held between its samples.
+
+    Returns:
+        The disturbance at each tick, in units of the command.
+
+    Raises:
+        InputError: If there is no such column, or no log to have it.
+    """
+    times = np.asarray(times, dtype=np.float64)
+    if disturbance is None:
+        return np.zeros((times.size, 1))
+    if isinstance(disturbance, str):
+        return _column(disturbance, times, log)
+    cycle = disturbance["on"] + disturbance["off"]
+    since = times - disturbance.get("start", 0.0) - _SWITCH * cycle
+    on = (since > 0) & (np.mod(since, cycle) < disturbance["on"])
+    return np.where(on, disturbance["level"], 0.0)[:, None]
+
+
+def _column(name: str, times: np.ndarray, log: Log | None) -> np.ndarray:
+    where = f"disturbance = '{name}'"
+    if log is None:
+        mend = "give { level, on, off, start } in its place"
+        raise InputError("a column needs a log to stand in", where=where, mend=mend)
+    values = read_columns(log.source, [name], log.rows)[0][name]
+    if not np.isfinite(values).all():
+        row = log.rows[0] + int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+        mend = "mend that row, or cut it out with rows"
+        raise InputError(f"row {row} is not a number", where=f"{log.source}, {where}", mend=mend)
+    # A tick belongs to the sample at its own instant, however that is rounded.
+    held = np.searchsorted(log.time, times + 1e-3 * log.period, side="right") - 1
+    return values[np.clip(held, 0, len(values) - 1)]

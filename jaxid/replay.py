@@ -1,0 +1,221 @@
+"""A machine run over the input of a log: in its loop where the controller is known, else open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Array, Float
+
+from jaxid.controllers import Controller
+from jaxid.errors import InputError
+from jaxid.io.log import Log
+from jaxid.machine import Machine, disturbance_at
+from jaxid.model import Plant
+from jaxid.readings import State, acceleration
+from jaxid.sensors import Sensor
+from jaxid.simulate import Drive, Trajectory, closed_loop, open_loop
+
+# Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
+_FINE = 0.2
+# A band-limited command is refined so often, then joined by lines.
+_REFINE = 8
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """How a replay integrates.
+
+    Args:
+        set_valued: Dry friction sticks exactly; else it is smoothed.
+        substeps: Integration steps between samples of the command.
+        longest_delay: Samples of past command kept, for delays in a loop.
+        segment: Samples after which an open-loop run restarts from the log; None: never.
+    """
+
+    set_valued: bool = True
+    substeps: int = 1
+    longest_delay: int = 0
+    segment: int | None = None
+
+
+class Replay(eqx.Module):
+    """Inputs of a log, ready to drive a plant; call it with the plant.
+
+    Args:
+        drive: How the command acts.
+        controller: The law; None: open loop.
+        sensor: What the controller reads.
+        reference, disturbance: At every tick (closed loop).
+        command: Logged command (open loop), refined where it is band-limited.
+        position, velocity: At the start.
+        restart: Flags, positions and velocities of segments (open loop).
+        every: The log holds one tick in so many.
+    """
+
+    drive: Drive
+    controller: Controller | None
+    sensor: Sensor
+    reference: Array | None
+    disturbance: Array | None
+    command: Array | None
+    position: Float[Array, " n"]
+    velocity: Float[Array, " n"]
+    restart: tuple[Array, Array, Array] | None
+    every: int = eqx.field(static=True)
+
+    def __call__(self, plant: Plant, nudge: Array | None = None) -> Trajectory:
+        """Trajectory at the samples of the log.
+
+        Args:
+            plant: The plant.
+            nudge: Added to position and velocity at the start, (2 n,).
+        """
+        q, v = self.position, self.velocity
+        if nudge is not None:
+            q, v = q + nudge[: q.size], v + nudge[q.size :]
+        if self.controller is not None:
+            run = closed_loop(
+                plant, self.drive, self.controller, self.reference, self.disturbance, q, v,
+                self.sensor,
+            )
+        else:
+            run = open_loop(plant, self.drive, self.command, q, v, None, self.restart)
+        return jax.tree.map(lambda a: a[:: self.every], run)
+
+    def with_numerics(self, numerics: Numerics) -> Replay:
+        """The same run, integrated otherwise."""
+        drive = self.drive
+        new = Drive(
+            drive.gain, drive.period, drive.hold, numerics.substeps, numerics.set_valued,
+            numerics.longest_delay,
+        )
+        return eqx.tree_at(lambda r: r.drive, self, new)
+
+
+def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) -> Replay:
+    """Prepare a log to drive its machine.
+
+    Args:
+        machine: The machine; with a controller the loop is closed.
+        log: The log; in a loop it needs a reference.
+        numerics: How to integrate; default exact sticking, steps as fine as the plant asks.
+
+    Raises:
+        InputError: If the loop is to be closed and the log has no reference, or its rate does not
+            fit the controller's.
+    """
+    numerics = numerics or Numerics(substeps=needed_steps(machine, log))
+    velocity = start_velocity(log)
+    if machine.controller is None:
+        return _open(machine, log, numerics, velocity)
+    period = machine.controller.period
+    every = max(1, round(log.period / period))
+    if abs(log.period / period / every - 1) > 1e-3:
+        raise InputError(
+            f"{log.source}: one sample every {log.period:g} s is no whole multiple of the "
+            f"controller's period {period:g} s; resample the log or correct [controller] period."
+        )
+    if log.reference is None:
+        raise InputError(
+            f"{log.source}: the loop cannot be simulated without a reference; name its column "
+            "as reference in [log], or leave out [controller] to simulate from the measured force."
+        )
+    ticks = log.time[0] + period * np.arange((log.samples - 1) * every + 1)
+    if every == 1:
+        reference, times = log.reference, log.time
+    else:
+        columns = [np.interp(ticks, log.time, r) for r in log.reference.T]
+        reference, times = np.stack(columns, axis=1), ticks
+    drive = Drive(
+        jnp.asarray(machine.gain), period, "zero_order", numerics.substeps, numerics.set_valued,
+        numerics.longest_delay,
+    )
+    return Replay(
+        drive, machine.controller, machine.sensor, jnp.asarray(reference),
+        jnp.asarray(disturbance_at(machine.disturbance, times, log)), None,
+        jnp.asarray(log.position[0]), jnp.asarray(velocity), None, every,
+    )
+
+
+def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) -> Replay:
+    command, period, hold, every = log.force, log.period, log.hold, 1
+    if hold == "band_limited":
+        command, every = _refined(command), _REFINE
+        period, hold = period / every, "linear"
+        numerics = replace(numerics, substeps=max(1, round(numerics.substeps / every)))
+    drive = Drive(
+        jnp.asarray(machine.gain), period, hold, numerics.substeps, numerics.set_valued,
+        numerics.longest_delay,
+    )
+    restart = _segments(log, numerics.segment, every) if numerics.segment else None
+    return Replay(
+        drive, None, machine.sensor, None, None, jnp.asarray(command),
+        jnp.asarray(log.position[0]), jnp.asarray(velocity), restart, every,
+    )
+
+
+def _refined(command: np.ndarray) -> np.ndarray:
+    """Band-limited interpolation, of an odd extension so that the ends do not ring."""
+    n = len(command)
+    pad = min(n - 1, 200)
+    whole = np.concatenate(
+        [2 * command[0] - command[pad:0:-1], command, 2 * command[-1] - command[-2 : -pad - 2 : -1]]
+    )
+    fine = scipy.signal.resample(whole, len(whole) * _REFINE, axis=0)
+    return fine[pad * _REFINE : (pad + n - 1) * _REFINE + 1]
+
+
+def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
+    """Restart every `length` samples from the measured position and its local slope."""
+    n = (log.samples - 1) * every + 1
+    flags = np.zeros(n, bool)
+    q, v = np.zeros((n, log.position.shape[1])), np.zeros((n, log.position.shape[1]))
+    for k in range(0, log.samples, length):
+        flags[k * every] = True
+        q[k * every], v[k * every] = local_line(log, k)
+    return jnp.asarray(flags), jnp.asarray(q), jnp.asarray(v)
+
+
+def local_line(log: Log, k: int, reach: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at sample k from a parabola through its neighbours."""
+    lo = int(np.clip(k - reach, 0, max(log.samples - 2 * reach - 1, 0)))
+    window = slice(lo, lo + 2 * reach + 1)
+    t = log.period * (np.arange(lo, lo + len(log.position[window])) - k)
+    c = np.polynomial.polynomial.polyfit(t, log.position[window], 2)
+    return c[0], c[1]
+
+
+def start_velocity(log: Log) -> np.ndarray:
+    """Velocity at the first sample."""
+    return local_line(log, 0)[1]
+
+
+def needed_steps(machine: Machine, log: Log) -> int:
+    """Integration steps a sample that the smooth part of the plant asks for along a log."""
+    period = machine.controller.period if machine.controller is not None else log.period
+    picks = np.linspace(0, log.samples - 1, 50).astype(int)
+    q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    return max(1, int(np.ceil(float(_fastest(machine.plant, q, u)) * period / _FINE)))
+
+
+@eqx.filter_jit
+def _fastest(plant: Plant, q: Array, u: Array) -> Array:
+    """Fastest rate of the plant without dry friction, linearised at rest at some positions."""
+
+    def rate(q: Array, u: Array) -> Array:
+        zero = jnp.zeros_like(q)
+        own = plant.initial_states(u)
+        none = jnp.zeros_like(plant.ports(q))
+
+        def acc(q: Array, v: Array) -> Array:
+            return acceleration(plant, State(q, v, own), u, jnp.zeros(()), none)
+
+        stiffness, damping = jax.jacfwd(acc, argnums=(0, 1))(q, zero)
+        return jnp.maximum(jnp.sqrt(jnp.abs(stiffness).max()), jnp.abs(damping).max())
+
+    return jax.vmap(rate)(q, u).max()

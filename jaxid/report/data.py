@@ -1,0 +1,160 @@
+"""What a report is made of: plain arrays and numbers, whoever computed them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class LogView:
+    """One joint of one log, as it is drawn.
+
+    Two clocks: `time` is the log's own (N samples); `band_time` is what is left after
+    decimation and the removal of rest (K samples), and so has gaps.
+
+    Args:
+        name: What the log is called in headings.
+        time: The log's time [s], (N,).
+        position_measured: Measured position, (N,).
+        position_simulated_before: Position simulated with the declared model, (N,) or None.
+        position_simulated_after: Position simulated with the final model, (N,) or None.
+        band_time: Time of the samples that the force balance uses [s], (K,).
+        velocity: Velocity there, (K,).
+        position: Position there, (K,).
+        force_measured: Force at the load there, low-passed, (K,).
+        residual_before: Force measured minus force of the declared model, (K,) or None.
+        residual_after: The same with the final model, (K,) or None.
+    """
+
+    name: str
+    time: np.ndarray
+    position_measured: np.ndarray
+    position_simulated_before: np.ndarray | None
+    position_simulated_after: np.ndarray | None
+    band_time: np.ndarray
+    velocity: np.ndarray
+    position: np.ndarray
+    force_measured: np.ndarray
+    residual_before: np.ndarray | None = None
+    residual_after: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class CandidateScore:
+    """How much one candidate effect would explain.
+
+    Args:
+        kind: The effect's name, with its place where there are several.
+        evidence: Gain in held-out log-likelihood [nats]; not finite where it could not be fitted.
+        accepted: Whether this is the one that was added.
+    """
+
+    kind: str
+    evidence: float
+    accepted: bool = False
+
+
+@dataclass(frozen=True)
+class SearchStep:
+    """One step of the search; the first is the refitted baseline.
+
+    Args:
+        added: Effect added in this step, or None.
+        dropped: Effect taken out again in this step, or None.
+        gap_fit: RMS force residual of the model after this step, on the fit log.
+        gap_validation: The same on the validation log, or None.
+        candidates: Scores of all effects tried in this step.
+        threshold: Evidence that an effect needs to be added [nats].
+    """
+
+    added: str | None
+    dropped: str | None
+    gap_fit: float
+    gap_validation: float | None = None
+    candidates: tuple[CandidateScore, ...] = ()
+    threshold: float = 0.0
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One parameter; `value` and `std` are None where the data cannot tell it."""
+
+    name: str
+    value: float | None
+    std: float | None
+    unit: str
+    identifiable: bool = True
+
+
+class WherePlot(NamedTuple):
+    """The force residual's mean over bins of one variable.
+
+    Args:
+        variable: Name of the variable, such as "velocity".
+        unit: Its unit.
+        x: Middle of each bin, (B,).
+        mean: Mean force residual in each bin, (B,).
+        low: Lower edge of the mean's confidence band, (B,).
+        high: Upper edge of that band, (B,).
+    """
+
+    variable: str
+    unit: str
+    x: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def si_units() -> dict[str, str]:
+    """Units of a linear axis; the default of a report."""
+    return {"position": "m", "velocity": "m/s", "force": "N", "time": "s"}
+
+
+@dataclass(frozen=True, eq=False)
+class ReportData:
+    """Everything that a report shows; `gap`, `effects` and `where` are the JSON results' objects.
+
+    Args:
+        title: Heading of the page.
+        command: "identify" or "discover".
+        case_name: Name of the case.
+        log_name: Name of the log that was fitted.
+        verdict: "found", "nothing_missing", "unexplained", or None for `identify`.
+        summary_lines: Sentences of the answer; composed from the rest where empty.
+        gap: The `gap` object of the JSON result.
+        parameters: The case's unknowns after the last fit.
+        unidentifiable: `{"combination": {name: weight}}`, one for each.
+        effects: The effects that were found, in the order in which they were added.
+        where: The `where` object of the JSON result, or None.
+        steps: The search, step by step.
+        where_plot: The residual over the variable that `where` names, or None.
+        views: The logs to draw: first the fitted one, then the validations.
+        units: Labels of position, velocity, force and time.
+        notes: Remarks, warnings, proposals; one sentence or more each.
+        versions: Program names and versions.
+        converged: Whether the solver converged, where that is known.
+    """
+
+    title: str
+    command: str
+    case_name: str
+    log_name: str
+    verdict: str | None
+    summary_lines: tuple[str, ...]
+    gap: Mapping
+    parameters: tuple[ParameterRow, ...]
+    unidentifiable: tuple[Mapping, ...] = ()
+    effects: tuple[Mapping, ...] = ()
+    where: Mapping | None = None
+    steps: tuple[SearchStep, ...] = ()
+    where_plot: WherePlot | tuple | None = None
+    views: tuple[LogView, ...] = ()
+    units: Mapping[str, str] = field(default_factory=si_units)
+    notes: tuple[str, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    converged: bool | None = None

@@ -1,0 +1,286 @@
+"""The report: it stands alone, holds the numbers, and copes with what is absent."""
+
+import html
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxid.report import (
+    CandidateScore,
+    LogView,
+    ParameterRow,
+    ReportData,
+    SearchStep,
+    WherePlot,
+    render,
+    write_report,
+)
+
+
+def _view(name="fit", samples=2000, *, simulated=True, before=True, after=True):
+    """A slow axis with dry friction of 20 N that the first model lacks; noise of 6 N."""
+    rng = np.random.default_rng(len(name))
+    time = np.arange(samples) * 1e-3
+    velocity = 0.2 * np.sin(2.0 * time)
+    position = -0.1 * np.cos(2.0 * time)
+    moving = np.flatnonzero(np.abs(velocity) > 1e-2)[::4]
+    noise = 6.0 * rng.standard_normal(moving.size)
+    friction = 20.0 * np.sign(velocity[moving])
+    return LogView(
+        name=name,
+        time=time,
+        position_measured=position + 2e-6 * rng.standard_normal(samples),
+        position_simulated_before=position + 0.01 * np.sin(2.1 * time) if simulated else None,
+        position_simulated_after=position + 1e-4 * np.sin(2.1 * time) if simulated else None,
+        band_time=time[moving],
+        velocity=velocity[moving],
+        position=position[moving],
+        force_measured=friction + 40.0 * position[moving] + noise,
+        residual_before=friction + noise if before else None,
+        residual_after=noise if after else None,
+    )
+
+
+def _step():
+    scores = (("cogging", -3.0), ("coulomb_friction", 812.4), ("hysteresis", 811.2))
+    candidates = [CandidateScore(k, e, k == "coulomb_friction") for k, e in scores]
+    failed = CandidateScore("backlash", float("nan"))
+    return SearchStep("coulomb_friction", None, 6.1, 6.9, (*candidates, failed), 12.5)
+
+
+def _discovery(**changes):
+    speeds = np.linspace(-0.2, 0.2, 21)
+    mean = 20.0 * np.sign(speeds)
+    level = {"value": 20.123, "std": 0.31, "unit": "N"}
+    effect = {"kind": "coulomb_friction", "joint": 1, "parameters": {"level": level}}
+    effect |= {"evidence": 812.4, "alternatives": [{"kind": "hysteresis", "evidence": 811.2}]}
+    gap = {"unit": "N", "band_hz": 60.0, "before": 20.7, "after": 6.9, "noise_floor": 5.8}
+    data = ReportData(
+        title="Axis of the test stand",
+        command="discover",
+        case_name="axis.toml",
+        log_name="axis.csv",
+        verdict="found",
+        summary_lines=("The model lacks dry friction",),
+        gap={**gap, "on": "validation", "simulation": {"unit": "m", "before": 0.011, "after": 0.0}},
+        parameters=(
+            ParameterRow("inertia", 95.1034, 0.2134, "kg m^2"),
+            ParameterRow("added_mass.mass", None, None, "kg", identifiable=False),
+        ),
+        unidentifiable=({"combination": {"inertia": 0.71, "added_mass.mass": -0.71}},),
+        effects=(effect,),
+        where={
+            "joint": 1,
+            "variable": "velocity",
+            "region": [-0.02, 0.02],
+            "intervals": [[1.2, 1.31]],
+            "text": "It jumps at rest.",
+        },
+        steps=(SearchStep(None, None, 21.0, 20.7), _step()),
+        where_plot=WherePlot("velocity", "m/s", speeds, mean, mean - 2.0, mean + 2.0),
+        views=(_view(), _view("pulses")),
+        notes=("Reverse more often.",),
+        versions={"jaxid": "0.1.0"},
+    )
+    return replace(data, **changes)
+
+
+def _identification(**changes):
+    data = ReportData(
+        title="Axis",
+        command="identify",
+        case_name="axis.toml",
+        log_name="axis.csv",
+        verdict=None,
+        summary_lines=(),
+        gap={
+            "unit": "N",
+            "band_hz": 60.0,
+            "fit": 6.1,
+            "validation": 7.0,
+            "noise_floor": None,
+            "relative": {"fit": 0.031, "validation": None},
+            "simulation": None,
+        },
+        parameters=(ParameterRow("inertia", 95.1, 0.2, "kg"),),
+    )
+    return replace(data, **changes)
+
+
+def _words(page):
+    """The page's text as a reader sees it."""
+    body = page[page.index("<body>") :]
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).replace("\u00a0", " ").split())
+
+
+@pytest.fixture(scope="module")
+def page():
+    return render(_discovery())
+
+
+def test_the_page_stands_alone(page):
+    assert page.lstrip().startswith("<!DOCTYPE html>")
+    assert "http://" not in page
+    assert "https://" not in page
+    assert "<script" not in page
+    targets = re.findall(r'(?:src|href|srcset)="([^"]*)"', page)
+    assert targets
+    assert all(target.startswith(("#", "data:image/")) for target in targets)
+    assert "url(" not in page
+    assert "@import" not in page
+
+
+def test_anchors_lead_somewhere_and_images_have_words(page):
+    for anchor in re.findall(r'href="#([^"]*)"', page):
+        assert page.count(f'id="{anchor}"') == 1
+    images = re.findall(r"<img[^>]*>", page)
+    # Each log: position, force, three clouds; then the ranking and the place.
+    assert len(images) == 2 * 5 + 1 + 1
+    assert all(re.search(r'alt="[^"]{10,}"', image) for image in images)
+
+
+def test_the_page_holds_the_numbers(page):
+    words = _words(page)
+    assert "found: coulomb_friction The model lacks dry friction." in words
+    assert "force validation 20.7 N 6.90 N 5.80 N 1.19" in words
+    assert "force fit 21.0 N 6.10 N" in words
+    assert "simulated position validation 11.0 mm 0 mm" in words
+    assert "inertia 95.10 0.21 0.22 % kg m²" in words
+    assert "added_mass.mass the log cannot tell" in words
+    assert "level 20.12 0.31 1.5 % N" in words
+    assert "hysteresis (811.2)" in words
+    assert "inertia by +0.71 and added_mass.mass by −0.71" in words
+    assert "1 coulomb_friction added 6.10 6.90 4 812.4 12.5" in words
+    assert "−0.02 to 0.02 m/s" in words
+    assert "1.2–1.31 s" in words
+    assert "Reverse more often." in words
+    assert "jaxid 0.1.0" in words
+
+
+def test_sections_stand_in_the_promised_order(page):
+    order = ["gap", "parameters", "effects", "untold", "search", "log-0", "log-1", "where", "notes"]
+    places = [page.index(f'id="{name}"') for name in order]
+    assert places == sorted(places)
+
+
+def test_hostile_names_are_escaped():
+    bad = "<script>alert(1)</script>\"'"
+    data = _discovery(
+        title=bad,
+        case_name=bad,
+        log_name=bad,
+        summary_lines=(bad,),
+        parameters=(ParameterRow(bad, 1.0, 0.1, bad),),
+        unidentifiable=({"combination": {bad: 1.0}},),
+        effects=({"kind": bad, "parameters": {}, "evidence": None, "alternatives": []},),
+        where={"joint": 1, "variable": bad, "text": bad},
+        steps=(SearchStep(bad, None, 1.0),),
+        where_plot=None,
+        views=(_view(bad, 400, simulated=False, before=False),),
+        notes=(bad,),
+        versions={bad: bad},
+    )
+    page = render(data)
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;") >= 12
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        _identification(),
+        _identification(gap={}, parameters=(), converged=False),
+        _identification(views=(_view(simulated=False, before=False),)),
+        _identification(views=(_view(simulated=False, before=False, after=False),)),
+        _discovery(verdict="unexplained", effects=(), views=(), where_plot=None),
+        _discovery(verdict="nothing_missing", effects=(), where=None, steps=(), views=()),
+        _discovery(where={"joint": None, "variable": None, "region": None, "text": None}, views=()),
+        _discovery(effects=({"kind": "backlash", "spring": 2, "parameters": {}},), views=()),
+    ],
+)
+def test_what_is_absent_is_left_out(data):
+    words = _words(render(data))
+    assert not re.search(r"\b(nan|none|inf)\b", words, re.IGNORECASE)
+
+
+def test_verdicts_are_in_plain_words():
+    assert "nothing is missing" in _words(render(_discovery(verdict="nothing_missing", views=())))
+    assert "unexplained" in _words(render(_discovery(verdict="unexplained", views=())))
+    words = _words(render(_identification()))
+    assert "1 parameter identified" in words
+    assert "The force residual on the fit log is 6.10 N (RMS)." in words
+    assert "did not converge" in _words(render(_identification(converged=False)))
+    place = {"kind": "coulomb_friction", "joint": 2, "parameters": {}}
+    assert "found: coulomb_friction (joint 2)" in _words(
+        render(_discovery(effects=(place,), views=()))
+    )
+
+
+def test_gap_of_several_joints_and_logs():
+    words = _words(
+        render(
+            _identification(
+                gap={
+                    "unit": ["N", "N m"],
+                    "fit": [6.1, 0.5],
+                    "validation": [7.0, 0.6],
+                    "validations": {"slow": [7.0, 0.55], "fast": [6.5, 0.6]},
+                    "noise_floor": [5.0, None],
+                }
+            )
+        )
+    )
+    assert "force, joint 1 fit 6.10 N 5.00 N 1.22" in words
+    assert "force, joint 2 validation: fast 0.600 N m" in words
+
+
+def test_non_finite_data_neither_fail_nor_show():
+    view = _view()
+    diverged = view.position_measured.copy()
+    diverged[900:] = np.inf
+    rough = replace(
+        view,
+        position_simulated_after=diverged,
+        residual_before=np.full_like(view.residual_before, np.nan),
+    )
+    page = render(_discovery(views=(rough,), gap={"unit": "N", "before": float("nan")}))
+    assert "nan" not in _words(page).lower()
+
+
+def test_tiny_and_constant_logs_can_be_drawn():
+    one = np.ones(1)
+    none = np.ones(0)
+    render(_discovery(views=(LogView("one", one, one, one, one, one, one, one, one, one, one),)))
+    render(_discovery(views=(LogView("rest", one, one, None, None, *[none] * 6),)))
+    flat = replace(_view(), velocity=np.zeros_like(_view().velocity))
+    render(_discovery(views=(flat,)))
+
+
+def test_long_logs_stay_small(tmp_path):
+    path = tmp_path / "report.html"
+    write_report(_discovery(views=(_view(samples=25_000), _view("pulses", 25_000))), path)
+    assert path.stat().st_size < 3e6
+
+
+def test_writing_is_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "report.html"
+    write_report(_identification(), path)
+    first = path.read_text(encoding="utf-8")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_report(_identification(title="Other"), path)
+    assert path.read_text(encoding="utf-8") == first
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_importing_the_report_leaves_jax_and_pyplot_alone():
+    code = "import sys, jaxid.report; sys.exit(len({'jax', 'matplotlib.pyplot'} & {*sys.modules}))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

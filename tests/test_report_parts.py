@@ -1,0 +1,103 @@
+"""What the report is drawn and written with: digits, thinned lines, figures."""
+
+import numpy as np
+import pytest
+
+from jaxid.report import CandidateScore, LogView, SearchStep
+from jaxid.report.curves import binned_mean, envelope
+from jaxid.report.numbers import plain, pretty_unit, scaled_unit, with_std
+from jaxid.report.plots import plot_candidates, plot_fit, plot_residual_against
+
+
+def _view(**changes):
+    time = np.linspace(0.0, 5.0, 500)
+    position, velocity = 0.3 * np.cos(time), -0.3 * np.sin(time)
+    fields = {
+        "name": "fit",
+        "time": time,
+        "position_measured": position,
+        "position_simulated_before": position + 1e-3,
+        "position_simulated_after": position + 1e-5,
+        "band_time": time,
+        "velocity": velocity,
+        "position": position,
+        "force_measured": 20.0 * np.sign(velocity),
+        "residual_before": 20.0 * np.sign(velocity),
+        "residual_after": 0.1 * np.cos(9.0 * time),
+    }
+    return LogView(**{**fields, **changes})
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "texts"),
+    [
+        (95.1034, 0.2134, ("95.10", "0.21")),
+        (203.5, 1.96, ("203.5", "2.0")),
+        (5.0, 0.0996, ("5.00", "0.10")),
+        (12345.0, 230.0, ("12340", "230")),
+        (-0.001, 0.25, ("0.00", "0.25")),
+        (1.2345e6, 1.2e4, ("1.234 × 10⁶", "0.012 × 10⁶")),
+        (1.2349e-5, 2.3e-7, ("1.235 × 10⁻⁵", "0.023 × 10⁻⁵")),
+        (3.14159, None, ("3.142", "–")),
+        (None, None, ("–", "–")),
+        (float("nan"), 1.0, ("–", "1.0")),
+    ],
+)
+def test_digits_follow_the_standard_deviation(value, std, texts):
+    assert with_std(value, std) == texts
+
+
+def test_plain_numbers_and_units():
+    assert plain(0.99999) == "1.00"
+    assert plain(-1234.5) == "−1230"
+    assert plain(2.5e-7, 2) == "2.5 × 10⁻⁷"
+    assert plain(True) == "–"
+    assert pretty_unit("(N m)^2 s^-1") == "(N m)² s⁻¹"
+    assert scaled_unit("m", [0.0012, None, np.array([np.nan])]) == (1e-3, "mm")
+    assert scaled_unit("V", [0.0]) == (1.0, "V")
+    assert scaled_unit("counts", [1e-5]) == (1.0, "counts")
+
+
+def test_thinned_lines_keep_extremes_and_gaps():
+    time = np.concatenate([np.arange(0.0, 5.0, 1e-3), np.arange(7.0, 12.0, 1e-3)])
+    values = np.sin(time)
+    values[[1234, 8765]] = (9.0, -9.0)
+    x, y = envelope(time, values, 100)
+    assert x.size < 250
+    assert np.nanmax(y) == 9.0
+    assert np.nanmin(y) == -9.0
+    (hole,) = np.flatnonzero(np.isnan(x))
+    assert x[hole - 1] < 5.0
+    assert x[hole + 1] >= 7.0
+
+
+def test_means_do_not_cross_groups():
+    x = np.linspace(-1.0, 1.0, 1000)
+    mean_x, mean_y = binned_mean(x, np.sign(x), bins=7, group=(x >= 0.0).astype(int))
+    (hole,) = np.flatnonzero(np.isnan(mean_x))
+    np.testing.assert_allclose(mean_y[:hole], -1.0)
+    np.testing.assert_allclose(mean_y[hole + 1 :], 1.0)
+
+
+def test_figures_label_their_axes_with_units():
+    units = {"position": "rad", "velocity": "rad/s", "force": "N m", "time": "s"}
+    fit = plot_fit(_view(), units)
+    assert [ax.get_ylabel() for ax in fit.axes][0] == "position [rad]"
+    assert fit.axes[-1].get_xlabel() == "time [s]"
+    assert "[mrad]" in fit.axes[-1].get_ylabel()
+    against = plot_residual_against(_view(), units)
+    assert [ax.get_xlabel() for ax in against.axes[3:]] == [
+        "velocity [rad/s]",
+        "position [rad]",
+        "time [s]",
+    ]
+    with pytest.raises(ValueError, match="no force residual"):
+        plot_residual_against(_view(residual_before=None, residual_after=None), units)
+
+
+def test_candidates_are_ranked():
+    scores = (("cogging", -3.0), ("backlash", np.nan), ("hysteresis", 811.2), ("coulomb", 812.4))
+    step = SearchStep("coulomb", None, 6.1, None, tuple(CandidateScore(*s) for s in scores), 12.0)
+    (ax,) = plot_candidates(step).axes
+    names = [label.get_text() for label in ax.get_yticklabels()]
+    assert names == ["coulomb", "hysteresis", "cogging", "backlash"]
