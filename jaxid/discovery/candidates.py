@@ -224,7 +224,7 @@ def refine(
     start = np.clip(np.asarray(transform.inward(jnp.asarray(theta[moving]))), lower, upper)
     fit = scipy.optimize.least_squares(
         lambda x: both(x)[0], start, lambda x: both(x)[1], (lower, upper), x_scale="jac",
-        ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=40,
+        ftol=1e-7, xtol=1e-7, gtol=1e-10, max_nfev=25,
     )
     out = theta.copy()
     out[moving] = np.asarray(transform.outward(jnp.asarray(fit.x)))
@@ -266,7 +266,7 @@ def points(
 
 def many_points(union: Union, candidate: Candidate, data: ForceData) -> list[Point]:
     """A candidate with many starts at each of them, on a plant that has nothing else."""
-    effect: Effect = union.machine.plant.effects[_position(union, candidate)]
+    effect: Effect = union.machine.plant.effects[position(union, candidate)]
     alone = eqx.tree_at(lambda p: p.effects, union.machine.plant, (effect,))
     names = [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
     places = tuple((("effects", 0, n), None) for n in names)
@@ -293,7 +293,7 @@ def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array) -> Arr
     return jax.lax.map(columns, starts)
 
 
-def _position(union: Union, candidate: Candidate) -> int:
+def position(union: Union, candidate: Candidate) -> int:
     path = union.machine.parameters.free[candidate.index[0]].path
     return int(path[1])
 

@@ -24,8 +24,11 @@ _TIE_PART = 0.01
 # the best: a flexible one gains by imitating what is not there yet. What is still missing then
 # shows in the next round, and what has become superfluous is dropped.
 _MODEST = 0.7
-# An effect must lower the held-out RMS residual by this part, whatever its evidence.
-_RELEVANT = 0.005
+# An effect must close this part of what stands above the noise floor (in sum of squares, so half
+# of it in RMS), whatever its evidence: on measured data everything helps a little. One that is
+# there already goes where it closes less than a third of that.
+_RELEVANT = 0.15
+_SUPERFLUOUS = 0.05
 # The gain on the validation log must be at least this part of what the log itself promises.
 _CONFIRMED = 0.1
 
@@ -58,6 +61,7 @@ class Search:
     Args:
         union: Machine with all candidates.
         data: The log to fit, prepared.
+        floor: RMS force that the sensors' noise alone leaves, by joint.
         validation: Logs that must confirm each effect.
         progress: Called with a line at every stage.
         added: Effects added, in order.
@@ -65,6 +69,7 @@ class Search:
 
     union: cand.Union
     data: Prepared
+    floor: np.ndarray
     validation: tuple[Prepared, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     added: list[cand.Candidate] = field(default_factory=list)
@@ -114,11 +119,17 @@ class Search:
                 return steps
             tried.add(now)
 
-    def best(self) -> tuple[Score | None, tuple[Score, ...], float]:
-        """Screen all candidates, refit the most promising, choose; and all scores."""
+    def best(self, near: float = 0.0) -> tuple[Score | None, tuple[Score, ...], float]:
+        """Screen all candidates, refit the most promising, choose; and all scores.
+
+        Args:
+            near: Only those are refitted whose screened evidence reaches this part of the best.
+        """
         self.progress(f"screening {len(self.rest())} effects")
         screened = screen_candidates(self)
-        promising = [s for s in screened.scores if s.evidence > 0.5 * screened.threshold]
+        top = max((s.evidence for s in screened.scores), default=0.0)
+        least = max(0.5 * screened.threshold, near * top)
+        promising = [s for s in screened.scores if s.evidence > least]
         refitted = []
         for score in _few(promising):
             self.progress(f"refitting with {score.candidate.kind}")
@@ -131,8 +142,8 @@ class Search:
     def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:
         """For each effect added, those that could stand in its place without loss.
 
-        Each effect is taken out and all are scored against the rest. A stand-in that is better
-        by more than a tie, or as good with fewer parameters, takes the place for good.
+        Each effect is taken out and all are scored against the rest. A stand-in that closes
+        relevantly more of the gap without more parameters, or as much with fewer, takes its place.
         """
         found: dict[int, tuple[Score, ...]] = {}
         for k in range(len(self.added)):
@@ -141,7 +152,7 @@ class Search:
             kept, theta = list(self.added), self.theta
             self.added = [c for c in kept if c is not own]
             self.theta = self._fit(self._without(theta, own), self.active)
-            _, scores, limit = self.best()
+            _, scores, limit = self.best(near=_MODEST)
             good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
             self.added, self.theta = kept, theta
             mine = next((s for s in scores if s.candidate is own), None)
@@ -149,15 +160,26 @@ class Search:
                 found[k] = ()
                 continue
             best, ties = _simplest(good)
-            if best.candidate is not own and mine.total < best.total - _margin(best):
+            if best.candidate is not own and self._takes_over(best, mine, own):
                 self.added = [best.candidate if c is own else c for c in kept]
                 self.theta = self._fit(best.theta, self.active)
-                swap = Step(best, own, scores, limit, self.theta, self.active)
-                steps.append(swap)
+                steps.append(Step(best, own, scores, limit, self.theta, self.active))
             elif best.candidate is not own:
-                ties = tuple(s for s in [best, *ties] if s.candidate is not own)
+                ties = (best, *ties) if mine.total > best.total - _margin(best) else ()
             found[k] = tuple(s for s in ties if s.candidate is not self.added[k])
         return found
+
+    def _takes_over(self, best: Score, mine: Score, own: cand.Candidate) -> bool:
+        """Whether a stand-in is as good with fewer parameters, or closes relevantly more.
+
+        One with more parameters has had its chance beside what is there, in the rounds before.
+        """
+        more = len(best.candidate.index) - len(own.index)
+        if more > 0 or mine.total > best.total - _margin(best):
+            return more < 0
+        now, _ = cand.evaluate(self.union, self.arrays, self.theta)
+        then, _ = cand.evaluate(self.union, self.arrays, best.theta)
+        return self._closed(now, then) > _RELEVANT
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         return cand.refine(self.union, self.arrays, theta, active)[0]
@@ -177,7 +199,7 @@ class Search:
         after = screened.held_out(e, jacobian[..., active])
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
         validation, confirmed = self._validated(theta)
-        reason = self._objection(c, theta, e, confirmed)
+        reason = self._objection(c, theta, e, validation, confirmed)
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
 
     def _validated(self, theta: np.ndarray) -> tuple[float | None, float | None]:
@@ -202,7 +224,8 @@ class Search:
         return total, worst
 
     def _objection(
-        self, c: cand.Candidate, theta: np.ndarray, e: np.ndarray, confirmed: float | None
+        self, c: cand.Candidate, theta: np.ndarray, e: np.ndarray, validation: float | None,
+        confirmed: float | None,
     ) -> str:
         """Why a refitted candidate may not be named; empty where it may."""
         free = self.union.machine.parameters.free
@@ -212,11 +235,10 @@ class Search:
             if free[i].sign == "nonnegative" and theta[i] <= 0.0:
                 return f"{free[i].name} would have to be negative"
         old, _ = cand.evaluate(self.union, self.arrays, self.theta)
-        counts = self.data.moving
-        closed = 1 - float(np.sum(e[counts] ** 2) / np.sum(old[counts] ** 2))
-        if closed < 2 * _RELEVANT:
+        closed = self._closed(old, e)
+        if closed < _RELEVANT:
             return f"it closes only {100 * max(closed, 0) / 2:.1f} % of the gap"
-        if confirmed is not None and confirmed < _CONFIRMED * closed:
+        if validation is not None and (validation < _TIE_NATS or confirmed < _CONFIRMED * closed):
             return "it does not help on the validation log"
         return ""
 
@@ -237,10 +259,16 @@ class Search:
         now = Screen.of(ev.Whitener.of(e, self.data.moving), e, jacobian[..., self.active])
         less, jacobian = cand.evaluate(self.union, self.arrays, theta)
         after = now.held_out(less, jacobian[..., active])
-        counts = self.data.moving
-        opened = 1 - float(np.sum(e[counts] ** 2) / np.sum(less[counts] ** 2))
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
-        return lost > limit and opened > 2 * _RELEVANT
+        return lost > limit and self._closed(less, e) > _SUPERFLUOUS
+
+    def _closed(self, old: np.ndarray, new: np.ndarray) -> float:
+        """Part by which the gap above the noise floor closes, in sum of squares."""
+        counts = self.data.moving
+        floor = np.sum(counts.sum(axis=0) * np.square(self.floor))
+        before, after = np.sum(old[counts] ** 2), np.sum(new[counts] ** 2)
+        # The floor is itself an estimate: at least a tenth of the residual counts as gap.
+        return float((before - after) / max(before - floor, 0.1 * before))
 
 
 def _few(promising: list[Score]) -> list[Score]:

@@ -67,9 +67,10 @@ class Cogging(Effect):
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         # Two neighbouring periods must not lose more than half a turn over the stroke, or a true
         # ripple falls between them: the grid is uniform in turns per stroke. Of three phases one
-        # has at least half of the amplitude with the right sign.
+        # has at least half of the amplitude with the right sign. Below two turns a ripple is no
+        # ripple, but any smooth force of position.
         return [
             {"amplitude": scales.force, "period": 2 * scales.position / turns, "phase": phase}
-            for turns in np.arange(1.0, 60.0, 0.5)
+            for turns in np.arange(2.0, 60.0, 0.5)
             for phase in (0.0, 2 / 3 * np.pi, 4 / 3 * np.pi)
         ]

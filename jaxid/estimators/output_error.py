@@ -128,7 +128,7 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple
     )
 
 
-def choose_numerics(machine: Machine, log: Log) -> Numerics:
+def choose_numerics(machine: Machine, log: Log, *, segments: bool = True) -> Numerics:
     """Integration that suits a machine and its log.
 
     Dry friction sticks exactly: its gradient is exact too, because the force is continuous where
@@ -140,7 +140,7 @@ def choose_numerics(machine: Machine, log: Log) -> Numerics:
         substeps=needed_steps(machine, log),
         longest_delay=12 if "input_delay" in kinds and machine.controller is not None else 0,
     )
-    if machine.controller is not None:
+    if machine.controller is not None or not segments:
         return numerics
     run = eqx.filter_jit(lambda r, p: r(p).position)(make_replay(machine, log, numerics), machine.plant)
     off = np.abs(np.asarray(run) - log.position).max()

@@ -1,0 +1,241 @@
+"""The whole way: gap, where, what, refit, simulate again, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.discovery import candidates as cand
+from jaxid.discovery.screen import Score
+from jaxid.discovery.search import Search, Step
+from jaxid.discovery.where import Where, locate
+from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.estimators.output_error import output_error
+from jaxid.estimators.result import Estimate
+from jaxid.gap import noise_floor
+from jaxid.identify import Gap, gaps
+from jaxid.io.case import Case
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.model import parameters_of
+from jaxid.parameters import Parameters, free_effect
+from jaxid.session import Session, open_session
+
+# A residual counts as a disagreement only where it stands this far above the noise floor.
+_ABOVE_FLOOR = 1.3
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was added.
+
+    Args:
+        kind: Its name.
+        joint: 1-based.
+        names: Names of its parameters in the estimate.
+        score: Its evidence when it was added.
+        alternatives: Effects that this log cannot tell from it.
+    """
+
+    kind: str
+    joint: int
+    names: tuple[str, ...]
+    score: Score
+    alternatives: tuple[Score, ...]
+
+
+@dataclass(frozen=True)
+class Round:
+    """One step of the search with its gap.
+
+    Args:
+        step: The step.
+        fit: RMS force residual on the log, by joint.
+        validation: The worst of the validation logs; None without any.
+    """
+
+    step: Step
+    fit: np.ndarray
+    validation: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What `discover` returns.
+
+    Args:
+        session: Case and logs.
+        verdict: "found", "nothing_missing" or "unexplained".
+        where: Where the baseline's residual lies; None where nothing is missing.
+        effects: Effects added, in order.
+        rounds: The search.
+        before: The refitted baseline.
+        after: The last refit, effects included.
+        gaps_before: By log, the fitted one first.
+        gaps_after: The same after.
+        noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
+    """
+
+    session: Session
+    verdict: str
+    where: Where | None
+    effects: tuple[Found, ...]
+    rounds: tuple[Round, ...]
+    before: Estimate
+    after: Estimate
+    gaps_before: tuple[Gap, ...]
+    gaps_after: tuple[Gap, ...]
+    noise_floor: np.ndarray
+
+    @property
+    def kinds(self) -> list[str]:
+        """Names of the effects added."""
+        return [e.kind for e in self.effects]
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last refit did."""
+        return self.after.converged
+
+    def __str__(self) -> str:
+        from jaxid.io.results import discovery_table
+
+        return discovery_table(self)
+
+    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+        """Write `discovery.json` and `report.html` to a folder.
+
+        Raises:
+            InputError: If the folder holds what jaxid did not make and `force` is not given.
+        """
+        from jaxid.io.results import save_discovery
+
+        return save_discovery(self, Path(folder), force=force)
+
+
+def discover(
+    case: Case | str | Path,
+    log: Log | str | Path,
+    *,
+    validate: Sequence[Log | str | Path] = (),
+    max_effects: int = 5,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Discovery:
+    """Find the effects that a case's model is missing, on a log.
+
+    Args:
+        case: The case, or its file.
+        log: The log, or its file.
+        validate: Logs that must confirm each effect, beside the case's own.
+        max_effects: Most effects to add.
+        progress: Called with a line at every stage.
+
+    Raises:
+        InputError: If case or log are unsound.
+    """
+    session = open_session(case, log, validate, align_hold=True)
+    machine, data = session.machine, session.fit.data
+    progress("fitting what is there")
+    baseline = inverse_dynamics(machine, data)
+    floor = noise_floor(baseline.machine, session.fit.log, data)
+    union = cand.build_union(baseline.machine, data)
+    search = Search(union, data, floor, tuple(v.data for v in session.validations), progress)
+    steps = search.run(max_effects)
+    alternatives = search.alternatives(steps)
+    where = _where(search, steps[0])
+    final, effects = _final_machine(baseline.machine, search, alternatives, steps)
+    verdict = _verdict(effects, where, steps, search)
+    progress("refitting in simulation")
+    before = _refit(session.with_machine(baseline.machine), baseline)
+    after = before
+    if effects:
+        again = inverse_dynamics(final, data)
+        after = _refit(session.with_machine(again.machine), again)
+    progress("simulating")
+    old = gaps(before.machine, session.runs)
+    new = gaps(after.machine, session.runs) if effects else old
+    return Discovery(
+        session, verdict, None if verdict == "nothing_missing" else where, effects,
+        tuple(_round(search, s) for s in steps), before, after, old, new, floor,
+    )
+
+
+def _where(search: Search, baseline: Step) -> Where:
+    e, jacobian = cand.evaluate(search.union, search.arrays, baseline.theta)
+    return locate(-e, jacobian[..., baseline.active], search.data)
+
+
+def _verdict(
+    effects: tuple[Found, ...], where: Where, steps: list[Step], search: Search
+) -> str:
+    if effects:
+        return "found"
+    e, _ = cand.evaluate(search.union, search.arrays, steps[0].theta)
+    rms = np.sqrt(np.mean(np.where(search.data.moving, e, 0.0) ** 2, axis=0))
+    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor))
+    return "unexplained" if above and where.significant else "nothing_missing"
+
+
+def _final_machine(
+    machine: Machine, search: Search, alternatives: dict[int, tuple[Score, ...]], steps: list[Step]
+) -> tuple[Machine, tuple[Found, ...]]:
+    """The case's machine with only the effects that were added, at their refitted values."""
+    plant, parameters = machine.plant, machine.parameters
+    theta = [*search.theta[search.union.base]]
+    effects = []
+    for k, c in enumerate(search.added):
+        effect = search.union.machine.plant.effects[cand.position(search.union, c)]
+        values = dict(zip(_names(effect), search.theta[c.index], strict=True))
+        plant, free = free_effect(plant, type(effect)(**values, port=c.port), machine.units)
+        parameters = Parameters((*parameters.free, *free))
+        theta.extend(search.theta[c.index])
+        score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
+        names = tuple(f.name for f in free)
+        effects.append(Found(c.kind, c.port + 1, names, score, alternatives.get(k, ())))
+    final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
+    return final, tuple(effects)
+
+
+def _names(effect: object) -> list[str]:
+    return [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
+
+
+def _refit(session: Session, start: Estimate) -> Estimate:
+    """Output error from the force-domain fit; the latter stands where simulation cannot follow."""
+    blind = not bool(np.all(start.identifiable))
+    if blind or session.fit.log.reference is None and session.machine.controller is not None:
+        return start
+    estimate = output_error(session.machine, session.fit.log)
+    if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
+        note = f"output error: {estimate.message}; parameters are inverse dynamics'"
+        return replace(start, notes=(*start.notes, note))
+    old = _simulation_rms(start, session)
+    new = _simulation_rms(estimate, session)
+    if not np.isfinite(new) or new > old:
+        note = "output error did not bring the simulation nearer; parameters are inverse dynamics'"
+        return replace(start, notes=(*start.notes, note))
+    return estimate
+
+
+def _simulation_rms(estimate: Estimate, session: Session) -> float:
+    run = session.fit
+    gap = gaps(estimate.machine, (run,))[0].simulation
+    return np.inf if gap is None else float(np.linalg.norm(gap.rms))
+
+
+def _round(search: Search, step: Step) -> Round:
+    fit, *others = (
+        _rms(search, data, arrays, step.theta)
+        for data, arrays in [
+            (search.data, search.arrays), *zip(search.validation, search.validation_arrays, strict=True)
+        ]
+    )
+    return Round(step, fit, np.max(others, axis=0) if others else None)
+
+
+def _rms(search: Search, data: object, arrays: object, theta: np.ndarray) -> np.ndarray:
+    e, _ = cand.evaluate(search.union, arrays, theta)
+    return np.sqrt(np.nanmean(np.where(data.moving, e, np.nan) ** 2, axis=0))

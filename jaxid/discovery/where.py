@@ -1,0 +1,229 @@
+"""Where simulation and measurement part, explained without any physics.
+
+The residual is regressed on one variable at a time with a curve of no particular form, and scored
+like any candidate: on held-out time, against surrogates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxid.discovery import evidence as ev
+from jaxid.preprocess import Prepared
+
+_KNOTS = 12
+# A window of this many samples is loud where its energy exceeds the median's by this factor: in
+# noise of one level that happens less than once in 10^9 windows.
+_WINDOW = 20
+_LOUD = 8.0
+# A spectral line must carry this part of the variance, and stand above the median of its
+# neighbours by a factor that white noise exceeds once in 10^8.
+_LINE_PART = 0.05
+_LINE_FACTOR = 25.0
+
+
+@dataclass(frozen=True)
+class Where:
+    """Region and intervals in which a residual lies.
+
+    Args:
+        joint: 1-based.
+        variable: What the residual depends on most.
+        region: Range of that variable in which it is largest.
+        intervals: Times in which it is loud [s].
+        text: The same in words.
+        explained: Part of the residual's variance that the variable explains on held-out time.
+        evidence: Held-out gain in log-likelihood [nats].
+        threshold: What noise alone exceeds once in a thousand.
+        x, mean, low, high: The curve and its 95 % band, in force.
+        frequency_hz: Of a spectral line; None without one.
+    """
+
+    joint: int
+    variable: str
+    region: tuple[float, float]
+    intervals: tuple[tuple[float, float], ...]
+    text: str
+    explained: float
+    evidence: float
+    threshold: float
+    x: Float[np.ndarray, " bin"]
+    mean: Float[np.ndarray, " bin"]
+    low: Float[np.ndarray, " bin"]
+    high: Float[np.ndarray, " bin"]
+    frequency_hz: float | None = None
+
+    @property
+    def significant(self) -> bool:
+        """Whether anything but noise is there."""
+        loud = bool(self.intervals) and self.variable == "time"
+        return self.evidence > self.threshold or self.frequency_hz is not None or loud
+
+
+def variables(data: Prepared, joint: int) -> dict[str, Float[np.ndarray, " kept"]]:
+    """What a residual may depend on, at the kept samples."""
+    v = data.at_kept(data.qd)[:, joint]
+    time = data.kept * data.period
+    flips = np.flatnonzero(np.diff(np.sign(v)) != 0)
+    last = np.maximum.accumulate(np.where(np.isin(np.arange(len(v)), flips + 1), time, time[0]))
+    return {
+        "velocity": v,
+        "position": data.at_kept(data.q)[:, joint],
+        "acceleration": data.at_kept(data.qdd)[:, joint],
+        "force": data.at_kept(data.force)[:, min(joint, data.force.shape[1] - 1)],
+        "time since reversal": time - last,
+        "time": time,
+    }
+
+
+def locate(
+    residual: Float[np.ndarray, "kept n"], jacobian: Float[np.ndarray, "kept n p"], data: Prepared
+) -> Where:
+    """Find the joint and variable that explain most of a residual.
+
+    Args:
+        residual: Measured minus modelled force at the kept samples.
+        jacobian: Of the residual in the model's unknowns: what they can absorb does not count.
+        data: The prepared log.
+    """
+    found = [_locate(residual[:, i], jacobian[:, i], data, i) for i in range(residual.shape[1])]
+    return max(found, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
+
+
+def _locate(e: np.ndarray, jacobian: np.ndarray, data: Prepared, joint: int) -> Where:
+    counts = data.moving[:, joint]
+    named = variables(data, joint)
+    hats = {name: _hats(x, counts) for name, x in named.items()}
+    whitener = _whitener(e, jacobian, list(hats.values()), counts)
+    blocks = whitener.blocks()
+    base = _independent(whitener(jacobian[:, None]))
+    white = whitener(e[:, None, None])
+    left = white[:, 0] - base @ np.linalg.lstsq(base, white[:, 0], rcond=1e-9)[0]
+    rng = np.random.default_rng(20240501)
+    surrogates = ev.flipped(left, max(2, len(left) // 100), 100, rng)
+    before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
+    largest, gains = np.full(100, -np.inf), {}
+    for name, hat in hats.items():
+        both = np.concatenate([base, _independent(whitener(hat[:, None]))], axis=1)
+        after = _held(both, np.concatenate([white, surrogates], axis=1), blocks)
+        gain = ev.log_evidence(len(blocks), before, after)
+        gains[name] = float(gain[0])
+        largest = np.maximum(largest, gain[1:])
+    intervals = _loud(e, counts, data)
+    line = _line(left, whitener, data, joint)
+    best = max(gains, key=lambda n: gains[n])
+    limit = ev.threshold(largest)
+    if gains[best] <= limit and (intervals or line is not None):
+        best = "time"
+    return _describe(e, counts, named[best], best, joint, gains[best], limit, intervals, line, data)
+
+
+def _describe(
+    e: np.ndarray, counts: np.ndarray, x: np.ndarray, name: str, joint: int, gain: float,
+    limit: float, intervals: tuple, line: float | None, data: Prepared,
+) -> Where:
+    centre, mean, error = _binned(e, counts, x)
+    peak = int(np.argmax(np.abs(mean) - error))
+    strong = np.abs(mean) > 0.5 * np.abs(mean[peak])
+    lo, hi = peak, peak
+    while lo > 0 and strong[lo - 1] and mean[lo - 1] * mean[peak] > 0:
+        lo -= 1
+    while hi < len(mean) - 1 and strong[hi + 1] and mean[hi + 1] * mean[peak] > 0:
+        hi += 1
+    explained = float(1 - np.exp(-2 * max(gain, 0.0) / max(int(counts.sum()), 1)))
+    text = f"joint {joint}: the residual depends on {name}"
+    text += f", most between {centre[lo]:.3g} and {centre[hi]:.3g}"
+    if line is not None:
+        text = f"joint {joint}: the residual holds a line at {line:.3g} Hz that no motion explains"
+    elif name == "time" and intervals:
+        text = f"joint {joint}: the residual is loud in {len(intervals)} interval(s) of time"
+    return Where(
+        joint + 1, name, (float(centre[lo]), float(centre[hi])), intervals,
+        text.replace(f"joint {joint}", f"joint {joint + 1}"), explained, gain, limit, centre, mean,
+        mean - 1.96 * error, mean + 1.96 * error, line,
+    )
+
+
+def _hats(x: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "kept knot"]:
+    """Piecewise-linear functions with knots at quantiles: any curve, of no particular form."""
+    knots = np.unique(np.quantile(x[counts], np.linspace(0, 1, _KNOTS)))
+    eye = np.eye(len(knots))
+    return np.stack([np.interp(x, knots, row) for row in eye], axis=1)
+
+
+def _whitener(
+    e: np.ndarray, jacobian: np.ndarray, hats: list[np.ndarray], counts: Bool[np.ndarray, " kept"]
+) -> ev.Whitener:
+    columns = _independent(np.concatenate([jacobian, *hats], axis=1)[counts])
+    left = np.zeros_like(e)
+    left[counts] = e[counts] - columns @ np.linalg.lstsq(columns, e[counts], rcond=1e-9)[0]
+    return ev.Whitener.of(left[:, None], counts[:, None])
+
+
+def _independent(columns: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(columns, axis=0)
+    columns = columns[:, norm > 0] / norm[norm > 0]
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, s > 1e-8 * s[0]] if len(s) else columns
+
+
+def _held(columns: np.ndarray, e: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    return ev.held_out(ev.grams(columns, blocks), *ev.products(columns, e, blocks))
+
+
+def _binned(
+    e: np.ndarray, counts: np.ndarray, x: np.ndarray, bins: int = 30
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean of e in bins of x with equal counts, and the error of that mean."""
+    order = np.argsort(x[counts])
+    parts = [p for p in np.array_split(order, bins) if len(p)]
+    es, xs = e[counts], x[counts]
+    centre = np.array([np.median(xs[p]) for p in parts])
+    mean = np.array([np.mean(es[p]) for p in parts])
+    # Neighbours in time are correlated: count a fifth of the samples as independent.
+    error = np.array([np.std(es[p]) / np.sqrt(max(len(p) / 5, 1)) for p in parts])
+    return centre, mean, error
+
+
+def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[float, float], ...]:
+    """Intervals in which the residual has far more energy than elsewhere."""
+    energy = np.where(counts, e, 0.0) ** 2
+    kernel = np.ones(_WINDOW)
+    share = np.convolve(counts.astype(float), kernel, mode="same")
+    local = np.convolve(energy, kernel, mode="same") / np.maximum(share, 1)
+    usual = np.median(local[share > _WINDOW / 2])
+    loud = (local > _LOUD * usual) & (share > _WINDOW / 2)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], loud, [False]]).astype(int)))
+    time = data.kept * data.period
+    spans = [(float(time[a]), float(time[b - 1])) for a, b in edges.reshape(-1, 2)]
+    if len(spans) > 20 or loud.mean() > 0.3:  # everywhere is nowhere
+        return ()
+    return tuple(spans)
+
+
+def _line(
+    left: Float[np.ndarray, " row"], whitener: ev.Whitener, data: Prepared, joint: int
+) -> float | None:
+    """Frequency of a line in the whitened residual that the motion does not have; None without [Hz]."""
+    n = len(left)
+    if n < 100:
+        return None
+    window = np.hanning(n)
+    power = np.abs(np.fft.rfft(left * window)) ** 2
+    power[:5] = 0.0
+    k = int(np.argmax(power))
+    part = power[max(k - 2, 0) : k + 3].sum() / power.sum()
+    motion = data.at_kept(data.qd)[:, joint][whitener.rows[:, 0]]
+    moved = np.abs(np.fft.rfft((motion - motion.mean()) * window)) ** 2
+    if part < _LINE_PART or _stands_out(moved, k) or not _stands_out(power, k):
+        return None
+    rate = 1.0 / (data.period * data.recipe.decimation)
+    return float(k * rate / n)
+
+
+def _stands_out(power: np.ndarray, k: int) -> bool:
+    around = power[max(5, k - 50) : k + 51]
+    return bool(power[k] > _LINE_FACTOR * np.median(around))

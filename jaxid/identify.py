@@ -1,0 +1,140 @@
+"""Identification of a case's unknowns from a log: estimate, gap, noise floor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.estimators import METHODS
+from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.result import Estimate
+from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
+from jaxid.io.case import Case
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.replay import make_replay
+from jaxid.session import Run, Session, open_session
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How far a machine is from one log.
+
+    Args:
+        name: Of the log.
+        force: In force, by inverse dynamics.
+        simulation: In position, by simulation; None where it diverges.
+    """
+
+    name: str
+    force: ForceGap
+    simulation: SimulationGap | None
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What `identify` returns.
+
+    Args:
+        session: Case and logs.
+        estimate: Parameters and their precision.
+        gaps: The fitted log's first, then the validations'.
+        noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
+    """
+
+    session: Session
+    estimate: Estimate
+    gaps: tuple[Gap, ...]
+    noise_floor: np.ndarray
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solver did."""
+        return self.estimate.converged
+
+    def value(self, name: str) -> float:
+        """Estimate of one parameter, by its name in results."""
+        return self.estimate.value(name)
+
+    def __str__(self) -> str:
+        from jaxid.io.results import identification_table
+
+        return identification_table(self)
+
+    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+        """Write `result.json` and `report.html` to a folder.
+
+        Raises:
+            InputError: If the folder holds what jaxid did not make and `force` is not given.
+        """
+        from jaxid.io.results import save_identification
+
+        return save_identification(self, Path(folder), force=force)
+
+
+def identify(
+    case: Case | str | Path,
+    log: Log | str | Path,
+    *,
+    method: str = "output_error",
+    validate: Sequence[Log | str | Path] = (),
+    progress: Callable[[str], None] = lambda text: None,
+) -> Identification:
+    """Identify the unknowns of a case from a log.
+
+    Args:
+        case: The case, or its file.
+        log: The log, or its file.
+        method: One of `jaxid.estimators.METHODS`.
+        validate: Logs to validate on, beside the case's own.
+        progress: Called with a line at every stage.
+
+    Raises:
+        InputError: If case, log or method are unsound.
+    """
+    if method not in METHODS:
+        raise InputError(
+            f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
+        )
+    session = open_session(case, log, validate)
+    if not session.machine.parameters.free:
+        raise InputError(
+            "nothing is unknown", where=str(session.case.path),
+            mend="give at least one parameter as { guess = ... }",
+        )
+    progress(f"fitting by {method}")
+    estimate = METHODS[method](session)
+    progress("simulating")
+    return Identification(
+        session, estimate, gaps(estimate.machine, session.runs),
+        noise_floor(estimate.machine, session.fit.log, session.fit.data),
+    )
+
+
+def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:
+    """Gap of a machine on each log."""
+    return tuple(
+        Gap(r.name, force_gap(r.machine(machine), r.data), simulated(r.machine(machine), r.log))
+        for r in runs
+    )
+
+
+def simulated(machine: Machine, log: Log) -> SimulationGap | None:
+    """Gap in position over the whole log; None where the simulation cannot run or diverges."""
+    if machine.controller is not None and log.reference is None:
+        machine = replace(machine, controller=None)
+    numerics = replace(choose_numerics(machine, log, segments=False), segment=None)
+    gap = simulation_gap(machine, make_replay(machine, log, numerics), log)
+    return gap if np.all(np.isfinite(gap.rms)) and np.all(gap.relative < 1e3) else None
+
+
+def force_start(session: Session) -> np.ndarray | None:
+    """Start for a simulation fit from inverse dynamics, where that tells all unknowns."""
+    estimate = inverse_dynamics(session.machine, session.fit.data)
+    good = estimate.converged and bool(np.all(estimate.identifiable))
+    return estimate.theta if good else None

@@ -1,0 +1,159 @@
+"""A case and its logs, opened, checked and prepared: where every command starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.io.case import Case, load_case
+from jaxid.io.log import Log, read_log
+from jaxid.io.soundness import Finding, check_log, plausible_inertia, raise_on_error
+from jaxid.machine import Machine, build_machine
+from jaxid.preprocess import Prepared, Recipe, choose_recipe, prepare
+
+
+@dataclass(frozen=True)
+class Run:
+    """One log with what was different when it was taken.
+
+    Args:
+        name: In results.
+        log: The log.
+        data: The same, prepared.
+        disturbance: The controller's.
+    """
+
+    name: str
+    log: Log
+    data: Prepared
+    disturbance: dict | str | None
+
+    def machine(self, machine: Machine) -> Machine:
+        """A machine as it stood when this log was taken."""
+        return replace(machine, disturbance=self.disturbance)
+
+
+@dataclass(frozen=True)
+class Session:
+    """A case, its machine at the guesses, the log to fit and the logs to validate on.
+
+    Args:
+        case: The case.
+        machine: Its machine.
+        fit: The log to fit.
+        validations: Others, by name; prepared by the same recipe.
+        recipe: How the logs are filtered.
+        findings: Warnings on the logs.
+    """
+
+    case: Case
+    machine: Machine
+    fit: Run
+    validations: tuple[Run, ...]
+    recipe: Recipe
+    findings: tuple[Finding, ...]
+
+    @property
+    def runs(self) -> tuple[Run, ...]:
+        """All logs, the fitted one first."""
+        return (self.fit, *self.validations)
+
+    def with_machine(self, machine: Machine) -> Session:
+        """The same session around another machine."""
+        return replace(self, machine=machine)
+
+
+def open_session(
+    case: Case | str | Path,
+    log: Log | str | Path,
+    validate: Sequence[Log | str | Path] = (),
+    *,
+    align_hold: bool | None = None,
+) -> Session:
+    """Open a case and its logs, check them and prepare them.
+
+    Args:
+        case: The case, or its file.
+        log: The log to fit, or its file.
+        validate: More logs to validate on, beside the case's own.
+        align_hold: See `jaxid.preprocess.Recipe`; absent: what the case's recipe implies.
+
+    Raises:
+        InputError: If anything in case or logs is unsound.
+    """
+    case = case if isinstance(case, Case) else load_case(case)
+    fit = _read(case, log, case.columns)
+    machine = build_machine(case, period=fit.period)
+    findings = _check(case, fit, machine)
+    recipe = choose_recipe(fit, case.preprocess)
+    if align_hold is not None:
+        recipe = replace(recipe, align_hold=align_hold)
+    disturbance = machine.disturbance
+    opened = [Run("fit", fit, _prepare(fit, machine, recipe), disturbance)]
+    names = {"fit"}
+    for entry in case.validations:
+        other = fit if entry.log is None else entry.log
+        source = other.source if isinstance(other, Log) else other
+        read = read_log(source, entry.columns, joints=case.plant.joints)
+        findings += _check(case, read, machine)
+        opened.append(Run(entry.name, read, _prepare(read, machine, recipe), entry.disturbance))
+        names.add(entry.name)
+    for extra in validate:
+        read = _read(case, extra, {k: v for k, v in case.columns.items() if k != "rows"})
+        findings += _check(case, read, machine)
+        name = Path(read.source).stem
+        while name in names:
+            name += "'"
+        names.add(name)
+        opened.append(Run(name, read, _prepare(read, machine, recipe), disturbance))
+    machine = _scaled(machine, opened[0].data)
+    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
+
+
+def _read(case: Case, log: Log | str | Path, columns: dict) -> Log:
+    return log if isinstance(log, Log) else read_log(log, columns, joints=case.plant.joints)
+
+
+def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
+    limit = (case.controller or {}).get("limit")
+    units = machine.units
+    findings = check_log(
+        log, command_limit=limit, motion=units.motion,
+        units={"position": units.position} if units.position else None,
+    )
+    guess = next((f.guess for f in machine.parameters.free if f.name == "inertia"), None)
+    guess = float(np.asarray(machine.plant.inertia)) if guess is None else guess
+    slip = plausible_inertia(log, guess, float(machine.gain[0]), motion=units.motion)
+    findings += [slip] if slip is not None else []
+    raise_on_error(findings)
+    return findings
+
+
+def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
+    left = log.samples // recipe.decimation - 2 * recipe.trim
+    if left < 5 * max(len(machine.parameters.free), 4):
+        raise InputError(
+            f"too short: {log.samples} samples leave {max(left, 0)} after decimation by "
+            f"{recipe.decimation} and trimming {recipe.trim} at each end",
+            where=log.source, mend="take a longer log, or lower decimation and trim in [preprocess]",
+        )
+    data = prepare(log, machine.gain, recipe)
+    if data.moving.sum() < 5 * max(len(machine.parameters.free), 4):
+        raise InputError(
+            f"only {int(data.moving.sum())} samples move faster than the rest velocity "
+            f"{min(recipe.rest_velocity):.3g}",
+            where=log.source, mend="take a log with more motion, or lower rest_velocity",
+        )
+    return data
+
+
+def _scaled(machine: Machine, data: Prepared) -> Machine:
+    """The machine with the velocity scale of its log, which the smoothed sign multiplies."""
+    speed = float(np.sqrt(np.mean(data.qd**2)))
+    plant = replace(machine.plant, velocity_scale=jnp.asarray(speed))
+    return machine.with_plant(plant, machine.parameters)
