@@ -62,7 +62,7 @@ class Identification:
         return self.estimate.value(name)
 
     def __str__(self) -> str:
-        from jaxid.io.results import identification_table
+        from jaxid.io.tables import identification_table
 
         return identification_table(self)
 

@@ -30,6 +30,7 @@ class Recipe:
             instead of at the instants at which it was logged.
         derivatives: "central" (differences) or "spectral" (exact in the band).
         keeps_reversals: Whether a fit uses samples that only pass through zero.
+        edge: Edge of the parallel filter over half the sampling rate; None: its decimation's.
     """
 
     cutoff_hz: float
@@ -40,6 +41,7 @@ class Recipe:
     align_hold: bool
     derivatives: str
     keeps_reversals: bool = False
+    edge: float | None = None
 
     def band_hz(self, rate_hz: float) -> float:
         """Edge of the band in which forces are compared."""
@@ -47,8 +49,12 @@ class Recipe:
 
     @property
     def decimator(self) -> signals.Decimator:
-        """The parallel filter."""
-        return signals.Decimator(self.decimation, self.trim)
+        """The parallel filter.
+
+        A stated recipe's is its decimation's. Else the band ends where the position's filter is
+        still flat: beyond that, the force would have no motion to be compared with.
+        """
+        return signals.Decimator(self.decimation, self.trim, self.edge)
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,8 @@ class Prepared:
         q, qd, qdd: Filtered motion at the log's rate, (time, n).
         force: Declared force, (time, m) [N or N m].
         period: Sampling time of the log [s].
-        held: Whether `force` acts held from its sample on (see `Recipe.align_hold`).
+        hold: For how long each force is held from its sample on [s]; zero where that is not to
+            count (see `Recipe.align_hold`).
         recipe: How it was filtered.
         moving: Which kept samples are not at rest, (kept, n).
         fitted: Which kept samples a fit uses, (kept, n): those that move; under a stated recipe
@@ -72,7 +79,7 @@ class Prepared:
     qdd: Float[np.ndarray, "time n"]
     force: Float[np.ndarray, "time m"]
     period: float
-    held: bool
+    hold: float
     recipe: Recipe
     moving: Bool[np.ndarray, "kept n"]
     fitted: Bool[np.ndarray, "kept n"]
@@ -117,6 +124,7 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         align_hold=bool(stated.get("align_hold", not literal)),
         derivatives="central" if literal else "spectral",
         keeps_reversals=literal,
+        edge=None if literal else min(1.5 * cutoff / rate, 0.95),
     )
 
 
@@ -146,13 +154,16 @@ def differentiate(
     return q, qd, signals.central_difference(qd, period)
 
 
-def prepare(log: Log, gain: np.ndarray, recipe: Recipe) -> Prepared:
+def prepare(
+    log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | None = None
+) -> Prepared:
     """Filter a log and mark the samples that count.
 
     Args:
         log: The log.
         gain: Declared force per unit of command, (m,).
         recipe: How to filter it.
+        hold_period: For how long a held command is held [s]; absent: the log's sampling time.
     """
     q, qd, qdd = differentiate(
         log.position, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives
@@ -161,9 +172,11 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe) -> Prepared:
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
     moving = ~_smeared(at_rest, recipe.decimation)[kept]
     fitted = ~_smeared(_dwelling(at_rest, 2 * recipe.decimation), recipe.decimation)[kept]
+    held = recipe.align_hold and log.hold == "zero_order"
+    hold = (hold_period or log.period) if held else 0.0
     return Prepared(
         q, qd, qdd, log.force * gain, log.period,
-        recipe.align_hold and log.hold == "zero_order", recipe, moving,
+        hold, recipe, moving,
         fitted if recipe.keeps_reversals else moving, kept,
     )
 

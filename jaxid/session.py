@@ -142,7 +142,8 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
             f"{recipe.decimation} and trimming {recipe.trim} at each end",
             where=log.source, mend="take a longer log, or lower decimation and trim in [preprocess]",
         )
-    data = prepare(log, machine.gain, recipe)
+    hold = None if machine.controller is None else machine.controller.period
+    data = prepare(log, machine.gain, recipe, hold)
     if data.moving.sum() < 5 * max(len(machine.parameters.free), 4):
         raise InputError(
             f"only {int(data.moving.sum())} samples move faster than the rest velocity "

@@ -101,7 +101,7 @@ class Discovery:
         return self.after.converged
 
     def __str__(self) -> str:
-        from jaxid.io.results import discovery_table
+        from jaxid.io.tables import discovery_table
 
         return discovery_table(self)
 
@@ -122,6 +122,7 @@ def discover(
     *,
     validate: Sequence[Log | str | Path] = (),
     max_effects: int = 5,
+    refit: bool = True,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
     """Find the effects that a case's model is missing, on a log.
@@ -131,6 +132,7 @@ def discover(
         log: The log, or its file.
         validate: Logs that must confirm each effect, beside the case's own.
         max_effects: Most effects to add.
+        refit: Refit the parameters in simulation too; without, they are inverse dynamics'.
         progress: Called with a line at every stage.
 
     Raises:
@@ -148,12 +150,12 @@ def discover(
     where = _where(search, steps[0])
     final, effects = _final_machine(baseline.machine, search, alternatives, steps)
     verdict = _verdict(effects, where, steps, search)
-    progress("refitting in simulation")
-    before = _refit(session.with_machine(baseline.machine), baseline)
-    after = before
-    if effects:
-        again = inverse_dynamics(final, data)
-        after = _refit(session.with_machine(again.machine), again)
+    before = baseline
+    after = inverse_dynamics(final, data) if effects else before
+    if refit:
+        progress("refitting in simulation")
+        before = _refit(session.with_machine(before.machine), before)
+        after = _refit(session.with_machine(after.machine), after) if effects else before
     progress("simulating")
     old = gaps(before.machine, session.runs)
     new = gaps(after.machine, session.runs) if effects else old

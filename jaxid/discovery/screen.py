@@ -92,10 +92,10 @@ def screen_candidates(search: Search) -> Screen:
     rest = search.rest()
     points = cand.points(search.union, rest, search.arrays, search.theta, e)
     base = jacobian[..., search.active]
-    whitener = _saturated_whitener(e, base, points, search.data.moving)
     for c in rest:
         if c.many:
             points.extend(search.many(c))
+    whitener = _saturated_whitener(e, base, points, search.data.moving)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
     noise = _left(np.concatenate([columns, *_plain(points, whitener)], axis=1), white[:, 0])
@@ -178,8 +178,21 @@ def _saturated_whitener(
     The colour of the current residual is partly the missing effect itself; whitened with that,
     the effect would vanish.
     """
-    columns = np.concatenate([base, *[p.columns for p in points if not p.candidate.many]], axis=2)
+    few = [base, *[p.columns for p in points if not p.candidate.many]]
+    columns = np.concatenate(few, axis=2)
+    many = [p for p in points if p.candidate.many]
     left = np.zeros_like(e)
     for i, rows in enumerate(counts.T):
-        left[rows, i] = _left(columns[rows, i], e[rows, i])
+        now, own = e[rows, i], columns[rows, i]
+        rest = _left(own, now)
+        taken = [_explained(p.columns[rows, i], rest) for p in many]
+        if taken:
+            best = many[int(np.argmax(taken))].columns[rows, i]
+            rest = _left(np.concatenate([own, best], axis=1), now)
+        left[rows, i] = rest
     return ev.Whitener.of(left, counts)
+
+
+def _explained(columns: np.ndarray, e: np.ndarray) -> float:
+    """Sum of squares that some columns take off e."""
+    return float(e @ e - np.sum(_left(columns, e) ** 2))

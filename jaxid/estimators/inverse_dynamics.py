@@ -37,7 +37,7 @@ class ForceData(eqx.Module):
     force: Float[Array, "time m"]
     weight: Float[Array, "kept n"]
     period: float = eqx.field(static=True)
-    held: bool = eqx.field(static=True)
+    hold: float = eqx.field(static=True)
     decimator: signals.Decimator = eqx.field(static=True)
 
     @classmethod
@@ -47,19 +47,19 @@ class ForceData(eqx.Module):
         return cls(
             jnp.asarray(data.q), jnp.asarray(data.qd), jnp.asarray(data.qdd),
             jnp.asarray(data.force), jnp.asarray(rows, dtype=float), data.period,
-            data.held, data.recipe.decimator,
+            data.hold, data.recipe.decimator,
         )
 
 
 def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
-    u = signals.delayed(data.force, plant.command_delay(), data.period, held=data.held)
+    u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
     return data.decimator(residual_along(plant, data.q, data.qd, data.qdd, u, data.period))
 
 
 def measured_force(data: ForceData) -> Float[Array, "kept m"]:
     """Declared force through the same filter [N or N m]."""
-    u = signals.delayed(data.force, jnp.zeros(()), data.period, held=data.held)
+    u = signals.delayed(data.force, jnp.zeros(()), data.period, hold=data.hold)
     return data.decimator(u)
 
 

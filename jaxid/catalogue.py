@@ -1,0 +1,34 @@
+"""What there is: plants and effects with their parameters and units, read off the registries."""
+
+from __future__ import annotations
+
+from jaxid.effects import EFFECTS
+from jaxid.io.tables import aligned
+from jaxid.model import parameters_of
+from jaxid.plants import PLANTS
+from jaxid.units import Units
+
+_SIGNS = {"free": "any", "nonnegative": ">= 0", "positive": "> 0"}
+
+
+def effects_table() -> str:
+    """Every registered effect: what it does, its parameters, their signs and units."""
+    return _table(EFFECTS, "effect")
+
+
+def plants_table() -> str:
+    """Every plant: what it is, its parameters, their signs and units."""
+    return _table(PLANTS, "plant")
+
+
+def _table(registry: dict[str, type], what: str) -> str:
+    linear, rotary = Units("linear"), Units("rotary")
+    rows = [[what, "parameter", "sign", "linear", "rotary", "what it is"]]
+    for kind, cls in registry.items():
+        rows.append([kind, "", "", "", "", (cls.__doc__ or "").strip().splitlines()[0]])
+        for name, info in parameters_of(cls).items():
+            shown = f"{name}?" if info.optional else name
+            units = [linear.label(info.dimension), rotary.label(info.dimension)]
+            rows.append(["", shown, _SIGNS[info.sign], *units, info.doc])
+    note = "\n? : one of these" if any(r[1].endswith("?") for r in rows) else ""
+    return aligned(rows) + note

@@ -1,0 +1,228 @@
+"""The command line: thin covers of the Python interface, loaded only when asked for."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from jaxid.errors import InputError
+
+METHODS = ("output_error", "inverse_dynamics", "algebraic")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Returns:
+        0 done, whatever the verdict; 2 bad input; 1 anything else, no convergence included.
+    """
+    args = _parser().parse_args(argv)
+    try:
+        return args.run(args)
+    except InputError as error:
+        print(f"jaxid: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("jaxid: interrupted", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        return 1
+
+
+def entry() -> None:
+    """Entry point of the installed command."""
+    sys.exit(main())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="jaxid",
+        description="Identify machines with friction, and find the physics that a simulation "
+        "is missing.",
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _demo(commands)
+    for name, what, run in (
+        ("plants", "the plants there are, with parameters and units", _run_plants),
+        ("effects", "the effects there are, with parameters and units", _run_effects),
+    ):
+        commands.add_parser(name, help=what, description=what).set_defaults(run=run)
+    _simulate(commands)
+    _check(commands)
+    _identify(commands)
+    _discover(commands)
+    return parser
+
+
+def _add(
+    commands: argparse._SubParsersAction, name: str, what: str, run: Callable
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=what, description=what)
+    parser.set_defaults(run=run)
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.add_argument("--force", action="store_true", help="overwrite what jaxid did not make")
+    return parser
+
+
+def _demo(commands: argparse._SubParsersAction) -> None:
+    what = "the whole way, check to report, on a log that ships with jaxid"
+    parser = _add(commands, "demo", what, _run_demo)
+    parser.add_argument("-o", metavar="DIR", default="jaxid-demo", help="default: jaxid-demo")
+
+
+def _simulate(commands: argparse._SubParsersAction) -> None:
+    parser = _add(commands, "simulate", "the log that a case would give", _run_simulate)
+    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("-o", metavar="LOG.csv", required=True)
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the sensors' noise")
+
+
+def _logs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("log", metavar="LOG")
+    parser.add_argument("-o", metavar="DIR", help="where results go; absent: only printed")
+
+
+def _validate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--validate", metavar="LOG2", action="append", default=[],
+        help="a log to validate on, beside the case's own; may be repeated",
+    )
+
+
+def _check(commands: argparse._SubParsersAction) -> None:
+    what = "before any fit: is the log sound, does it excite what is asked, what can be told apart"
+    _logs(_add(commands, "check", what, _run_check))
+
+
+def _identify(commands: argparse._SubParsersAction) -> None:
+    parser = _add(commands, "identify", "identify the unknowns of a case from a log", _run_identify)
+    _logs(parser)
+    parser.add_argument("--method", metavar="M", default="output_error", help=", ".join(METHODS))
+    _validate(parser)
+
+
+def _discover(commands: argparse._SubParsersAction) -> None:
+    what = "find the effects that a case's model is missing, add them, show the gap shrink"
+    parser = _add(commands, "discover", what, _run_discover)
+    _logs(parser)
+    _validate(parser)
+    parser.add_argument("--max-effects", metavar="N", type=int, default=5, help="default: 5")
+
+
+@contextmanager
+def _progress(args: argparse.Namespace, stages: int):
+    """A bar on a terminal, nothing when piped or quiet."""
+    from tqdm import tqdm
+
+    with tqdm(
+        total=stages, disable=args.quiet or not sys.stderr.isatty(), leave=False, unit="stage",
+        bar_format="{desc:42.42s} |{bar}| {elapsed}",
+    ) as bar:
+
+        def tell(text: str) -> None:
+            bar.set_description_str(text)
+            if bar.n < stages - 1:
+                bar.update()
+
+        yield tell
+
+
+def _ready(args: argparse.Namespace, *files: str) -> None:
+    """Refuse before the work what could not be written after it."""
+    if args.o is not None:
+        from jaxid.io.output import check_folder
+
+        check_folder(Path(args.o), files, force=args.force)
+
+
+def _run_plants(args: argparse.Namespace) -> int:
+    from jaxid.catalogue import plants_table
+
+    print(plants_table())
+    return 0
+
+
+def _run_effects(args: argparse.Namespace) -> int:
+    from jaxid.catalogue import effects_table
+
+    print(effects_table())
+    return 0
+
+
+def _run_simulate(args: argparse.Namespace) -> int:
+    from jaxid.io.output import ready_file
+
+    path = ready_file(Path(args.o), force=args.force)
+    with _progress(args, 2) as tell:
+        tell("simulating")
+        from jaxid.virtual import simulate
+
+        virtual = simulate(args.case, seed=args.seed)
+    virtual.save(path)
+    print(f"{virtual.log.samples} samples at {virtual.log.rate_hz:g} Hz in {path}")
+    return 0
+
+
+def _run_check(args: argparse.Namespace) -> int:
+    _ready(args, "check.json")
+    with _progress(args, 2) as tell:
+        tell("checking")
+        from jaxid.check import check
+
+        result = check(args.case, args.log)
+    print(result)
+    return _finish(args, result, "check.json")
+
+
+def _run_identify(args: argparse.Namespace) -> int:
+    if args.method not in METHODS:
+        raise InputError(
+            f"method {args.method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
+        )
+    _ready(args, "result.json", "report.html")
+    with _progress(args, 4) as tell:
+        tell("starting")
+        from jaxid.identify import identify
+
+        result = identify(
+            args.case, args.log, method=args.method, validate=args.validate, progress=tell
+        )
+    print(result)
+    return _finish(args, result, "result.json", "report.html")
+
+
+def _run_discover(args: argparse.Namespace) -> int:
+    if args.max_effects < 0:
+        raise InputError(f"--max-effects is {args.max_effects}", mend="give zero or more")
+    _ready(args, "discovery.json", "report.html")
+    with _progress(args, 40) as tell:
+        tell("starting")
+        from jaxid.discovery.discover import discover
+
+        result = discover(
+            args.case, args.log, validate=args.validate, max_effects=args.max_effects,
+            progress=tell,
+        )
+    print(result)
+    return _finish(args, result, "discovery.json", "report.html")
+
+
+def _run_demo(args: argparse.Namespace) -> int:
+    from jaxid.demo import run_demo
+
+    with _progress(args, 40) as tell:
+        tell("starting")
+        text, converged = run_demo(Path(args.o), force=args.force, progress=tell)
+    print(text)
+    return 0 if converged else 1
+
+
+def _finish(args: argparse.Namespace, result: object, *files: str) -> int:
+    if args.o is not None:
+        result.save(args.o, force=args.force)
+        print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in files)}")
+    return 0 if getattr(result, "converged", True) else 1

@@ -1,0 +1,105 @@
+"""Writing results: whole or not at all, and never over what jaxid did not make."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.errors import InputError
+
+# A folder with this file in it was made by jaxid, and may be written again.
+_MARK = ".jaxid"
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays and numbers into what JSON knows; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [plain(v) for v in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that it is either there entirely or not at all."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a result as JSON, numbers as JSON numbers, absent ones as null."""
+    write_whole(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+
+
+def check_folder(folder: Path, files: Sequence[str], *, force: bool = False) -> None:
+    """See that results may be written to a folder, before the work that makes them.
+
+    Raises:
+        InputError: If it holds one of the files, jaxid did not make it, and `force` is not given;
+            or if it is no folder.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=str(folder), mend="choose another -o")
+    taken = [f for f in files if (folder / f).exists()]
+    if taken and not (folder / _MARK).exists() and not force:
+        raise InputError(
+            f"holds {', '.join(taken)} already", where=str(folder),
+            mend="choose another -o, or overwrite with --force",
+        )
+
+
+def ready_folder(folder: Path, files: Sequence[str], *, force: bool = False) -> Path:
+    """Make a folder for results, where there is none.
+
+    Raises:
+        InputError: As `check_folder`, or if it cannot be made.
+    """
+    check_folder(folder, files, force=force)
+    try:
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            (folder / _MARK).write_text("made by jaxid\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"cannot be made: {error.strerror}", where=str(folder), mend="choose another -o"
+        ) from error
+    return folder
+
+
+def ready_file(path: Path, *, force: bool = False) -> Path:
+    """See that a file may be written.
+
+    Raises:
+        InputError: If it exists and `force` is not given, or its folder does not.
+    """
+    if path.exists() and not force:
+        raise InputError(
+            "exists already", where=str(path), mend="choose another -o, or overwrite with --force"
+        )
+    if not path.parent.is_dir():
+        raise InputError("has no such folder", where=str(path), mend="make the folder first")
+    return path

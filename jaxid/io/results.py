@@ -1,0 +1,236 @@
+"""The JSON results and the tables that commands print."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxid.discovery.screen import Score
+from jaxid.estimators.result import Estimate
+from jaxid.identify import Gap, Identification
+from jaxid.io.output import ready_folder, write_json, write_whole
+from jaxid.session import Session
+
+if TYPE_CHECKING:
+    from jaxid.discovery.discover import Discovery, Found
+
+
+def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """Value, standard deviation, unit and identifiability by name; plant lists as lists."""
+    out: dict[str, Any] = {}
+    rows = zip(
+        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        strict=True,
+    )
+    for f, value, std, told in rows:
+        if names is not None and f.name not in names:
+            continue
+        entry = {
+            "value": float(value) if told else None, "std": float(std) if told else None,
+            "unit": f.unit, "identifiable": bool(told),
+        }
+        if f.index is None:
+            out[f.name] = entry
+            continue
+        listed = out.setdefault(
+            f.name.partition("[")[0], {"value": [], "std": [], "unit": f.unit, "identifiable": []}
+        )
+        for key in ("value", "std", "identifiable"):
+            listed[key].append(entry[key])
+    return out
+
+
+def _one(x: np.ndarray | None) -> Any:
+    """A number where there is one joint, a list where there are several."""
+    if x is None:
+        return None
+    x = np.atleast_1d(x)
+    return float(x[0]) if x.size == 1 else [float(v) for v in x]
+
+
+def _worst(gaps: Sequence[Gap], pick: str) -> Any:
+    values = [_pick(g, pick) for g in gaps]
+    values = [v for v in values if v is not None]
+    return _one(np.max(values, axis=0)) if values else None
+
+
+def _pick(gap: Gap, what: str) -> np.ndarray | None:
+    domain, _, field = what.partition(".")
+    part = gap.force if domain == "force" else gap.simulation
+    return None if part is None else getattr(part, field)
+
+
+def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[str, Any]:
+    """The `gap` object of result.json."""
+    fit, others = gaps[0], gaps[1:]
+    units = session.machine.units
+    out: dict[str, Any] = {
+        "unit": units.label("force"),
+        "band_hz": session.recipe.band_hz(session.fit.log.rate_hz),
+        "fit": _one(fit.force.rms),
+        "validation": _worst(others, "force.rms"),
+        "noise_floor": _one(floor),
+        "relative": {
+            "fit": _one(fit.force.relative), "validation": _worst(others, "force.relative")
+        },
+        "simulation": {
+            "unit": units.label("position"),
+            "fit": _one(_pick(fit, "simulation.rms")),
+            "validation": _worst(others, "simulation.rms"),
+            "relative": {
+                "fit": _one(_pick(fit, "simulation.relative")),
+                "validation": _worst(others, "simulation.relative"),
+            },
+            "command_relative": {
+                "fit": _one(_pick(fit, "simulation.command_relative")),
+                "validation": _worst(others, "simulation.command_relative"),
+            },
+        },
+    }
+    if len(others) > 1:
+        out["validations"] = {
+            g.name: {
+                "force": _one(g.force.rms), "relative": _one(g.force.relative),
+                "simulation": _one(_pick(g, "simulation.rms")),
+                "simulation_relative": _one(_pick(g, "simulation.relative")),
+            }
+            for g in others
+        }
+    return out
+
+
+def identification_json(result: Identification) -> dict[str, Any]:
+    """Content of result.json."""
+    estimate = result.estimate
+    return {
+        "method": estimate.method,
+        "converged": estimate.converged,
+        "message": estimate.message,
+        "samples": estimate.samples,
+        "parameters": parameters_json(estimate),
+        "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
+        "gap": gap_json(result.session, result.gaps, result.noise_floor),
+        "preprocess": recipe_json(result.session),
+        "notes": notes(result.session, estimate),
+    }
+
+
+def recipe_json(session: Session) -> dict[str, Any]:
+    """How the logs were filtered, chosen or stated."""
+    r = session.recipe
+    return {
+        "cutoff_hz": r.cutoff_hz, "order": r.order, "decimation": r.decimation, "trim": r.trim,
+        "rest_velocity": list(r.rest_velocity), "align_hold": r.align_hold,
+        "derivatives": r.derivatives,
+    }
+
+
+def notes(session: Session, estimate: Estimate) -> list[str]:
+    """What a reader should know: warnings on the logs, and how the fit was done."""
+    warnings = [f"{f.where}: {f.what}; {f.mend}" for f in session.findings]
+    return [*warnings, *estimate.notes]
+
+
+def effect_json(found: Found, estimate: Estimate) -> dict[str, Any]:
+    """One entry of `effects` in discovery.json."""
+    own = parameters_json(estimate, found.names)
+    return {
+        "kind": found.kind,
+        "joint": found.joint,
+        "parameters": {name.rpartition(".")[2]: entry for name, entry in own.items()},
+        "evidence": found.score.evidence,
+        "alternatives": [_alternative(s) for s in found.alternatives],
+    }
+
+
+def _alternative(score: Score) -> dict[str, Any]:
+    return {"kind": score.candidate.kind, "evidence": score.evidence}
+
+
+def where_json(result: Discovery) -> dict[str, Any] | None:
+    """The `where` object of discovery.json."""
+    w = result.where
+    if w is None:
+        return None
+    return {
+        "joint": w.joint, "variable": w.variable, "region": list(w.region),
+        "intervals": [list(i) for i in w.intervals], "text": w.text,
+        "frequency_hz": w.frequency_hz,
+    }
+
+
+def discovery_json(result: Discovery) -> dict[str, Any]:
+    """Content of discovery.json."""
+    own = result.session.machine.parameters.names
+    before, after = result.gaps_before, result.gaps_after
+    on = "validation" if len(after) > 1 else "fit"
+    judged = slice(1, None) if len(after) > 1 else slice(0, 1)
+    units = result.session.machine.units
+    return {
+        "verdict": result.verdict,
+        "converged": result.converged,
+        "where": where_json(result),
+        "effects": [effect_json(e, result.after) for e in result.effects],
+        "steps": [step_json(r) for r in result.rounds if r.step.added or r.step.dropped or not r.step.scores],
+        "gap": {
+            "unit": units.label("force"),
+            "band_hz": result.session.recipe.band_hz(result.session.fit.log.rate_hz),
+            "before": _worst(before[judged], "force.rms"),
+            "after": _worst(after[judged], "force.rms"),
+            "noise_floor": _one(result.noise_floor),
+            "on": on,
+            "relative": {
+                "before": _worst(before[judged], "force.relative"),
+                "after": _worst(after[judged], "force.relative"),
+            },
+            "simulation": {
+                "unit": units.label("position"),
+                "before": _worst(before[judged], "simulation.rms"),
+                "after": _worst(after[judged], "simulation.rms"),
+            },
+        },
+        "parameters": {
+            k: v for k, v in parameters_json(result.after).items()
+            if any(n == k or n.startswith(f"{k}[") for n in own)
+        },
+        "unidentifiable": [{"combination": c} for c in result.after.precision.unidentifiable],
+        "fit_gap": gap_json(result.session, after, result.noise_floor),
+        "method": result.after.method,
+        "preprocess": recipe_json(result.session),
+        "notes": notes(result.session, result.after),
+    }
+
+
+def step_json(r: Any) -> dict[str, Any]:
+    """One entry of `steps`: what was added (or dropped) and the gap after it."""
+    step = r.step
+    out = {
+        "added": step.added.candidate.kind if step.added else None,
+        "fit": _one(r.fit), "validation": _one(r.validation),
+    }
+    if step.dropped is not None:
+        out["dropped"] = step.dropped.kind
+    return out
+
+
+def save_identification(result: Identification, folder: Path, *, force: bool = False) -> Path:
+    """Write result.json and report.html."""
+    from jaxid.report.build import identification_report
+
+    ready_folder(folder, ["result.json", "report.html"], force=force)
+    write_whole(folder / "report.html", identification_report(result))
+    write_json(folder / "result.json", identification_json(result))
+    return folder
+
+
+def save_discovery(result: Discovery, folder: Path, *, force: bool = False) -> Path:
+    """Write discovery.json and report.html."""
+    from jaxid.report.build import discovery_report
+
+    ready_folder(folder, ["discovery.json", "report.html"], force=force)
+    write_whole(folder / "report.html", discovery_report(result))
+    write_json(folder / "discovery.json", discovery_json(result))
+    return folder

@@ -1,0 +1,125 @@
+"""Results as text, for a terminal or a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from jaxid.io import results
+from jaxid.report.numbers import with_std
+
+if TYPE_CHECKING:
+    from jaxid.discovery.discover import Discovery
+    from jaxid.estimators.result import Estimate
+    from jaxid.identify import Identification
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Columns padded to their widest entry."""
+    widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)) for r in rows]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def parameter_lines(estimate: Estimate) -> str:
+    """Value, standard deviation and unit of every parameter."""
+    rows = [["parameter", "value", "std", "unit"]]
+    for f, value, std, told in zip(
+        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        strict=True,
+    ):
+        shown = with_std(value, std) if told else ("-", "this log cannot tell it")
+        rows.append([f.name, *shown, f.unit])
+    return aligned(rows)
+
+
+def _number(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return ", ".join(_number(v) for v in value)
+    return f"{value:.4g}"
+
+
+def identification_table(result: Identification) -> str:
+    """What `identify` prints."""
+    estimate = result.estimate
+    gap = results.gap_json(result.session, result.gaps, result.noise_floor)
+    head = f"{estimate.method}: {estimate.message}, {estimate.samples} samples"
+    simulation = gap["simulation"]
+    rows = [
+        ["gap", "fit", "validation", "unit"],
+        ["force", _number(gap["fit"]), _number(gap["validation"]), gap["unit"]],
+        ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
+        ["noise floor", _number(gap["noise_floor"]), "", gap["unit"]],
+        ["simulated position", _number(simulation["fit"]), _number(simulation["validation"]),
+         simulation["unit"]],
+    ]
+    return "\n".join([head, "", parameter_lines(estimate), *_blind(estimate), "", aligned(rows),
+                      *_notes(results.notes(result.session, estimate))])
+
+
+def discovery_table(result: Discovery) -> str:
+    """What `discover` prints."""
+    content = results.discovery_json(result)
+    lines = [f"verdict: {result.verdict}"]
+    if content["where"]:
+        lines.append(f"where:   {content['where']['text']}")
+    for effect in content["effects"]:
+        others = ", ".join(a["kind"] for a in effect["alternatives"])
+        told = f"; this log cannot tell it from {others}" if others else ""
+        lines.append(f"effect:  {effect['kind']} (evidence {effect['evidence']:.0f} nats{told})")
+    gap = content["gap"]
+    rows = [["step", "force gap, fit", "force gap, validation"]]
+    for step in content["steps"]:
+        name = f"+ {step['added']}" if step["added"] else "baseline"
+        if "dropped" in step:
+            name = (f"{name}, " if step["added"] else "") + f"- {step['dropped']}"
+        rows.append([name, f"{_number(step['fit'])} {gap['unit']}", _number(step["validation"])])
+    lines += ["", aligned(rows), "", parameter_lines(result.after), *_blind(result.after), ""]
+    lines.append(
+        f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {gap['unit']} "
+        f"(noise floor {_number(gap['noise_floor'])}); simulated position "
+        f"{_number(gap['simulation']['before'])} -> {_number(gap['simulation']['after'])} "
+        f"{gap['simulation']['unit']}"
+    )
+    return "\n".join([*lines, *_notes(content["notes"])])
+
+
+def _blind(estimate: Estimate) -> list[str]:
+    return [
+        "cannot be told apart: " + ", ".join(f"{w:+.2f} {n}" for n, w in c.items())
+        for c in estimate.precision.unidentifiable
+    ]
+
+
+def _notes(lines: Sequence[str]) -> list[str]:
+    return ["", *[f"note: {line}" for line in lines]] if lines else []
+
+
+def check_table(result: Any) -> str:
+    """What `check` prints."""
+    content = result.json()
+    log, unit = content["log"], result.session.machine.units.label
+    one = results._one
+    head = (
+        f"{log['samples']} samples at {log['rate_hz']:.6g} Hz, {log['duration_s']:.4g} s; stroke "
+        f"{_number(one(log['stroke']))} {unit('position')}, up to "
+        f"{_number(one(log['peak_velocity']))} {unit('position/time')} and "
+        f"{_number(one(log['peak_force']))} {unit('force')}; {100 * log['moving']:.0f} % moving"
+    )
+    recipe = content["preprocess"]
+    how = (
+        f"filter: {recipe['cutoff_hz']:.4g} Hz, one sample in {recipe['decimation']} kept; noise "
+        f"floor {_number(one(content['noise_floor']))} {unit('force')}"
+    )
+    rows = [["unknown", "guess", "std at best", "unit"]]
+    for name, p in content["parameters"].items():
+        best = f"{p['expected_std']:.2g}" if p["identifiable"] else "this log cannot tell it"
+        rows.append([name, f"{p['guess']:.4g}", best, p["unit"]])
+    blind = [
+        "cannot be told apart: " + ", ".join(f"{w:+.2f} {n}" for n, w in c["combination"].items())
+        for c in content["unidentifiable"]
+    ]
+    table = ["", aligned(rows)] if len(rows) > 1 else []
+    return "\n".join(["the log is sound", head, how, *table, *blind, *_notes(content["warnings"])])

@@ -1,0 +1,172 @@
+"""From the results of identify and discover to a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.io import results
+from jaxid.report.data import (
+    CandidateScore,
+    LogView,
+    ParameterRow,
+    ReportData,
+    SearchStep,
+    WherePlot,
+)
+from jaxid.report.page import render
+
+if TYPE_CHECKING:
+    from jaxid.discovery.discover import Discovery, Round
+    from jaxid.estimators.result import Estimate
+    from jaxid.identify import Gap, Identification
+    from jaxid.session import Run, Session
+
+
+def identification_report(result: Identification) -> str:
+    """The report of `identify`, as one page of HTML."""
+    content = results.identification_json(result)
+    session = result.session
+    return render(
+        ReportData(
+            title=f"Identification of {session.case.path.stem}",
+            command="identify",
+            verdict=None,
+            summary_lines=(),
+            gap=content["gap"],
+            unidentifiable=tuple(content["unidentifiable"]),
+            views=_views(session, None, result.gaps),
+            converged=result.converged,
+            **_common(session, result.estimate, content["notes"]),
+        )
+    )
+
+
+def discovery_report(result: Discovery) -> str:
+    """The report of `discover`, as one page of HTML."""
+    content = results.discovery_json(result)
+    session = result.session
+    before = result.gaps_before if result.effects else None
+    return render(
+        ReportData(
+            title=f"What is missing in {session.case.path.stem}",
+            command="discover",
+            verdict=result.verdict,
+            summary_lines=(),
+            gap=content["gap"],
+            unidentifiable=tuple(content["unidentifiable"]),
+            effects=tuple(content["effects"]),
+            where=content["where"],
+            steps=tuple(_step(r) for r in result.rounds),
+            where_plot=_where_plot(result),
+            views=_views(session, before, result.gaps_after),
+            converged=result.converged,
+            **_common(session, result.after, content["notes"]),
+        )
+    )
+
+
+def views(result: Identification | Discovery) -> tuple[LogView, ...]:
+    """The logs of a result as the plots take them, for notebooks."""
+    if hasattr(result, "gaps"):
+        return _views(result.session, None, result.gaps)
+    return _views(result.session, result.gaps_before, result.gaps_after)
+
+
+def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
+    return {
+        "case_name": session.case.path.name,
+        "log_name": Path(session.fit.log.source).name,
+        "parameters": _rows(estimate),
+        "units": units_of(session),
+        "notes": tuple(notes),
+        "versions": {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")},
+    }
+
+
+def units_of(session: Session) -> dict[str, str]:
+    """Labels of position, velocity, force and time."""
+    units = session.machine.units
+    return {
+        "position": units.label("position"), "velocity": units.label("position/time"),
+        "force": units.label("force"), "time": "s",
+    }
+
+
+def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
+    rows = zip(
+        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        strict=True,
+    )
+    return tuple(
+        ParameterRow(
+            f.name, float(v) if told else None, float(s) if told else None, f.unit, bool(told)
+        )
+        for f, v, s, told in rows
+    )
+
+
+def _views(
+    session: Session, before: Sequence[Gap] | None, after: Sequence[Gap]
+) -> tuple[LogView, ...]:
+    earlier = before or [None] * len(after)
+    joints = range(session.fit.log.position.shape[1])
+    return tuple(
+        _view(run, old, new, joint, len(joints))
+        for run, old, new in zip(session.runs, earlier, after, strict=True)
+        for joint in joints
+    )
+
+
+def _view(run: Run, before: Gap | None, after: Gap, joint: int, joints: int) -> LogView:
+    data, log = run.data, run.log
+    rows = data.moving[:, joint]
+    name = run.name if joints == 1 else f"{run.name}, joint {joint + 1}"
+
+    def simulated(gap: Gap | None) -> np.ndarray | None:
+        return None if gap is None or gap.simulation is None else gap.simulation.position[:, joint]
+
+    return LogView(
+        name=name,
+        time=log.time,
+        position_measured=log.position[:, joint],
+        position_simulated_before=simulated(before),
+        position_simulated_after=simulated(after),
+        band_time=log.time[data.kept][rows],
+        velocity=data.at_kept(data.qd)[rows, joint],
+        position=data.at_kept(data.q)[rows, joint],
+        force_measured=after.force.measured[rows, min(joint, after.force.measured.shape[1] - 1)],
+        residual_before=None if before is None else before.force.residual[rows, joint],
+        residual_after=after.force.residual[rows, joint],
+    )
+
+
+def _step(r: Round) -> SearchStep:
+    step = r.step
+    added = step.added.candidate if step.added else None
+    return SearchStep(
+        added=added.kind if added else None,
+        dropped=step.dropped.kind if step.dropped else None,
+        gap_fit=float(np.max(r.fit)),
+        gap_validation=None if r.validation is None else float(np.max(r.validation)),
+        candidates=tuple(
+            CandidateScore(s.candidate.kind, s.evidence, s.candidate is added) for s in step.scores
+        ),
+        threshold=step.threshold,
+    )
+
+
+def _where_plot(result: Discovery) -> WherePlot | None:
+    w = result.where
+    if w is None:
+        return None
+    label = result.session.machine.units.label
+    unit = {
+        "velocity": label("position/time"), "position": label("position"),
+        "acceleration": label("position/time2"), "force": label("force"),
+    }.get(w.variable, "s")
+    return WherePlot(w.variable, unit, w.x, w.mean, w.low, w.high)

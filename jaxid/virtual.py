@@ -1,0 +1,178 @@
+"""The log that a case would give: reference or input in, sensors' readings out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.io.case import Case, load_case
+from jaxid.io.log import Log
+from jaxid.io.output import write_whole
+from jaxid.machine import Machine, build_machine, disturbance_at
+from jaxid.references import make_reference
+from jaxid.simulate import Drive, Trajectory, closed_loop, open_loop
+
+
+@dataclass(frozen=True)
+class Virtual:
+    """A simulated log.
+
+    Args:
+        log: As a sensor would have recorded it.
+        trajectory: The motion behind it, without noise, one row a tick.
+        columns: Names of the columns, as the case's [log] has them.
+    """
+
+    log: Log
+    trajectory: Trajectory
+    columns: dict[str, str]
+
+    def csv(self) -> str:
+        """The log as a table with a header, every digit kept."""
+        log = self.log
+        parts = {"time": log.time[:, None], "position": log.position, "force": log.force}
+        if log.reference is not None:
+            parts["reference"] = log.reference
+        header = []
+        for key, values in parts.items():
+            names = self.columns[key]
+            header += [names] if isinstance(names, str) else [*names]
+            if values.shape[1] != (1 if isinstance(names, str) else len(names)):
+                raise InputError(
+                    f"[log] {key} names {names!r} for {values.shape[1]} columns",
+                    mend="give a list with one name a joint",
+                )
+        rows = np.concatenate([*parts.values()], axis=1)
+        lines = [",".join(repr(float(v)) for v in row) for row in rows]
+        return "\n".join([",".join(header), *lines]) + "\n"
+
+    def save(self, path: str | Path) -> Path:
+        """Write the log as CSV, whole or not at all."""
+        write_whole(Path(path), self.csv())
+        return Path(path)
+
+
+def simulate(case: Case | str | Path, *, seed: int = 0) -> Virtual:
+    """Simulate the log that a case would give, at its true values where it has any.
+
+    Args:
+        case: The case, or its file; it needs [simulation] with duration and sample_rate, and
+            [reference] (with a [controller]) or [input].
+        seed: Of the sensors' noise.
+
+    Raises:
+        InputError: If the case does not say what to simulate.
+    """
+    case = case if isinstance(case, Case) else load_case(case)
+    where = str(case.path)
+    setting = case.simulation
+    for key in ("duration", "sample_rate"):
+        if key not in setting:
+            raise InputError(
+                f"[simulation] has no {key}", where=where, mend=f"add {key} = ... to [simulation]"
+            )
+    rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+    machine = build_machine(case, true=True, period=1 / rate)
+    joints = case.plant.joints
+    position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
+    velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
+    rng = np.random.default_rng(seed)
+    if machine.controller is None:
+        return _open(case, machine, rate, duration, position, velocity, rng)
+    return _closed(case, machine, rate, duration, position, velocity, rng)
+
+
+def _closed(
+    case: Case, machine: Machine, rate: float, duration: float, position: np.ndarray,
+    velocity: np.ndarray, rng: np.random.Generator,
+) -> Virtual:
+    if not case.reference:
+        raise InputError(
+            "there is nothing to follow", where=str(case.path), mend="add a [reference]"
+        )
+    period = machine.controller.period
+    every = max(1, round(1 / (rate * period)))
+    reference = make_reference(case.reference, 1 / period, duration, case.folder)
+    times = period * np.arange(len(reference))
+    machine = _scaled(machine, reference, period)
+    drive = _drive(case, machine, period)
+    run = eqx.filter_jit(closed_loop)(
+        machine.plant, drive, machine.controller, jnp.asarray(reference),
+        jnp.asarray(disturbance_at(machine.disturbance, times)), jnp.asarray(position),
+        jnp.asarray(velocity), machine.sensor, jnp.asarray(rng.standard_normal(reference.shape)),
+    )
+    pick = slice(None, None, every)
+    log = _log(case, machine, times[pick], run.reading[pick], run.command[pick], rng, reference[pick])
+    return Virtual(log, run, _columns(case, reference=True))
+
+
+def _open(
+    case: Case, machine: Machine, rate: float, duration: float, position: np.ndarray,
+    velocity: np.ndarray, rng: np.random.Generator,
+) -> Virtual:
+    if not case.input:
+        raise InputError(
+            "nothing drives the plant", where=str(case.path),
+            mend="add an [input], or a [reference] and a [controller]",
+        )
+    command = make_reference(case.input, rate, duration, case.folder, where="input")
+    drive = _drive(case, machine, 1 / rate)
+    run = eqx.filter_jit(open_loop)(
+        machine.plant, drive, jnp.asarray(command), jnp.asarray(position), jnp.asarray(velocity)
+    )
+    reading = machine.sensor.read(run.position, jnp.asarray(rng.standard_normal(run.position.shape)))
+    times = np.arange(len(command)) / rate
+    log = _log(case, machine, times, reading, run.command, rng, None)
+    return Virtual(log, run, _columns(case, reference=False))
+
+
+def _drive(case: Case, machine: Machine, period: float) -> Drive:
+    """Exact sticking, unless the case states a sharpness: then friction is smoothed."""
+    delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
+    longest = int(np.ceil(float(machine.plant.command_delay()) / period)) + 1 if delayed else 0
+    hold = "linear" if machine.hold == "band_limited" else machine.hold
+    return Drive(
+        jnp.asarray(machine.gain), period, hold, int(case.simulation.get("substeps", 4)),
+        "sharpness" not in case.simulation, longest,
+    )
+
+
+def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
+    """The velocity that the smoothed sign's sharpness multiplies: the reference's largest."""
+    speed = float(np.abs(np.diff(reference, axis=0)).max() / period)
+    if speed == 0.0:
+        return machine
+    plant = replace(machine.plant, velocity_scale=jnp.asarray(speed))
+    return machine.with_plant(plant, machine.parameters)
+
+
+def _log(
+    case: Case, machine: Machine, times: np.ndarray, reading: np.ndarray, command: np.ndarray,
+    rng: np.random.Generator, reference: np.ndarray | None,
+) -> Log:
+    noise = machine.sensor.force_noise
+    command = np.asarray(command)
+    if noise is not None:
+        command = command + np.asarray(noise) * rng.standard_normal(command.shape)
+    if not np.all(np.isfinite(reading)):
+        raise InputError(
+            "the simulation diverged", where=str(case.path),
+            mend="check gains and parameters, or raise substeps in [simulation]",
+        )
+    return Log(
+        time=times, position=np.asarray(reading), force=command, reference=reference,
+        hold=machine.hold, source=f"simulation of {case.path.name}",
+    )
+
+
+def _columns(case: Case, *, reference: bool) -> dict[str, str]:
+    names = {"time": "t", "position": "q", "force": "u", "reference": "ref"}
+    names.update({k: v for k, v in case.log.items() if k in names})
+    if not reference:
+        names.pop("reference")
+    return names

@@ -1,0 +1,230 @@
+"""What is read from the balance, against closed forms."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxid.effects import EFFECTS
+from jaxid.parameters import scatter
+from jaxid.plants import Axis
+from jaxid.readings import State, residual_along, set_valued_step, small_solve, step
+from jaxid.simulate import Drive, open_loop
+
+MASS, DAMPING, STIFFNESS = 2.0, 3.0, 800.0
+OSCILLATOR = (
+    EFFECTS["viscous_friction"](coefficient=DAMPING),
+    EFFECTS["linear_stiffness"](coefficient=STIFFNESS),
+)
+
+
+@eqx.filter_jit
+def run(plant, period, force, start, substeps=1, set_valued=False, hold="zero_order"):
+    """Open loop under a command a sample, from position and velocity `start`."""
+    drive = Drive(jnp.ones(1), period, hold, substeps, set_valued)
+    return open_loop(plant, drive, force[:, None], start[0][None], start[1][None])
+
+
+def coast(plant, samples: int, period: float, velocity: float, **options):
+    start = (jnp.zeros(()), jnp.asarray(velocity))
+    out = run(plant, period, jnp.zeros(samples), start, **options)
+    return np.asarray(out.position)[:, 0], np.asarray(out.velocity)[:, 0]
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6])
+def test_small_solve_is_numpys(size):
+    random = np.random.default_rng(size)
+    root, b = random.standard_normal((size, size)), random.standard_normal(size)
+    a = root @ root.T + 0.1 * np.eye(size)
+    x = np.asarray(jax.jit(small_solve)(jnp.asarray(a), jnp.asarray(b)))
+    # condition below 1e3 here: three digits of sixteen
+    np.testing.assert_allclose(x, np.linalg.solve(a, b), rtol=1e-12)
+
+
+def oscillation(t: np.ndarray, position: float, velocity: float) -> np.ndarray:
+    decay = DAMPING / (2 * MASS)
+    omega = np.sqrt(STIFFNESS / MASS - decay**2)
+    sine = (velocity + decay * position) / omega
+    return np.exp(-decay * t) * (position * np.cos(omega * t) + sine * np.sin(omega * t))
+
+
+def test_damped_oscillator_follows_its_closed_form_to_fourth_order():
+    plant, errors = Axis(MASS, effects=OSCILLATOR), []
+    for period in (4e-3, 2e-3, 1e-3):
+        samples = round(0.8 / period)
+        start = (jnp.asarray(0.1), jnp.asarray(0.5))
+        q = np.asarray(run(plant, period, jnp.zeros(samples), start).position)[:, 0]
+        errors.append(np.abs(q - oscillation(period * np.arange(samples), 0.1, 0.5)).max())
+    # (w h)^5 / 120 a step at w h = 0.02, 16 radians long, of 0.1 m: 2e-9
+    assert errors[-1] < 5e-9
+    # 2^4 = 16; the next order is 2 % at w h = 0.08
+    np.testing.assert_allclose(np.divide(errors[:-1], errors[1:]), 16.0, rtol=0.05)
+
+
+def test_order_is_four_with_memory_too():
+    """The exponential form: a lag as long as the motion, a sliding hysteresis, under a ramp."""
+    effects = (
+        *OSCILLATOR,
+        EFFECTS["actuator_lag"](time_constant=0.05),
+        EFFECTS["hysteresis"](stiffness=300.0, level=4.0),
+    )
+    plant, ends = Axis(MASS, effects=effects, sharpness=0.3), []
+    for period in (8e-3, 4e-3, 2e-3, 2.5e-4):
+        command = 20.0 * period * jnp.arange(round(0.32 / period) + 1)
+        start = (jnp.asarray(0.05), jnp.asarray(0.5))
+        ends.append(float(run(plant, period, command, start, hold="linear").position[-1, 0]))
+    errors = np.abs(np.array(ends[:-1]) - ends[-1])
+    ratios = errors[:-1] / errors[1:]
+    # 16 with a fifth-order term of some 10 % at these steps; third order would be 8
+    np.testing.assert_allclose(ratios, 16.0, rtol=0.25)
+
+
+def test_lag_far_shorter_than_the_step_is_exact_and_stable():
+    """A held force through a lag of a hundredth of the step: its state follows in one step."""
+    lag, h = 1e-5, 1e-3
+    plant = Axis(MASS, effects=(EFFECTS["actuator_lag"](time_constant=lag),))
+    x = State(jnp.zeros(1), jnp.zeros(1), (jnp.asarray(-3.0),))
+    force, zero = jnp.asarray([6.0]), jnp.zeros(())
+    for one in (step, set_valued_step):
+        new = jax.jit(lambda x, one=one: one(plant, x, lambda s: force, zero, jnp.asarray(h)))(x)
+        assert float(new.own[0]) == pytest.approx(6.0 - 9.0 * np.exp(-h / lag), rel=1e-13)
+
+
+@pytest.mark.parametrize("ratio", [0.01, 0.1, 0.5, 2.0])
+def test_impulse_through_a_lag(ratio):
+    """Velocity after one step: the lag's mean force, of which a stiff lag hides the start."""
+    h = 1e-3
+    lag = ratio * h
+    plant = Axis(MASS, effects=(EFFECTS["actuator_lag"](time_constant=lag),))
+    x = State(jnp.zeros(1), jnp.zeros(1), (jnp.asarray(-3.0),))
+    force = jnp.asarray([6.0])
+    new = jax.jit(lambda x: step(plant, x, lambda s: force, jnp.zeros(()), jnp.asarray(h)))(x)
+    exact = (6.0 * h + 9.0 * lag * np.expm1(-h / lag)) / MASS
+    assert float(new.qd[0]) == pytest.approx(exact, rel=1e-12)
+
+
+def test_stopping_time_and_distance_tend_to_the_sharp_ones():
+    """m v / F seconds and m v^2 / 2 F metres, as the sign sharpens."""
+    level, speed, period = 3.0, 1.0, 2e-3
+    exact, errors = MASS * speed**2 / (2 * level), []
+    for sharpness in (0.1, 0.03, 0.01):
+        friction = EFFECTS["coulomb_friction"](level=level)
+        plant = Axis(MASS, effects=(friction,), sharpness=sharpness)
+        q, _ = coast(plant, 600, period, speed)
+        errors.append(q[-1] - exact)
+    # slower by tanh: the distance past the sharp stop is (pi^2 / 24) m width^2 / F, up to the end
+    widths = np.array([0.1, 0.03, 0.01])
+    expected = np.pi**2 / 24 * MASS * widths**2 / level
+    np.testing.assert_allclose(errors, expected, rtol=0.02)  # RK4 at level h / (m width) = 0.3
+
+
+def test_set_valued_step_stops_at_the_right_time_and_stays():
+    level, speed, period = 3.0, 1.0, 1e-3
+    plant = Axis(MASS, effects=(EFFECTS["coulomb_friction"](level=level),))
+    q, v = coast(plant, 1000, period, speed, set_valued=True)
+    t = period * np.arange(1000)
+    np.testing.assert_allclose(v, np.maximum(speed - level / MASS * t, 0.0), atol=period)
+    assert np.all(v[t > MASS * speed / level + period] == 0.0)
+    # the last step to rest has a constant reaction that is up to the level too small: F h^2 / 2 m
+    assert q[-1] == pytest.approx(MASS * speed**2 / (2 * level), abs=level * period**2 / MASS)
+
+
+def test_sticks_exactly_under_any_force_below_the_level():
+    plant = Axis(MASS, effects=(EFFECTS["coulomb_friction"](level=3.0),))
+    force = 2.999 * np.sin(np.arange(500))
+    start = (jnp.asarray(0.1), jnp.zeros(()))
+    out = run(plant, 1e-3, jnp.asarray(force), start, set_valued=True)
+    assert np.all(np.asarray(out.velocity) == 0.0)
+    # the free step out and the reaction back cancel to rounding in the position
+    np.testing.assert_allclose(np.asarray(out.position), 0.1, atol=1e-14)
+
+
+@pytest.mark.parametrize("set_valued", [False, True])
+def test_energy_is_what_the_drive_gave_less_what_friction_took(set_valued):
+    level, samples, period = 3.0, 4000, 2.5e-4
+    effects = (*OSCILLATOR, EFFECTS["coulomb_friction"](level=level))
+    plant = Axis(MASS, effects=effects, sharpness=1e-3)
+    t = period * np.arange(samples)
+    force = 40.0 * np.sin(20.0 * t)
+    out = run(
+        plant, period, jnp.asarray(force), (jnp.zeros(()), jnp.asarray(0.3)),
+        set_valued=set_valued, hold="linear",
+    )
+    q, v = np.asarray(out.position)[:, 0], np.asarray(out.velocity)[:, 0]
+    energy = 0.5 * MASS * v**2 + 0.5 * STIFFNESS * q**2
+    power = force * v - DAMPING * v**2 - level * np.abs(v)
+    given = np.concatenate([[0.0], np.cumsum(0.5 * period * (power[1:] + power[:-1]))])
+    took = level * np.abs(np.diff(q)).sum()
+    assert took > 0.5 * np.ptp(energy)  # friction matters here
+    # trapezoids of the power: (w h)^2 / 12 relative, and the width of the sign against 1 m/s
+    np.testing.assert_allclose(energy - energy[0], given, atol=1e-3 * np.ptp(energy))
+
+
+def simulated_motion() -> tuple[Axis, list[jax.Array], float]:
+    """A smooth run, with the accelerations that its balance gave, at 1 kHz."""
+    effects = (*OSCILLATOR, EFFECTS["coulomb_friction"](level=3.0), EFFECTS["cubic_friction"](coefficient=0.7))
+    plant, period = Axis(MASS, effects=effects, sharpness=0.02), 1e-3
+    t = period * np.arange(800)
+    u = 40.0 * np.sin(20.0 * t) + 15.0 * np.cos(57.0 * t)
+    out = run(plant, period, jnp.asarray(u), (jnp.zeros(()), jnp.asarray(0.3)), hold="linear")
+    q, v = np.asarray(out.position), np.asarray(out.velocity)
+    table = u[:, None] - DAMPING * v - STIFFNESS * q - 3.0 * np.tanh(v / 0.02) - 0.7 * v**3
+    return plant, [jnp.asarray(x) for x in (q, v, table / MASS, u[:, None])], period
+
+
+PLACES = (
+    (("inertia",), None),
+    (("effects", 0, "coefficient"), None),
+    (("effects", 1, "coefficient"), None),
+    (("effects", 2, "level"), None),
+    (("effects", 3, "coefficient"), None),
+)
+TRUTH = np.array([MASS, DAMPING, STIFFNESS, 3.0, 0.7])
+
+
+def test_regressor_times_parameters_is_the_force():
+    """Two routes, one answer: Y theta is the declared force along a simulated motion."""
+    plant, motion, period = simulated_motion()
+
+    def residual(theta):
+        return residual_along(scatter(PLACES, plant, theta), *motion, period)[:, 0]
+
+    e, regressor = jax.jit(lambda th: (residual(th), jax.jacfwd(residual)(th)))(TRUTH)
+    u = np.asarray(motion[3])[:, 0]
+    np.testing.assert_allclose(np.asarray(e), 0.0, atol=1e-12)  # rounding of 100 N
+    np.testing.assert_allclose(np.asarray(regressor) @ TRUTH, u, atol=1e-12)
+    # and least squares on it gives the truth back
+    fit = np.linalg.lstsq(np.asarray(regressor), u, rcond=None)[0]
+    np.testing.assert_allclose(fit, TRUTH, rtol=1e-10)
+
+
+def test_simulated_velocities_agree_with_the_balance():
+    """The residual with accelerations differenced from the simulation vanishes to second order."""
+    plant, (q, v, _, u), period = simulated_motion()
+    a = jnp.gradient(v[:, 0], period)[:, None]
+    e = np.asarray(jax.jit(residual_along)(plant, q, v, a, u, period))[1:-1, 0]
+    calm = np.abs(np.asarray(v)[1:-1, 0]) > 0.1  # away from the corner of the sign
+    # h^2 / 6 times the third derivative of v: 1e-6 / 6 * (60 / s)^3 * 1 m/s * 2 kg = 0.07 N
+    assert np.abs(e[calm]).max() < 0.07
+    assert np.abs(e[calm]).max() < 2e-3 * np.abs(np.asarray(u)).max()
+
+
+@pytest.mark.parametrize("kind", ["actuator_lag", "hysteresis"])
+def test_own_states_driven_along_a_motion_are_those_of_the_simulation(kind):
+    values = {
+        "actuator_lag": {"time_constant": 0.01},
+        "hysteresis": {"stiffness": 2e3, "level": 5.0},
+    }[kind]
+    plant = Axis(MASS, effects=(*OSCILLATOR, EFFECTS[kind](**values)), sharpness=1e-3)
+    errors = []
+    for period in (1e-3, 5e-4):
+        t = period * np.arange(round(0.6 / period))
+        u = 40.0 * np.sin(20.0 * t)
+        out = run(plant, period, jnp.asarray(u), (jnp.zeros(()), jnp.asarray(0.3)), hold="linear")
+        a = jnp.gradient(out.velocity[:, 0], period)[:, None]
+        e = jax.jit(residual_along)(plant, out.position, out.velocity, a, jnp.asarray(u)[:, None], period)
+        errors.append(np.sqrt(np.mean(np.asarray(e)[2:-2, 0] ** 2)))
+    # of a force of 40 N; second order, 4 a halving, less at the corners of the hysteresis
+    assert errors[1] < 0.05
+    assert errors[0] > 2.5 * errors[1]
