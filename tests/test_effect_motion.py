@@ -1,6 +1,5 @@
 """Every registered effect in a closed loop: gradients against differences, motion against truth."""
 
-import dataclasses
 from functools import cache
 
 import jax
@@ -83,9 +82,7 @@ def test_gradient_through_the_loop_that_sticks(name):
 
 
 def truth(effects: tuple) -> np.ndarray:
-    loop = Loop(
-        "cascade_pd", reference=REFERENCE, kp=KP, kv=KV, velocity_average=AVERAGE
-    )
+    loop = Loop("cascade_pd", reference=REFERENCE, kp=KP, kv=KV, velocity_average=AVERAGE)
     machine = Machine(MASS, dict(effects), actuator_gain=GAIN)
     log = simulate(machine, loop, Sensor(), rate=1 / PERIOD, duration=TICKS * PERIOD)
     return log["true_position"]
@@ -101,7 +98,12 @@ def distance(name: str, substeps: int) -> float:
 # Of the stroke. Dry friction: when sliding starts is known to a step of 0.25 ms (first order). A
 # delay off the grid is averaged over a tick (second order in it). |v| is rounded over 1 mm/s.
 # All else is smooth: the stepper's second order at 5 us.
-CLOSE = {"input_delay": 1e-5, "asymmetric_viscous": 1e-6, "hysteresis": 1e-6, "quadratic_drag": 2e-9}
+CLOSE = {
+    "input_delay": 1e-5,
+    "asymmetric_viscous": 1e-6,
+    "hysteresis": 1e-6,
+    "quadratic_drag": 2e-9,
+}
 
 
 @each_row

@@ -78,11 +78,13 @@ def test_added_mass_weighs_on_a_vertical_axis():
 def test_break_away_holds_below_and_leaves_above():
     row = ROWS["static_friction"]
     plant, rest = plant_of(row.effects), State(jnp.zeros(1), jnp.zeros(1), (None, None))
-    step = jax.jit(
-        lambda u, v: set_valued_step(
-            plant, eqx.tree_at(lambda s: s.qd, rest, v), lambda s: u, jnp.zeros(()), jnp.asarray(1e-4)
-        ).qd
-    )
+    zero, h = jnp.zeros(()), jnp.asarray(1e-4)
+
+    @jax.jit
+    def step(u, v):
+        x = eqx.tree_at(lambda s: s.qd, rest, v)
+        return set_valued_step(plant, x, lambda s: u, zero, h).qd
+
     for u, leaves in ((69.9, False), (-69.9, False), (70.1, True), (-70.1, True)):
         assert (float(step(jnp.asarray([u]), jnp.zeros(1))[0]) != 0.0) == leaves
     # once it slides, only the 30 N of Coulomb are left: (69.9 - 30) / 100 * 1e-4
@@ -121,7 +123,7 @@ def short_motion() -> ForceData:
     qdd = 0.03 * w1**2 * np.cos(w1 * t) - 0.003 * w2**2 * np.sin(w2 * t)
     force = MASS * qdd + 30 * np.tanh(qd / 0.01)
     arrays = [jnp.asarray(x) for x in (q, qd, qdd, force)]
-    return ForceData(*arrays, jnp.ones((400, 1)), period, True, Decimator(4, 2))
+    return ForceData(*arrays, jnp.ones((400, 1)), period, hold=period, decimator=Decimator(4, 2))
 
 
 MOTION = short_motion()

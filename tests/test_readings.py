@@ -113,10 +113,10 @@ def test_stopping_time_and_distance_tend_to_the_sharp_ones():
         plant = Axis(MASS, effects=(friction,), sharpness=sharpness)
         q, _ = coast(plant, 600, period, speed)
         errors.append(q[-1] - exact)
-    # slower by tanh: the distance past the sharp stop is (pi^2 / 24) m width^2 / F, up to the end
+    # slower by tanh: the distance past the sharp stop is (pi^2 / 12) m width^2 / F, up to the end
     widths = np.array([0.1, 0.03, 0.01])
-    expected = np.pi**2 / 24 * MASS * widths**2 / level
-    np.testing.assert_allclose(errors, expected, rtol=0.02)  # RK4 at level h / (m width) = 0.3
+    expected = np.pi**2 / 12 * MASS * widths**2 / level
+    np.testing.assert_allclose(errors, expected, rtol=1e-3)  # RK4 at level h / (m width) = 0.3
 
 
 def test_set_valued_step_stops_at_the_right_time_and_stays():
@@ -146,7 +146,7 @@ def test_energy_is_what_the_drive_gave_less_what_friction_took(set_valued):
     effects = (*OSCILLATOR, EFFECTS["coulomb_friction"](level=level))
     plant = Axis(MASS, effects=effects, sharpness=1e-3)
     t = period * np.arange(samples)
-    force = 40.0 * np.sin(20.0 * t)
+    force = 20.0 * np.sin(9.0 * t)  # far below the resonance at 20 rad/s
     out = run(
         plant, period, jnp.asarray(force), (jnp.zeros(()), jnp.asarray(0.3)),
         set_valued=set_valued, hold="linear",

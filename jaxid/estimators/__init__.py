@@ -27,7 +27,14 @@ def _output_error(session: Session) -> Estimate:
     return output_error(session.machine, session.fit.log, start=force_start(session))
 
 
+def _algebraic(session: Session) -> Estimate:
+    from jaxid.estimators.algebraic import algebraic
+
+    return algebraic(session.machine, session.fit.log, session.fit.data)
+
+
 METHODS: dict[str, Callable[[Session], Estimate]] = {
     "output_error": _output_error,
     "inverse_dynamics": _inverse_dynamics,
+    "algebraic": _algebraic,
 }

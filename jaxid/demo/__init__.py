@@ -1,0 +1,60 @@
+"""The demo: check, identify, discover and report on a log whose truth the case does not know.
+
+The two logs were made by an exact set-valued friction stepper that shares no code with jaxid
+(`tests/make_demo.py`), with an encoder's noise and rounding.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+
+from jaxid.check import check
+from jaxid.discovery.discover import discover
+from jaxid.identify import identify
+from jaxid.io.output import ready_folder
+
+_FILES = ("case.toml", "log.csv", "validation.csv")
+
+
+def run_demo(
+    folder: Path, *, force: bool = False, progress: Callable[[str], None] = lambda text: None
+) -> tuple[str, bool]:
+    """Run the whole way in a folder.
+
+    Args:
+        folder: Where case, logs and results go.
+        force: Overwrite what jaxid did not make.
+        progress: Called with a line at every stage.
+
+    Returns:
+        What to print, and whether all fits converged.
+
+    Raises:
+        InputError: If the folder cannot be written to.
+    """
+    results = ("check.json", "result.json", "discovery.json", "report.html")
+    ready_folder(folder, [*_FILES, *results], force=force)
+    for name in _FILES:
+        with resources.as_file(resources.files("jaxid.demo") / name) as source:
+            shutil.copyfile(source, folder / name)
+    case, log = folder / "case.toml", folder / "log.csv"
+    progress("checking the log")
+    checked = check(case, log)
+    checked.save(folder, force=force)
+    identified = identify(case, log, progress=progress)
+    identified.save(folder, force=force)
+    discovered = discover(case, log, progress=progress)
+    discovered.save(folder, force=force)
+    shown = f"{folder}/case.toml {folder}/log.csv"
+    text = "\n".join(
+        [
+            f"$ jaxid check {shown}", str(checked), "",
+            f"$ jaxid identify {shown}", str(identified), "",
+            f"$ jaxid discover {shown}", str(discovered), "",
+            f"report: {folder / 'report.html'}",
+        ]
+    )
+    return text, identified.converged and discovered.converged
