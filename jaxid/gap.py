@@ -128,7 +128,7 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
 
 def _position_filter(f: np.ndarray, recipe: object, rate: float) -> np.ndarray:
     if recipe.derivatives == "spectral":
-        return 0.5 * (1 + np.cos(np.pi * np.clip((f / recipe.cutoff_hz - 0.8) / 0.2, 0.0, 1.0)))
+        return signals.roll_off(f, recipe.cutoff_hz)
     sos = scipy.signal.butter(recipe.order, recipe.cutoff_hz, fs=rate, output="sos")
     return np.abs(scipy.signal.freqz_sos(sos, worN=f, fs=rate)[1]) ** 2
 

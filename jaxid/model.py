@@ -175,10 +175,6 @@ class Effect(eqx.Module):
         """Relative change of every dry-friction level at time t."""
         return 0.0
 
-    def static_gain(self) -> Array | float:
-        """Applied force over declared force; the residual is stated in declared units."""
-        return 1.0
-
     # Whether the effect is a force beside the others, in proportion to those of its parameters
     # that carry a force. False for what sits in the drive or acts on other effects.
     adds_force: ClassVar[bool] = True
@@ -192,6 +188,15 @@ class Effect(eqx.Module):
         """
         own = parameters_of(cls).items()
         return [{n: scales.natural(i.dimension) for n, i in own if not i.optional}]
+
+    @classmethod
+    def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
+        """Bounds within which a search keeps a parameter, beside its sign.
+
+        Beyond them the effect would only imitate another (a ripple longer than the stroke is any
+        smooth force of position).
+        """
+        return {}
 
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:
@@ -218,12 +223,14 @@ class Balance(eqx.Module):
         dry: Level of dry friction, by port.
         stick: Level above it at rest, by port.
         rates: Time derivatives of the effects' own states.
+        drive: Force at the load of each drive, after all effects in its path [N or N m].
     """
 
     residual: Array
     dry: Array
     stick: Array
     rates: tuple
+    drive: Array
 
 
 class Plant(eqx.Module):
@@ -248,7 +255,7 @@ class Plant(eqx.Module):
 
     def applied(self, u: Array, coordinates: int) -> Array:
         """Generalized forces of the drives: one for each of the first coordinates by default."""
-        return jnp.zeros(coordinates, u.dtype).at[: u.size].add(u)
+        return u if u.size == coordinates else jnp.zeros(coordinates, u.dtype).at[: u.size].add(u)
 
     def port_gravity(self, q: Array) -> Array:
         """Acceleration of gravity along each port [m/s^2]."""
@@ -266,13 +273,6 @@ class Plant(eqx.Module):
     def command_delay(self) -> Array:
         """Total delay of the command [s]."""
         return jnp.asarray(sum((e.command_delay() for e in self.effects), 0.0))
-
-    def static_gain(self) -> Array:
-        """Applied over declared force at rest, all effects together."""
-        gain = jnp.asarray(1.0)
-        for effect in self.effects:
-            gain = gain * effect.static_gain()
-        return gain
 
     def initial_states(self, u: Array) -> tuple:
         """Own states of the effects where the drive has long been at `u`."""
@@ -305,44 +305,61 @@ class Plant(eqx.Module):
                 smoothed, -level tanh(yd / width).
 
         Returns:
-            Residual `M qdd + h - effects - drive`, levels of dry friction, rates of the states.
+            Residual `M qdd + h - effects - drive`, levels of dry friction, rates of the states, drive.
         """
-        y, yd, ydd = port_motion(self.ports, q, qd, qdd)
-        gravity, normal = self.port_gravity(q), self.port_normal(q)
+        y, yd, ydd = port_motion(self, q, qd, qdd)
+        gravity, normal, width = self.port_gravity(q), self.port_normal(q), self.width
         dry_scale = jnp.asarray(1.0 + sum((e.dry_drift(t) for e in self.effects), 0.0))
-        force, dry, stick = jnp.zeros_like(y), jnp.zeros_like(y), jnp.zeros_like(y)
-        rates = []
+        # Sums by port and drive in lists: arrays updated in place compile much more slowly.
+        force, dry, stick = ([0.0] * y.size for _ in range(3))
+        drive, rates = [u[j] for j in range(u.size)], []
         for effect, state in zip(self.effects, states, strict=True):
             i, j = effect.port, min(effect.port, u.size - 1)
             x = Signals(
-                y[i], yd[i], ydd[i], u[j], t, self.width, dry_scale, gravity[i], normal[i]
+                y[i], yd[i], ydd[i], drive[j], t, width, dry_scale, gravity[i], normal[i]
             )
             action = effect.act(x, state)
-            force = force.at[i].add(action.force)
-            dry, stick = dry.at[i].add(action.dry), stick.at[i].add(action.stick)
-            u = u if action.drive is None else u.at[j].set(action.drive)
+            force[i], dry[i] = force[i] + action.force, dry[i] + action.dry
+            stick[i] = stick[i] + action.stick
+            drive[j] = drive[j] if action.drive is None else action.drive
             rates.append(action.rate)
-        dry, stick = dry * dry_scale, stick * dry_scale
+        at_rest_only = _stack(stick) * dry_scale
+        levels = _stack(dry) * dry_scale
         if reaction is None:
-            at_rest = smooth.at_rest(yd, self.width) / smooth.REST_PEAK
-            reaction = -(dry + stick * at_rest) * smooth.sign(yd, self.width)
-        react = _pull_back(self.ports, q, force + reaction)
+            held = levels
+            # Not even added where it is nothing: its exponential would be evaluated all the same.
+            if not all(isinstance(s, float) for s in stick):
+                held = held + at_rest_only * (smooth.at_rest(yd, width) / smooth.REST_PEAK)
+            reaction = -held * smooth.sign(yd, width)
+        react = _pull_back(self, q, _stack(force) + reaction)
+        u = _stack(drive)
         residual = self.inertial(q, qd, qdd) - react - self.applied(u, q.size)
-        return Balance(residual, dry, stick, tuple(rates))
+        return Balance(residual, levels, at_rest_only, tuple(rates), u)
 
 
 def port_motion(
-    ports: Callable[[Array], Array], q: Array, qd: Array, qdd: Array
+    plant: Plant, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array, Array]:
     """Coordinate, velocity and acceleration of the ports by forward-mode differentiation."""
+    if _ports_are_joints(plant):
+        return q, qd, qdd
 
     def velocity(q: Array, qd: Array) -> tuple[Array, Array]:
-        return jax.jvp(ports, (q,), (qd,))
+        return jax.jvp(plant.ports, (q,), (qd,))
 
     (y, yd), (_, ydd) = jax.jvp(velocity, (q, qd), (qd, qdd))
     return y, yd, ydd
 
 
-def _pull_back(ports: Callable[[Array], Array], q: Array, force: Array) -> Array:
+def _pull_back(plant: Plant, q: Array, force: Array) -> Array:
     """Generalized force of forces on the ports: the transposed Jacobian."""
-    return jax.vjp(ports, q)[1](force)[0]
+    return force if _ports_are_joints(plant) else jax.vjp(plant.ports, q)[1](force)[0]
+
+
+def _ports_are_joints(plant: Plant) -> bool:
+    """Whether there is nothing to differentiate, which takes half of all compile time."""
+    return type(plant).ports is Plant.ports
+
+
+def _stack(parts: list[Array | float]) -> Array:
+    return jnp.stack([jnp.asarray(p, dtype=jnp.float64) for p in parts])

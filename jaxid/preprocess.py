@@ -6,7 +6,7 @@ velocity follow from the log's own noise, and are reported.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.signal
@@ -14,6 +14,10 @@ from jaxtyping import Bool, Float
 
 from jaxid import signals
 from jaxid.io.log import Log
+
+
+# Where the surroundings of reversals are more of a log than this, they are not left out.
+_MOSTLY = 0.5
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,8 @@ class Recipe:
             instead of at the instants at which it was logged.
         derivatives: "central" (differences) or "spectral" (exact in the band).
         keeps_reversals: Whether a fit uses samples that only pass through zero.
-        edge: Edge of the parallel filter over half the sampling rate; None: its decimation's.
+        edge: Of the parallel filter over half the sampling rate (see `signals.Decimator`); None:
+            its decimation's.
     """
 
     cutoff_hz: float
@@ -71,7 +76,8 @@ class Prepared:
         moving: Which kept samples are not at rest, (kept, n).
         fitted: Which kept samples a fit uses, (kept, n): those that move; under a stated recipe
             also those that only pass through zero, as the published recipes leave nothing out.
-        kept: Their indices in the log.
+        kept: Their indices in these arrays.
+        start: Time of the first sample, from the start of the log [s].
     """
 
     q: Float[np.ndarray, "time n"]
@@ -84,6 +90,41 @@ class Prepared:
     moving: Bool[np.ndarray, "kept n"]
     fitted: Bool[np.ndarray, "kept n"]
     kept: np.ndarray
+    start: float = 0.0
+
+    @property
+    def times(self) -> Float[np.ndarray, " kept"]:
+        """Time of the kept samples from the start of the log [s]."""
+        return self.start + self.period * self.kept
+
+    def parts(self, most: int, pieces: int) -> list[Prepared]:
+        """The log itself, or, where it keeps more than `most` samples, pieces spread over it.
+
+        All pieces have one length, so that compiled code serves them all, and begin on a kept
+        sample.
+
+        Args:
+            most: Samples to keep, all pieces together.
+            pieces: Into how many.
+        """
+        if len(self.kept) <= most:
+            return [self]
+        step, trim = self.recipe.decimation, self.recipe.trim
+        rows = most // pieces
+        length = (rows + 2 * trim) * step
+        last = (len(self.q) - length) // step
+        return [self._piece(int(k) * step, length) for k in np.linspace(0, last, pieces)]
+
+    def _piece(self, first: int, length: int) -> Prepared:
+        part = slice(first, first + length)
+        kept = self.recipe.decimator.kept(length)
+        at = first // self.recipe.decimation
+        rows = slice(at, at + len(kept))
+        return replace(
+            self, q=self.q[part], qd=self.qd[part], qdd=self.qdd[part], force=self.force[part],
+            moving=self.moving[rows], fitted=self.fitted[rows], kept=kept,
+            start=self.start + first * self.period,
+        )
 
     def at_kept(self, x: np.ndarray) -> np.ndarray:
         """Values of a signal of the log at the kept samples."""
@@ -93,8 +134,9 @@ class Prepared:
 def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     """Complete a stated recipe from the log, or choose all of it.
 
-    The cut-off is the highest frequency at which the position still stands four times above its
-    noise floor in power, at most 0.3 of the sampling rate. The rest velocity is five standard
+    The parallel filter ends at the highest frequency at which the position still stands four times
+    above its noise floor in power, at most 0.3 of the sampling rate; the position's own filter, at
+    twice that, is flat where the parallel filter still passes anything. The rest velocity is five standard
     deviations of the velocity's noise in that band, at least half a percent of the RMS velocity.
 
     Args:
@@ -104,9 +146,10 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     stated = dict(stated or {})
     rate = log.rate_hz
     literal = "cutoff_hz" in stated
-    cutoff = float(stated.get("cutoff_hz", _noise_cutoff(log)))
-    room = max(1, int(0.4 * rate / cutoff))
-    decimation = int(stated.get("decimation", room))
+    edge = None if literal else _noise_cutoff(log)
+    cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
+    band = cutoff if literal else edge
+    decimation = int(stated.get("decimation", max(1, int(0.4 * rate / band))))
     q, qd, _ = differentiate(log.position, log.period, cutoff, 4, "central" if literal else "spectral")
     noise = signals.high_band_std(log.position, rate)
     # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
@@ -118,13 +161,13 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         cutoff_hz=cutoff,
         order=int(stated.get("order", 4)),
         decimation=decimation,
-        # Two periods of the band edge: as far as the ends of filters reach.
-        trim=int(stated.get("trim", np.ceil(2 * rate / (cutoff * decimation)))),
+        # Three periods of the band edge: as far as the ends of filters reach.
+        trim=int(stated.get("trim", np.ceil(3 * rate / (band * decimation)))),
         rest_velocity=tuple(float(r) for r in rest),
         align_hold=bool(stated.get("align_hold", not literal)),
         derivatives="central" if literal else "spectral",
         keeps_reversals=literal,
-        edge=None if literal else min(1.5 * cutoff / rate, 0.95),
+        edge=None if literal else 2 * edge / rate,
     )
 
 
@@ -140,7 +183,9 @@ def _noise_cutoff(log: Log) -> float:
     above = np.all(p > 4 * floor, axis=1) & (f < 0.3 * rate)
     first_lost = np.argmax(~above[1:]) + 1 if np.any(~above[1:]) else len(f) - 1
     lowest = 8.0 / (len(log.position) * log.period)
-    return float(np.clip(f[first_lost], lowest, 0.3 * rate))
+    # Two digits, rounded down: it is not known better, and alike logs share compiled code.
+    digit = 10.0 ** (np.floor(np.log10(f[first_lost])) - 1)
+    return float(np.clip(np.floor(f[first_lost] / digit) * digit, lowest, 0.3 * rate))
 
 
 def differentiate(
@@ -170,8 +215,15 @@ def prepare(
     )
     kept = recipe.decimator.kept(len(q))
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
-    moving = ~_smeared(at_rest, recipe.decimation)[kept]
-    fitted = ~_smeared(_dwelling(at_rest, 2 * recipe.decimation), recipe.decimation)[kept]
+    reach = recipe.decimator.reach
+    if recipe.derivatives == "spectral":
+        reach = max(reach, recipe.decimation - 1)
+        turns = _smeared(at_rest | _turning(qd), reach)
+        # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
+        at_rest = at_rest | (_turning(qd) & (turns.mean(axis=0) < _MOSTLY))
+        reach = reach if np.all(turns.mean(axis=0) < _MOSTLY) else 0
+    moving = ~_smeared(at_rest, reach)[kept]
+    fitted = ~_smeared(_dwelling(at_rest, 2 * recipe.decimation), reach)[kept]
     held = recipe.align_hold and log.hold == "zero_order"
     hold = (hold_period or log.period) if held else 0.0
     return Prepared(
@@ -181,10 +233,17 @@ def prepare(
     )
 
 
-def _smeared(flags: np.ndarray, decimation: int) -> np.ndarray:
+def _turning(v: np.ndarray) -> np.ndarray:
+    """Samples between which a velocity changes its sign: a fast reversal has none at rest."""
+    turns = np.diff(np.sign(v), axis=0) != 0
+    edge = np.zeros((1, v.shape[1]), bool)
+    return np.concatenate([turns, edge]) | np.concatenate([edge, turns])
+
+
+def _smeared(flags: np.ndarray, reach: int) -> np.ndarray:
     """Flags and their neighbours: the parallel filter smears a stop, which goes with them."""
-    reach = np.ones(2 * decimation - 1)
-    return np.stack([np.convolve(f, reach, mode="same") > 0.5 for f in flags.T], axis=1)
+    window = np.ones(2 * reach + 1)
+    return np.stack([scipy.signal.convolve(f, window, "same") > 0.5 for f in flags.T], axis=1)
 
 
 def _dwelling(flags: np.ndarray, length: int) -> np.ndarray:

@@ -47,8 +47,7 @@ def spectral_derivatives(
 
     Central differences are 10 % short where ten samples make a period; a resonance near a tenth
     of the sampling rate needs this instead. A cubic through the ends is taken off first, so that
-    the periodic continuation has neither a jump nor a corner, and the roll-off is a half cosine
-    from 0.8 to 1 of the cut-off.
+    the periodic continuation has neither a jump nor a corner, and the roll-off is `roll_off`.
 
     Returns:
         The signal, its first and its second derivative.
@@ -70,11 +69,15 @@ def spectral_derivatives(
     rest = x - trend
     odd = np.concatenate([rest, -rest[-2:0:-1]])
     f = scipy.fft.rfftfreq(len(odd), period)[:, None]
-    window = 0.5 * (1 + np.cos(np.pi * np.clip((f / cutoff_hz - 0.8) / 0.2, 0.0, 1.0)))
-    spectrum = scipy.fft.rfft(odd, axis=0) * window
+    spectrum = scipy.fft.rfft(odd, axis=0) * roll_off(f, cutoff_hz)
     omega = 2j * np.pi * f
     out = [scipy.fft.irfft(spectrum * omega**k, len(odd), axis=0)[:n] for k in range(3)]
     return out[0] + trend, out[1] + d_trend, out[2] + dd_trend
+
+
+def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
+    """One up to 0.6 of the cut-off, zero beyond it, a half cosine between."""
+    return 0.5 * (1 + np.cos(np.pi * np.clip((f / cutoff_hz - 0.6) / 0.4, 0.0, 1.0)))
 
 
 def _end_slope(x: np.ndarray, period: float) -> np.ndarray:
@@ -93,11 +96,14 @@ class Decimator:
     applied as its squared magnitude in the frequency domain, so that JAX can differentiate, batch
     and compile it.
 
+    With a stated edge it is a Gaussian. A steep filter rings for a tenth of a second after every
+    reversal, where no model of dry friction fits a band-limited velocity; a Gaussian forgets it.
+
     Args:
         factor: One sample in so many is kept; 1 keeps all and does not filter.
         trim: Samples left out at each end, after decimation.
-        edge: Edge of the pass band over half the sampling rate; absent: 0.8 / factor, and no
-            filter where all samples are kept.
+        edge: Where the Gaussian has fallen to a tenth, over half the sampling rate; absent: the
+            Chebyshev filter with its pass band up to 0.8 / factor, none where all are kept.
     """
 
     factor: int
@@ -122,8 +128,18 @@ class Decimator:
 
     @property
     def pass_band(self) -> float:
-        """Edge of the pass band over half the sampling rate."""
-        return min(0.8 / self.factor, self.edge or 1.0) if self.filters else 1.0
+        """Edge of the pass band (3 dB down) over half the sampling rate."""
+        if self.edge is not None:
+            return self.edge * float(np.sqrt(np.log10(2) / 2))
+        return 0.8 / self.factor if self.filters else 1.0
+
+    @property
+    def reach(self) -> int:
+        """Samples of the log over which an event spreads: beyond, 10^-4 of it is left."""
+        if self.edge is None:
+            return self.factor - 1 if self.filters else 0
+        # Four standard deviations of the Gaussian in time.
+        return int(np.ceil(4 * np.sqrt(2 * np.log(10)) / (np.pi * self.edge)))
 
     def band_hz(self, rate_hz: float) -> float:
         """Edge of the pass band."""
@@ -133,7 +149,9 @@ class Decimator:
         """Gain at each frequency [Hz]."""
         if not self.filters:
             return np.ones_like(frequency)
-        # 0.05 dB of ripple; without a stated edge to 0.8 of the new Nyquist frequency.
+        if self.edge is not None:
+            return 10.0 ** -np.square(2 * frequency / (rate_hz * self.edge))
+        # 0.05 dB of ripple, pass band to 0.8 of the new Nyquist frequency.
         sos = scipy.signal.cheby1(8, 0.05, self.pass_band, output="sos")
         _, h = scipy.signal.freqz_sos(sos, worN=2 * np.pi * frequency / rate_hz)
         return np.abs(h) ** 2

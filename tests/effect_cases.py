@@ -65,16 +65,23 @@ ROWS: dict[str, Row] = {
     ),
     "coulomb_friction": Row(*COULOMB, lambda x: x.u - 30.0 * sign(x.v), dry=True),
     "coulomb_friction of mu": Row(
-        "coulomb_friction", {"friction_coefficient": 0.04},
-        lambda x: x.u - 0.04 * MASS * GRAVITY * sign(x.v), dry=True,
+        "coulomb_friction",
+        {"friction_coefficient": 0.04},
+        lambda x: x.u - 0.04 * MASS * GRAVITY * sign(x.v),
+        dry=True,
     ),
     "static_friction": Row(
-        "static_friction", {"level": 40.0}, lambda x: x.u - 30.0 * sign(x.v),
-        beside=(COULOMB,), dry=True,
+        "static_friction",
+        {"level": 40.0},
+        lambda x: x.u - 30.0 * sign(x.v),
+        beside=(COULOMB,),
+        dry=True,
     ),
     "stribeck_friction": Row(
-        "stribeck_friction", {"level": 30.0, "velocity": 0.08},
-        lambda x: x.u - 30.0 * math.exp(-((x.v / 0.08) ** 2)) * sign(x.v), dry=True,
+        "stribeck_friction",
+        {"level": 30.0, "velocity": 0.08},
+        lambda x: x.u - 30.0 * math.exp(-((x.v / 0.08) ** 2)) * sign(x.v),
+        dry=True,
     ),
     "asymmetric_viscous": Row(
         "asymmetric_viscous", {"coefficient": 100.0}, lambda x: x.u - 100.0 * abs(x.v)
@@ -82,9 +89,7 @@ ROWS: dict[str, Row] = {
     "quadratic_drag": Row(
         "quadratic_drag", {"coefficient": 300.0}, lambda x: x.u - 300.0 * x.v * abs(x.v)
     ),
-    "cubic_friction": Row(
-        "cubic_friction", {"coefficient": 700.0}, lambda x: x.u - 700.0 * x.v**3
-    ),
+    "cubic_friction": Row("cubic_friction", {"coefficient": 700.0}, lambda x: x.u - 700.0 * x.v**3),
     "quartic_friction": Row(
         "quartic_friction", {"coefficient": 2000.0}, lambda x: x.u - 2000.0 * x.v**3 * abs(x.v)
     ),
@@ -95,11 +100,10 @@ ROWS: dict[str, Row] = {
     "quadratic_stiffness": Row(
         "quadratic_stiffness", {"coefficient": 3e4}, lambda x: x.u - 3e4 * x.q**2
     ),
-    "cubic_stiffness": Row(
-        "cubic_stiffness", {"coefficient": 5e5}, lambda x: x.u - 5e5 * x.q**3
-    ),
+    "cubic_stiffness": Row("cubic_stiffness", {"coefficient": 5e5}, lambda x: x.u - 5e5 * x.q**3),
     "cogging": Row(
-        "cogging", {"amplitude": 20.0, "period": 0.02, "phase": 0.4},
+        "cogging",
+        {"amplitude": 20.0, "period": 0.02, "phase": 0.4},
         lambda x: x.u - 20.0 * math.cos(2 * math.pi * x.q / 0.02 + 0.4),
     ),
     # own state: friction over its level, here 0.6
@@ -113,7 +117,10 @@ ROWS: dict[str, Row] = {
     "saturation": Row("saturation", {"limit": 150.0}, lambda x: clip(x.u, 150.0)),
     "added_mass": Row("added_mass", {"mass": 20.0}, lambda x: x.u - 20.0 * x.a),
     "friction_drift": Row(
-        "friction_drift", {"rate": 1.5},
-        lambda x: x.u - 30.0 * (1 + 1.5 * x.t) * sign(x.v), beside=(COULOMB,), dry=True,
+        "friction_drift",
+        {"rate": 1.5},
+        lambda x: x.u - 30.0 * (1 + 1.5 * x.t) * sign(x.v),
+        beside=(COULOMB,),
+        dry=True,
     ),
 }

@@ -11,7 +11,7 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
-from jaxid.readings import State, set_valued_step
+from jaxid.readings import State, residual_along, set_valued_step
 from jaxid.signals import Decimator
 
 each_row = pytest.mark.parametrize("row", ROWS.values(), ids=[*ROWS])
@@ -63,9 +63,12 @@ def test_every_registered_effect_has_a_search_case():
 def test_force_is_the_tables(row):
     plant, own = plant_of(row.effects), own_of(row)
     for x in instants(row):
-        load = MASS * x.a - float(balance(plant, x, own).residual[0])
+        now = balance(plant, x, own)
+        load = MASS * x.a - float(now.residual[0])
         # forces of a few hundred N: rounding, and tanh(50) which is one to the last digit
         assert load == pytest.approx(row.load(x), abs=1e-10)
+        if not EFFECTS[row.kind].adds_force and not row.dry:  # what sits in the drive
+            assert float(now.drive[0]) == pytest.approx(row.load(x), abs=1e-10)
 
 
 def test_added_mass_weighs_on_a_vertical_axis():
@@ -93,10 +96,17 @@ def test_break_away_holds_below_and_leaves_above():
 
 
 @each_row
-def test_delay_and_gain_are_what_the_effect_says(row):
-    plant = plant_of(row.effects)
-    assert float(plant.command_delay()) == row.values.get("delay", 0.0)
-    assert float(plant.static_gain()) == row.values.get("gain", 1.0)
+def test_delay_is_what_the_effect_says(row):
+    assert float(plant_of(row.effects).command_delay()) == row.values.get("delay", 0.0)
+
+
+def test_residual_is_in_declared_units():
+    """(m a - g u) / g: in units of the load, a gain of zero would be a perfect fit."""
+    plant = plant_of((("actuator_gain", {"gain": 1.2}),))
+    motion = [getattr(MOTION, name) for name in ("q", "qd", "qdd", "force")]
+    e = np.asarray(jax.jit(residual_along)(plant, *motion, MOTION.period))
+    expected = MASS / 1.2 * np.asarray(MOTION.qdd) - np.asarray(MOTION.force)
+    np.testing.assert_allclose(e, expected, atol=1e-10)  # rounding of a thousand N
 
 
 @each_row
@@ -123,7 +133,8 @@ def short_motion() -> ForceData:
     qdd = 0.03 * w1**2 * np.cos(w1 * t) - 0.003 * w2**2 * np.sin(w2 * t)
     force = MASS * qdd + 30 * np.tanh(qd / 0.01)
     arrays = [jnp.asarray(x) for x in (q, qd, qdd, force)]
-    return ForceData(*arrays, jnp.ones((400, 1)), period, hold=period, decimator=Decimator(4, 2))
+    weight, start = jnp.ones((400, 1)), jnp.zeros(())
+    return ForceData(*arrays, weight, start, period, hold=period, decimator=Decimator(4, 2))
 
 
 MOTION = short_motion()

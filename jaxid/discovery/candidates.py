@@ -7,7 +7,7 @@ take longer than all of the search.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -26,6 +26,9 @@ from jaxid.preprocess import Prepared
 
 # An effect with more starts than this is evaluated on a plant of its own, all starts at once.
 _FEW = 8
+# Of a long log a search looks at so many kept samples, in so many pieces spread over it.
+_MOST = 12_000
+_PIECES = 6
 # Strength at which the columns of an added force are taken, relative to the log's force.
 _FAINT = 1e-6
 
@@ -146,11 +149,21 @@ def build_union(machine: Machine, data: Prepared) -> Union:
                 continue
             neutral = cls.neutral(scales)
             plant, free = free_effect(plant, cls(**neutral, port=port), machine.units)
+            free = _limited(free, cls.limits(scales))
             first = len(parameters.free)
             parameters = parameters.extended(free)
             candidates.append(_candidate(cls, port, np.arange(first, first + len(free)), scales))
     union = machine.with_plant(sharpened(plant, data), parameters)
     return Union(union, base, tuple(candidates), scales)
+
+
+def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[Free]:
+    """Unknowns within the bounds that a search keeps."""
+    out = []
+    for f in free:
+        lower, upper = limits.get(f.name.rpartition(".")[2], (-np.inf, np.inf))
+        out.append(replace(f, lower=lower, upper=upper))
+    return out
 
 
 def _candidate(cls: type[Effect], port: int, index: np.ndarray, scales: Scales) -> Candidate:
@@ -176,18 +189,42 @@ def _residual_and_jacobian(
     return e, jacobian
 
 
+class Samples:
+    """What a search looks at of a log: all of it, or pieces spread over a long one.
+
+    Args:
+        data: The log, prepared.
+    """
+
+    def __init__(self, data: Prepared) -> None:
+        self.parts = data.parts(_MOST, _PIECES)
+        self.arrays = [ForceData.of(p) for p in self.parts]
+        moving = [p.moving.copy() for p in self.parts]
+        for m in moving[1:]:
+            m[0] = False  # a piece does not continue the one before it
+        self.moving = np.concatenate(moving)
+        self.weight = np.concatenate([np.asarray(a.weight) for a in self.arrays])
+
+
 def evaluate(
-    union: Union, data: ForceData, theta: Float[np.ndarray, " p"]
+    union: Union, samples: Samples, theta: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """Residual of the union and its Jacobian in all unknowns."""
-    e, jacobian = _residual_and_jacobian(
-        union.machine.plant, union.machine.parameters.places, data, jnp.asarray(theta)
-    )
-    return np.asarray(e), np.asarray(jacobian)
+    return evaluate_on(union, samples.arrays, theta)
+
+
+def evaluate_on(
+    union: Union, logs: list[ForceData], theta: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
+    """The same on several logs or pieces, one after the other."""
+    plant, places = union.machine.plant, union.machine.parameters.places
+    found = [_residual_and_jacobian(plant, places, a, jnp.asarray(theta)) for a in logs]
+    e, jacobian = (np.concatenate([np.asarray(f[i]) for f in found]) for i in range(2))
+    return e, jacobian
 
 
 def refine(
-    union: Union, data: ForceData, theta: Float[np.ndarray, " p"], moving: np.ndarray
+    union: Union, data: Samples, theta: Float[np.ndarray, " p"], moving: np.ndarray
 ) -> tuple[Float[np.ndarray, " p"], bool]:
     """Fit some unknowns of the union in the force domain, the rest held.
 
@@ -206,7 +243,7 @@ def refine(
     few = free_of(union, moving)
     transform = Transform.of(few)
     lower, upper = (np.asarray(transform.inward(b)) for b in few.bounds)
-    weight = np.asarray(data.weight)[..., None]
+    weight = data.weight[..., None]
     latest: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -232,7 +269,7 @@ def refine(
 
 
 def points(
-    union: Union, rest: list[Candidate], data: ForceData, theta: Float[np.ndarray, " p"],
+    union: Union, rest: list[Candidate], data: Samples, theta: Float[np.ndarray, " p"],
     residual: Float[np.ndarray, "kept n"],
 ) -> list[Point]:
     """Every candidate that has few starts at each of them, all together through the union.
@@ -264,15 +301,18 @@ def points(
     return found
 
 
-def many_points(union: Union, candidate: Candidate, data: ForceData) -> list[Point]:
+def many_points(union: Union, candidate: Candidate, data: Samples) -> list[Point]:
     """A candidate with many starts at each of them, on a plant that has nothing else."""
     effect: Effect = union.machine.plant.effects[position(union, candidate)]
     alone = eqx.tree_at(lambda p: p.effects, union.machine.plant, (effect,))
     names = [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
     places = tuple((("effects", 0, n), None) for n in names)
     probes = np.stack([candidate.probe(k) for k in range(len(candidate.starts))])
-    chunks = [np.asarray(_columns(alone, places, data, jnp.asarray(s))) for s in _chunks(probes)]
-    columns = np.concatenate(chunks)[: len(candidate.starts)]
+    found = []
+    for arrays in data.arrays:
+        chunks = [np.asarray(_columns(alone, places, arrays, jnp.asarray(s))) for s in _chunks(probes)]
+        found.append(np.concatenate(chunks)[: len(candidate.starts)])
+    columns = np.concatenate(found, axis=1)
     zero = np.zeros(columns.shape[1:3])
     return [Point(candidate, k, zero, c) for k, c in enumerate(columns)]
 

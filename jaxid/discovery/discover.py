@@ -12,7 +12,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.where import Where, locate
-from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
 from jaxid.estimators.output_error import output_error
 from jaxid.estimators.result import Estimate
 from jaxid.gap import noise_floor
@@ -166,7 +166,9 @@ def discover(
 
 
 def _where(search: Search, baseline: Step) -> Where:
-    e, jacobian = cand.evaluate(search.union, search.arrays, baseline.theta)
+    """Where the baseline's residual lies, on the whole log."""
+    whole = [ForceData.of(search.data)]
+    e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta)
     return locate(-e, jacobian[..., baseline.active], search.data)
 
 
@@ -175,8 +177,8 @@ def _verdict(
 ) -> str:
     if effects:
         return "found"
-    e, _ = cand.evaluate(search.union, search.arrays, steps[0].theta)
-    rms = np.sqrt(np.mean(np.where(search.data.moving, e, 0.0) ** 2, axis=0))
+    e, _ = cand.evaluate(search.union, search.samples, steps[0].theta)
+    rms = np.sqrt(np.nanmean(np.where(search.samples.moving, e, np.nan) ** 2, axis=0))
     above = bool(np.any(rms > _ABOVE_FLOOR * search.floor))
     return "unexplained" if above and where.significant else "nothing_missing"
 
@@ -230,14 +232,12 @@ def _simulation_rms(estimate: Estimate, session: Session) -> float:
 
 def _round(search: Search, step: Step) -> Round:
     fit, *others = (
-        _rms(search, data, arrays, step.theta)
-        for data, arrays in [
-            (search.data, search.arrays), *zip(search.validation, search.validation_arrays, strict=True)
-        ]
+        _rms(search, samples, step.theta)
+        for samples in [search.samples, *search.validation_samples]
     )
     return Round(step, fit, np.max(others, axis=0) if others else None)
 
 
-def _rms(search: Search, data: object, arrays: object, theta: np.ndarray) -> np.ndarray:
-    e, _ = cand.evaluate(search.union, arrays, theta)
-    return np.sqrt(np.nanmean(np.where(data.moving, e, np.nan) ** 2, axis=0))
+def _rms(search: Search, samples: cand.Samples, theta: np.ndarray) -> np.ndarray:
+    e, _ = cand.evaluate(search.union, samples, theta)
+    return np.sqrt(np.nanmean(np.where(samples.moving, e, np.nan) ** 2, axis=0))

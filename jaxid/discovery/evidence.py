@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
+import scipy.sparse
 from jaxtyping import Bool, Float
 
 from jaxid.precision import NoiseModel
@@ -24,32 +26,51 @@ class Whitener:
 
     Args:
         noise: Model by joint.
-        rows: Which samples count, by joint, their past included.
+        rows: Which samples count, by joint.
     """
 
     noise: tuple[NoiseModel, ...]
     rows: Bool[np.ndarray, "kept n"]
 
+    def __post_init__(self) -> None:
+        pairs = zip(self.noise, self.rows.T, strict=True)
+        object.__setattr__(self, "_matrices", [_predictor(m, c) for m, c in pairs])
+
     @classmethod
     def of(cls, e: Float[np.ndarray, "kept n"], counts: Bool[np.ndarray, "kept n"]) -> Whitener:
         """Whitener for noise such as `e`."""
-        noise = tuple(NoiseModel.fit(e[:, i], counts[:, i], 20) for i in range(e.shape[1]))
-        return cls(noise, np.stack([m.whitened_counts(c) for m, c in zip(noise, counts.T, strict=True)], 1))
+        return cls(tuple(NoiseModel.fit(x, c, 20) for x, c in zip(e.T, counts.T, strict=True)), counts)
 
-    def on(self, counts: Bool[np.ndarray, "kept n"]) -> Whitener:
-        """The same noise on another log."""
-        rows = [m.whitened_counts(c) for m, c in zip(self.noise, counts.T, strict=True)]
-        return Whitener(self.noise, np.stack(rows, 1))
+    def then(self, after: Whitener) -> Whitener:
+        """This whitener and then another as one."""
+        noise = tuple(
+            NoiseModel(
+                -np.convolve([1.0, *-a.coefficients], [1.0, *-b.coefficients])[1:],
+                a.innovation * b.innovation,
+            )
+            for a, b in zip(self.noise, after.noise, strict=True)
+        )
+        return Whitener(noise, self.rows)
 
     def __call__(self, x: Float[np.ndarray, "kept n k"]) -> Float[np.ndarray, "row k"]:
-        """Whitened rows, joint after joint."""
-        parts = []
-        for i, model in enumerate(self.noise):
-            parts.append(model.whiten(x[:, i])[self.rows[:, i]])
-        return np.concatenate(parts)
+        """Whitened rows, block after block of time."""
+        return np.concatenate([m @ x[:, i] for i, m in enumerate(self._matrices)])[self._order()]
+
+    def placed(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, "kept n"]:
+        """Rows back at their samples; zero where none counts."""
+        out, own = np.zeros(self.rows.shape), np.empty_like(rows)
+        own[self._order()] = rows
+        out.T[self.rows.T] = own
+        return out
 
     def blocks(self) -> np.ndarray:
-        """Block of time of every row."""
+        """Block of time of every row, in rising order."""
+        return np.sort(self._blocks())
+
+    def _order(self) -> np.ndarray:
+        return np.argsort(self._blocks(), kind="stable")
+
+    def _blocks(self) -> np.ndarray:
         parts = []
         for i in range(len(self.noise)):
             n = int(self.rows[:, i].sum())
@@ -57,20 +78,53 @@ class Whitener:
         return np.concatenate(parts)
 
 
+def _predictor(model: NoiseModel, counts: Bool[np.ndarray, " kept"]) -> scipy.sparse.csr_array:
+    """Matrix from a signal to its innovations at the samples that count, over their deviation.
+
+    After a gap fewer past samples are there, and the predictor of that order takes over: a log
+    with many reversals would lose most of its rows otherwise.
+    """
+    order = len(model.coefficients)
+    size = scipy.fft.next_fast_len(max(4096, 64 * order), real=True)
+    covariance = np.fft.irfft(model.density(size), size)[: order + 1]
+    index = np.flatnonzero(counts)
+    since = np.arange(len(counts)) - np.maximum.accumulate(
+        np.where(counts, -1, np.arange(len(counts)))
+    )
+    past = np.minimum(since[index] - 1, order)
+    rows, columns, values = [], [], []
+    a, variance = np.zeros(0), covariance[0]
+    for k in range(order + 1):
+        if k > 0:
+            turn = (covariance[k] - a @ covariance[k - 1 : 0 : -1]) / variance
+            a, variance = np.append(a - turn * a[::-1], turn), variance * (1 - turn**2)
+        here = np.flatnonzero(past == k)
+        rows.append(np.repeat(here, k + 1))
+        columns.append((index[here][:, None] - np.arange(k + 1)).ravel())
+        values.append(np.tile(np.array([1.0, *-a]) / np.sqrt(variance), len(here)))
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.csr_array(entries, shape=(len(index), len(counts)))
+
+
 def grams(
     columns: Float[np.ndarray, "row k"], blocks: np.ndarray
 ) -> Float[np.ndarray, "block k k"]:
     """Products of columns, block by block."""
-    return np.stack([columns[blocks == b].T @ columns[blocks == b] for b in range(BLOCKS)])
+    return np.stack([columns[b].T @ columns[b] for b in _slices(blocks)])
 
 
 def products(
     columns: Float[np.ndarray, "row k"], e: Float[np.ndarray, "row r"], blocks: np.ndarray
 ) -> tuple[Float[np.ndarray, "block k r"], Float[np.ndarray, "block r"]]:
     """Products of columns with residuals, and squares of residuals, block by block."""
-    mixed = [columns[blocks == b].T @ e[blocks == b] for b in range(BLOCKS)]
-    squares = [np.sum(e[blocks == b] ** 2, axis=0) for b in range(BLOCKS)]
-    return np.stack(mixed), np.stack(squares)
+    slices = _slices(blocks)
+    squares = [np.einsum("ir,ir->r", e[b], e[b]) for b in slices]
+    return np.stack([columns[b].T @ e[b] for b in slices]), np.stack(squares)
+
+
+def _slices(blocks: np.ndarray) -> list[slice]:
+    edges = np.searchsorted(blocks, np.arange(BLOCKS + 1))
+    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
 def held_out(

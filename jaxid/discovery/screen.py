@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 _SURROGATES = 200
 # A stretch that keeps its sign in a surrogate: this part of the log.
 _STRETCH = 1 / 100
+# A column that stands out of others by less than this part of itself is theirs: with smoothing
+# and filtering, what is collinear in physics is so to four digits in numbers.
+_NOTHING_NEW = 1e-3
+# Times that the colour of the noise is fitted again after filling it up; more change nothing.
+_FILLINGS = 2
 
 
 @dataclass(frozen=True)
@@ -88,17 +93,16 @@ class Screen:
 
 def screen_candidates(search: Search) -> Screen:
     """Evaluate every candidate at every start, whiten, score, calibrate."""
-    e, jacobian = cand.evaluate(search.union, search.arrays, search.theta)
+    e, jacobian = cand.evaluate(search.union, search.samples, search.theta)
     rest = search.rest()
-    points = cand.points(search.union, rest, search.arrays, search.theta, e)
+    points = cand.points(search.union, rest, search.samples, search.theta, e)
     base = jacobian[..., search.active]
     for c in rest:
         if c.many:
             points.extend(search.many(c))
-    whitener = _saturated_whitener(e, base, points, search.data.moving)
+    whitener, noise = _noise(e, base, points, search.samples.moving)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
-    noise = _left(np.concatenate([columns, *_plain(points, whitener)], axis=1), white[:, 0])
     length = max(2, int(out.rows * _STRETCH))
     surrogates = ev.flipped(noise, length, _SURROGATES, np.random.default_rng(20240501))
     _score(out, search, white, columns, surrogates, points)
@@ -109,6 +113,7 @@ def _score(
     out: Screen, search: Search, white: np.ndarray, base: np.ndarray, surrogates: np.ndarray,
     points: list[cand.Point],
 ) -> None:
+    residuals = np.concatenate([white, surrogates], axis=1)
     null_before = out.held(base, surrogates)
     largest = np.full(surrogates.shape[1], -np.inf)
     best: dict[tuple[str, int], Score] = {}
@@ -116,9 +121,9 @@ def _score(
         extra = _independent(base, out.whitener(p.columns))
         if extra.shape[1] == 0:
             continue
-        offset = out.whitener(p.offset[..., None])
+        offset = out.whitener(p.offset[..., None]) if p.offset.any() else 0.0
         both = np.concatenate([base, extra], axis=1)
-        after = out.held(both, np.concatenate([white, surrogates], axis=1) + offset)
+        after = out.held(both, residuals + offset if p.offset.any() else residuals)
         largest = np.maximum(largest, ev.log_evidence(out.rows, null_before, after[1:]))
         guess = _guess(p, base, out.whitener, white + offset, search)
         if guess is None:
@@ -152,47 +157,80 @@ def _guess(
 
 
 def _independent(base: np.ndarray, extra: np.ndarray) -> np.ndarray:
-    """Those columns of `extra` that are not rounding beside the base."""
-    norm = np.linalg.norm(extra, axis=0)
-    extra = extra[:, norm > 0] / norm[norm > 0]
-    rest = extra - base @ np.linalg.lstsq(base, extra, rcond=None)[0]
-    return rest[:, np.linalg.norm(rest, axis=0) > 1e-5]
+    """What is new in the columns of `extra` beside the base, those left out that bring nothing."""
+    extra = _unit(extra)
+    q = np.linalg.qr(_unit(base))[0] if base.shape[1] else base
+    rest = extra - q @ (q.T @ extra)
+    return rest[:, np.linalg.norm(rest, axis=0) > _NOTHING_NEW]
 
 
-def _plain(points: list[cand.Point], whitener: ev.Whitener) -> list[np.ndarray]:
-    return [whitener(p.columns) for p in points if not p.candidate.many]
-
-
-def _left(columns: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """What is left of e beside all columns."""
+def _unit(columns: np.ndarray) -> np.ndarray:
     norm = np.linalg.norm(columns, axis=0)
-    columns = columns[:, norm > 0] / norm[norm > 0]
-    return e - columns @ np.linalg.lstsq(columns, e, rcond=1e-7)[0]
+    return columns[:, norm > 0] / norm[norm > 0]
 
 
-def _saturated_whitener(
+def _span(base: np.ndarray, extra: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span the base and what is new in the rest."""
+    q = np.linalg.qr(_unit(base))[0] if base.shape[1] else base
+    rest = _unit(_independent(base, extra))
+    if rest.shape[1] == 0:
+        return q
+    u, s, _ = np.linalg.svd(rest, full_matrices=False)
+    return np.concatenate([q, u[:, s > _NOTHING_NEW * s[0]]], axis=1)
+
+
+def _left(span: np.ndarray, e: np.ndarray) -> np.ndarray:
+    return e - span @ (span.T @ e)
+
+
+def _noise(
     e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray
-) -> ev.Whitener:
-    """Whitener for what is left when every candidate has had its say.
+) -> tuple[ev.Whitener, np.ndarray]:
+    """Whitener for the noise in a residual, and that noise as whitened rows.
 
-    The colour of the current residual is partly the missing effect itself; whitened with that,
-    the effect would vanish.
+    The colour of the residual is partly the missing effect itself: whitened with that, the effect
+    would vanish. So every candidate has its say first. But that takes noise away too, where the
+    candidates look, and on a short log most of it: what they took is filled up with noise of unit
+    variance, once a first model of its colour is known, and the colour fitted again.
     """
-    few = [base, *[p.columns for p in points if not p.candidate.many]]
-    columns = np.concatenate(few, axis=2)
-    many = [p for p in points if p.candidate.many]
+    extra = _all_columns(e, base, points, counts)
     left = np.zeros_like(e)
     for i, rows in enumerate(counts.T):
-        now, own = e[rows, i], columns[rows, i]
-        rest = _left(own, now)
-        taken = [_explained(p.columns[rows, i], rest) for p in many]
-        if taken:
-            best = many[int(np.argmax(taken))].columns[rows, i]
-            rest = _left(np.concatenate([own, best], axis=1), now)
-        left[rows, i] = rest
-    return ev.Whitener.of(left, counts)
+        left[rows, i] = _left(_span(base[rows, i], extra[rows, i]), e[rows, i])
+    whitener = ev.Whitener.of(left, counts)
+    for _ in range(_FILLINGS):
+        filled = whitener.placed(_filled(whitener, e, base, extra))
+        whitener = whitener.then(ev.Whitener.of(filled, counts))
+    return whitener, _filled(whitener, e, base, extra)
 
 
-def _explained(columns: np.ndarray, e: np.ndarray) -> float:
-    """Sum of squares that some columns take off e."""
-    return float(e @ e - np.sum(_left(columns, e) ** 2))
+def _filled(
+    whitener: ev.Whitener, e: np.ndarray, base: np.ndarray, extra: np.ndarray
+) -> np.ndarray:
+    q = _span(whitener(base), whitener(extra))
+    left = _left(q, whitener(e[..., None])[:, 0])
+    spread = np.sqrt(np.sum(left**2) / max(len(left) - q.shape[1], 1))
+    return left + q @ (spread * np.random.default_rng(20240501).standard_normal(q.shape[1]))
+
+
+def _all_columns(
+    e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray
+) -> np.ndarray:
+    """Columns of every candidate with few starts, and of a clear one with many."""
+    columns = np.concatenate([p.columns for p in points if not p.candidate.many], axis=2)
+    many = [p for p in points if p.candidate.many]
+    if not many:
+        return columns
+    gained = np.zeros(len(many))
+    for i, rows in enumerate(counts.T):
+        own = _span(base[rows, i], columns[rows, i])
+        rest = _left(own, e[rows, i])
+        for k, p in enumerate(many):
+            fresh = _left(own, _unit(p.columns[rows, i]))
+            part = np.sum((np.linalg.qr(fresh)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
+            gained[k] -= 0.5 * rows.sum() * np.log1p(-min(part, 1 - 1e-12))
+    best = int(np.argmax(gained))
+    # What the best of so many starts gains by chance, once in a thousand.
+    chance = np.log(1000 * len(many)) + many[best].columns.shape[2]
+    found = [many[best].columns] if gained[best] > chance else []
+    return np.concatenate([columns, *found], axis=2)

@@ -10,7 +10,6 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.screen import Score, Screen, screen_candidates
-from jaxid.estimators.inverse_dynamics import ForceData
 from jaxid.preprocess import Prepared
 
 # So many of the best candidates are refitted; a linear screen at a start is not the last word.
@@ -75,8 +74,8 @@ class Search:
     added: list[cand.Candidate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.arrays = ForceData.of(self.data)
-        self.validation_arrays = [ForceData.of(d) for d in self.validation]
+        self.samples = cand.Samples(self.data)
+        self.validation_samples = [cand.Samples(d) for d in self.validation]
         self.theta = self.union.neutral
         self._many: dict[tuple[str, int], list[cand.Point]] = {}
 
@@ -96,7 +95,7 @@ class Search:
         """A candidate at its many starts, computed once."""
         key = (candidate.kind, candidate.port)
         if key not in self._many:
-            self._many[key] = cand.many_points(self.union, candidate, self.arrays)
+            self._many[key] = cand.many_points(self.union, candidate, self.samples)
         return self._many[key]
 
     def run(self, most: int) -> list[Step]:
@@ -177,12 +176,12 @@ class Search:
         more = len(best.candidate.index) - len(own.index)
         if more > 0 or mine.total > best.total - _margin(best):
             return more < 0
-        now, _ = cand.evaluate(self.union, self.arrays, self.theta)
-        then, _ = cand.evaluate(self.union, self.arrays, best.theta)
+        now, _ = cand.evaluate(self.union, self.samples, self.theta)
+        then, _ = cand.evaluate(self.union, self.samples, best.theta)
         return self._closed(now, then) > _RELEVANT
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
-        return cand.refine(self.union, self.arrays, theta, active)[0]
+        return cand.refine(self.union, self.samples, theta, active)[0]
 
     def _without(self, theta: np.ndarray, c: cand.Candidate) -> np.ndarray:
         theta = theta.copy()
@@ -195,7 +194,7 @@ class Search:
         theta = self.theta.copy()
         theta[c.index] = score.guess
         theta = self._fit(theta, active)
-        e, jacobian = cand.evaluate(self.union, self.arrays, theta)
+        e, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = screened.held_out(e, jacobian[..., active])
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
         validation, confirmed = self._validated(theta)
@@ -212,12 +211,12 @@ class Search:
         if not self.validation:
             return None, None
         total, worst = 0.0, np.inf
-        for data, arrays in zip(self.validation, self.validation_arrays, strict=True):
+        for samples in self.validation_samples:
             old, new = (
-                np.where(data.moving, cand.evaluate(self.union, arrays, t)[0], 0.0)
+                np.where(samples.moving, cand.evaluate(self.union, samples, t)[0], 0.0)
                 for t in (self.theta, theta)
             )
-            whitener = ev.Whitener.of(new, data.moving)
+            whitener = ev.Whitener.of(new, samples.moving)
             squares = [np.sum(whitener(e[..., None]) ** 2) for e in (old, new)]
             total += float(ev.log_evidence(int(whitener.rows.sum()), *squares))
             worst = min(worst, 1 - float(np.sum(new**2) / np.sum(old**2)))
@@ -234,7 +233,7 @@ class Search:
                 return "its fit diverged"
             if free[i].sign == "nonnegative" and theta[i] <= 0.0:
                 return f"{free[i].name} would have to be negative"
-        old, _ = cand.evaluate(self.union, self.arrays, self.theta)
+        old, _ = cand.evaluate(self.union, self.samples, self.theta)
         closed = self._closed(old, e)
         if closed < _RELEVANT:
             return f"it closes only {100 * max(closed, 0) / 2:.1f} % of the gap"
@@ -255,20 +254,21 @@ class Search:
 
     def _costs(self, theta: np.ndarray, active: np.ndarray, limit: float) -> bool:
         """Whether a smaller model is worse by more than noise and by what is relevant."""
-        e, jacobian = cand.evaluate(self.union, self.arrays, self.theta)
-        now = Screen.of(ev.Whitener.of(e, self.data.moving), e, jacobian[..., self.active])
-        less, jacobian = cand.evaluate(self.union, self.arrays, theta)
+        e, jacobian = cand.evaluate(self.union, self.samples, self.theta)
+        now = Screen.of(ev.Whitener.of(e, self.samples.moving), e, jacobian[..., self.active])
+        less, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = now.held_out(less, jacobian[..., active])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
         return lost > limit and self._closed(less, e) > _SUPERFLUOUS
 
     def _closed(self, old: np.ndarray, new: np.ndarray) -> float:
         """Part by which the gap above the noise floor closes, in sum of squares."""
-        counts = self.data.moving
+        counts = self.samples.moving
         floor = np.sum(counts.sum(axis=0) * np.square(self.floor))
         before, after = np.sum(old[counts] ** 2), np.sum(new[counts] ** 2)
-        # The floor is itself an estimate: at least a tenth of the residual counts as gap.
-        return float((before - after) / max(before - floor, 0.1 * before))
+        # The floor is itself an estimate, and a search always finds something to close: at least
+        # half of the residual counts as gap.
+        return float((before - after) / max(before - floor, 0.5 * before))
 
 
 def _few(promising: list[Score]) -> list[Score]:

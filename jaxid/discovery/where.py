@@ -66,7 +66,7 @@ class Where:
 def variables(data: Prepared, joint: int) -> dict[str, Float[np.ndarray, " kept"]]:
     """What a residual may depend on, at the kept samples."""
     v = data.at_kept(data.qd)[:, joint]
-    time = data.kept * data.period
+    time = data.times
     flips = np.flatnonzero(np.diff(np.sign(v)) != 0)
     last = np.maximum.accumulate(np.where(np.isin(np.arange(len(v)), flips + 1), time, time[0]))
     return {
@@ -197,7 +197,7 @@ def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[floa
     usual = np.median(local[share > _WINDOW / 2])
     loud = (local > _LOUD * usual) & (share > _WINDOW / 2)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], loud, [False]]).astype(int)))
-    time = data.kept * data.period
+    time = data.times
     spans = [(float(time[a]), float(time[b - 1])) for a, b in edges.reshape(-1, 2)]
     if len(spans) > 20 or loud.mean() > 0.3:  # everywhere is nowhere
         return ()

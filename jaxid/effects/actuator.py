@@ -24,9 +24,6 @@ class ActuatorGain(Effect):
     def act(self, x: Signals, state: None) -> Action:
         return Action(drive=self.gain * x.u)
 
-    def static_gain(self) -> Array:
-        return self.gain
-
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:
         return {"gain": 1.0}

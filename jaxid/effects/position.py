@@ -74,3 +74,7 @@ class Cogging(Effect):
             for turns in np.arange(2.0, 60.0, 0.5)
             for phase in (0.0, 2 / 3 * np.pi, 4 / 3 * np.pi)
         ]
+
+    @classmethod
+    def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
+        return {"period": (0.0, 1.2 * scales.position)}

@@ -29,7 +29,7 @@ from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess
 from jaxid.preprocess import Prepared
-from jaxid.readings import drive_own_states
+from jaxid.readings import drive_own_states, drive_ratio
 
 # Windows: so many periods of the band edge each, half overlapping. Shorter ones hold too little
 # motion to tell inertia from friction, longer ones too much of the noise's drift.
@@ -100,7 +100,7 @@ def weak_residual(
     times = data.period * jnp.arange(raw.shape[0])
     fast = jnp.abs(data.qd).max(axis=0)
 
-    def split(q: Array, v: Array, u: Array, t: Array, own: tuple) -> tuple[Array, Array, Array]:
+    def split(q: Array, v: Array, u: Array, t: Array, own: tuple) -> tuple[Array, ...]:
         def residual(v: Array, a: Array) -> Array:
             return plant.balance(q, v, a, u, t, own).residual
 
@@ -108,9 +108,10 @@ def weak_residual(
         mass = jax.jacfwd(residual, argnums=1)(v, zero)
         slope = jax.jacfwd(residual)
         damping = 0.5 * (slope(fast, zero) + slope(-fast, zero))
-        return mass, damping, residual(v, zero) - damping @ v
+        drive = plant.balance(q, v, zero, u, t, own).drive
+        return mass, damping, residual(v, zero) - damping @ v, drive
 
-    mass, damping, rest = jax.vmap(split)(raw, data.qd, u, times, own)
+    mass, damping, rest, drive = jax.vmap(split)(raw, data.qd, u, times, own)
 
     def window(start: Array) -> Array:
         def cut(x: Array) -> Array:
@@ -123,7 +124,7 @@ def weak_residual(
 
     starts = jnp.arange(0, raw.shape[0] - length + 1, length // 2)
     span = data.period * (length - 1)
-    return jax.vmap(window)(starts) * 12 / span**4 / plant.static_gain()
+    return jax.vmap(window)(starts) * 12 / span**4 / drive_ratio(drive, u)
 
 
 @eqx.filter_jit

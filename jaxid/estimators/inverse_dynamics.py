@@ -29,6 +29,7 @@ class ForceData(eqx.Module):
     Args:
         q, qd, qdd, force: At the log's rate.
         weight: Of each kept sample, (kept, n); zero where it does not count.
+        start: Time of the first sample, from the start of the log [s].
     """
 
     q: Float[Array, "time n"]
@@ -36,6 +37,7 @@ class ForceData(eqx.Module):
     qdd: Float[Array, "time n"]
     force: Float[Array, "time m"]
     weight: Float[Array, "kept n"]
+    start: Float[Array, ""]
     period: float = eqx.field(static=True)
     hold: float = eqx.field(static=True)
     decimator: signals.Decimator = eqx.field(static=True)
@@ -46,7 +48,8 @@ class ForceData(eqx.Module):
         rows = data.moving if rows is None else rows
         return cls(
             jnp.asarray(data.q), jnp.asarray(data.qd), jnp.asarray(data.qdd),
-            jnp.asarray(data.force), jnp.asarray(rows, dtype=float), data.period,
+            jnp.asarray(data.force), jnp.asarray(rows, dtype=float),
+            jnp.asarray(data.start), data.period,
             data.hold, data.recipe.decimator,
         )
 
@@ -54,7 +57,7 @@ class ForceData(eqx.Module):
 def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
     u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
-    return data.decimator(residual_along(plant, data.q, data.qd, data.qdd, u, data.period))
+    return data.decimator(residual_along(plant, data.q, data.qd, data.qdd, u, data.period, data.start))
 
 
 def measured_force(data: ForceData) -> Float[Array, "kept m"]:

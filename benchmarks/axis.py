@@ -1,0 +1,114 @@
+"""The axis that the speed benchmarks run: EMPS-like, in its cascade loop, 25 000 samples at 1 kHz.
+
+Its log comes from the independent stepper of the tests, with an encoder's rounding and noise.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import stepper_machines as machines
+
+from jaxid.controllers import CascadePD
+from jaxid.effects import EFFECTS
+from jaxid.estimators.least_squares import Transform
+from jaxid.estimators.output_error import _fit
+from jaxid.parameters import scatter
+from jaxid.plants import Axis
+from jaxid.replay import Numerics, Replay
+from jaxid.sensors import Sensor
+from jaxid.simulate import Drive
+
+PERIOD, GAIN = 1e-3, 35.15065
+TRUTH = np.array([95.1, 203.5, 20.39, -3.16])
+START = 0.7 * TRUTH
+# Fitted: inertia, viscous coefficient, Coulomb level, constant force.
+PLACES = (
+    (("inertia",), None),
+    (("effects", 0, "coefficient"), None),
+    (("effects", 1, "level"), None),
+    (("effects", 2, "level"), None),
+)
+TRANSFORM = Transform(jnp.asarray([True, False, False, False]))
+BOUNDS = (jnp.asarray([1e-9, 0.0, 0.0, -np.inf]), jnp.full(4, np.inf))
+
+
+def log(samples: int = 25_000) -> tuple[np.ndarray, np.ndarray]:
+    """Reference and measured position of the stepper's log."""
+    setup = machines.emps_like(duration=25.0).with_effect("constant_force", level=TRUTH[3])
+    return setup.loop.reference[:samples], np.asarray(setup.run()["position"])[:samples]
+
+
+def plant(theta: np.ndarray, sharpness: float = 1e-3) -> Axis:
+    """The axis at some parameters."""
+    effects = (
+        EFFECTS["viscous_friction"](coefficient=1.0),
+        EFFECTS["coulomb_friction"](level=1.0),
+        EFFECTS["constant_force"](level=1.0),
+    )
+    return scatter(PLACES, Axis(1.0, effects=effects, sharpness=sharpness), jnp.asarray(theta))
+
+
+def replay(reference: np.ndarray, numerics: Numerics) -> Replay:
+    """The run in the loop, from rest, the reading exact."""
+    law = CascadePD(
+        kp=jnp.asarray(160.18), kv=jnp.asarray(243.45), limit=jnp.asarray(10.0), period=PERIOD,
+        velocity_average=2,
+    )
+    drive = Drive(
+        jnp.asarray([GAIN]), PERIOD, "zero_order", numerics.substeps, numerics.set_valued
+    )
+    zero = jnp.zeros((len(reference), 1))
+    return Replay(
+        drive, law, Sensor(), jnp.asarray(reference)[:, None], zero, None,
+        jnp.zeros(1), jnp.zeros(1), None, 1,
+    )
+
+
+def simulated(run: Replay, base: Axis, theta: jax.Array) -> jax.Array:
+    """Position as a function of the parameters."""
+    return run(scatter(PLACES, base, theta)).position[:, 0]
+
+
+forward = eqx.filter_jit(simulated)
+
+
+@eqx.filter_jit
+def jacobian(run: Replay, base: Axis, theta: jax.Array) -> jax.Array:
+    """Forward-mode Jacobian of the position, (time, 4)."""
+    return jax.jacfwd(lambda x: simulated(run, base, x))(theta)
+
+
+@eqx.filter_jit
+def gauss_newton(run: Replay, base: Axis, theta: jax.Array, measured: jax.Array) -> tuple:
+    """J'J, J'e and half the sum of squares."""
+
+    def residual(x: jax.Array) -> tuple:
+        e = measured - simulated(run, base, x)
+        return e, e
+
+    jac, e = jax.jacfwd(residual, has_aux=True)(theta)
+    return jac.T @ jac, jac.T @ e, 0.5 * e @ e
+
+
+@eqx.filter_jit
+def costs(run: Replay, base: Axis, thetas: jax.Array, measured: jax.Array) -> jax.Array:
+    """Half the sum of squares of many parameter sets."""
+
+    def cost(x: jax.Array) -> jax.Array:
+        e = measured - simulated(run, base, x)
+        return 0.5 * e @ e
+
+    return jax.vmap(cost)(thetas)
+
+
+def fit(run: Replay, base: Axis, theta: np.ndarray, measured: np.ndarray):
+    """jaxid's own output-error fit."""
+    measured = jnp.asarray(measured)[:, None]
+    weight = jnp.ones(measured.shape)
+    return _fit(run, PLACES, base, measured, weight, jnp.asarray(theta), TRANSFORM, BOUNDS)

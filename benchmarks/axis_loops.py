@@ -1,0 +1,157 @@
+"""What a person would write by hand for one axis in its cascade loop: loops compiled by numba.
+
+`theta` is inertia, viscous coefficient, Coulomb level and constant force; `loop` holds what is
+known: gain, kp, kv, limit, period and the width of the smoothed sign. The velocity is the
+difference of two positions two ticks apart, as in `velocity_average = 2`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+P = 4
+
+
+@njit(cache=False)
+def command(r, q, past, loop):
+    """The cascade law, limited."""
+    _, kp, kv, limit, period, _ = loop
+    u = kv * (kp * (r - q) - (q - past) / (2 * period))
+    return min(max(u, -limit), limit)
+
+
+@njit(cache=False)
+def acceleration(v, u, theta, width):
+    m, c, f, f0 = theta
+    return (u - c * v - f * math.tanh(v / width) + f0) / m
+
+
+@njit(cache=False)
+def rk4_forward(theta, reference, loop, start, out):
+    """Smoothed friction, classical Runge-Kutta, one step a tick; positions into `out`."""
+    h, width = loop[4], loop[5]
+    half = 0.5 * h
+    q, v = start
+    last, past = q - h * v, q - 2 * h * v
+    for k in range(len(reference)):
+        out[k] = q
+        u = loop[0] * command(reference[k], q, past, loop)
+        a1 = acceleration(v, u, theta, width)
+        v2 = v + half * a1
+        a2 = acceleration(v2, u, theta, width)
+        v3 = v + half * a2
+        a3 = acceleration(v3, u, theta, width)
+        v4 = v + h * a3
+        a4 = acceleration(v4, u, theta, width)
+        past, last = last, q
+        q += h / 6 * (v + 2 * v2 + 2 * v3 + v4)
+        v += h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+
+
+@njit(cache=False)
+def linear_flow(theta, h):
+    """Runge-Kutta's map of v' = (f - c v) / m over a step: what v and f give to v and q."""
+    m, c, _, _ = theta
+    z = -h * c / m
+    grow = 1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))
+    p1 = 1 + z / 2 * (1 + z / 3 * (1 + z / 4))
+    p2 = 0.5 + z / 6 * (1 + z / 4)
+    return grow, h / m * p1, h * p1, h * h / m * p2
+
+
+@njit(cache=False)
+def ideal_forward(theta, reference, loop, start, out):
+    """Set-valued friction: the linear flow, then friction that stops or drags."""
+    h = loop[4]
+    vv, vf, qv, qf = linear_flow(theta, h)
+    level, mobility = theta[2], h / theta[0]
+    q, v = start
+    last, past = q - h * v, q - 2 * h * v
+    for k in range(len(reference)):
+        out[k] = q
+        force = loop[0] * command(reference[k], q, past, loop) + theta[3]
+        free = vv * v + vf * force
+        wanted = -free / mobility
+        reaction = min(max(wanted, -level), level)
+        past, last = last, q
+        q += qv * v + qf * (force + reaction)
+        v = free + vf * reaction if reaction != wanted else 0.0
+
+
+@njit(cache=False)
+def sensed(v, u, theta, width, dv, du, a, da):
+    """Acceleration and its derivative: by v and u, which have moved along dv and du, and theta."""
+    m, c, f, f0 = theta
+    t = math.tanh(v / width)
+    a = (u - c * v - f * t + f0) / m
+    slope = -(c + f * (1 - t * t) / width)
+    for i in range(P):
+        da[i] = du[i] + slope * dv[i]
+    da[0] -= a
+    da[1] -= v
+    da[2] -= t
+    da[3] += 1.0
+    for i in range(P):
+        da[i] /= m
+    return a
+
+
+@njit(cache=False)
+def rk4_normal(theta, reference, measured, loop, start, normal, gradient):
+    """Gauss-Newton of the position: J'J, J'e and e'e/2, sensitivities written by hand."""
+    gain, kp, kv, limit, h, width = loop
+    half = 0.5 * h
+    q, v = start
+    last, past = q - h * v, q - 2 * h * v
+    dq, dv, dlast, dpast = np.zeros(P), np.zeros(P), np.zeros(P), np.zeros(P)
+    du, d2, d3, d4 = np.zeros(P), np.zeros(P), np.zeros(P), np.zeros(P)
+    e1, e2, e3, e4 = np.zeros(P), np.zeros(P), np.zeros(P), np.zeros(P)
+    normal[:] = 0.0
+    gradient[:] = 0.0
+    cost = 0.0
+    for k in range(len(reference)):
+        e = measured[k] - q
+        cost += 0.5 * e * e
+        for i in range(P):
+            gradient[i] -= e * dq[i]
+            for j in range(P):
+                normal[i, j] += dq[i] * dq[j]
+        raw = kv * (kp * (reference[k] - q) - (q - past) / (2 * h))
+        inside = gain if abs(raw) < limit else 0.0
+        u = gain * min(max(raw, -limit), limit)
+        for i in range(P):
+            du[i] = -inside * kv * (kp * dq[i] + (dq[i] - dpast[i]) / (2 * h))
+        a1 = sensed(v, u, theta, width, dv, du, 0.0, e1)
+        v2 = v + half * a1
+        for i in range(P):
+            d2[i] = dv[i] + half * e1[i]
+        a2 = sensed(v2, u, theta, width, d2, du, 0.0, e2)
+        v3 = v + half * a2
+        for i in range(P):
+            d3[i] = dv[i] + half * e2[i]
+        a3 = sensed(v3, u, theta, width, d3, du, 0.0, e3)
+        v4 = v + h * a3
+        for i in range(P):
+            d4[i] = dv[i] + h * e3[i]
+        a4 = sensed(v4, u, theta, width, d4, du, 0.0, e4)
+        past, last = last, q
+        q += h / 6 * (v + 2 * v2 + 2 * v3 + v4)
+        v += h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        for i in range(P):
+            dpast[i], dlast[i] = dlast[i], dq[i]
+            dq[i] += h / 6 * (dv[i] + 2 * d2[i] + 2 * d3[i] + d4[i])
+            dv[i] += h / 6 * (e1[i] + 2 * e2[i] + 2 * e3[i] + e4[i])
+    return cost
+
+
+@njit(cache=False, parallel=True)
+def rk4_sets(thetas, reference, measured, loop, start, costs):
+    """Half the sum of squares of the position for many parameter sets, on all threads."""
+    for n in prange(len(thetas)):
+        out = np.empty(len(reference))
+        rk4_forward(thetas[n], reference, loop, start, out)
+        cost = 0.0
+        for k in range(len(reference)):
+            cost += 0.5 * (measured[k] - out[k]) ** 2
+        costs[n] = cost

@@ -1,0 +1,139 @@
+"""Levenberg-Marquardt: far starts, bounds, logarithms, failures that are told, batches."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxid.estimators.least_squares import Transform, levenberg_marquardt
+from jaxid.parameters import Free, Parameters
+
+TIME = np.linspace(0.0, 2.0, 80)
+# amplitude and rate positive, offset free, drag nonnegative
+SIGNS = ("positive", "positive", "free", "nonnegative")
+TRUTH = np.array([3.0, 2.5, -0.7, 0.0])
+GUESS = np.array([30.0, 0.3, 5.0, 4.0])
+
+
+def model(theta):
+    return theta[0] * jnp.exp(-theta[1] * TIME) + theta[2] - theta[3] * TIME
+
+
+DATA = model(TRUTH)
+
+
+def unknowns(guess=GUESS, lower=(-np.inf,) * 4, upper=(np.inf,) * 4) -> Parameters:
+    rows = zip(SIGNS, guess, lower, upper, strict=True)
+    free = [Free(f"p{k}", ("p",), "1", s, float(g), *at) for k, (s, g, *at) in enumerate(rows)]
+    return Parameters(tuple(free))
+
+
+def fit(parameters: Parameters, data=DATA, **options):
+    transform, bounds = Transform.of(parameters), parameters.bounds
+    return levenberg_marquardt(
+        lambda theta: data - model(theta), parameters.guess, transform, *bounds, **options
+    )
+
+
+@pytest.mark.parametrize("guess", [GUESS, [1.0, 8.0, 2.0, 0.5], [3e3, 1.0, 1.0, 30.0]])
+def test_recovers_from_far_starts(guess):
+    parameters = unknowns(guess)
+    assert np.abs(parameters.guess - TRUTH).max() > 1  # the start fails the tolerance below
+    minimum = jax.jit(lambda: fit(parameters))()
+    assert bool(minimum.converged)
+    assert int(minimum.steps) < 60
+    np.testing.assert_allclose(np.asarray(minimum.theta), TRUTH, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(minimum.residual), 0.0, atol=1e-6)
+
+
+def test_stops_at_the_bounds_that_bind():
+    """At the bounds the cost falls outwards only; in what remains it is stationary."""
+    parameters = unknowns(lower=(0, 0, -9, 0.2), upper=(np.inf, np.inf, -0.9, np.inf))
+    minimum = jax.jit(lambda: fit(parameters))()
+    theta = np.asarray(minimum.theta)
+    assert bool(minimum.converged)
+    np.testing.assert_array_equal(theta[2:], [-0.9, 0.2])
+    slope = np.asarray(minimum.jacobian).T @ np.asarray(minimum.residual)
+    np.testing.assert_allclose(slope[:2], 0.0, atol=1e-5)
+    assert slope[2] < 0 < slope[3]
+
+
+def test_jacobian_is_that_of_the_physical_values():
+    minimum = jax.jit(lambda: fit(unknowns()))()
+    expected = -np.asarray(jax.jacfwd(model)(minimum.theta))
+    np.testing.assert_allclose(np.asarray(minimum.jacobian), expected, atol=1e-10)
+
+
+def test_inactive_unknowns_stay_put():
+    active = jnp.asarray([True, True, False, False])
+    minimum = jax.jit(lambda: fit(unknowns(), active=active))()
+    np.testing.assert_array_equal(np.asarray(minimum.theta)[2:], GUESS[2:])
+    assert np.all(np.abs(np.asarray(minimum.theta)[:2] - GUESS[:2]) > 0.1)
+
+
+def test_batch_equals_loop():
+    """Fits of several noisy data sets at once; steps that one needs do not move the others."""
+    noise = 0.1 * np.random.default_rng(3).standard_normal((5, TIME.size))
+    parameters = unknowns()
+    one = jax.jit(lambda e: fit(parameters, DATA + e, keep=False))
+    batch = jax.jit(jax.vmap(lambda e: fit(parameters, DATA + e, keep=False)))(noise)
+    assert batch.residual.shape[-1] == 0  # nothing kept
+    assert len(set(np.asarray(batch.steps).tolist())) > 1
+    for k, e in enumerate(noise):
+        alone = one(e)
+        assert int(batch.steps[k]) == int(alone.steps)
+        # sums in another order
+        np.testing.assert_allclose(batch.theta[k], alone.theta, rtol=1e-9, atol=1e-12)
+        assert float(batch.cost[k]) == pytest.approx(float(alone.cost), rel=1e-12)
+
+
+def test_running_out_of_steps_is_told():
+    minimum = jax.jit(lambda: fit(unknowns(), max_steps=2))()
+    assert not bool(minimum.converged)
+    assert int(minimum.steps) == 2
+
+
+def test_a_start_that_is_not_finite_is_told():
+    minimum = jax.jit(lambda: fit(unknowns(), DATA * jnp.nan))()
+    assert not bool(minimum.converged)
+
+
+def unbounded(residual, start: list[float]):
+    free, wide = Transform(jnp.zeros(len(start), bool)), jnp.full(len(start), jnp.inf)
+    theta = jnp.asarray(start)
+    return jax.jit(lambda: levenberg_marquardt(residual, theta, free, -wide, wide))()
+
+
+def test_steps_into_the_infinite_are_refused():
+    """A residual that overflows far out: the step shrinks, and the fit still arrives."""
+
+    def residual(theta):
+        wild = jnp.where(theta[0] > 6.0, jnp.nan, theta[0])
+        return jnp.asarray([10 * jnp.tanh(wild) - 10 * jnp.tanh(2.0), 0.1 * (wild - 2.0)])
+
+    minimum = unbounded(residual, [-4.0])
+    assert bool(minimum.converged)
+    assert float(minimum.theta[0]) == pytest.approx(2.0, abs=1e-6)
+
+
+def test_collinear_unknowns_do_not_run_away():
+    """Only the sum is told: it is found, and the difference stays near its start."""
+    minimum = unbounded(lambda theta: (theta[0] + theta[1] - 3.0) * jnp.ones(4), [1.0, 5.0])
+    assert bool(minimum.converged)
+    np.testing.assert_allclose(np.asarray(minimum.theta), [-0.5, 3.5], atol=1e-5)
+
+
+def test_transform_has_one_inverse():
+    transform = Transform.of(unknowns())
+    theta = jnp.asarray([3.0, 1e-7, -0.7, 0.0])
+    x = transform.inward(theta)
+    np.testing.assert_allclose(np.asarray(transform.outward(x)), theta, rtol=1e-14)
+    slope = np.diag(np.asarray(jax.jacfwd(transform.outward)(x)))
+    np.testing.assert_allclose(np.asarray(transform.slope(theta)), slope, rtol=1e-14)
+
+
+def test_signs_give_bounds_and_guesses_survive_the_round_trip():
+    lower, upper = unknowns().bounds
+    np.testing.assert_array_equal(np.asarray(lower)[2:], [-np.inf, 0.0])
+    assert np.all(np.asarray(lower)[:2] > 0)
+    assert np.all(np.asarray(upper) == np.inf)

@@ -1,0 +1,159 @@
+"""Process-wide settings, and which module may import which."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "jaxid"
+OPTION = "xla_cpu_small_while_loop_byte_threshold=1000000000"
+KEY = "--xla_backend_extra_options="
+
+
+def fresh(code: str, flags: str | None = None) -> list[str]:
+    """Lines that a new Python process prints."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_ENABLE_X64")}
+    if flags is not None:
+        environment["XLA_FLAGS"] = flags
+    run = subprocess.run(
+        [sys.executable, "-W", "error::DeprecationWarning", "-c", code],
+        cwd=ROOT, env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    return run.stdout.split("\n")
+
+
+def test_import_is_light_and_sets_float64():
+    code = (
+        "import jaxid, sys; print([m for m in ('jax', 'numpy', 'scipy') if m in sys.modules])\n"
+        "import jax; print(jax.numpy.ones(1).dtype)"
+    )
+    assert fresh(code)[:2] == ["[]", "float64"]
+
+
+def test_float64_after_jax_was_imported_first():
+    code = "import jax, jaxid, os; print(jax.numpy.ones(1).dtype, os.environ['XLA_FLAGS'])"
+    assert fresh(code)[0] == f"float64 {KEY}{OPTION}"
+
+
+OWN = "--xla_cpu_enable_fast_math=false"
+USER = "xla_cpu_use_acl=true"
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (None, f"{KEY}{OPTION}"),
+        (OWN, f"{OWN} {KEY}{OPTION}"),
+        (f"{KEY}{USER} {OWN}", f"{KEY}{USER},{OPTION} {OWN}"),
+        # the user's own threshold stays
+        (f"{KEY}{OPTION[:-9]}", f"{KEY}{OPTION[:-9]}"),
+    ],
+)
+def test_users_flags_are_kept(flags, expected):
+    code = "import jaxid, os; print(os.environ['XLA_FLAGS'])"
+    assert fresh(code, flags)[0] == expected
+
+
+def test_warns_where_the_backend_is_already_up():
+    code = (
+        "import warnings, os, jax; jax.numpy.ones(1).block_until_ready()\n"
+        "with warnings.catch_warnings(record=True) as told:\n"
+        "    warnings.simplefilter('always')\n"
+        "    import jaxid\n"
+        "print(len(told), 'several times slower' in str(told[0].message))\n"
+        "print(told[0].filename, os.environ.get('XLA_FLAGS'), jax.numpy.ones(1).dtype)"
+    )
+    lines = fresh(code)
+    assert lines[0] == "1 True"
+    assert lines[1].endswith("None float64")
+
+
+LOOP = """
+import jaxid, jax, jax.numpy as jnp
+from jaxid.effects import EFFECTS
+from jaxid.plants import Axis
+from jaxid.simulate import Drive, open_loop
+def end(level):
+    plant = Axis(2.0, effects=(EFFECTS["coulomb_friction"](level=level),))
+    u = jnp.ones((50, 1))
+    return open_loop(plant, Drive(jnp.ones(1), 1e-3), u, jnp.zeros(1), jnp.zeros(1)).position[-1, 0]
+print(jax.jit(jax.grad(end)).lower(jnp.asarray(3.0)).compile().as_text().count(
+    'xla_cpu_small_call="true"'))
+"""
+
+
+def test_the_loop_and_its_gradient_are_one_kernel_each():
+    """The undocumented option still works: without it the count is zero."""
+    assert int(fresh(LOOP)[0]) >= 2
+    off = f"{KEY}xla_cpu_small_while_loop_byte_threshold=1"
+    assert int(fresh(LOOP, off)[0]) == 0
+
+
+def imports(path: Path) -> set[str]:
+    """Modules of jaxid that a file imports, where it runs or inside functions."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+    return found
+
+
+def files(*places: str) -> list[Path]:
+    out = []
+    for place in places:
+        path = PACKAGE / place
+        out += sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    assert out, f"{places} is gone: this test guards nothing"
+    return out
+
+
+ABOVE_PHYSICS = (
+    "estimators", "discovery", "io", "report", "cli", "identify", "session", "machine", "replay",
+    "gap", "precision", "preprocess", "studies", "check", "virtual",
+)  # fmt: skip
+BESIDE = ("effects", "plants", "controllers", "sensors", "simulate")
+
+
+@pytest.mark.parametrize(
+    ("places", "forbidden"),
+    [
+        (("smooth.py", "units.py", "_platform.py", "errors.py"), ("",)),  # nothing of jaxid
+        (("model.py",), ("readings", *BESIDE, *ABOVE_PHYSICS)),
+        (("readings.py",), (*BESIDE, *ABOVE_PHYSICS)),
+        (("effects",), ("plants", "controllers", "simulate", "readings", *ABOVE_PHYSICS)),
+        (("plants", "controllers", "sensors.py"), ("effects", "simulate", *ABOVE_PHYSICS)),
+        (("simulate.py", "signals.py", "parameters.py"), ABOVE_PHYSICS),
+        (("references",), ABOVE_PHYSICS),
+        (("estimators",), ("plants", "discovery", "report", "cli", "studies")),
+        (("precision.py",), ("plants", "discovery", "report", "cli", "io", "estimators")),
+        (("discovery",), ("plants", "report", "cli", "studies")),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else None,
+)
+def test_imports_point_up_the_list_only(places, forbidden):
+    for path in files(*places):
+        own = {m for m in imports(path) if m.startswith("jaxid.")}
+        for name in forbidden:
+            bad = {m for m in own if f"{m}.".startswith(f"jaxid.{name}." if name else "jaxid.")}
+            assert not bad, f"{path.relative_to(ROOT)} imports {bad}"
+
+
+def test_the_package_does_not_import_its_tests_or_experiments():
+    strangers = {p.stem for p in (ROOT / "tests").glob("*.py")}
+    strangers |= {"tests", "experiments", "benchmarks"}
+    for path in PACKAGE.rglob("*.py"):
+        roots = {m.split(".")[0] for m in imports(path)}
+        assert not roots & strangers, path
+
+
+def test_the_truth_does_not_import_what_it_judges():
+    for path in (ROOT / "tests").glob("stepper*.py"):
+        roots = {m.split(".")[0] for m in imports(path)}
+        assert not roots & {"jax", "jaxid", "diffrax", "equinox"}, path

@@ -1,0 +1,211 @@
+"""Trajectories: the scan against diffrax, controllers against plain Python, delay and rounding."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxid.controllers.linear import CascadePD
+from jaxid.effects import EFFECTS
+from jaxid.parameters import scatter
+from jaxid.plants import Axis
+from jaxid.sensors import Sensor
+from jaxid.simulate import (
+    Drive,
+    closed_loop,
+    interval_forces,
+    needed_substeps,
+    open_loop,
+    with_diffrax,
+)
+
+MASS, PERIOD, SAMPLES = 2.0, 1e-2, 60
+TIMES = PERIOD * np.arange(SAMPLES)
+COMMAND = 6.0 * np.sin(9.0 * TIMES) + 4.0 * np.cos(31.0 * TIMES)
+START = (jnp.asarray([0.05]), jnp.asarray([-0.4]))
+
+SMOOTH = {
+    "springs": {
+        "cubic_stiffness": {"coefficient": 3e3},
+        "cogging": {"amplitude": 2.0, "period": 0.2, "phase": 0.3},
+        "viscous_friction": {"coefficient": 3.0},
+    },
+    "memory": {
+        "actuator_lag": {"time_constant": 0.03},
+        "hysteresis": {"stiffness": 200.0, "level": 3.0},
+    },
+    "smoothed sign": {
+        "coulomb_friction": {"level": 1.5},
+        "stribeck_friction": {"level": 1.0, "velocity": 0.5},
+    },
+}
+
+
+def smooth_plant(case: str) -> Axis:
+    effects = tuple(EFFECTS[kind](**values) for kind, values in SMOOTH[case].items())
+    return Axis(MASS, effects=effects, sharpness=0.3)
+
+
+def forces(hold: str):
+    """The command as a function of time, between its samples as the hold says."""
+    times, command = jnp.asarray(TIMES), jnp.asarray(COMMAND)[:, None]
+    if hold == "linear":
+        return diffrax.LinearInterpolation(times, command).evaluate
+    # side="right": at a sample its own command acts; diffrax looks just before a jump too
+    return lambda t: command[jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0)]
+
+
+@eqx.filter_jit
+def by_scan(plant, substeps, hold):
+    drive = Drive(jnp.ones(1), PERIOD, hold, substeps)
+    out = open_loop(plant, drive, jnp.asarray(COMMAND)[:, None], *START)
+    return out.position, out.velocity
+
+
+@eqx.filter_jit
+def by_diffrax(plant, hold, step_length=None):
+    times = jnp.asarray(TIMES)
+    adaptive = diffrax.ClipStepSizeController(
+        diffrax.PIDController(rtol=1e-11, atol=1e-12), jump_ts=times[1:-1]
+    )
+    return with_diffrax(
+        plant,
+        forces(hold),
+        times,
+        *START,
+        solver=diffrax.Dopri8(),
+        controller=adaptive if step_length is None else None,
+        step_length=step_length,
+    )
+
+
+@pytest.mark.parametrize(
+    ("case", "hold"),
+    [("springs", "zero_order"), ("memory", "linear"), ("smoothed sign", "zero_order")],
+)
+def test_scan_agrees_with_diffrax(case, hold):
+    plant = smooth_plant(case)
+    for ours, theirs in zip(by_scan(plant, 16, hold), by_diffrax(plant, hold), strict=True):
+        # rates of 30 / s at steps of 0.6 ms: (w h)^4 / 120 = 1e-9 relative
+        scale = np.abs(np.asarray(theirs)).max()
+        np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=1e-8 * scale)
+
+
+def test_fixed_steps_of_diffrax_agree_with_adaptive_ones():
+    plant = smooth_plant("memory")
+    fixed, adaptive = by_diffrax(plant, "linear", PERIOD / 8), by_diffrax(plant, "linear")
+    for a, b in zip(fixed, adaptive, strict=True):
+        np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=1e-8)
+
+
+def test_a_continuous_hold_is_another_model():
+    """What would go wrong if the hold were ignored: a thousand times the tolerance above."""
+    plant = smooth_plant("springs")
+    held, linear = by_scan(plant, 16, "zero_order")[0], by_scan(plant, 16, "linear")[0]
+    assert np.abs(np.asarray(held - linear)).max() > 1e-5 * np.abs(np.asarray(held)).max()
+
+
+DELAY = 2.3 * PERIOD
+
+
+def delayed_forces(hold: str):
+    plant = Axis(MASS, effects=(EFFECTS["input_delay"](delay=DELAY),))
+    drive = Drive(jnp.asarray([3.0]), PERIOD, hold)
+    both = interval_forces(plant, drive, jnp.asarray(COMMAND)[:, None])
+    return [np.asarray(x)[4:, 0] for x in both]
+
+
+def test_held_and_delayed_force_is_its_mean_over_each_interval():
+    start, end = delayed_forces("zero_order")
+    late = PERIOD * (np.arange(SAMPLES * 1000) + 0.5) / 1000 - DELAY
+    held = COMMAND[np.clip(np.floor(late / PERIOD).astype(int), 0, None)]
+    mean = 3.0 * held.reshape(SAMPLES, 1000).mean(axis=1)
+    np.testing.assert_allclose(start, mean[4:], atol=1e-12)
+    np.testing.assert_array_equal(end, start)
+
+
+def test_ramped_and_delayed_force_is_right_at_the_samples():
+    start, end = delayed_forces("linear")
+    np.testing.assert_allclose(start, 3 * np.interp(TIMES - DELAY, TIMES, COMMAND)[4:], atol=1e-12)
+    np.testing.assert_allclose(end[:-1], start[1:], atol=1e-12)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_gradient_in_the_delay_is_there(closed):
+    plant = Axis(MASS, effects=(EFFECTS["input_delay"](delay=0.0),))
+    drive = Drive(jnp.ones(1), PERIOD, longest_delay=4)
+
+    @jax.jit
+    def end(delay):
+        moved = scatter(((("effects", 0, "delay"), None),), plant, delay[None])
+        if not closed:
+            return open_loop(moved, drive, jnp.asarray(COMMAND)[:, None], *START).position[-1, 0]
+        law = CascadePD(jnp.asarray([4.0]), jnp.asarray([10.0]), period=PERIOD)
+        reference = jnp.asarray(0.01 * COMMAND)[:, None]
+        zero = jnp.zeros((SAMPLES, 1))
+        return closed_loop(moved, drive, law, reference, zero, *START).position[-1, 0]
+
+    slope, step = jax.jit(jax.grad(end)), 1e-6
+    for delay in (0.4 * PERIOD, 2.3 * PERIOD):
+        difference = (end(delay + step) - end(delay - step)) / (2 * step)
+        assert abs(difference) > 1e-3  # m/s: it acts
+        assert float(slope(jnp.asarray(delay))) == pytest.approx(float(difference), rel=1e-6)
+
+
+# F h / (m width) = 3 * 1e-2 / (2 * 1e-3) = 15: RK4 leaves its stability at 2.8.
+STIFF = Axis(MASS, effects=(EFFECTS["coulomb_friction"](level=3.0),), sharpness=1e-3)
+
+
+@pytest.mark.parametrize("seen", ["at rest", "passing through rest between samples"])
+def test_needed_substeps_counts_the_smoothed_sign(seen):
+    v = {"at rest": [0.3, 0.0], "passing through rest between samples": [0.3, -0.3]}[seen]
+    zero = jnp.zeros((2, 1))
+    drive = Drive(jnp.ones(1), PERIOD)
+    assert needed_substeps(STIFF, drive, zero, jnp.asarray(v)[:, None], zero) == 15
+
+
+def test_too_coarse_a_step_has_a_garbage_gradient_and_is_flagged():
+    """The trajectory looks plausible; only the count of substeps tells."""
+    sharp = eqx.tree_at(lambda p: p.sharpness, STIFF, jnp.asarray(2e-4))
+    zero = jnp.zeros((1, 1))
+    needed = needed_substeps(sharp, Drive(jnp.ones(1), PERIOD), zero, zero, zero)
+    assert needed == 75
+    command = jnp.asarray(8.0 * np.sin(9.0 * TIMES))[:, None]
+
+    def position(level, substeps):
+        moved = scatter(((("effects", 0, "level"), None),), sharp, level[None])
+        drive = Drive(jnp.ones(1), PERIOD, substeps=substeps)
+        return open_loop(moved, drive, command, *START).position[:, 0]
+
+    def with_slope(substeps):
+        one = jnp.ones(())
+        return jax.jit(lambda x: jax.jvp(lambda x: position(x, substeps), (x,), (one,)))
+
+    coarse, fine = with_slope(1), with_slope(needed)
+    level = jnp.asarray(3.0)
+    (rough, garbage), (q, slope) = coarse(level), fine(level)
+    secant = (fine(level + 0.05)[0] - fine(level - 0.05)[0]) / 0.1
+    size = np.linalg.norm(np.asarray(secant))
+    assert np.abs(np.asarray(rough - q)).max() < 0.05 * np.ptp(np.asarray(q))
+    # the secant over 3 % of the level is curved and smooth to a few percent
+    assert np.linalg.norm(np.asarray(slope - secant)) < 0.05 * size
+    assert np.linalg.norm(np.asarray(garbage - secant)) > 2 * size
+
+
+def test_rounded_reading_has_the_gradient_of_the_position():
+    sensor = Sensor(position_resolution=jnp.asarray(0.01))
+    q = jnp.asarray([0.0123, -0.0449])
+    np.testing.assert_allclose(np.asarray(sensor.read(q)), [0.01, -0.04], atol=1e-15)
+    np.testing.assert_array_equal(np.asarray(jax.jacfwd(sensor.read)(q)), np.eye(2))
+
+
+def test_restarts_put_the_run_back_on_the_given_motion():
+    plant, drive = Axis(MASS), Drive(jnp.ones(1), PERIOD)
+    flags = np.arange(SAMPLES) % 20 == 0
+    q, v = np.full((SAMPLES, 1), 0.3), np.full((SAMPLES, 1), -1.0)
+    reset = tuple(jnp.asarray(x) for x in (flags, q, v))
+    out = open_loop(plant, drive, jnp.zeros((SAMPLES, 1)), *START, None, reset)
+    expected = 0.3 - PERIOD * (np.arange(SAMPLES) % 20)
+    np.testing.assert_allclose(np.asarray(out.position)[:, 0], expected, atol=1e-14)
