@@ -17,7 +17,7 @@ from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulatio
 from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.replay import make_replay
+from jaxid.replay import make_replay, with_fitted_start
 from jaxid.session import Run, Session, open_session
 
 
@@ -129,7 +129,8 @@ def simulated(machine: Machine, log: Log) -> SimulationGap | None:
     if machine.controller is not None and log.reference is None:
         machine = replace(machine, controller=None)
     numerics = replace(choose_numerics(machine, log, segments=False), segment=None)
-    gap = simulation_gap(machine, make_replay(machine, log, numerics), log)
+    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
+    gap = simulation_gap(machine, replay, log)
     return gap if np.all(np.isfinite(gap.rms)) and np.all(gap.relative < 1e3) else None
 
 

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxid.model import Plant, port_motion
-
+from jaxid.affine import Affine, affine
+from jaxid.model import Balance, Plant, port_motion
 
 # Coordinates, velocities, and own states in one array.
 Split = tuple[Array, Array, Array]
@@ -50,17 +50,6 @@ def small_solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, "
         known = [rows[k][j] * x[j] for j in range(k + 1, n)]
         x[k] = sum((-y for y in known), rows[k][n]) * scale[k]
     return jnp.stack(x)
-
-
-def mass_matrix(plant: Plant, x: State, u: Array, t: Array) -> Float[Array, "n n"]:
-    """Derivative of the balance with respect to the accelerations."""
-    zero = jnp.zeros_like(x.q)
-    no_friction = jnp.zeros_like(plant.ports(x.q))
-
-    def residual(qdd: Array) -> Array:
-        return plant.balance(x.q, x.qd, qdd, u, t, x.own, no_friction).residual
-
-    return jax.jacfwd(residual)(zero)
 
 
 def acceleration(
@@ -231,8 +220,39 @@ def _classical_step(
     return State(q, v, x.own)
 
 
+def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array) -> Affine | None:
+    """`step` under a given reaction as one matrix, where the plant's forces are affine.
+
+    Args:
+        plant: The plant.
+        x: Any state, for its shape.
+        u: Declared force at the ends of the step, once where it is held; for its shape.
+        t: Any time: a force that depends on it is not affine.
+        h: Step [s].
+
+    Returns:
+        For `set_valued_step`, a function of state, force at the ends and reaction; or None.
+    """
+
+    def flow(x: State, u: tuple[Array, ...], reaction: Array, t: Array) -> State:
+        return step(plant, x, line(u), t, h, reaction)
+
+    return affine(flow, (x, u, jnp.zeros_like(plant.ports(x.q))), (t,))
+
+
+def line(ends: tuple[Array, ...]) -> Callable[[Array], Array]:
+    """From the first to the last value as a function of the fraction in [0, 1]."""
+    start, end = ends[0], ends[-1]
+    return lambda s: start if len(ends) == 1 else start + s * (end - start)
+
+
 def set_valued_step(
-    plant: Plant, x: State, u: Callable[[Array], Array], t: Array, h: Array
+    plant: Plant,
+    x: State,
+    u: Callable[[Array], Array],
+    t: Array,
+    h: Array,
+    flow: Callable[[State, Array], State] | None = None,
 ) -> State:
     """One step under set-valued friction: flow without it, then the reaction that stops or drags.
 
@@ -240,34 +260,55 @@ def set_valued_step(
     at the step's end, clipped to the level of dry friction there (plus the break-away level where
     the port was at rest). Ports that are coupled through the mass matrix share their reactions by
     projected Gauss-Seidel sweeps; one port needs one.
+
+    Args:
+        plant: The plant.
+        x: State at t.
+        u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
+        t: Time [s].
+        h: Step [s].
+        flow: `step` as a function of state and reaction, where there is a cheaper one.
     """
-    free = step(plant, x, u, t, h, jnp.zeros_like(plant.ports(x.q)))
+    if flow is None:
+        flow = lambda x, reaction: step(plant, x, u, t, h, reaction)
+    none = jnp.zeros_like(plant.ports(x.q))
+    free = flow(x, none)
     _, speed, _ = port_motion(plant, free.q, free.qd, jnp.zeros_like(free.q))
     _, before, _ = port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))
-    end = u(jnp.asarray(1.0))
-    levels = plant.balance(
-        x.q, 0.5 * (x.qd + free.qd), jnp.zeros_like(x.q), end, t, x.own, jnp.zeros_like(speed)
-    )
+    midway, end = 0.5 * (x.qd + free.qd), u(jnp.asarray(1.0))
+
+    def residual(qdd: Array) -> tuple[Array, Balance]:
+        levels = plant.balance(x.q, midway, qdd, end, t, x.own, none)
+        return levels.residual, levels
+
+    # The mass does not depend on the velocity: one balance gives it and the levels.
+    mass, levels = jax.jacfwd(residual, has_aux=True)(jnp.zeros_like(x.q))
     bound = levels.dry + jnp.where(before == 0.0, levels.stick, 0.0)
     jacobian = jax.jacfwd(plant.ports)(x.q)
-    mass = mass_matrix(plant, x, end, t)
     columns = [small_solve(mass, jacobian[i]) for i in range(speed.size)]
     mobility = h * jnp.stack([jacobian @ c for c in columns], axis=1)
     reaction = _box_reaction(mobility, speed, bound)
-    slid = step(plant, x, u, t, h, reaction)
-    return _rest_exactly(plant, slid, jnp.abs(reaction) < bound)
+    return _rest_exactly(plant, flow(x, reaction), jnp.abs(reaction) < bound)
 
 
 def _box_reaction(mobility: Array, speed: Array, bound: Array) -> Array:
     """Reaction within plus or minus bound that leaves `speed + mobility @ reaction` complementary."""
     n = speed.size
+    inverse = 1.0 / jnp.diagonal(mobility)
+    if n == 1:
+        return _within(-speed * inverse, bound)
     reaction = jnp.zeros(n)
-    for _ in range(1 if n == 1 else 20):
+    for _ in range(20):
         for i in range(n):
-            slip = speed[i] + mobility[i] @ reaction
-            wanted = reaction[i] - slip / mobility[i, i]
-            reaction = reaction.at[i].set(jnp.clip(wanted, -bound[i], bound[i]))
+            slip = speed[i] + jnp.sum(mobility[i] * reaction)
+            wanted = reaction[i] - slip * inverse[i]
+            reaction = reaction.at[i].set(_within(wanted, bound[i]))
     return reaction
+
+
+def _within(x: Array, bound: Array) -> Array:
+    """Clip to plus or minus bound; selects, because clip's derivative divides the ties."""
+    return jnp.where(x > bound, bound, jnp.where(x < -bound, -bound, x))
 
 
 def _rest_exactly(plant: Plant, x: State, stuck: Array) -> State:

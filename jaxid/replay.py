@@ -142,6 +142,47 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     )
 
 
+def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100) -> Replay:
+    """An open-loop run whose initial position and velocity fit the first samples of its log.
+
+    A slope through noisy samples is a poor velocity, worse where an oscillation is sampled ten
+    times a period; the plant itself knows how the first samples hang together.
+
+    Args:
+        replay: The run.
+        plant: The plant.
+        log: The log.
+        samples: How many count.
+    """
+    if replay.controller is not None or replay.restart is not None:
+        return replay
+    count = min(samples, log.samples)
+    short = eqx.tree_at(
+        lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1]
+    )
+    nudge = _start(short, plant, jnp.asarray(log.position[:count]))
+    n = replay.position.size
+    moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
+    if not bool(jnp.all(jnp.isfinite(nudge))):
+        return replay
+    return eqx.tree_at(lambda r: (r.position, r.velocity), replay, moved)
+
+
+@eqx.filter_jit
+def _start(replay: Replay, plant: Plant, measured: Array) -> Array:
+    def residual(nudge: Array) -> Array:
+        return (replay(plant, nudge).position - measured).ravel()
+
+    def improve(_: int, nudge: Array) -> Array:
+        jacobian = jax.jacfwd(residual)(nudge)
+        scale = jnp.linalg.norm(jacobian, axis=0) + 1e-300
+        step = jnp.linalg.lstsq(jacobian / scale, residual(nudge))[0] / scale
+        return nudge - step
+
+    # Three steps: the start enters almost linearly over so short a run.
+    return jax.lax.fori_loop(0, 3, improve, jnp.zeros(2 * replay.position.size))
+
+
 def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) -> Replay:
     command, period, hold, every = log.force, log.period, log.hold, 1
     if hold == "band_limited":

@@ -18,7 +18,15 @@ from jaxtyping import Array, Float
 
 from jaxid.controllers import Controller, Tick
 from jaxid.model import Plant
-from jaxid.readings import State, acceleration, set_valued_step, step, vector_field
+from jaxid.readings import (
+    State,
+    acceleration,
+    affine_flow,
+    line,
+    set_valued_step,
+    step,
+    vector_field,
+)
 from jaxid.sensors import Sensor
 
 # Largest product of step and fastest decay for which the fourth-order step keeps both trajectory
@@ -61,26 +69,36 @@ class Drive(eqx.Module):
     set_valued: bool = eqx.field(static=True, default=False)
     longest_delay: int = eqx.field(static=True, default=0)
 
-    def advance(
-        self, plant: Plant, x: State, start: Array, end: Array, t: Array
-    ) -> State:
-        """One sample: the force goes from `start` to `end`, linearly (equal where it is held)."""
-        h = self.period / self.substeps
-        one = set_valued_step if self.set_valued else step
+    def stepper(
+        self, plant: Plant, x: State, ends: tuple[Array, ...]
+    ) -> Callable[[State, tuple[Array, ...], Array], State]:
+        """What advances a state by one sample, given the force at its ends, and the time.
 
-        def between(s: Array) -> Array:
-            return start if self.hold == "zero_order" else start + s * (end - start)
+        To be called outside the loop over the samples: where the plant's forces are affine, its
+        flow is one matrix, worked out here once.
 
-        if self.substeps == 1:
-            return one(plant, x, between, t, jnp.asarray(h))
+        Args:
+            plant: The plant.
+            x, ends: A state and the force at the ends of a sample, for their shapes; one force
+                where it is held.
+        """
+        h = jnp.asarray(self.period / self.substeps)
+        flow = affine_flow(plant, x, ends, jnp.zeros(()), h) if self.set_valued else None
 
-        def inner(x: State, k: Array) -> tuple[State, None]:
-            def force(s: Array) -> Array:
-                return between((k + s) / self.substeps)
+        def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
+            if not self.set_valued:
+                return step(plant, x, line(ends), t, h)
+            bound = None if flow is None else lambda x, reaction: flow(x, ends, reaction)
+            return set_valued_step(plant, x, line(ends), t, h, bound)
 
-            return one(plant, x, force, t + k * h, jnp.asarray(h)), None
+        def several(x: State, ends: tuple[Array, ...], t: Array) -> State:
+            def inner(x: State, k: Array) -> tuple[State, None]:
+                part = [line(ends)((k + i) / self.substeps) for i in range(len(ends))]
+                return one(x, tuple(part), t + k * h), None
 
-        return jax.lax.scan(inner, x, jnp.arange(self.substeps, dtype=jnp.float64))[0]
+            return jax.lax.scan(inner, x, jnp.arange(self.substeps, dtype=jnp.float64))[0]
+
+        return one if self.substeps == 1 else several
 
 
 def open_loop(
@@ -106,6 +124,8 @@ def open_loop(
     start, end = interval_forces(plant, drive, command)
     times = drive.period * jnp.arange(command.shape[0])
     x0 = State(position, velocity, plant.initial_states(start[0]))
+    held = drive.hold == "zero_order"
+    advance = drive.stepper(plant, x0, (start[0],) if held else (start[0], end[0]))
     n = command.shape[0]
     flag, q_new, v_new = (
         (jnp.zeros(n, bool), jnp.zeros((n, 1)), jnp.zeros((n, 1))) if reset is None else reset
@@ -115,7 +135,7 @@ def open_loop(
         u0, u1, t, restart, q, v = now
         if reset is not None:
             x = State(jnp.where(restart, q, x.q), jnp.where(restart, v, x.qd), x.own)
-        return drive.advance(plant, x, u0, u1, t), (x.q, x.qd)
+        return advance(x, (u0,) if held else (u0, u1), t), (x.q, x.qd)
 
     _, (q, v) = jax.lax.scan(tick, x0, (start, end, times, flag, q_new, v_new))
     reading = q if sensor is None else sensor.read(q)
@@ -179,6 +199,7 @@ def closed_loop(
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
     past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
     x0 = State(position, velocity, plant.initial_states(held))
+    advance = drive.stepper(plant, x0, (held,))
 
     def tick(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         x, memory, past = carry
@@ -186,7 +207,7 @@ def closed_loop(
         reading = sensor.read(x.q, noise)
         u, memory = controller.command(Tick(reading, reference), memory, disturbance)
         force, past = _delayed_force(plant, drive, u, past)
-        new = drive.advance(plant, x, force, force, t)
+        new = advance(x, (force,), t)
         return (new, memory, past), (x.q, x.qd, u, reading)
 
     inputs = (reference, disturbance, noise, times)

@@ -145,6 +145,45 @@ def held_out(
     return out
 
 
+class Beside:
+    """Held-out sums of squares of a base with further columns beside it, for many residuals.
+
+    What the base and the residuals have in common is summed once; a candidate adds only its own.
+
+    Args:
+        base: Whitened columns of the base.
+        e: Whitened residuals.
+        blocks: Block of time of every row.
+    """
+
+    def __init__(
+        self, base: Float[np.ndarray, "row k"], e: Float[np.ndarray, "row r"], blocks: np.ndarray
+    ) -> None:
+        self.base, self.e, self.blocks = base, e, blocks
+        self.gram = grams(base, blocks)
+        self.mixed, self.squares = products(base, e, blocks)
+
+    def held_out(
+        self, extra: Float[np.ndarray, "row j"], offset: Float[np.ndarray, "row 1"] | None = None
+    ) -> Float[np.ndarray, " r"]:
+        """With further columns, and with an offset that all residuals share."""
+        slices = _slices(self.blocks)
+        cross = np.stack([self.base[b].T @ extra[b] for b in slices])
+        own = grams(extra, self.blocks)
+        gram = np.block([[self.gram, cross], [np.swapaxes(cross, 1, 2), own]])
+        mixed = np.concatenate(
+            [self.mixed, np.stack([extra[b].T @ self.e[b] for b in slices])], axis=1
+        )
+        squares = self.squares
+        if offset is not None:
+            both = np.concatenate([self.base, extra], axis=1)
+            shift, size = products(both, offset, self.blocks)
+            mixed = mixed + shift
+            with_e = np.stack([offset[b].T @ self.e[b] for b in slices])[:, 0]
+            squares = squares + 2 * with_e + size
+        return held_out(gram, mixed, squares)
+
+
 def log_evidence(rows: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Gain in held-out log-likelihood (nats) where a sum of squares falls from before to after."""
     return 0.5 * rows * np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))

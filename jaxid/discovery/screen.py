@@ -113,7 +113,7 @@ def _score(
     out: Screen, search: Search, white: np.ndarray, base: np.ndarray, surrogates: np.ndarray,
     points: list[cand.Point],
 ) -> None:
-    residuals = np.concatenate([white, surrogates], axis=1)
+    beside = ev.Beside(base, np.concatenate([white, surrogates], axis=1), out.blocks)
     null_before = out.held(base, surrogates)
     largest = np.full(surrogates.shape[1], -np.inf)
     best: dict[tuple[str, int], Score] = {}
@@ -121,11 +121,10 @@ def _score(
         extra = _independent(base, out.whitener(p.columns))
         if extra.shape[1] == 0:
             continue
-        offset = out.whitener(p.offset[..., None]) if p.offset.any() else 0.0
-        both = np.concatenate([base, extra], axis=1)
-        after = out.held(both, residuals + offset if p.offset.any() else residuals)
+        offset = out.whitener(p.offset[..., None]) if p.offset.any() else None
+        after = beside.held_out(extra, offset)
         largest = np.maximum(largest, ev.log_evidence(out.rows, null_before, after[1:]))
-        guess = _guess(p, base, out.whitener, white + offset, search)
+        guess = _guess(p, base, out.whitener, white if offset is None else white + offset, search)
         if guess is None:
             continue
         gain = float(ev.log_evidence(out.rows, out.before, after[:1])[0])

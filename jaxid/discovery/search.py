@@ -28,6 +28,8 @@ _MODEST = 0.7
 # there already goes where it closes less than a third of that.
 _RELEVANT = 0.15
 _SUPERFLUOUS = 0.05
+# A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
+_SCATTER = 3.0
 # The gain on the validation log must be at least this part of what the log itself promises.
 _CONFIRMED = 0.1
 
@@ -124,6 +126,8 @@ class Search:
         Args:
             near: Only those are refitted whose screened evidence reaches this part of the best.
         """
+        if self._at_floor():
+            return None, (), 0.0
         self.progress(f"screening {len(self.rest())} effects")
         screened = screen_candidates(self)
         top = max((s.evidence for s in screened.scores), default=0.0)
@@ -260,6 +264,16 @@ class Search:
         after = now.held_out(less, jacobian[..., active])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
         return lost > limit and self._closed(less, e) > _SUPERFLUOUS
+
+    def _at_floor(self) -> bool:
+        """Whether the residual is what the sensors' noise leaves, within the scatter of its RMS."""
+        e, _ = cand.evaluate(self.union, self.samples, self.theta)
+        for x, counts, floor in zip(e.T, self.samples.moving.T, self.floor, strict=True):
+            # The filter leaves about every other kept sample independent.
+            scatter = np.sqrt(1 / max(counts.sum(), 1))
+            if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
+                return False
+        return True
 
     def _closed(self, old: np.ndarray, new: np.ndarray) -> float:
         """Part by which the gap above the noise floor closes, in sum of squares."""

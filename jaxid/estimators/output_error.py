@@ -21,10 +21,11 @@ from jaxid.machine import Machine
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess, full_hessian
-from jaxid.replay import Numerics, Replay, make_replay, needed_steps
+from jaxid.replay import Numerics, Replay, make_replay, needed_steps, with_fitted_start
 
-# An open-loop run that ends further off than this part of the stroke is cut into segments.
-_LOST = 0.2
+# An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
+# deviation is cut into segments.
+_LOST = 0.5
 # So many segments then; each long enough to show friction, short enough not to drift away.
 _SEGMENTS = 40
 
@@ -84,6 +85,7 @@ def output_error(
     machine = machine if start is None else machine.with_estimate(start)
     numerics = numerics or choose_numerics(machine, log)
     replay = make_replay(machine, log, numerics)
+    replay = with_fitted_start(replay, machine.plant, log)
     nuisance = 0 if replay.controller is not None or numerics.segment else 2 * log.position.shape[1]
     problem = _problem(machine, replay, log, nuisance)
     minimum = _fit(*problem)
@@ -142,9 +144,10 @@ def choose_numerics(machine: Machine, log: Log, *, segments: bool = True) -> Num
     )
     if machine.controller is not None or not segments:
         return numerics
-    run = eqx.filter_jit(lambda r, p: r(p).position)(make_replay(machine, log, numerics), machine.plant)
-    off = np.abs(np.asarray(run) - log.position).max()
-    if np.isfinite(off) and off < _LOST * np.ptp(log.position):
+    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
+    run = eqx.filter_jit(lambda r, p: r(p).position)(replay, machine.plant)
+    off = np.sqrt(np.mean((np.asarray(run) - log.position) ** 2))
+    if np.isfinite(off) and off < _LOST * np.std(log.position):
         return numerics
     length = max(20, log.samples // _SEGMENTS)
     return Numerics(numerics.set_valued, numerics.substeps, 0, length)

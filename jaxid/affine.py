@@ -1,0 +1,99 @@
+"""Whether a function is affine in its arguments, read off its trace; and its matrix, if so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Jaxpr, Literal, jaxpr_as_fun
+from jaxtyping import Array
+
+# What becomes of the arguments on their way: not seen, affine, or anything else.
+_CONSTANT, _AFFINE, _OTHER = range(3)
+# Affine in all operands together; in the first alone; in any one of them.
+_SUMS = {
+    "add", "sub", "neg", "add_any", "broadcast_in_dim", "concatenate", "copy", "reduce_sum",
+    "reshape", "slice", "split", "squeeze", "stack", "transpose", "unstack",
+}
+_FIRST = {"div", "dynamic_slice", "gather"}
+_PRODUCTS = {"mul", "dot_general"}
+
+
+class Affine(eqx.Module):
+    """`f(*args)` as offset plus matrices, one for every pair of a leaf that leaves and enters."""
+
+    offset: Any
+    matrices: Any
+
+    def __call__(self, *args: Any) -> Any:
+        """The value at some arguments."""
+        leaves, treedef = jax.tree.flatten(self.offset)
+        entering = jax.tree.leaves(args)
+        out = []
+        for leaf, blocks in zip(leaves, self.matrices, strict=True):
+            for block, z in zip(blocks, entering, strict=True):
+                # Sums of products: a call to a matrix library would defeat the loop flag.
+                leaf = leaf + jnp.sum(block * z, axis=tuple(range(-z.ndim, 0)))
+            out.append(leaf)
+        return jax.tree.unflatten(treedef, out)
+
+
+def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
+    """The function as a matrix where it is affine; None where it is not, or may not be.
+
+    Args:
+        f: Called with `args` and `fixed`; trees of arrays in and out.
+        args: Arguments in which it should be affine; only their shapes count.
+        fixed: Arguments on which it should not depend at all.
+
+    Returns:
+        The map; evaluating it costs as many products as its matrix has entries.
+    """
+    zeros = jax.tree.map(jnp.zeros_like, args)
+    closed, shape = jax.make_jaxpr(f, return_shape=True)(*zeros, *fixed)
+    entering = [_AFFINE] * len(jax.tree.leaves(args))
+    banned = [_OTHER] * len(jax.tree.leaves(fixed))
+    if max(_follow(closed.jaxpr, [*entering, *banned])) == _OTHER:
+        return None
+
+    def flat(*leaves: Array) -> tuple[list, list]:
+        out = jaxpr_as_fun(closed)(*leaves, *jax.tree.leaves(fixed))
+        return out, out
+
+    places = tuple(range(len(entering)))
+    matrices, offset = jax.jacfwd(flat, places, has_aux=True)(*jax.tree.leaves(zeros))
+    return Affine(jax.tree.unflatten(jax.tree.structure(shape), offset), matrices)
+
+
+def _follow(jaxpr: Jaxpr, entering: list[int]) -> list[int]:
+    """What becomes of the arguments in each output of a trace."""
+    seen = dict(zip(jaxpr.invars, entering, strict=True))
+
+    def of(variable: Any) -> int:
+        return _CONSTANT if isinstance(variable, Literal) else seen.get(variable, _CONSTANT)
+
+    for step in jaxpr.eqns:
+        kinds = [of(v) for v in step.invars]
+        inner = step.params.get("jaxpr")
+        if inner is not None and step.primitive.name in ("jit", "pjit"):
+            seen.update(zip(step.outvars, _follow(inner.jaxpr, kinds), strict=True))
+        else:
+            seen.update(dict.fromkeys(step.outvars, _after(step, kinds)))
+    return [of(v) for v in jaxpr.outvars]
+
+
+def _after(step: Any, kinds: list[int]) -> int:
+    """What one operation makes of it."""
+    name, worst = step.primitive.name, max(kinds, default=_CONSTANT)
+    if worst == _CONSTANT:
+        return _CONSTANT
+    keeps = (
+        name in _SUMS
+        or (name in _FIRST and max(kinds[1:]) == _CONSTANT)
+        or (name in _PRODUCTS and kinds.count(_CONSTANT) == 1)
+        or (name == "convert_element_type" and step.params["new_dtype"] == jnp.float64)
+    )
+    return worst if keeps else _OTHER
