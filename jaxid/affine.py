@@ -29,12 +29,12 @@ class Affine(eqx.Module):
     matrices: Any
 
     def __call__(self, *args: Any) -> Any:
-        """The value at some arguments."""
+        """The value at some arguments; the last ones may be left out where they are zero."""
         leaves, treedef = jax.tree.flatten(self.offset)
         entering = jax.tree.leaves(args)
         out = []
         for leaf, blocks in zip(leaves, self.matrices, strict=True):
-            for block, z in zip(blocks, entering, strict=True):
+            for block, z in zip(blocks, entering, strict=False):
                 # Sums of products: a call to a matrix library would defeat the loop flag.
                 leaf = leaf + jnp.sum(block * z, axis=tuple(range(-z.ndim, 0)))
             out.append(leaf)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxid.affine import Affine, affine
 from jaxid.model import Balance, Plant, port_motion
+from jaxid.smooth import sharp_clip
 
 # Coordinates, velocities, and own states in one array.
 Split = tuple[Array, Array, Array]
@@ -252,7 +253,7 @@ def set_valued_step(
     u: Callable[[Array], Array],
     t: Array,
     h: Array,
-    flow: Callable[[State, Array], State] | None = None,
+    flow: Callable[..., State] | None = None,
 ) -> State:
     """One step under set-valued friction: flow without it, then the reaction that stops or drags.
 
@@ -267,12 +268,13 @@ def set_valued_step(
         u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
         t: Time [s].
         h: Step [s].
-        flow: `step` as a function of state and reaction, where there is a cheaper one.
+        flow: `step` as a function of state and reaction (left out: zero), where there is a
+            cheaper one.
     """
-    if flow is None:
-        flow = lambda x, reaction: step(plant, x, u, t, h, reaction)
     none = jnp.zeros_like(plant.ports(x.q))
-    free = flow(x, none)
+    if flow is None:
+        flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
+    free = flow(x)
     _, speed, _ = port_motion(plant, free.q, free.qd, jnp.zeros_like(free.q))
     _, before, _ = port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))
     midway, end = 0.5 * (x.qd + free.qd), u(jnp.asarray(1.0))
@@ -296,19 +298,14 @@ def _box_reaction(mobility: Array, speed: Array, bound: Array) -> Array:
     n = speed.size
     inverse = 1.0 / jnp.diagonal(mobility)
     if n == 1:
-        return _within(-speed * inverse, bound)
+        return sharp_clip(speed * -inverse, bound)
     reaction = jnp.zeros(n)
     for _ in range(20):
         for i in range(n):
             slip = speed[i] + jnp.sum(mobility[i] * reaction)
             wanted = reaction[i] - slip * inverse[i]
-            reaction = reaction.at[i].set(_within(wanted, bound[i]))
+            reaction = reaction.at[i].set(sharp_clip(wanted, bound[i]))
     return reaction
-
-
-def _within(x: Array, bound: Array) -> Array:
-    """Clip to plus or minus bound; selects, because clip's derivative divides the ties."""
-    return jnp.where(x > bound, bound, jnp.where(x < -bound, -bound, x))
 
 
 def _rest_exactly(plant: Plant, x: State, stuck: Array) -> State:

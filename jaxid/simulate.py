@@ -88,7 +88,7 @@ class Drive(eqx.Module):
         def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
             if not self.set_valued:
                 return step(plant, x, line(ends), t, h)
-            bound = None if flow is None else lambda x, reaction: flow(x, ends, reaction)
+            bound = None if flow is None else lambda x, *reaction: flow(x, ends, *reaction)
             return set_valued_step(plant, x, line(ends), t, h, bound)
 
         def several(x: State, ends: tuple[Array, ...], t: Array) -> State:

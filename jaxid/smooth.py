@@ -42,6 +42,14 @@ def clip(
     return x - dead_zone(x, limit, width)
 
 
+def sharp_clip(x: Float[Array, "..."], limit: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Clip of x to plus or minus limit, not smoothed.
+
+    `jnp.clip` halves its derivative at ties, which costs two divisions in every loop.
+    """
+    return jnp.where(x > limit, limit, jnp.where(x < -limit, -limit, x))
+
+
 def dead_zone(
     x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
 ) -> Float[Array, "..."]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxid.smooth import sharp_clip
 
 
 class Tick(eqx.Module):
@@ -36,8 +37,9 @@ class Controller(eqx.Module):
 
     def start(self, position: Array, velocity: Array, reference: Array) -> Any:
         """Memory of a controller that has watched the motion pass at constant velocity."""
-        k = jnp.arange(1, self.velocity_average + 1)[:, None]
-        return position - k * self.period * velocity, self.start_law(reference)
+        ticks = range(1, self.velocity_average + 1)
+        past = tuple(position - k * self.period * velocity for k in ticks)
+        return past, self.start_law(reference)
 
     def start_law(self, reference: Array) -> Any:
         """Memory of the law itself."""
@@ -56,9 +58,8 @@ class Controller(eqx.Module):
         past, inner = memory
         velocity = (tick.position - past[-1]) / (self.velocity_average * self.period)
         u, inner = self.law(tick, velocity, inner, disturbance)
-        past = jnp.concatenate([tick.position[None], past[:-1]])
-        return self.clipped(u + disturbance), (past, inner)
+        return self.clipped(u + disturbance), ((tick.position, *past[:-1]), inner)
 
     def clipped(self, u: Array) -> Array:
         """The command within its limit."""
-        return u if self.limit is None else jnp.clip(u, -self.limit, self.limit)
+        return u if self.limit is None else sharp_clip(u, self.limit)

@@ -96,8 +96,8 @@ def weak_residual(
         One row a window, over t^4 / 12: a weighted mean of the residual force [N or N m].
     """
     u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
-    own = drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period)
-    times = data.period * jnp.arange(raw.shape[0])
+    own = drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
+    times = data.start + data.period * jnp.arange(raw.shape[0])
     fast = jnp.abs(data.qd).max(axis=0)
 
     def split(q: Array, v: Array, u: Array, t: Array, own: tuple) -> tuple[Array, ...]:

@@ -12,8 +12,12 @@ from jaxtyping import Array, Bool, Float
 from jaxid.parameters import Parameters
 
 # A fit has converged where the cost can fall by no more than this part of itself: with 10^4
-# samples that is 10^-5 of a standard deviation.
-_TOLERANCE = 1e-12
+# samples that is a hundredth of a standard deviation in the worst direction.
+_TOLERANCE = 1e-9
+# It has also converged where no step within this damping lowers the cost, although one should by
+# less than a tenth of a standard deviation: sticking makes the last digits of a cost rough.
+_ROUGH = 1e-6
+_STUCK = 1e3
 
 
 class Transform(eqx.Module):
@@ -134,11 +138,15 @@ def levenberg_marquardt(
             (p.x, p.cost, p.gradient, p.normal, p.kept),
         )
         pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-        change, predicted = _step(gradient, normal, damping, moves & ~pressed)
-        small = predicted <= _TOLERANCE * cost
-        stuck = ~better & (damping > 1e12)
-        growth = jnp.where(better, 2.0, 2 * p.growth)
+        change = _step(gradient, normal, damping, moves & ~pressed)
         trial = jnp.clip(x + change, lower, upper)
+        # Of the step that is taken: a bound cuts it short.
+        change = trial - x
+        predicted = -change @ gradient - 0.5 * change @ normal @ change
+        small = predicted <= _TOLERANCE * cost
+        rough = ~better & (damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)
+        stuck = rough | (~better & (damping > 1e12))
+        growth = jnp.where(better, 2.0, 2 * p.growth)
         return _Progress(
             trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.steps + 1,
             small | stuck | ~jnp.isfinite(cost),
@@ -161,14 +169,12 @@ def levenberg_marquardt(
 
 def _step(
     gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"]
-) -> tuple[Array, Array]:
-    """Damped step of the free unknowns, and by how much it should lower the cost."""
+) -> Array:
+    """Damped step of the free unknowns."""
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
     normal = jnp.where(jnp.outer(free, free), normal / jnp.outer(scale, scale), 0.0)
     # A trace of damping keeps directions that the data cannot tell where they are.
     matrix = normal + jnp.diag(jnp.where(free, damping + 1e-13, 1.0))
     gradient = jnp.where(free, gradient / scale, 0.0)
-    change = -jnp.linalg.solve(matrix, gradient)
-    predicted = -change @ gradient - 0.5 * change @ normal @ change
-    return change / scale, predicted
+    return -jnp.linalg.solve(matrix, gradient) / scale
