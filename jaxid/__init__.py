@@ -9,7 +9,7 @@ _platform.configure()
 if TYPE_CHECKING:
     from jaxid.discovery.discover import discover as discover
     from jaxid.effects import EFFECTS as EFFECTS
-    from jaxid.effects import register as register_effect
+    from jaxid.effects import register as register_effect  # noqa: F401
     from jaxid.errors import InputError as InputError
     from jaxid.identify import identify as identify
     from jaxid.io.case import load_case as load_case

@@ -8,7 +8,6 @@ lives in `jaxid.readings`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -52,6 +51,7 @@ def parameter(dimension: str, sign: str, doc: str, *, optional: bool = False) ->
 
 
 def as_array(value: Any) -> Any:
+    """A number or list as a float64 array; anything else as it is."""
     # Anything that is neither number nor list passes: JAX fills trees with markers of its own.
     if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool):
         return jnp.asarray(value, dtype=jnp.float64)

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from jaxid import signals
 from jaxid.io.log import Log
 
-
 # Where the surroundings of reversals are more of a log than this, they are not left out.
 _MOSTLY = 0.5
 

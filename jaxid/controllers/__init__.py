@@ -5,6 +5,6 @@ To add one: write its class and register it here.
 
 from jaxid.controllers.base import Controller as Controller
 from jaxid.controllers.base import Tick as Tick
-from jaxid.controllers.linear import CascadePD, PD, PID
+from jaxid.controllers.linear import PD, PID, CascadePD
 
 CONTROLLERS: dict[str, type[Controller]] = {"cascade_pd": CascadePD, "pd": PD, "pid": PID}

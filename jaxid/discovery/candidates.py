@@ -334,6 +334,7 @@ def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array) -> Arr
 
 
 def position(union: Union, candidate: Candidate) -> int:
+    """Index of a candidate among the effects of the union's plant."""
     path = union.machine.parameters.free[candidate.index[0]].path
     return int(path[1])
 

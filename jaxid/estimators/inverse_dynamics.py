@@ -7,7 +7,6 @@ is solved in one step and what is not (a Stribeck velocity, a lag) by a few more
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 from jaxid.parameters import Parameters
 
 # A fit has converged where the cost can fall by no more than this part of itself: with 10^4
-# samples that is a hundredth of a standard deviation in the worst direction.
-_TOLERANCE = 1e-9
+# samples that is 10^-4 of a standard deviation.
+_TOLERANCE = 1e-12
 # It has also converged where no step within this damping lowers the cost, although one should by
 # less than a tenth of a standard deviation: sticking makes the last digits of a cost rough.
 _ROUGH = 1e-6
@@ -43,7 +43,7 @@ class Transform(eqx.Module):
         return jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x)
 
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """d physical / d solver, for Jacobians."""
+        """D physical / d solver, for Jacobians."""
         return jnp.where(self.log, theta, 1.0)
 
 
@@ -138,12 +138,13 @@ def levenberg_marquardt(
             (p.x, p.cost, p.gradient, p.normal, p.kept),
         )
         pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-        change = _step(gradient, normal, damping, moves & ~pressed)
-        trial = jnp.clip(x + change, lower, upper)
+        aim = x + _step(gradient, normal, damping, moves & ~pressed)
+        trial = jnp.clip(aim, lower, upper)
         # Of the step that is taken: a bound cuts it short.
         change = trial - x
         predicted = -change @ gradient - 0.5 * change @ normal @ change
-        small = predicted <= _TOLERANCE * cost
+        # A step cut short by a bound says little of what is left: its unknown rests from now on.
+        small = (predicted <= _TOLERANCE * cost) & jnp.all(trial == aim)
         rough = ~better & (damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)
         stuck = rough | (~better & (damping > 1e12))
         growth = jnp.where(better, 2.0, 2 * p.growth)
@@ -153,7 +154,7 @@ def levenberg_marquardt(
         )
 
     x0 = jnp.clip(transform.inward(theta), lower, upper)
-    p, size = theta.size, jax.eval_shape(evaluate, x0)[0].size if keep else 0
+    p, size = theta.size, jax.eval_shape(residual, theta).size if keep else 0
     start = _Progress(
         x0, jnp.asarray(0.0), x0, jnp.asarray(jnp.inf), jnp.zeros(p), jnp.zeros((p, p)),
         (jnp.zeros(size), jnp.zeros((size, p))), jnp.asarray(1e-4), jnp.asarray(2.0),
