@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from jaxid.effects import EFFECTS as EFFECTS
     from jaxid.effects import register as register_effect  # noqa: F401
     from jaxid.errors import InputError as InputError
-    from jaxid.identify import identify as identify
+    from jaxid.identification import identify as identify
     from jaxid.io.case import load_case as load_case
     from jaxid.io.log import Log as Log
     from jaxid.io.log import read_log as read_log
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 # bad input) does without.
 _HOMES = {
     "discover": ("jaxid.discovery.discover", "discover"),
-    "identify": ("jaxid.identify", "identify"),
+    "identify": ("jaxid.identification", "identify"),
     "simulate": ("jaxid.virtual", "simulate"),
-    "check": ("jaxid.check", "check"),
+    "check": ("jaxid.checks", "check"),
     "load_case": ("jaxid.io.case", "load_case"),
     "read_log": ("jaxid.io.log", "read_log"),
     "Log": ("jaxid.io.log", "Log"),

@@ -171,7 +171,7 @@ def _run_check(args: argparse.Namespace) -> int:
     _ready(args, "check.json")
     with _progress(args, 2) as tell:
         tell("checking")
-        from jaxid.check import check
+        from jaxid.checks import check
 
         result = check(args.case, args.log)
     print(result)
@@ -186,7 +186,7 @@ def _run_identify(args: argparse.Namespace) -> int:
     _ready(args, "result.json", "report.html")
     with _progress(args, 4) as tell:
         tell("starting")
-        from jaxid.identify import identify
+        from jaxid.identification import identify
 
         result = identify(
             args.case, args.log, method=args.method, validate=args.validate, progress=tell

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
-from jaxid.check import check
+from jaxid.checks import check
 from jaxid.discovery.discover import discover
-from jaxid.identify import identify
+from jaxid.identification import identify
 from jaxid.io.output import ready_folder
 
 _FILES = ("case.toml", "log.csv", "validation.csv")

@@ -16,7 +16,7 @@ from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
 from jaxid.estimators.output_error import output_error
 from jaxid.estimators.result import Estimate
 from jaxid.gap import noise_floor
-from jaxid.identify import Gap, gaps
+from jaxid.identification import Gap, gaps
 from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine

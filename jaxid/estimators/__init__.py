@@ -22,7 +22,7 @@ def _inverse_dynamics(session: Session) -> Estimate:
 
 def _output_error(session: Session) -> Estimate:
     from jaxid.estimators.output_error import output_error
-    from jaxid.identify import force_start
+    from jaxid.identification import force_start
 
     return output_error(session.machine, session.fit.log, start=force_start(session))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxid.discovery.screen import Score
 from jaxid.estimators.result import Estimate
-from jaxid.identify import Gap, Identification
+from jaxid.identification import Gap, Identification
 from jaxid.io.output import ready_folder, write_json, write_whole
 from jaxid.session import Session
 

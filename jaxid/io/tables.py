@@ -11,7 +11,7 @@ from jaxid.report.numbers import with_std
 if TYPE_CHECKING:
     from jaxid.discovery.discover import Discovery
     from jaxid.estimators.result import Estimate
-    from jaxid.identify import Identification
+    from jaxid.identification import Identification
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:

@@ -23,7 +23,7 @@ from jaxid.report.page import render
 if TYPE_CHECKING:
     from jaxid.discovery.discover import Discovery, Round
     from jaxid.estimators.result import Estimate
-    from jaxid.identify import Gap, Identification
+    from jaxid.identification import Gap, Identification
     from jaxid.session import Run, Session
 
 

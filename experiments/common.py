@@ -1,0 +1,53 @@
+"""What the experiments share: the data's folder, a place for results, a table."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from jaxid.io.tables import aligned
+
+
+def arguments(doc: str, default: str) -> argparse.Namespace:
+    """Command line of an experiment."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("-o", metavar="DIR", type=Path, default=Path(default), help=f"default: {default}")
+    return parser.parse_args()
+
+
+def case_with_data(folder: Path, cases: tuple[str, ...], data: str, files: tuple[str, ...]) -> Path:
+    """A folder with case files and links to the measured logs beside them.
+
+    So every number of an experiment can be had by hand with a `jaxid` command in that folder.
+    """
+    root = os.environ.get("JAXID_DATA")
+    if not root or not (Path(root) / data).is_dir():
+        sys.exit(f"set JAXID_DATA to a folder that holds {data}/ with {', '.join(files)}")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in cases:
+        shutil.copyfile(Path(__file__).parent / "cases" / name, folder / name)
+    for name in files:
+        link = folder / name
+        link.unlink(missing_ok=True)
+        link.symlink_to((Path(root) / data / name).resolve())
+    return folder
+
+
+class Table:
+    """A titled table that prints itself."""
+
+    def __init__(self, title: str, head: list[str]) -> None:
+        self.title, self.rows = title, [head]
+
+    def row(self, *cells: object) -> None:
+        """Add a row."""
+        self.rows.append([str(c) for c in cells])
+
+    def show(self, seconds: float) -> None:
+        """Print it, with what it took."""
+        print(f"\n{self.title} ({seconds:.1f} s)\n{aligned(self.rows)}", flush=True)
