@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 from jaxid.errors import InputError
 
@@ -19,9 +21,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 done, whatever the verdict; 2 bad input; 1 anything else, no convergence included.
     """
-    args = _parser().parse_args(argv)
     try:
-        return args.run(args)
+        args = _parser().parse_args(argv)
+        status = args.run(args)
+        sys.stdout.flush()
+        return status
     except InputError as error:
         print(f"jaxid: {error}", file=sys.stderr)
         return 2
@@ -29,6 +33,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("jaxid: interrupted", file=sys.stderr)
         return 1
     except BrokenPipeError:
+        # Whoever read the output has gone; Python would complain once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        print(f"jaxid: {error}", file=sys.stderr)
         return 1
 
 
@@ -37,8 +46,15 @@ def entry() -> None:
     sys.exit(main())
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line too, with exit status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message, mend=f"see {self.prog} --help")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="jaxid",
         description="Identify machines with friction, and find the physics that a simulation "
         "is missing.",
@@ -156,6 +172,8 @@ def _run_effects(args: argparse.Namespace) -> int:
 def _run_simulate(args: argparse.Namespace) -> int:
     from jaxid.io.output import ready_file
 
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}", mend="give zero or more")
     path = ready_file(Path(args.o), force=args.force)
     with _progress(args, 2) as tell:
         tell("simulating")

@@ -179,7 +179,7 @@ def _verdict(
         return "found"
     e, _ = cand.evaluate(search.union, search.samples, steps[0].theta)
     rms = np.sqrt(np.nanmean(np.where(search.samples.moving, e, np.nan) ** 2, axis=0))
-    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor))
+    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.above_numerics(e)
     return "unexplained" if above and where.significant else "nothing_missing"
 
 

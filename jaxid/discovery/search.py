@@ -243,6 +243,8 @@ class Search:
                 return "its fit diverged"
             if free[i].sign == "nonnegative" and theta[i] <= 0.0:
                 return f"{free[i].name} would have to be negative"
+            if np.isfinite(free[i].upper) and theta[i] >= (1 - 1e-3) * free[i].upper:
+                return f"{free[i].name} runs to its limit, where it only imitates"
         old, _ = cand.evaluate(self.union, self.samples, self.theta)
         closed = self._closed(old, e)
         if closed < _RELEVANT:
@@ -280,6 +282,12 @@ class Search:
             if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
                 return False
         return True
+
+    def above_numerics(self, e: np.ndarray) -> bool:
+        """Whether a residual is more than filtering and integrating leave wrong."""
+        counts = self.samples.moving
+        floor = np.sum(counts.sum(axis=0) * np.square(self.floor))
+        return bool(np.sum(e[counts] ** 2) - floor > self.numerics)
 
     def _closed(self, old: np.ndarray, new: np.ndarray) -> float:
         """Part by which the gap above the noise floor closes, in sum of squares."""

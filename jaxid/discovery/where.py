@@ -208,15 +208,17 @@ def _line(
     left: Float[np.ndarray, " row"], whitener: ev.Whitener, data: Prepared, joint: int
 ) -> float | None:
     """Frequency of a line in the whitened residual that the motion does not have; None without [Hz]."""
-    n = len(left)
-    if n < 100:
+    if len(left) < 100:
         return None
+    # Rows that are left out stay as gaps: closed up, a line would shift and smear.
+    series = whitener.placed(left)[:, 0]
+    n = len(series)
     window = np.hanning(n)
-    power = np.abs(np.fft.rfft(left * window)) ** 2
+    power = np.abs(np.fft.rfft(series * window)) ** 2
     power[:5] = 0.0
     k = int(np.argmax(power))
     part = power[max(k - 2, 0) : k + 3].sum() / power.sum()
-    motion = data.at_kept(data.qd)[:, joint][whitener.rows[:, 0]]
+    motion = data.at_kept(data.qd)[:, joint]
     moved = np.abs(np.fft.rfft((motion - motion.mean()) * window)) ** 2
     if part < _LINE_PART or _stands_out(moved, k) or not _stands_out(power, k):
         return None

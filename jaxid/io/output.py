@@ -62,8 +62,9 @@ def check_folder(folder: Path, files: Sequence[str], *, force: bool = False) -> 
         InputError: If it holds one of the files, jaxid did not make it, and `force` is not given;
             or if it is no folder.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=str(folder), mend="choose another -o")
+    there = next((p for p in (folder, *folder.parents) if p.exists()), folder)
+    if there.exists() and not there.is_dir():
+        raise InputError("is a file, not a folder", where=str(there), mend="choose another -o")
     taken = [f for f in files if (folder / f).exists()]
     if taken and not (folder / _MARK).exists() and not force:
         raise InputError(
@@ -91,11 +92,19 @@ def ready_folder(folder: Path, files: Sequence[str], *, force: bool = False) -> 
 
 
 def ready_file(path: Path, *, force: bool = False) -> Path:
-    """See that a file may be written.
+    """See that a log may be written, before the work that makes it.
 
     Raises:
-        InputError: If it exists and `force` is not given, or its folder does not.
+        InputError: If it exists and `force` is not given, or its folder does not; or if it is a
+            folder, or no CSV by its name.
     """
+    if path.is_dir():
+        raise InputError("is a folder", where=str(path), mend="name a file: -o LOG.csv")
+    if path.suffix.lower() != ".csv":
+        raise InputError(
+            f"suffix {path.suffix!r}: the log is written as CSV", where=str(path),
+            mend="end its name in .csv",
+        )
     if path.exists() and not force:
         raise InputError(
             "exists already", where=str(path), mend="choose another -o, or overwrite with --force"

@@ -174,7 +174,11 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "converged": result.converged,
         "where": where_json(result),
         "effects": [effect_json(e, result.after) for e in result.effects],
-        "steps": [step_json(r) for r in result.rounds if r.step.added or r.step.dropped or not r.step.scores],
+        "steps": [
+            step_json(r) for k, r in enumerate(result.rounds)
+            # The baseline, and what changed it; the last round mostly adds nothing.
+            if k == 0 or r.step.added or r.step.dropped
+        ],
         "gap": {
             "unit": units.label("force"),
             "band_hz": result.session.recipe.band_hz(result.session.fit.log.rate_hz),
