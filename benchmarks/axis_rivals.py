@@ -1,6 +1,5 @@
 """The same axis by scipy and by diffrax: what one would otherwise call."""
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -34,10 +33,10 @@ def _rates(t, x, theta, force, period, width):
 
 
 def solve_ivp(theta: tuple, force: np.ndarray, period: float, width: float) -> np.ndarray:
-    """RK45 at 1e-6 under the force that the loop gave, held; the right-hand side by numba."""
+    """RK45 at 1e-6 under the held force that the loop gave; the right-hand side by numba."""
     times = period * np.arange(len(force))
     solution = scipy.integrate.solve_ivp(
-        _rates, (0.0, times[-1]), [0.0, 0.0], "RK45", t_eval=times, rtol=1e-6, atol=1e-9,
+        _rates, (0.0, times[-1]), [0.0, 0.0], "RK45", t_eval=times, rtol=1e-6, atol=1e-6,
         args=(theta, force, period, width),
     )
     return solution.y[0]

@@ -4,7 +4,6 @@ import json
 import sys
 import time
 
-begin = time.perf_counter()
 import axis
 import jax
 import jax.numpy as jnp
@@ -15,8 +14,6 @@ reference, measured = axis.log()
 run = axis.replay(reference, Numerics(set_valued=sys.argv[1] == "ideal"))
 base = axis.plant(axis.TRUTH)
 jax.block_until_ready(jnp.zeros(1) + 1)
-ready = time.perf_counter()
+wall, cpu = time.perf_counter(), time.process_time()
 axis.fit(run, base, axis.START, measured)
-first = time.perf_counter()
-axis.fit(run, base, axis.START, measured)
-print(json.dumps({"fit": first - ready, "again": time.perf_counter() - first}))
+print(json.dumps([time.perf_counter() - wall, time.process_time() - cpu]))

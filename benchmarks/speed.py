@@ -12,17 +12,16 @@ import platform
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 # One BLAS thread: the problems are small, and more would only compete with what is measured.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "2")
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["NUMBA_NUM_THREADS"] = "2"
 
 import axis
 import axis_loops as loops
@@ -36,7 +35,7 @@ HERE = Path(__file__).parent
 WIDTH = 1e-3
 LOOP = (axis.GAIN, 160.18, 243.45, 10.0, axis.PERIOD, WIDTH)
 REST = (0.0, 0.0)
-SETS = 1024
+SETS, GROUP = 1024, 64
 
 
 @dataclass
@@ -61,6 +60,11 @@ class Row:
     best: float
     difference: float
     aim: float | None = None
+
+    @property
+    def met(self) -> bool:
+        """By the fastest runs: other load on the machine must not decide."""
+        return self.aim is None or self.best <= self.aim
 
 
 def timed(function: Callable) -> float:
@@ -147,21 +151,19 @@ class Sides:
         return costs
 
     def two_threads(self, name: str) -> Callable:
-        """Each of two threads with a vmapped half: the lanes of one vmap run on one core."""
-        function = self.compiled(axis.costs, name)
-        halves = [jnp.asarray(part) for part in np.split(self.sets, 2)]
-        out: list = [None, None]
+        """Vmapped groups, shared out between two threads: one vmap's lanes run on one core.
 
-        def half(k: int) -> None:
-            out[k] = np.asarray(function(halves[k], self.seen))
+        Larger groups leave the first-level cache, smaller ones leave lanes of the core idle.
+        """
+        function = self.compiled(axis.costs, name)
+        groups = [jnp.asarray(part) for part in np.split(self.sets, SETS // GROUP)]
+
+        def one(group: np.ndarray) -> np.ndarray:
+            return np.asarray(function(group, self.seen))
 
         def run() -> np.ndarray:
-            threads = [threading.Thread(target=half, args=(k,)) for k in range(2)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-            return np.concatenate(out)
+            with ThreadPoolExecutor(2) as pool:
+                return np.concatenate(list(pool.map(one, groups)))
 
         return run
 
@@ -187,7 +189,8 @@ def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
     prange, lm = "numba RK4, prange, 2 threads", "scipy lm, numba, differences"
     return [
         compare("forward, smoothed, RK4", smooth, loop, rk4, 1.3, n, 1e-10),
-        # The two friction laws differ where the axis starts and stops, by some 1e-5 of the stroke.
+        # Wide tolerances are of models that differ: here where the axis starts and stops, with
+        # diffrax and solve_ivp in the held force, of which the last stage sees the next sample.
         compare("forward, ideal step", exact, "numba RK4 loop", rk4, 0.40, n, 1e-3),
         compare("forward, ideal step", exact, "numba ideal loop", ideal, None, n, 1e-10),
         compare("Jacobian, 4 parameters", of_jacobian, by_hand, sides.loop_normal, None, n, 1e-9),
@@ -200,16 +203,16 @@ def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
                 None, n, 1e-3),
         compare("fit, warm, ideal", sides.fit("ideal"), lm, sides.scipy_fit("smooth"), None, n,
                 0.1),
-        compare("1024 sets, vmap", lambda: vmapped(sets, sides.seen), prange, sides.loop_sets,
+        compare("1024 sets, one vmap", lambda: vmapped(sets, sides.seen), prange, sides.loop_sets,
                 None, few, 1e-6),
         compare("1024 sets, 2 threads", sides.two_threads("smooth"), prange, sides.loop_sets,
                 0.35, few, 1e-6),
         compare("1024 sets, 2 threads, ideal", sides.two_threads("ideal"), prange,
                 sides.loop_sets, None, few, 1.0),
         compare("forward, smoothed, RK4", smooth, "diffrax Tsit5, constant step", tsit5, None,
-                few, 1e-3),
+                few, 1e-2),
         compare("forward, smoothed, RK4", smooth, "scipy solve_ivp RK45 1e-6", ivp, 1 / 300,
-                few, 1e-3),
+                few, 1e-2),
     ]  # fmt: skip
 
 
@@ -237,8 +240,8 @@ def in_process(*words: str, **environment: str) -> tuple[float, str]:
     return time.perf_counter() - begin, done.stdout
 
 
-def cold_fits(repeats: int) -> dict[str, float]:
-    """First fit of a fresh process, without and with compiled code on disk [s]."""
+def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
+    """First fit of a fresh process, without and with compiled code on disk [s, CPU s]."""
     script, out = str(HERE / "cold_fit.py"), {}
     for name in ("smooth", "ideal"):
         with tempfile.TemporaryDirectory() as folder:
@@ -246,13 +249,14 @@ def cold_fits(repeats: int) -> dict[str, float]:
                 "JAX_COMPILATION_CACHE_DIR": folder,
                 "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
             }
-            fits = {"no cache": [], "cache": []}
+            fits: dict[str, list] = {"no cache": [], "cache": []}
             in_process(script, name, **cache)
             for _ in range(repeats):
                 for label, environment in (("no cache", {}), ("cache", cache)):
                     words = in_process(script, name, **environment)[1]
-                    fits[label].append(json.loads(words.splitlines()[-1])["fit"])
-        out |= {f"first fit, {name}, {k}": float(np.median(v)) for k, v in fits.items()}
+                    fits[label].append(json.loads(words.splitlines()[-1]))
+        for label, seconds in fits.items():
+            out[f"first fit, {name}, {label}"] = tuple(np.median(seconds, axis=0).tolist())
     return out
 
 
@@ -268,13 +272,6 @@ def start_times(repeats: int) -> dict[str, float]:
     }
     nothing = seconds.pop("nothing")
     return {name: s - nothing for name, s in seconds.items()}
-
-
-def scipy_cold(sides: Sides) -> float:
-    """The rival's fit where numba's code is compiled already [s]: its cold is another matter."""
-    fit = sides.scipy_fit("smooth")
-    fit()
-    return min(timed(fit) for _ in range(5))
 
 
 def versions() -> dict[str, str]:
@@ -301,10 +298,7 @@ def table(rows: list[Row]) -> list[str]:
     return out
 
 
-Row.met = property(lambda row: row.aim is None or row.best <= row.aim)
-
-
-def report(rows: list[Row], compiled: dict, starts: dict[str, float]) -> str:
+def report(rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float]) -> str:
     shown = ", ".join(f"{k} {v}" for k, v in versions().items())
     flag = all(c["loop_flag"] for c in compiled.values())
     lines = [
@@ -313,16 +307,16 @@ def report(rows: list[Row], compiled: dict, starts: dict[str, float]) -> str:
         "", f"{os.cpu_count()} CPU cores, {shown}.", "",
         *table(rows), "",
         f"Loop flag in all compiled loops: {'yes' if flag else '**no**'}.", "",
-        "| seconds | |", "|---|---|",
-        *[f"| {name} | {s:.2f} |" for name, s in starts.items()],
+        "| once a process | s | CPU s |", "|---|---|---|",
+        *[f"| {name} | {s:.2f} | |" for name, s in starts.items()],
+        *[f"| {name} | {wall:.2f} | {cpu:.2f} |" for name, (wall, cpu) in fits.items()],
         *[
-            f"| {name}: trace + compile | {c['trace_s']:.2f} + {c['compile_s']:.2f} |"
+            f"| {name}: trace + compile | | {c['trace_s']:.2f} + {c['compile_s']:.2f} |"
             for name, c in compiled.items()
         ],
         "",
     ]
-    notes = HERE / "results" / "speed_notes.md"
-    return "\n".join(lines) + ("\n" + notes.read_text() if notes.exists() else "")
+    return "\n".join(lines) + "\n" + (HERE / "speed_notes.md").read_text()
 
 
 def main() -> int:
@@ -335,9 +329,8 @@ def main() -> int:
     print(HEAD)
     rows = comparisons(sides, n, few)
     compiled = compile_times(sides)
-    starts = {**cold_fits(cold), "fit by scipy lm and numba, compiled": scipy_cold(sides)}
-    starts |= start_times(cold)
-    text = report(rows, compiled, starts)
+    fits, starts = cold_fits(cold), start_times(cold)
+    text = report(rows, compiled, fits, starts)
     print("\n" + text)
     if not options.no_write:
         folder = HERE / "results"
@@ -345,7 +338,7 @@ def main() -> int:
         (folder / "speed.md").write_text(text)
         data = {
             "cpu_count": os.cpu_count(), "versions": versions(),
-            "rows": [asdict(r) for r in rows], "compile": compiled, "starts": starts,
+            "rows": [asdict(r) for r in rows], "compile": compiled, "first_fits": fits, "starts": starts,
         }
         (folder / "speed.json").write_text(json.dumps(data, indent=1) + "\n")
     return 0

@@ -64,3 +64,23 @@ def place(folder: Path, log: Mapping[str, np.ndarray], case: str | None = None) 
     """Case and log in a folder, as the commands take them."""
     folder.mkdir(exist_ok=True)
     return [write_case(folder, case or text()), write_csv(folder / "log.csv", dict(log))]
+
+
+def held(folder):
+    """Every file below a folder with its content."""
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def refused(capsys, folder, *argv, told):
+    """Exit status 2, one line on stderr, nothing on stdout, nothing written."""
+    before, entries = held(folder), sorted(folder.rglob("*"))
+    ran = run(capsys, *argv)
+    assert ran.status == 2, ran.err
+    assert ran.out == ""
+    assert ran.err.startswith("jaxid: ")
+    assert ran.err.endswith("\n")
+    assert ran.err.count("\n") == 1
+    assert told in ran.err
+    assert sorted(folder.rglob("*")) == entries
+    assert held(folder) == before
+    return ran.err

@@ -1,15 +1,14 @@
-"""The command line: what it takes, what it refuses, what it writes over, how it ends."""
+"""The command line: what there is, what it writes over, how it ends."""
 
 import functools
 import io
 import os
-import shlex
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from cli_setup import TRUTH, place, recorded, run, text
+from cli_setup import TRUTH, held, place, recorded, refused, run, text
 
 from jaxid import cli
 from jaxid.effects import EFFECTS
@@ -37,26 +36,6 @@ def sound():
 @pytest.fixture
 def files(tmp_path, sound):
     return place(tmp_path / "in", sound)
-
-
-def held(folder):
-    """Every file below a folder with its content."""
-    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-def refused(capsys, folder, *argv, told):
-    """Exit status 2, one line on stderr, nothing on stdout, nothing written."""
-    before, entries = held(folder), sorted(folder.rglob("*"))
-    ran = run(capsys, *argv)
-    assert ran.status == 2, ran.err
-    assert ran.out == ""
-    assert ran.err.startswith("jaxid: ")
-    assert ran.err.endswith("\n")
-    assert ran.err.count("\n") == 1
-    assert told in ran.err
-    assert sorted(folder.rglob("*")) == entries
-    assert held(folder) == before
-    return ran.err
 
 
 # What there is
@@ -89,124 +68,6 @@ def test_plants_and_effects_with_parameters_and_units(capsys):
 
 def test_methods_are_those_there_are():
     assert set(cli.METHODS) == set(METHODS)
-
-
-# Faults of the command itself
-
-
-@pytest.mark.parametrize(
-    ("line", "told"),
-    [
-        ("", "the following arguments are required: COMMAND; see jaxid --help"),
-        ("identfy a b", "invalid choice: 'identfy'"),
-        ("identify", "required: CASE.toml, LOG; see jaxid identify --help"),
-        ("check a b --colour", "unrecognized arguments: --colour"),
-        ("discover a b --max-effects two", "invalid int value: 'two'"),
-        ("discover a b --max-effects -1", "--max-effects is -1; give zero or more"),
-        ("simulate a -o b.csv --seed -1", "--seed is -1; give zero or more"),
-        ("simulate a -o b.npz", "the log is written as CSV; end its name in .csv"),
-        ("simulate a -o nowhere/b.csv", "has no such folder; make the folder first"),
-        ("simulate a -o folder.csv", "folder.csv: is a folder"),
-        ("identify a b --method output", "choose one of output_error, inverse_dynamics, algebraic"),
-        ("check a b -o file", "file: is a file, not a folder; choose another -o"),
-        ("check a b -o file/deeper/still", "file: is a file, not a folder; choose another -o"),
-    ],
-)
-def test_a_wrong_command_is_told_in_one_line(tmp_path, capsys, monkeypatch, line, told):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("mine")
-    (tmp_path / "folder.csv").mkdir()
-    refused(capsys, tmp_path, *shlex.split(line), told=told)
-
-
-# Faults of the case
-
-
-@pytest.mark.parametrize("command", ["check", "identify", "discover"])
-def test_missing_case(tmp_path, files, capsys, command):
-    case, log = files
-    case.unlink()
-    refused(capsys, tmp_path, command, case, log, "-o", tmp_path / "out", told="case.toml: ")
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "told"),
-    [
-        ("inertia =", "inertai =", "did you mean 'inertia'?"),
-        ("viscous_friction", "viscous_fricton", "did you mean 'viscous_friction'?"),
-        ("[sensor]", "[sensors]", "did you mean 'sensor'?"),
-        ('force = "u"', 'force = "volts"', "volts"),
-        ('force = "u"', "", "'force' is missing"),
-        ("[plant]", "[plant", "case.toml"),
-        ("{ guess = ", "{ min = 1000.0, guess = ", "case.toml"),
-    ],
-)
-def test_faults_of_the_case(tmp_path, sound, capsys, old, new, told):
-    case, log = place(tmp_path / "in", sound, text().replace(old, new, 1))
-    refused(capsys, tmp_path, "identify", case, log, "-o", tmp_path / "out", told=told)
-
-
-def test_a_case_without_unknowns_has_nothing_to_identify(tmp_path, sound, capsys):
-    known = "\n".join(
-        line.replace("{ guess = ", "").replace(" }", "") for line in text().splitlines()
-    )
-    case, log = place(tmp_path / "in", sound, known)
-    refused(capsys, tmp_path, "identify", case, log, told="nothing is unknown")
-
-
-def test_simulate_needs_to_know_what(tmp_path, files, capsys):
-    argv = ("simulate", files[0], "-o", tmp_path / "new.csv")
-    refused(capsys, tmp_path, *argv, told="[simulation] has no duration; add")
-
-
-# Faults of the log
-
-
-def _spoilt(log, name, rows, value):
-    column = log[name].copy()
-    column[rows] = value
-    return log | {name: column}
-
-
-def _without(log, rows):
-    return {name: np.delete(column, rows) for name, column in log.items()}
-
-
-def _mostly_at_rest(log):
-    """Long at rest, then a move of a few samples."""
-    rest = {k: np.full(2000, v[0]) + (k == "u") * 1e-3 * np.arange(2000) % 0.7
-            for k, v in log.items()}
-    both = {k: np.concatenate([rest[k], v[:60]]) for k, v in log.items()}
-    return both | {"t": np.arange(len(both["t"])) / 500.0}
-
-
-FAULTS = {
-    "missing column": (lambda g: {k: v for k, v in g.items() if k != "u"}, "'u'"),
-    "NaN": (lambda g: _spoilt(g, "q", 700, np.nan), "the first is row 700 (NaN)"),
-    "time backwards": (lambda g: _spoilt(g, "t", 700, 0.1), "row 700"),
-    "gap": (lambda g: _without(g, slice(700, 900)), "rows = [700, 1800]"),
-    "too short": (lambda g: _without(g, slice(40, None)), "is too short: 40 samples"),
-    "too short to filter": (lambda g: _without(g, slice(55, None)), "too short: 55 samples leave"),
-    "nothing moves": (lambda g: _spoilt(g, "q", slice(None), 0.2), "nothing moves"),
-    "saturated": (lambda g: g | {"u": 10.0 * np.sign(g["u"])}, "the command is saturated"),
-    "millimetres": (lambda g: g | {"q": 1e3 * g["q"], "ref": 1e3 * g["ref"]}, "position looks like millimetres"),
-    "not enough motion": (_mostly_at_rest, "samples move faster than the rest velocity"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_faults_of_the_log(tmp_path, sound, capsys, fault):
-    spoil, told = FAULTS[fault]
-    case, log = place(tmp_path / "in", spoil(sound))
-    refused(capsys, tmp_path, "check", case, log, "-o", tmp_path / "out", told=told)
-
-
-def test_missing_log_and_missing_validation_log(tmp_path, files, capsys):
-    case, log = files
-    out, no_log = ("-o", tmp_path / "out"), log.with_name("lag.csv")
-    refused(capsys, tmp_path, "check", case, no_log, *out, told="lag.csv: no such file")
-    argv = ("identify", case, log, "--validate", no_log, *out)
-    refused(capsys, tmp_path, *argv, told="lag.csv: no such file")
 
 
 # What is written over

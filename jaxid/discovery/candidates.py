@@ -255,7 +255,7 @@ def refine(
             e, jacobian = evaluate(union, data, at)
             slope = np.asarray(transform.slope(jnp.asarray(at[moving])))
             rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))
-            latest[key] = (np.nan_to_num(e * weight[..., 0], nan=1e150).ravel(), np.nan_to_num(rows))
+            latest[key] = (_finite(e * weight[..., 0]).ravel(), _finite(rows))
         return latest[key]
 
     start = np.clip(np.asarray(transform.inward(jnp.asarray(theta[moving]))), lower, upper)
@@ -266,6 +266,11 @@ def refine(
     out = theta.copy()
     out[moving] = np.asarray(transform.outward(jnp.asarray(fit.x)))
     return out, bool(fit.status > 0)
+
+
+def _finite(x: np.ndarray) -> np.ndarray:
+    """What diverged, as a number so large that a solver turns back, yet not too large to square."""
+    return np.nan_to_num(x, nan=1e60, posinf=1e60, neginf=-1e60)
 
 
 def points(

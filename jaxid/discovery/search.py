@@ -9,20 +9,10 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
+from jaxid.discovery.choice import MODEST, TIE_NATS, few, margin, modest, simplest
 from jaxid.discovery.screen import Score, Screen, screen_candidates
 from jaxid.preprocess import Prepared
 
-# So many of the best candidates are refitted; a linear screen at a start is not the last word.
-_REFITTED = 5
-# Two candidates whose evidence differs by less explain the log equally well: a factor of 20 in
-# likelihood, or one percent of a large evidence, which is what filtering and sampling leave
-# uncertain.
-_TIE_NATS = 3.0
-_TIE_PART = 0.01
-# While much is missing, the effect with fewer parameters goes first where it gains this part of
-# the best: a flexible one gains by imitating what is not there yet. What is still missing then
-# shows in the next round, and what has become superfluous is dropped.
-_MODEST = 0.7
 # An effect must close this part of what stands above the noise floor (in sum of squares, so half
 # of it in RMS), whatever its evidence: on measured data everything helps a little. One that is
 # there already goes where it closes less than a third of that.
@@ -140,13 +130,13 @@ class Search:
         least = max(0.5 * screened.threshold, near * top)
         promising = [s for s in screened.scores if s.evidence > least]
         refitted = []
-        for score in _few(promising):
+        for score in few(promising):
             self.progress(f"refitting with {score.candidate.kind}")
             refitted.append(self._refit(score, screened))
         refitted.sort(key=lambda s: -s.total)
         rest = [s for s in screened.scores if all(s.candidate is not r.candidate for r in refitted)]
         good = [s for s in refitted if not s.reason and s.evidence > screened.threshold]
-        return _modest(good), (*refitted, *rest), screened.threshold
+        return modest(good), (*refitted, *rest), screened.threshold
 
     def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:
         """For each effect added, those that could stand in its place without loss.
@@ -161,20 +151,20 @@ class Search:
             kept, theta = list(self.added), self.theta
             self.added = [c for c in kept if c is not own]
             self.theta = self._fit(self._without(theta, own), self.active)
-            _, scores, limit = self.best(near=_MODEST)
+            _, scores, limit = self.best(near=MODEST)
             good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
             self.added, self.theta = kept, theta
             mine = next((s for s in scores if s.candidate is own), None)
             if not good or mine is None:
                 found[k] = ()
                 continue
-            best, ties = _simplest(good)
+            best, ties = simplest(good)
             if best.candidate is not own and self._takes_over(best, mine, own):
                 self.added = [best.candidate if c is own else c for c in kept]
                 self.theta = self._fit(best.theta, self.active)
                 steps.append(Step(best, own, scores, limit, self.theta, self.active))
             elif best.candidate is not own:
-                ties = (best, *ties) if mine.total > best.total - _margin(best) else ()
+                ties = (best, *ties) if mine.total > best.total - margin(best) else ()
             found[k] = tuple(s for s in ties if s.candidate is not self.added[k])
         return found
 
@@ -184,7 +174,7 @@ class Search:
         One with more parameters has had its chance beside what is there, in the rounds before.
         """
         more = len(best.candidate.index) - len(own.index)
-        if more > 0 or mine.total > best.total - _margin(best):
+        if more > 0 or mine.total > best.total - margin(best):
             return more < 0
         now, _ = cand.evaluate(self.union, self.samples, self.theta)
         then, _ = cand.evaluate(self.union, self.samples, best.theta)
@@ -249,7 +239,7 @@ class Search:
         closed = self._closed(old, e)
         if closed < _RELEVANT:
             return f"it closes only {100 * max(closed, 0) / 2:.1f} % of the gap"
-        if validation is not None and (validation < _TIE_NATS or confirmed < _CONFIRMED * closed):
+        if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
             return "it does not help on the validation log"
         return ""
 
@@ -299,29 +289,3 @@ class Search:
         # The floor is itself an estimate, and a search always finds something to close: at least
         # half of the residual counts as gap.
         return float((before - after) / max(before - floor, 0.5 * before))
-
-
-def _few(promising: list[Score]) -> list[Score]:
-    """The best candidates, and the best of those with a single parameter."""
-    few = promising[:_REFITTED]
-    single = [s for s in promising[_REFITTED:] if len(s.candidate.index) == 1]
-    return [*few, *single[:1]]
-
-
-def _margin(score: Score) -> float:
-    return max(_TIE_NATS, _TIE_PART * abs(score.total))
-
-
-def _modest(good: list[Score]) -> Score | None:
-    """The effect to add next: of those that gain most of what the best gains, the simplest."""
-    if not good:
-        return None
-    enough = [s for s in good if s.total > min(_MODEST * good[0].total, good[0].total - _TIE_NATS)]
-    return min(enough, key=lambda s: (len(s.candidate.index), -s.total))
-
-
-def _simplest(good: list[Score]) -> tuple[Score, tuple[Score, ...]]:
-    """Of those that explain the log equally well, the simplest; and the others."""
-    equal = [s for s in good if s.total >= good[0].total - _margin(good[0])]
-    best = min(equal, key=lambda s: (len(s.candidate.index), -s.total))
-    return best, tuple(s for s in equal if s is not best)

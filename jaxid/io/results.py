@@ -204,8 +204,20 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "fit_gap": gap_json(result.session, after, result.noise_floor),
         "method": result.after.method,
         "preprocess": recipe_json(result.session),
-        "notes": notes(result.session, result.after),
+        "notes": [*notes(result.session, result.after), *turned_down(result)],
     }
+
+
+def turned_down(result: Discovery, most: int = 3) -> list[str]:
+    """Why the best of what the last round did not add was not added."""
+    if not result.rounds:
+        return []
+    lines = []
+    for score in result.rounds[-1].step.scores:
+        if score.reason and score.evidence > result.rounds[-1].step.threshold:
+            kind, nats = score.candidate.kind, score.evidence
+            lines.append(f"{kind} was not added, at {nats:.0f} nats: {score.reason}")
+    return lines[:most]
 
 
 def step_json(r: Any) -> dict[str, Any]:

@@ -1,0 +1,228 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # A first tour of jaxid
+#
+# A machine was logged. We have a model of it, and the model is missing something. In this tour
+# jaxid fits the model to the log, measures what the model leaves unexplained, finds out where
+# that lies, names the effect that is missing, and fits again with the effect in place.
+#
+# The log ships with jaxid: a slide of about 95 kg in a position loop. It was made by a program
+# that shares no code with jaxid, with something in it that the model does not have.
+#
+# With `JAXID_FAST=1` in the environment the search takes a shorter way.
+
+# %%
+# %matplotlib inline
+import os
+import shutil
+import tempfile
+from importlib import resources
+from pathlib import Path
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import jaxid
+from jaxid.replay import make_replay
+from jaxid.report import plots
+from jaxid.report.build import units_of, views
+
+FAST = os.environ.get("JAXID_FAST") == "1"
+
+# %% [markdown]
+# ## The case and its log
+#
+# A case file says what machine a log came from, what is known of it, and what is not. An
+# unknown has a guess: `{ guess = 60.0 }`. This one declares inertia, viscous and Coulomb
+# friction.
+
+# %%
+folder = Path(tempfile.mkdtemp())
+with resources.as_file(resources.files("jaxid.demo")) as shipped:
+    for name in ("case.toml", "log.csv", "validation.csv"):
+        shutil.copyfile(shipped / name, folder / name)
+case_file, log_file = folder / "case.toml", folder / "log.csv"
+print(case_file.read_text())
+
+# %% [markdown]
+# The log has one row a sample: time, position, the logged command, and the reference that the
+# loop was to follow. The command in V times the actuator's gain in N/V is the force at the load.
+
+# %%
+case = jaxid.load_case(case_file)
+log = jaxid.read_log(log_file, case.columns)
+
+figure, (top, below) = plt.subplots(2, 1, sharex=True, figsize=(10, 4.5), layout="constrained")
+top.plot(log.time, log.reference, color="0.7", lw=3, label="reference")
+top.plot(log.time, log.position, lw=1, label="position")
+top.set_ylabel("position [m]")
+top.legend()
+below.plot(log.time, case.gain * log.force, lw=0.6)
+below.set_ylabel("force [N]")
+below.set_xlabel("time [s]")
+plt.show()
+
+# %% [markdown]
+# ## Before any fit
+#
+# `check` looks whether the log is sound, and how well each unknown could be told if noise alone
+# stood between model and log.
+
+# %%
+print(jaxid.check(case_file, log_file))
+
+# %% [markdown]
+# ## Fit the declared model
+#
+# `identify` simulates the loop and fits the unknowns until the simulated position meets the
+# measured one. It works on the log and judges on a second one, which the case names.
+
+# %%
+declared = jaxid.identify(case_file, log_file)
+print(declared)
+
+# %% [markdown]
+# The fit converged, and still the force gap stands far above the noise floor: what the sensors'
+# noise alone would leave. Something is there that the model does not have. Where? We draw the
+# residual, force measured minus force of the model, against velocity and against position.
+
+# %%
+fitted = views(declared)[0]
+units = units_of(declared.session)
+plots.plot_residual_against(fitted, units, variables=("velocity", "position"), size=(11, 3.4))
+
+# %% [markdown]
+# Over velocity it is a cloud. Over position it is a wave: a force that repeats every 20 mm or so.
+# We have seen it; now let jaxid find it without being told.
+#
+# ## Find what is missing
+#
+# `discover` fits each effect that it knows to one part of the log and scores it on another,
+# then asks the second log to confirm. It adds the best, and goes on until nothing is worth it.
+
+# %%
+quicker = {"refit": False, "max_effects": 1} if FAST else {}
+found = jaxid.discover(case_file, log_file, **quicker)
+print(found)
+
+# %% [markdown]
+# The verdict names the effect. Its evidence is the gain in log-likelihood on data held out, and
+# this is how it stood against all others:
+
+# %%
+step = next(step for step in found.rounds if step.step.added)
+scores = sorted(step.step.scores, key=lambda score: -score.evidence)
+for score in scores[:6]:
+    print(f"{score.candidate.kind:22s} {score.evidence:9.1f} nats")
+
+# %% [markdown]
+# The same residual, before and after, on one scale:
+
+# %%
+searched = views(found)[0]
+plots.plot_residual_against(searched, units, variables=("velocity", "position"), size=(11, 5.6))
+
+# %% [markdown]
+# ## Make it part of the model
+#
+# What was found goes into the case file, as any other effect would. The values found make good
+# guesses.
+
+# %%
+lines = []
+for effect in found.effects:
+    lines += ["", "[[effects]]", f'kind = "{effect.kind}"']
+    for name in effect.names:
+        guess = found.after.value(name)
+        lines.append(f"{name.rpartition('.')[2]} = {{ guess = {guess:.5g} }}")
+print("\n".join(lines))
+
+extended_file = folder / "extended.toml"
+extended_file.write_text(case_file.read_text() + "\n".join(lines) + "\n")
+extended = jaxid.identify(extended_file, log_file, method="inverse_dynamics")
+print(extended)
+
+# %% [markdown]
+# Now compare: the force that each model leaves unexplained (RMS), on the log that was fitted and
+# on the one that was not.
+
+# %%
+print(f"{'log':12s} {'declared':>10s} {'extended':>10s} {'noise floor':>12s}")
+for before, after in zip(declared.gaps, extended.gaps, strict=True):
+    row = [before.force.rms[0], after.force.rms[0], extended.noise_floor[0]]
+    print(f"{before.name:12s} {row[0]:8.3f} N {row[1]:8.3f} N {row[2]:10.3f} N")
+
+# %% [markdown]
+# What is left is close to noise, and the inertia and friction have moved to their true values
+# (95.1 kg, 203.5 N s/m, 20.39 N): they no longer have to imitate what was not there.
+#
+# ## Everything is differentiable
+#
+# A fitted machine is a function that JAX can differentiate: from parameters to the position over
+# the whole log, controller, dry friction and all. `make_replay` holds the log's reference; call it
+# with a plant and get the motion.
+
+# %%
+machine = extended.estimate.machine
+replay = make_replay(machine, extended.session.fit.log)
+
+
+@jax.jit
+def position(theta):
+    """Simulated position [m] at every sample, (time,)."""
+    return replay(machine.parameters.insert(machine.plant, theta)).position[:, 0]
+
+
+theta = machine.parameters.guess
+slope = np.asarray(jax.jacfwd(position)(theta))  # (time, parameter)
+print(slope.shape, machine.parameters.names)
+
+# %% [markdown]
+# Against a finite difference in the inertia, on the stiff loop with its sticking friction:
+
+# %%
+inertia = machine.parameters.names.index("inertia")
+step = np.zeros(theta.size)
+step[inertia] = 1e-4 * float(theta[inertia])
+difference = np.asarray(position(theta + step) - position(theta - step)) / (2 * step[inertia])
+off = np.linalg.norm(slope[:, inertia] - difference) / np.linalg.norm(difference)
+print(f"jacfwd and finite difference are {off:.1e} apart, relative to their size")
+
+# %% [markdown]
+# How far the simulated position moves if a parameter grows by one percent: what a fit in position
+# sees of it, and when.
+
+# %%
+figure, axes = plt.subplots(figsize=(10, 3.6), layout="constrained")
+moved = 1e6 * 0.01 * slope * np.asarray(theta)
+for k, name in enumerate(machine.parameters.names):
+    axes.plot(extended.session.fit.log.time, moved[:, k], lw=1, label=name)
+axes.set_xlabel("time [s]")
+axes.set_ylabel("change of position [µm] per 1 %")
+axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+plt.show()
+
+# %% [markdown]
+# ## From here
+#
+# The same steps on the command line, with a report that stands alone:
+#
+# ```
+# jaxid check    case.toml log.csv
+# jaxid identify case.toml log.csv -o results
+# jaxid discover case.toml log.csv -o results
+# ```
+#
+# For a machine of your own: write its case file, name the columns of its log, and run `check`.

@@ -1,0 +1,81 @@
+"""What jaxid must show on measured logs; needs JAXID_DATA (see README)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+import jaxid
+
+CASES = Path(__file__).parents[1] / "experiments" / "cases"
+DATA = os.environ.get("JAXID_DATA")
+needs_data = pytest.mark.skipif(not DATA, reason="JAXID_DATA is not set: no measured logs")
+
+
+def folder_of(tmp_path_factory, data, files):
+    folder = tmp_path_factory.mktemp(data)
+    for case in CASES.glob(f"{data}*.toml"):
+        shutil.copy(case, folder)
+    for name in files:
+        (folder / name).symlink_to(Path(DATA) / data / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def emps(tmp_path_factory):
+    return folder_of(tmp_path_factory, "emps", ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"))
+
+
+@pytest.fixture(scope="module")
+def silverbox(tmp_path_factory):
+    return folder_of(tmp_path_factory, "silverbox", ("SNLS80mV.mat",))
+
+
+@needs_data
+def test_published_recipe_gives_the_published_parameters(emps):
+    result = jaxid.identify(emps / "emps_recipe.toml", emps / "DATA_EMPS.mat", method="inverse_dynamics")
+    # Janot, Gautier & Brunot (2019); their offset stands on the side of friction.
+    published = {
+        "inertia": (95.109, 0.005), "viscous_friction.coefficient": (203.50, 0.015),
+        "coulomb_friction.level": (20.39, 0.015), "constant_force.level": (3.165, 0.03),
+    }
+    for name, (value, part) in published.items():
+        assert result.value(name) == pytest.approx(value, rel=part), name
+    fit, pulses = result.gaps
+    assert fit.force.relative[0] <= 0.042
+    assert pulses.force.relative[0] <= 0.061
+
+
+@needs_data
+def test_friction_that_differs_by_direction_is_found_on_emps(emps):
+    found = jaxid.discover(emps / "emps_bare.toml", emps / "DATA_EMPS.mat")
+    assert found.verdict == "found"
+    added = [r.step.added.candidate.kind for r in found.rounds if r.step.added]
+    assert added[0] == "coulomb_friction"
+    assert "asymmetric_viscous" in found.kinds
+    assert "cogging" not in found.kinds
+    fit, pulses = found.gaps_after
+    assert pulses.force.relative[0] <= 0.054
+    # in the loop, reference in, position and command out
+    assert fit.simulation.relative[0] <= 1.2e-5
+    assert pulses.simulation.relative[0] <= 1.5e-5
+    assert fit.simulation.command_relative[0] <= 0.048
+    assert pulses.simulation.command_relative[0] <= 0.053
+
+
+@needs_data
+@pytest.mark.slow
+def test_cubic_spring_and_offset_are_found_in_silverbox(silverbox):
+    found = jaxid.discover(silverbox / "silverbox.toml", silverbox / "SNLS80mV.mat")
+    assert found.verdict == "found"
+    assert {"cubic_stiffness", "constant_force"} <= set(found.kinds)
+    assert set(found.kinds) <= {"cubic_stiffness", "constant_force", "quadratic_stiffness"}
+    before = {g.name: 1e3 * g.simulation.rms[0] for g in found.gaps_before}
+    after = {g.name: 1e3 * g.simulation.rms[0] for g in found.gaps_after}
+    assert before["arrow"] == pytest.approx(15.3, abs=0.5)
+    assert before["multisine"] == pytest.approx(9.0, abs=0.5)
+    assert after["arrow"] <= 0.45
+    assert after["multisine"] <= 0.33
