@@ -16,9 +16,9 @@ HIDDEN = {"amplitude": 4.0, "period": 0.02, "phase": 0.7}
 
 
 def demo_log(seed: int) -> dict[str, np.ndarray]:
-    """One log of the demo, 500 Hz: what a user would have recorded."""
-    machine = emps_like(seed, duration=8.0).with_effect("cogging", **HIDDEN)
-    return {k: v[::2] for k, v in machine.run().items() if k in ("t", "position", "force", "reference")}
+    """One log of the demo, 1 kHz: what a user would have recorded."""
+    machine = emps_like(seed, duration=6.0).with_effect("cogging", **HIDDEN)
+    return {k: v for k, v in machine.run().items() if k in ("t", "position", "force", "reference")}
 
 
 def main() -> None:
