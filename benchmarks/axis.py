@@ -25,7 +25,7 @@ from jaxid.parameters import scatter
 from jaxid.plants import Axis
 from jaxid.replay import Numerics, Replay
 from jaxid.sensors import Sensor
-from jaxid.simulate import Drive
+from jaxid.simulation import Drive
 
 PERIOD, GAIN = 1e-3, 35.15065
 TRUTH = np.array([95.1, 203.5, 20.39, -3.16])

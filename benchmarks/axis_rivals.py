@@ -10,7 +10,7 @@ from axis_loops import ideal_forward, rk4_forward
 from numba import njit
 
 from jaxid.plants import Axis
-from jaxid.simulate import with_diffrax
+from jaxid.simulation import with_diffrax
 
 
 def lm_fit(loop_name: str, reference: np.ndarray, measured: np.ndarray, loop: tuple, start):
@@ -32,11 +32,13 @@ def _rates(t, x, theta, force, period, width):
     return np.array([x[1], (u - c * x[1] - f * np.tanh(x[1] / width) + f0) / m])
 
 
-def solve_ivp(theta: tuple, force: np.ndarray, period: float, width: float) -> np.ndarray:
-    """RK45 at 1e-6 under the held force that the loop gave; the right-hand side by numba."""
+def solve_ivp(
+    theta: tuple, force: np.ndarray, period: float, width: float, atol: float
+) -> np.ndarray:
+    """RK45 at rtol 1e-6 under the held force that the loop gave; the right-hand side by numba."""
     times = period * np.arange(len(force))
     solution = scipy.integrate.solve_ivp(
-        _rates, (0.0, times[-1]), [0.0, 0.0], "RK45", t_eval=times, rtol=1e-6, atol=1e-6,
+        _rates, (0.0, times[-1]), [0.0, 0.0], "RK45", t_eval=times, rtol=1e-6, atol=atol,
         args=(theta, force, period, width),
     )
     return solution.y[0]

@@ -195,8 +195,9 @@ def assess(
 
 
 def _signed(v: np.ndarray) -> np.ndarray:
-    """The direction with its largest entry positive: eigenvectors come with either sign."""
-    return v if v[np.argmax(np.abs(v))] > 0 else -v
+    """The direction with its first named entry positive: eigenvectors come with either sign."""
+    first = v[np.argmax(np.abs(v) > _NEGLIGIBLE)]
+    return v if first > 0 else -v
 
 
 def full_hessian(

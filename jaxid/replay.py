@@ -18,7 +18,7 @@ from jaxid.machine import Machine, disturbance_at
 from jaxid.model import Plant
 from jaxid.readings import State, acceleration
 from jaxid.sensors import Sensor
-from jaxid.simulate import Drive, Trajectory, closed_loop, open_loop
+from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
 
 # Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
 _FINE = 0.2

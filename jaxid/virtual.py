@@ -15,7 +15,7 @@ from jaxid.io.log import Log
 from jaxid.io.output import write_whole
 from jaxid.machine import Machine, build_machine, disturbance_at
 from jaxid.references import make_reference
-from jaxid.simulate import Drive, Trajectory, closed_loop, open_loop
+from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
 
 
 @dataclass(frozen=True)

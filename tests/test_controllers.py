@@ -10,7 +10,7 @@ from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
 from jaxid.plants import Axis
 from jaxid.sensors import Sensor
-from jaxid.simulate import Drive, closed_loop
+from jaxid.simulation import Drive, closed_loop
 
 PERIOD, TICKS, MASS, GAIN = 2e-3, 250, 2.0, 5.0
 TIME = PERIOD * np.arange(TICKS)

@@ -12,7 +12,7 @@ from test_effects import differences, places_of, plant_of
 
 from jaxid.controllers import CONTROLLERS
 from jaxid.parameters import scatter
-from jaxid.simulate import Drive, closed_loop, needed_substeps
+from jaxid.simulation import Drive, closed_loop, needed_substeps
 
 PERIOD, TICKS, GAIN = 1e-3, 300, 35.0
 KP, KV, AVERAGE = 40.0, 200.0, 2

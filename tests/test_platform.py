@@ -77,7 +77,7 @@ LOOP = """
 import jaxid, jax, jax.numpy as jnp
 from jaxid.effects import EFFECTS
 from jaxid.plants import Axis
-from jaxid.simulate import Drive, open_loop
+from jaxid.simulation import Drive, open_loop
 def end(level):
     plant = Axis(2.0, effects=(EFFECTS["coulomb_friction"](level=level),))
     u = jnp.ones((50, 1))

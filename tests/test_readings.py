@@ -11,7 +11,7 @@ from jaxid.estimators.algebraic import iterated_integral, weak_motion
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
 from jaxid.readings import State, residual_along, set_valued_step, small_solve, step
-from jaxid.simulate import Drive, open_loop
+from jaxid.simulation import Drive, open_loop
 
 MASS, DAMPING, STIFFNESS = 2.0, 3.0, 800.0
 OSCILLATOR = (

@@ -27,8 +27,8 @@ from jaxid.preprocess import Prepared
 # An effect with more starts than this is evaluated on a plant of its own, all starts at once.
 _FEW = 8
 # Of a long log a search looks at so many kept samples, in so many pieces spread over it.
-_MOST = 12_000
-_PIECES = 6
+_MOST = 8_000
+_PIECES = 4
 # Strength at which the columns of an added force are taken, relative to the log's force.
 _FAINT = 1e-6
 

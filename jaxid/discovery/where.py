@@ -134,15 +134,17 @@ def _describe(
     while hi < len(mean) - 1 and strong[hi + 1] and mean[hi + 1] * mean[peak] > 0:
         hi += 1
     explained = float(1 - np.exp(-2 * max(gain, 0.0) / max(int(counts.sum()), 1)))
-    text = f"joint {joint}: the residual depends on {name}"
-    text += f", most between {centre[lo]:.3g} and {centre[hi]:.3g}"
+    # A variable of the motion that explains the residual says more than a line in its spectrum.
+    line = line if gain <= limit or name == "time" else None
+    text = f"joint {joint + 1}: the residual depends on {name}"
+    text += f", most between {centre[lo]:.3g} and {centre[hi]:.3g} (SI)"
     if line is not None:
-        text = f"joint {joint}: the residual holds a line at {line:.3g} Hz that no motion explains"
+        text = f"joint {joint + 1}: the residual holds a line at {line:.3g} Hz that no motion explains"
     elif name == "time" and intervals:
-        text = f"joint {joint}: the residual is loud in {len(intervals)} interval(s) of time"
+        text = f"joint {joint + 1}: the residual is loud in {len(intervals)} interval(s) of time"
     return Where(
         joint + 1, name, (float(centre[lo]), float(centre[hi])), intervals,
-        text.replace(f"joint {joint}", f"joint {joint + 1}"), explained, gain, limit, centre, mean,
+        text, explained, gain, limit, centre, mean,
         mean - 1.96 * error, mean + 1.96 * error, line,
     )
 

@@ -212,12 +212,18 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
     """Why the best of what the last round did not add was not added."""
     if not result.rounds:
         return []
+    present = {e.kind for e in result.session.machine.plant.effects}
     lines = []
+    if "static_friction" not in present:
+        lines.append(
+            "break-away friction (static_friction) was not looked for: it acts at rest, and samples "
+            "at rest are left out of the balance"
+        )
     for score in result.rounds[-1].step.scores:
         if score.reason and score.evidence > result.rounds[-1].step.threshold:
             kind, nats = score.candidate.kind, score.evidence
             lines.append(f"{kind} was not added, at {nats:.0f} nats: {score.reason}")
-    return lines[:most]
+    return lines[: most + 1]
 
 
 def step_json(r: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from jaxid.effects import EFFECTS
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
 from jaxid.sensors import Sensor
-from jaxid.simulate import (
+from jaxid.simulation import (
     Drive,
     closed_loop,
     interval_forces,
