@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_cases import GRAVITY, MASS, ROWS, Instant, Row
-from search_cases import SEARCH_CASES
 
 from jaxid.effects import EFFECTS
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
@@ -53,10 +52,6 @@ def balance(plant: Axis, x: Instant, own: tuple):
 
 def test_every_registered_effect_has_a_row():
     assert {row.kind for row in ROWS.values()} == set(EFFECTS)
-
-
-def test_every_registered_effect_has_a_search_case():
-    assert set(SEARCH_CASES) == set(EFFECTS)
 
 
 @each_row

@@ -118,7 +118,7 @@ ABOVE_PHYSICS = (
     "estimators", "discovery", "io", "report", "cli", "identify", "session", "machine", "replay",
     "gap", "precision", "preprocess", "studies", "check", "virtual",
 )  # fmt: skip
-BESIDE = ("effects", "plants", "controllers", "sensors", "simulate")
+BESIDE = ("effects", "plants", "controllers", "sensors", "simulation")
 
 
 @pytest.mark.parametrize(
@@ -127,9 +127,9 @@ BESIDE = ("effects", "plants", "controllers", "sensors", "simulate")
         (("smooth.py", "units.py", "_platform.py", "errors.py"), ("",)),  # nothing of jaxid
         (("model.py",), ("readings", *BESIDE, *ABOVE_PHYSICS)),
         (("readings.py",), (*BESIDE, *ABOVE_PHYSICS)),
-        (("effects",), ("plants", "controllers", "simulate", "readings", *ABOVE_PHYSICS)),
-        (("plants", "controllers", "sensors.py"), ("effects", "simulate", *ABOVE_PHYSICS)),
-        (("simulate.py", "signals.py", "parameters.py"), ABOVE_PHYSICS),
+        (("effects",), ("plants", "controllers", "simulation", "readings", *ABOVE_PHYSICS)),
+        (("plants", "controllers", "sensors.py"), ("effects", "simulation", *ABOVE_PHYSICS)),
+        (("simulation.py", "signals.py", "parameters.py"), ABOVE_PHYSICS),
         (("references",), ABOVE_PHYSICS),
         (("estimators",), ("plants", "discovery", "report", "cli", "studies")),
         (("precision.py",), ("plants", "discovery", "report", "cli", "io", "estimators")),

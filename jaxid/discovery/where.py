@@ -116,7 +116,10 @@ def _locate(e: np.ndarray, jacobian: np.ndarray, data: Prepared, joint: int) -> 
     line = _line(left, whitener, data, joint)
     best = max(gains, key=lambda n: gains[n])
     limit = ev.threshold(largest)
-    if gains[best] <= limit and (intervals or line is not None):
+    line, part = line
+    # A variable of the motion that explains more says more than a line in the spectrum.
+    line = line if part > _explained(gains[best], counts) else None
+    if line is not None or (gains[best] <= limit and intervals):
         best = "time"
     return _describe(e, counts, named[best], best, joint, gains[best], limit, intervals, line, data)
 
@@ -133,9 +136,7 @@ def _describe(
         lo -= 1
     while hi < len(mean) - 1 and strong[hi + 1] and mean[hi + 1] * mean[peak] > 0:
         hi += 1
-    explained = float(1 - np.exp(-2 * max(gain, 0.0) / max(int(counts.sum()), 1)))
-    # A variable of the motion that explains the residual says more than a line in its spectrum.
-    line = line if gain <= limit or name == "time" else None
+    explained = _explained(gain, counts)
     text = f"joint {joint + 1}: the residual depends on {name}"
     text += f", most between {centre[lo]:.3g} and {centre[hi]:.3g} (SI)"
     if line is not None:
@@ -147,6 +148,11 @@ def _describe(
         text, explained, gain, limit, centre, mean,
         mean - 1.96 * error, mean + 1.96 * error, line,
     )
+
+
+def _explained(gain: float, counts: np.ndarray) -> float:
+    """Part of the variance that a gain in log-likelihood amounts to."""
+    return float(1 - np.exp(-2 * max(gain, 0.0) / max(int(counts.sum()), 1)))
 
 
 def _hats(x: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "kept knot"]:
@@ -208,10 +214,10 @@ def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[floa
 
 def _line(
     left: Float[np.ndarray, " row"], whitener: ev.Whitener, data: Prepared, joint: int
-) -> float | None:
-    """Frequency of a line in the whitened residual that the motion does not have; None without [Hz]."""
+) -> tuple[float | None, float]:
+    """Frequency of a line in the whitened residual that the motion lacks [Hz], and its part of it."""
     if len(left) < 100:
-        return None
+        return None, 0.0
     # Rows that are left out stay as gaps: closed up, a line would shift and smear.
     series = whitener.placed(left)[:, 0]
     n = len(series)
@@ -223,9 +229,9 @@ def _line(
     motion = data.at_kept(data.qd)[:, joint]
     moved = np.abs(np.fft.rfft((motion - motion.mean()) * window)) ** 2
     if part < _LINE_PART or _stands_out(moved, k) or not _stands_out(power, k):
-        return None
+        return None, 0.0
     rate = 1.0 / (data.period * data.recipe.decimation)
-    return float(k * rate / n)
+    return float(k * rate / n), float(part)
 
 
 def _stands_out(power: np.ndarray, k: int) -> bool:

@@ -125,33 +125,7 @@ def levenberg_marquardt(
         return e, jacobian
 
     def advance(p: _Progress) -> _Progress:
-        e, jacobian = evaluate(p.trial)
-        cost = 0.5 * e @ e
-        first = p.steps == 0
-        better = first | (cost < p.cost)
-        ratio = (p.cost - cost) / jnp.maximum(p.predicted, 1e-300)
-        shrink = jnp.where(first, 1.0, jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
-        damping = jnp.clip(p.damping * jnp.where(better, shrink, p.growth), 1e-15, 1e20)
-        x, cost, gradient, normal, kept = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
-            (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept),
-            (p.x, p.cost, p.gradient, p.normal, p.kept),
-        )
-        pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-        aim = x + _step(gradient, normal, damping, moves & ~pressed)
-        trial = jnp.clip(aim, lower, upper)
-        # Of the step that is taken: a bound cuts it short.
-        change = trial - x
-        predicted = -change @ gradient - 0.5 * change @ normal @ change
-        # A step cut short by a bound says little of what is left: its unknown rests from now on.
-        small = (predicted <= _TOLERANCE * cost) & jnp.all(trial == aim)
-        rough = ~better & (damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)
-        stuck = rough | (~better & (damping > 1e12))
-        growth = jnp.where(better, 2.0, 2 * p.growth)
-        return _Progress(
-            trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.steps + 1,
-            small | stuck | ~jnp.isfinite(cost),
-        )
+        return _advanced(p, *evaluate(p.trial), (lower, upper), moves, keep)
 
     x0 = jnp.clip(transform.inward(theta), lower, upper)
     p, size = theta.size, jax.eval_shape(residual, theta).size if keep else 0
@@ -165,6 +139,40 @@ def levenberg_marquardt(
     return Minimum(
         theta, end.cost, end.steps, end.done & jnp.isfinite(end.cost), end.kept[0],
         end.kept[1] / transform.slope(theta),
+    )
+
+
+def _advanced(
+    p: _Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
+    keep: bool,
+) -> _Progress:
+    """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
+    lower, upper = bounds
+    cost = 0.5 * e @ e
+    first = p.steps == 0
+    better = first | (cost < p.cost)
+    ratio = (p.cost - cost) / jnp.maximum(p.predicted, 1e-300)
+    shrink = jnp.where(first, 1.0, jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
+    damping = jnp.clip(p.damping * jnp.where(better, shrink, p.growth), 1e-15, 1e20)
+    x, cost, gradient, normal, kept = jax.tree.map(
+        lambda new, old: jnp.where(better, new, old),
+        (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept),
+        (p.x, p.cost, p.gradient, p.normal, p.kept),
+    )
+    pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+    aim = x + _step(gradient, normal, damping, moves & ~pressed)
+    trial = jnp.clip(aim, lower, upper)
+    # Of the step that is taken: a bound cuts it short.
+    change = trial - x
+    predicted = -change @ gradient - 0.5 * change @ normal @ change
+    # A step cut short by a bound says little of what is left: its unknown rests from now on.
+    small = (predicted <= _TOLERANCE * cost) & jnp.all(trial == aim)
+    rough = ~better & (damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)
+    stuck = rough | (~better & (damping > 1e12))
+    growth = jnp.where(better, 2.0, 2 * p.growth)
+    return _Progress(
+        trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.steps + 1,
+        small | stuck | ~jnp.isfinite(cost),
     )
 
 
