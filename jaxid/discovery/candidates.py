@@ -270,7 +270,7 @@ def refine(
 
 def _finite(x: np.ndarray) -> np.ndarray:
     """What diverged, as a number so large that a solver turns back, yet not too large to square."""
-    return np.nan_to_num(x, nan=1e60, posinf=1e60, neginf=-1e60)
+    return np.clip(np.nan_to_num(x, nan=1e60), -1e60, 1e60)
 
 
 def points(

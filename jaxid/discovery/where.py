@@ -19,6 +19,11 @@ _KNOTS = 12
 # noise of one level that happens less than once in 10^9 windows.
 _WINDOW = 20
 _LOUD = 8.0
+# Measured acceleration and force carry the noise that the residual is made of: it depends on them
+# even where nothing is missing. They describe, where they explain so much more than position and
+# velocity do, but decide nothing.
+_OWN_NOISE = ("acceleration", "force")
+_FAR_MORE = 2.0
 # A spectral line must carry this part of the variance, and stand above the median of its
 # neighbours by a factor that white noise exceeds once in 10^8.
 _LINE_PART = 0.05
@@ -60,7 +65,8 @@ class Where:
     def significant(self) -> bool:
         """Whether anything but noise is there."""
         loud = bool(self.intervals) and self.variable == "time"
-        return self.evidence > self.threshold or self.frequency_hz is not None or loud
+        clean = self.evidence > self.threshold and self.variable not in _OWN_NOISE
+        return clean or self.frequency_hz is not None or loud
 
 
 def variables(data: Prepared, joint: int) -> dict[str, Float[np.ndarray, " kept"]]:
@@ -111,17 +117,25 @@ def _locate(e: np.ndarray, jacobian: np.ndarray, data: Prepared, joint: int) -> 
         after = _held(both, np.concatenate([white, surrogates], axis=1), blocks)
         gain = ev.log_evidence(len(blocks), before, after)
         gains[name] = float(gain[0])
-        largest = np.maximum(largest, gain[1:])
+        if name not in _OWN_NOISE:
+            largest = np.maximum(largest, gain[1:])
     intervals = _loud(e, counts, data)
     line = _line(left, whitener, data, joint)
-    best = max(gains, key=lambda n: gains[n])
+    best = _best(gains)
     limit = ev.threshold(largest)
     line, part = line
     # A variable of the motion that explains more says more than a line in the spectrum.
     line = line if part > _explained(gains[best], counts) else None
-    if line is not None or (gains[best] <= limit and intervals):
+    if line is not None or _share(e, counts, data, intervals) > _explained(gains[best], counts):
         best = "time"
     return _describe(e, counts, named[best], best, joint, gains[best], limit, intervals, line, data)
+
+
+def _best(gains: dict[str, float]) -> str:
+    """The variable to name: one that carries the residual's noise must explain far more."""
+    clean = max((n for n in gains if n not in _OWN_NOISE), key=lambda n: gains[n])
+    other = max(_OWN_NOISE, key=lambda n: gains[n])
+    return other if gains[other] > _FAR_MORE * max(gains[clean], 0.0) else clean
 
 
 def _describe(
@@ -210,6 +224,16 @@ def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[floa
     if len(spans) > 20 or loud.mean() > 0.3:  # everywhere is nowhere
         return ()
     return tuple(spans)
+
+
+def _share(
+    e: np.ndarray, counts: np.ndarray, data: Prepared, intervals: tuple[tuple[float, float], ...]
+) -> float:
+    """Part of the residual's sum of squares that lies in some intervals."""
+    inside = np.zeros(len(e), bool)
+    for start, end in intervals:
+        inside |= (data.times >= start) & (data.times <= end)
+    return float(np.sum(e[counts & inside] ** 2) / np.sum(e[counts] ** 2))
 
 
 def _line(
