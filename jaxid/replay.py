@@ -87,15 +87,6 @@ class Replay(eqx.Module):
             run = open_loop(plant, self.drive, self.command, q, v, None, self.restart)
         return jax.tree.map(lambda a: a[:: self.every], run)
 
-    def with_numerics(self, numerics: Numerics) -> Replay:
-        """The same run, integrated otherwise."""
-        drive = self.drive
-        new = Drive(
-            drive.gain, drive.period, drive.hold, numerics.substeps, numerics.set_valued,
-            numerics.longest_delay,
-        )
-        return eqx.tree_at(lambda r: r.drive, self, new)
-
 
 def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) -> Replay:
     """Prepare a log to drive its machine.

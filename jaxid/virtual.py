@@ -15,7 +15,7 @@ from jaxid.io.log import Log
 from jaxid.io.output import write_whole
 from jaxid.machine import Machine, build_machine, disturbance_at
 from jaxid.references import make_reference
-from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
+from jaxid.simulation import Drive, Trajectory, closed_loop, needed_substeps, open_loop
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,7 @@ def _closed(
     times = period * np.arange(len(reference))
     machine = _scaled(machine, reference, period)
     drive = _drive(case, machine, period)
+    _refuse_coarse(case, machine, drive, reference)
     run = eqx.filter_jit(closed_loop)(
         machine.plant, drive, machine.controller, jnp.asarray(reference),
         jnp.asarray(disturbance_at(machine.disturbance, times)), jnp.asarray(position),
@@ -140,6 +141,20 @@ def _drive(case: Case, machine: Machine, period: float) -> Drive:
         jnp.asarray(machine.gain), period, hold, int(case.simulation.get("substeps", 4)),
         "sharpness" not in case.simulation, longest,
     )
+
+
+def _refuse_coarse(case: Case, machine: Machine, drive: Drive, reference: np.ndarray) -> None:
+    """Refuse a step too coarse for the smoothed sign: its trajectory only looks plausible."""
+    if drive.set_valued:
+        return
+    q = jnp.asarray(reference[:: max(1, len(reference) // 50)])
+    needed = needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), jnp.zeros_like(q))
+    if needed > drive.substeps:
+        raise InputError(
+            f"[simulation] substeps = {drive.substeps} is too coarse for sharpness = "
+            f"{case.simulation['sharpness']:g}", where=str(case.path),
+            mend=f"set substeps = {needed}, a larger sharpness, or none (friction then sticks exactly)",
+        )
 
 
 def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:

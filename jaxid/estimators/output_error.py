@@ -7,6 +7,7 @@ would grow without bound, in segments that restart from the log.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess, full_hessian
 from jaxid.replay import Numerics, Replay, make_replay, needed_steps, with_fitted_start
+from jaxid.simulation import Drive, needed_substeps
 
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
 # deviation is cut into segments.
@@ -141,6 +143,8 @@ def choose_numerics(machine: Machine, log: Log, *, segments: bool = True) -> Num
         substeps=needed_steps(machine, log),
         longest_delay=12 if "input_delay" in kinds and machine.controller is not None else 0,
     )
+    if not numerics.set_valued:
+        numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))
     if machine.controller is not None or not segments:
         return numerics
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
@@ -150,6 +154,15 @@ def choose_numerics(machine: Machine, log: Log, *, segments: bool = True) -> Num
         return numerics
     length = max(20, log.samples // _SEGMENTS)
     return Numerics(numerics.set_valued, numerics.substeps, 0, length)
+
+
+def _sharp_steps(machine: Machine, log: Log) -> int:
+    """Steps a sample that the smoothed sign asks for: a coarser one gives garbage for a gradient."""
+    period = machine.controller.period if machine.controller is not None else log.period
+    picks = np.linspace(0, log.samples - 1, 50).astype(int)
+    q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    drive = Drive(jnp.asarray(machine.gain), period)
+    return needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
 
 
 def _failure(minimum: Minimum) -> str:
