@@ -157,3 +157,9 @@ def test_the_truth_does_not_import_what_it_judges():
     for path in (ROOT / "tests").glob("stepper*.py"):
         roots = {m.split(".")[0] for m in imports(path)}
         assert not roots & {"jax", "jaxid", "diffrax", "equinox"}, path
+
+
+def test_the_command_line_knows_every_method():
+    from jaxid import cli, estimators
+
+    assert tuple(estimators.METHODS) == cli.METHODS
