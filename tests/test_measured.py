@@ -67,6 +67,17 @@ def test_friction_that_differs_by_direction_is_found_on_emps(emps):
 
 
 @needs_data
+def test_emps_in_open_loop(emps):
+    result = jaxid.identify(emps / "emps_open_loop.toml", emps / "DATA_EMPS.mat")
+    assert result.converged
+    fit, pulses = result.gaps
+    # plain output error leaves 5.1 mm on the second file, inverse dynamics 9.2 mm
+    assert pulses.simulation.rms[0] < 5.1e-3
+    # the start is what the first samples tell: the fit's own residual is the simulation's gap
+    assert fit.simulation.rms[0] == pytest.approx(float((result.estimate.residual**2).mean()) ** 0.5, rel=0.02)
+
+
+@needs_data
 @pytest.mark.slow
 def test_cubic_spring_and_offset_are_found_in_silverbox(silverbox):
     found = jaxid.discover(silverbox / "silverbox.toml", silverbox / "SNLS80mV.mat")

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxid import signals
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
 from jaxid.io.log import Log
@@ -27,6 +28,14 @@ from jaxid.simulation import Drive, needed_substeps
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
 # deviation is cut into segments.
 _LOST = 0.5
+# The start of an open-loop run is fitted with the rest only where the residual's RMS is within this
+# factor of the position noise. Elsewhere the model's own error would bend the start, which the first
+# samples tell far better.
+_NOISE_LIMITED = 3.0
+# The start of an open-loop run is fitted with the rest only where the residual's RMS is within this
+# factor of the position noise. Elsewhere the model's own error would bend the start, which the
+# first samples tell far better.
+_NOISE_LIMITED = 3.0
 # So many segments then; each long enough to show friction, short enough not to drift away.
 _SEGMENTS = 40
 
@@ -36,7 +45,7 @@ def position_residual(
 ) -> Callable[[Array], Array]:
     """Measured minus simulated position as a function of the unknowns, (time, n) [m or rad].
 
-    In open loop the start's position and velocity are unknowns too, behind the others.
+    In open loop the start's position and velocity may be unknowns too, behind the others.
     """
 
     def residual(theta: Array) -> Array:
@@ -50,10 +59,10 @@ def position_residual(
 @eqx.filter_jit
 def _fit(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array,
-    transform: Transform, bounds: tuple[Array, Array],
+    transform: Transform, bounds: tuple[Array, Array], active: Array,
 ) -> Minimum:
     residual = position_residual(replay, places, plant, measured, weight)
-    return levenberg_marquardt(residual, theta, transform, *bounds)
+    return levenberg_marquardt(residual, theta, transform, *bounds, active)
 
 
 @eqx.filter_jit
@@ -88,19 +97,23 @@ def output_error(
     replay = make_replay(machine, log, numerics)
     replay = with_fitted_start(replay, machine.plant, log)
     nuisance = 0 if replay.controller is not None or numerics.segment else 2 * log.position.shape[1]
+    p = len(machine.parameters.free)
     problem = _problem(machine, replay, log, nuisance)
-    minimum = _fit(*problem)
+    active = np.arange(p + nuisance) < p
+    minimum = _fit(*problem, active)
+    if nuisance:
+        problem, active, minimum = _with_start(machine, log, problem, minimum)
     e = np.asarray(minimum.residual).reshape(log.position.shape)
     jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
     theta = np.asarray(minimum.theta)
-    p = len(machine.parameters.free)
     counts = np.ones(e.shape, bool)
-    names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]]
+    names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
+    full = np.asarray(_hessian(*problem[:5], minimum.theta)) if hessian else None
     precision = assess(
-        names, jacobian, e, counts,
+        names, jacobian[..., active], e, counts,
         float(np.linalg.norm(log.position - log.position.mean(axis=0))),
-        np.where(theta != 0, theta, 1.0),
-        np.asarray(_hessian(*problem[:5], minimum.theta)) if hessian else None,
+        np.where(theta != 0, theta, 1.0)[active],
+        None if full is None else full[np.ix_(active, active)],
     ).first(p)
     converged = bool(minimum.converged)
     return Estimate(
@@ -115,6 +128,22 @@ def output_error(
         steps=int(minimum.steps),
         notes=_notes(machine, numerics, log),
     )
+
+
+def _with_start(
+    machine: Machine, log: Log, problem: tuple, minimum: Minimum
+) -> tuple[tuple, np.ndarray, Minimum]:
+    """Fit again from a start that suits the fitted plant; with the start where noise is all that is left."""
+    p = len(machine.parameters.free)
+    fitted = machine.with_estimate(np.asarray(minimum.theta)[:p])
+    replay = with_fitted_start(problem[0], fitted.plant, log)
+    problem = (replay, *problem[1:5], minimum.theta, *problem[6:])
+    rms = np.sqrt(np.mean(np.square(minimum.residual)))
+    stated = machine.sensor.position_std
+    noise = signals.high_band_std(log.position, log.rate_hz) if stated is None else np.asarray(stated)
+    free = bool(rms <= _NOISE_LIMITED * np.max(noise))
+    active = (np.arange(len(minimum.theta)) < p) | free
+    return problem, active, _fit(*problem, active)
 
 
 def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple:
