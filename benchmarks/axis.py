@@ -134,6 +134,8 @@ class Compiled:
 def fit(run: Replay, base: Axis, theta: np.ndarray, measured: np.ndarray) -> Minimum:
     """jaxid's own output-error fit."""
     measured = jnp.asarray(measured)[:, None]
-    weight = jnp.ones(measured.shape)
-    minimum = _fit(run, PLACES, base, measured, weight, jnp.asarray(theta), TRANSFORM, BOUNDS)
+    weight, active = jnp.ones(measured.shape), np.ones(len(PLACES), bool)
+    minimum = _fit(
+        run, PLACES, base, measured, weight, jnp.asarray(theta), TRANSFORM, BOUNDS, active
+    )
     return jax.block_until_ready(minimum)

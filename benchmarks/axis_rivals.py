@@ -1,15 +1,19 @@
-"""The same axis by scipy and by diffrax: what one would otherwise call."""
+"""The same axis by scipy, diffrax and optimistix: what one would otherwise call."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import scipy.integrate
 import scipy.optimize
+from axis import PLACES, TRANSFORM
 from axis_loops import ideal_forward, rk4_forward
 from numba import njit
 
+from jaxid.parameters import scatter
 from jaxid.plants import Axis
+from jaxid.replay import Replay
 from jaxid.simulation import with_diffrax
 
 
@@ -54,3 +58,35 @@ def tsit5(base: Axis, force: jax.Array, period: float) -> jax.Array:
 
     zero = jnp.zeros(1)
     return with_diffrax(base, held, times, zero, zero, step_length=period)[0][:, 0]
+
+
+# Either stops where neither cost nor unknowns move by more than 1e-8 of themselves.
+OPTIMISTIX = {
+    "LevenbergMarquardt": optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8),
+    "Dogleg": optx.Dogleg(rtol=1e-8, atol=1e-8),
+}
+
+
+@eqx.filter_jit
+def optimistix_fit(
+    solver: optx.AbstractLeastSquaresSolver, run: Replay, base: Axis, start: jax.Array,
+    measured: jax.Array, scaled: bool,
+) -> tuple[jax.Array, jax.Array]:
+    """A solver of optimistix on jaxid's residual from jaxid's start: unknowns, half the sum of squares.
+
+    Its damping is the same for all unknowns, so their scale matters: as jaxid's solver sees them,
+    or (`scaled`) with start and residual of order one, which a user would have to think of.
+    """
+    unit = jnp.abs(start) if scaled else jnp.ones_like(start)
+    inward, outward = (
+        (lambda x: x / unit, lambda x: x * unit) if scaled else (TRANSFORM.inward, TRANSFORM.outward)
+    )
+
+    def residual(theta: jax.Array) -> jax.Array:
+        return measured - run(scatter(PLACES, base, theta)).position[:, 0]
+
+    weight = 1 / jnp.sqrt(jnp.mean(residual(start) ** 2)) if scaled else 1.0
+    found = optx.least_squares(
+        lambda x, _: weight * residual(outward(x)), solver, inward(start), max_steps=500
+    )
+    return outward(found.value), 0.5 * jnp.sum(residual(outward(found.value)) ** 2)

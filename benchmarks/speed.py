@@ -1,6 +1,6 @@
-"""Speed of jaxid on one axis, as ratios to hand-written loops, scipy and diffrax.
+"""Speed of jaxid on one axis, as ratios to hand-written loops, scipy, diffrax and optimistix.
 
-    python benchmarks/speed.py [--quick] [--no-write]
+    python benchmarks/speed.py [--quick] [--no-write] [--optimistix]
 
 prints the table and writes results/speed.json and results/speed.md beside this file.
 """
@@ -9,13 +9,11 @@ import argparse
 import json
 import os
 import platform
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
@@ -28,6 +26,7 @@ import axis_loops as loops
 import axis_rivals as rivals
 import jax.numpy as jnp
 import numpy as np
+from speed_rows import HEAD, Row, compare, in_process, line, table
 
 from jaxid.replay import Numerics
 
@@ -36,68 +35,6 @@ WIDTH = 1e-3
 LOOP = (axis.GAIN, 160.18, 243.45, 10.0, axis.PERIOD, WIDTH)
 REST = (0.0, 0.0)
 SETS, GROUP = 1024, 64
-
-
-@dataclass
-class Row:
-    """One comparison.
-
-    Args:
-        quantity: What is computed.
-        jaxid, alternative: Medians [s].
-        rival: What it is compared with.
-        ratio: jaxid over alternative, of the medians.
-        best: The same of the fastest runs: what other load on the machine touches least.
-        difference: Largest difference of the results, relative to their size.
-        aim: Target of the ratio; None: none.
-    """
-
-    quantity: str
-    rival: str
-    jaxid: float
-    alternative: float
-    ratio: float
-    best: float
-    difference: float
-    aim: float | None = None
-
-    @property
-    def met(self) -> bool:
-        """By the fastest runs: other load on the machine must not decide."""
-        return self.aim is None or self.best <= self.aim
-
-
-def timed(function: Callable) -> float:
-    begin = time.perf_counter()
-    function()
-    return time.perf_counter() - begin
-
-
-def compare(
-    quantity: str, ours: Callable, rival: str, theirs: Callable, aim: float | None, repeats: int,
-    tolerance: float,
-) -> Row:
-    """Check that both compute the same, then time them in turn."""
-    a, b = np.asarray(ours()), np.asarray(theirs())
-    difference = float(np.abs(a - b).max() / np.abs(b).max())
-    if not difference <= tolerance:
-        raise SystemExit(f"{quantity}: {rival} differs by {difference:.1e}, over {tolerance:.0e}")
-    times = np.array([(timed(ours), timed(theirs)) for _ in range(repeats)])
-    (mine, other), (fast, rival_fast) = np.median(times, axis=0), times.min(axis=0)
-    row = Row(
-        quantity, rival, float(mine), float(other), float(mine / other), float(fast / rival_fast),
-        difference, aim,
-    )
-    print(line(row), flush=True)
-    return row
-
-
-def line(row: Row) -> str:
-    aim = "" if row.aim is None else f"{row.aim:.3g}"
-    return (
-        f"{row.quantity:34s} {row.rival:35s} {1e3 * row.jaxid:9.2f} {1e3 * row.alternative:9.2f} "
-        f"{row.ratio:8.3g} {row.best:8.3g} {aim:>8s} {row.difference:9.1e}"
-    )
 
 
 class Sides:
@@ -171,6 +108,18 @@ class Sides:
         run = self.runs[name]
         return lambda: axis.fit(run, self.base, axis.START, self.measured).theta
 
+    def cost(self, name: str) -> Callable:
+        run = self.runs[name]
+        return lambda: axis.fit(run, self.base, axis.START, self.measured).cost
+
+    def optimistix_cost(self, name: str, solver: str, scaled: bool) -> Callable:
+        """Cost that a fit by optimistix reaches."""
+        run, start = self.runs[name], jnp.asarray(axis.START)
+        method = rivals.OPTIMISTIX[solver]
+        return lambda: np.asarray(
+            rivals.optimistix_fit(method, run, self.base, start, self.seen, scaled)[1]
+        )
+
     def scipy_fit(self, name: str) -> Callable:
         return lambda: rivals.lm_fit(name, self.reference, self.measured, LOOP, axis.START).x
 
@@ -218,6 +167,40 @@ def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
     ]  # fmt: skip
 
 
+def against_optimistix(sides: Sides, n: int, cold: int) -> list[Row]:
+    """Fits by jaxid's solver and by those of optimistix: the same residual, start and cost reached."""
+    rows = []
+    for name in ("smooth", "ideal"):
+        what = "fit, {}" + (", ideal" if name == "ideal" else "") + " (cost)"
+        for solver, scaled in (
+            ("LevenbergMarquardt", False), ("LevenbergMarquardt", True), ("Dogleg", False)
+        ):
+            rival = f"optimistix {solver}" + (", scaled" if scaled else "")
+            theirs = sides.optimistix_cost(name, solver, scaled)
+            rows.append(compare(what.format("warm"), sides.cost(name), rival, theirs, None, n, 1e-6))
+        rows.append(cold_row(what.format("cold"), name, "LevenbergMarquardt", cold))
+    return rows
+
+
+def cold_row(quantity: str, name: str, solver: str, repeats: int) -> Row:
+    """First fits of fresh processes in turn, tracing and compiling included."""
+    script = str(HERE / "cold_fit.py")
+    pairs = np.array(
+        [
+            [json.loads(in_process(script, name, *who)[1].splitlines()[-1]) for who in ((), (solver,))]
+            for _ in range(repeats)
+        ]
+    )
+    (mine, other), (fast, rival_fast) = np.median(pairs, axis=0)[:, 0], pairs.min(axis=0)[:, 0]
+    a, b = pairs[0, :, 2]
+    row = Row(
+        quantity, f"optimistix {solver}", float(mine), float(other), float(mine / other),
+        float(fast / rival_fast), float(abs(a - b) / b),
+    )
+    print(line(row), flush=True)
+    return row
+
+
 def compile_times(sides: Sides) -> dict[str, dict]:
     """Seconds of tracing and compiling, and whether the loop flag was taken."""
     out = {}
@@ -230,16 +213,6 @@ def compile_times(sides: Sides) -> dict[str, dict]:
             flag = 'xla_cpu_small_call="true"' in text
             out[f"{label}, {name}"] = {"trace_s": traced, "compile_s": compiled, "loop_flag": flag}
     return out
-
-
-def in_process(*words: str, **environment: str) -> tuple[float, str]:
-    """Wall time and output of a fresh Python."""
-    begin = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, check=True,
-        env={**os.environ, **environment},
-    )
-    return time.perf_counter() - begin, done.stdout
 
 
 def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
@@ -256,7 +229,7 @@ def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
             for _ in range(repeats):
                 for label, environment in (("no cache", {}), ("cache", cache)):
                     words = in_process(script, name, **environment)[1]
-                    fits[label].append(json.loads(words.splitlines()[-1]))
+                    fits[label].append(json.loads(words.splitlines()[-1])[:2])
         for label, seconds in fits.items():
             out[f"first fit, {name}, {label}"] = tuple(np.median(seconds, axis=0).tolist())
     return out
@@ -277,28 +250,8 @@ def start_times(repeats: int) -> dict[str, float]:
 
 
 def versions() -> dict[str, str]:
-    names = ("jax", "jaxlib", "diffrax", "equinox", "numba", "numpy", "scipy")
+    names = ("jax", "jaxlib", "diffrax", "optimistix", "equinox", "numba", "numpy", "scipy")
     return {"python": platform.python_version(), **{n: version(n) for n in names}}
-
-
-HEAD = (
-    f"{'quantity':34s} {'compared with':35s} {'jaxid ms':>9s} {'other ms':>9s} {'ratio':>8s} "
-    f"{'fastest':>8s} {'aim':>8s} {'differ':>9s}"
-)
-
-
-def table(rows: list[Row]) -> list[str]:
-    out = [
-        "| quantity | compared with | ratio | of the fastest runs | aim | met | differ |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        aim, met = ("", "") if r.aim is None else (f"{r.aim:.3g}", "yes" if r.met else "no")
-        out.append(
-            f"| {r.quantity} | {r.rival} | {r.ratio:.3g} | {r.best:.3g} | {aim} | {met} "
-            f"| {r.difference:.0e} |"
-        )
-    return out
 
 
 def report(rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float]) -> str:
@@ -326,11 +279,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few repeats, to see that it runs")
     parser.add_argument("--no-write", action="store_true", help="only print")
+    parser.add_argument("--optimistix", action="store_true", help="only print fits by optimistix")
     options = parser.parse_args()
     n, few, cold = (5, 2, 1) if options.quick else (41, 5, 3)
     sides = Sides()
     print(HEAD)
-    rows = comparisons(sides, n, few)
+    if options.optimistix:
+        against_optimistix(sides, n, cold)
+        return 0
+    rows = comparisons(sides, n, few) + against_optimistix(sides, n, cold)
     compiled = compile_times(sides)
     fits, starts = cold_fits(cold), start_times(3 * cold)
     text = report(rows, compiled, fits, starts)

@@ -10,9 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from jaxid.errors import InputError
+from jaxid.errors import InputError, suggest
 
 METHODS = ("output_error", "inverse_dynamics", "algebraic")
+SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -118,6 +119,11 @@ def _identify(commands: argparse._SubParsersAction) -> None:
     parser = _add(commands, "identify", "identify the unknowns of a case from a log", _run_identify)
     _logs(parser)
     parser.add_argument("--method", metavar="M", default="output_error", help=", ".join(METHODS))
+    parser.add_argument(
+        "--solver", metavar="NAME",
+        help="let diffrax integrate in output_error, dry friction smoothed: "
+        f"{', '.join(SOLVERS)}; absent: fixed steps, dry friction exact",
+    )
     _validate(parser)
 
 
@@ -201,13 +207,16 @@ def _run_identify(args: argparse.Namespace) -> int:
         raise InputError(
             f"method {args.method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
         )
+    if args.solver is not None and args.solver not in SOLVERS:
+        raise InputError(f"solver {args.solver!r} is not known", mend=suggest(args.solver, SOLVERS))
     _ready(args, "result.json", "report.html")
     with _progress(args, 4) as tell:
         tell("starting")
         from jaxid.identification import identify
 
         result = identify(
-            args.case, args.log, method=args.method, validate=args.validate, progress=tell
+            args.case, args.log, method=args.method, solver=args.solver, validate=args.validate,
+            progress=tell,
         )
     print(result)
     return _finish(args, result, "result.json", "report.html")
@@ -216,7 +225,9 @@ def _run_identify(args: argparse.Namespace) -> int:
 def _run_discover(args: argparse.Namespace) -> int:
     if args.max_effects < 0:
         raise InputError(f"--max-effects is {args.max_effects}", mend="give zero or more")
-    _ready(args, "discovery.json", "report.html")
+    # An experiment's name follows from what is found: any that is there already may be meant.
+    there = [] if args.o is None else [p.name for p in Path(args.o).glob("separate_*.csv")]
+    _ready(args, "discovery.json", "report.html", *there)
     with _progress(args, 40) as tell:
         tell("starting")
         from jaxid.discovery.discover import discover
@@ -226,7 +237,9 @@ def _run_discover(args: argparse.Namespace) -> int:
             progress=tell,
         )
     print(result)
-    return _finish(args, result, "discovery.json", "report.html")
+    from jaxid.io.results import discovery_files
+
+    return _finish(args, result, *discovery_files(result))
 
 
 def _run_demo(args: argparse.Namespace) -> int:

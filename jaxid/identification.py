@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxid.errors import InputError
+from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
@@ -17,8 +17,9 @@ from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulatio
 from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.replay import make_replay, with_fitted_start
+from jaxid.replay import make_replay, needed_steps, with_fitted_start
 from jaxid.session import Run, Session, open_session
+from jaxid.solvers import SOLVERS
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ def identify(
     log: Log | str | Path,
     *,
     method: str = "output_error",
+    solver: str | None = None,
     validate: Sequence[Log | str | Path] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
@@ -91,16 +93,20 @@ def identify(
         case: The case, or its file.
         log: The log, or its file.
         method: One of `jaxid.estimators.METHODS`.
+        solver: For `output_error`, one of `jaxid.solvers.SOLVERS`: diffrax then integrates between
+            samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
+            of the fixed steps either way.
         validate: Logs to validate on, beside the case's own.
         progress: Called with a line at every stage.
 
     Raises:
-        InputError: If case, log or method are unsound.
+        InputError: If case, log, method or solver are unsound.
     """
     if method not in METHODS:
         raise InputError(
             f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
         )
+    options = {} if solver is None else {"solver": _checked_solver(solver, method)}
     session = open_session(case, log, validate)
     if not session.machine.parameters.free:
         raise InputError(
@@ -108,12 +114,23 @@ def identify(
             mend="give at least one parameter as { guess = ... }",
         )
     progress(f"fitting by {method}")
-    estimate = METHODS[method](session)
+    estimate = METHODS[method](session, **options)
     progress("simulating")
     return Identification(
         session, estimate, gaps(estimate.machine, session.runs),
         noise_floor(estimate.machine, session.fit.log, session.fit.data),
     )
+
+
+def _checked_solver(solver: str, method: str) -> str:
+    if method != "output_error":
+        raise InputError(
+            f"solver {solver!r} goes only with output_error",
+            mend=f"leave out solver, or method {method!r}",
+        )
+    if solver not in SOLVERS:
+        raise InputError(f"solver {solver!r} is not known", mend=suggest(solver, SOLVERS))
+    return solver
 
 
 def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:
@@ -128,7 +145,9 @@ def simulated(machine: Machine, log: Log) -> SimulationGap | None:
     """Gap in position over the whole log; None where the simulation cannot run or diverges."""
     if machine.controller is not None and log.reference is None:
         machine = replace(machine, controller=None)
-    numerics = replace(choose_numerics(machine, log, segments=False), segment=None)
+    # Nothing is differentiated here: friction sticks exactly, break-away friction too.
+    numerics = choose_numerics(machine, log, segments=False)
+    numerics = replace(numerics, segment=None, set_valued=True, substeps=needed_steps(machine, log))
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     gap = simulation_gap(machine, replay, log)
     return gap if np.all(np.isfinite(gap.rms)) and np.all(gap.relative < 1e3) else None

@@ -140,6 +140,15 @@ class Precision:
             self.covariance[:p, :p], self.identifiable[:p], self.unidentifiable, self.information
         )
 
+    def beside(self, std: float) -> Precision:
+        """With one parameter more, known from elsewhere to a standard deviation."""
+        p = len(self.covariance)
+        covariance = np.zeros((p + 1, p + 1))
+        covariance[:p, :p], covariance[p, p] = self.covariance, std**2
+        return Precision(
+            covariance, np.append(self.identifiable, True), self.unidentifiable, self.information
+        )
+
 
 def assess(
     names: list[str],

@@ -160,14 +160,22 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         cutoff_hz=cutoff,
         order=int(stated.get("order", 4)),
         decimation=decimation,
-        # Three periods of the band edge: as far as the ends of filters reach.
-        trim=int(stated.get("trim", np.ceil(3 * rate / (band * decimation)))),
+        trim=int(stated.get("trim", _trim(log, band, decimation, literal))),
         rest_velocity=tuple(float(r) for r in rest),
         align_hold=bool(stated.get("align_hold", not literal)),
         derivatives="central" if literal else "spectral",
         keeps_reversals=literal,
         edge=None if literal else 2 * edge / rate,
     )
+
+
+def _trim(log: Log, band_hz: float, decimation: int, literal: bool) -> int:
+    """Kept samples to leave out at each end: as far as the ends of filters reach.
+
+    That is three periods of the band's edge; of a short log not more than an eighth.
+    """
+    reach = int(np.ceil(3 * log.rate_hz / (band_hz * decimation)))
+    return reach if literal else min(reach, log.samples // decimation // 8)
 
 
 def _noise_cutoff(log: Log) -> float:

@@ -258,8 +258,8 @@ def set_valued_step(
     """One step under set-valued friction: flow without it, then the reaction that stops or drags.
 
     The reaction of each port is the force, constant over the step, that brings the port to rest
-    at the step's end, clipped to the level of dry friction there (plus the break-away level where
-    the port was at rest). Ports that are coupled through the mass matrix share their reactions by
+    at the step's end, clipped to the level of dry friction there; at rest it holds up to the
+    break-away level above that. Ports that are coupled through the mass matrix share their reactions by
     projected Gauss-Seidel sweeps; one port needs one.
 
     Args:
@@ -285,27 +285,40 @@ def set_valued_step(
 
     # The mass does not depend on the velocity: one balance gives it and the levels.
     mass, levels = jax.jacfwd(residual, has_aux=True)(jnp.zeros_like(x.q))
-    bound = levels.dry + jnp.where(before == 0.0, levels.stick, 0.0)
     jacobian = jax.jacfwd(plant.ports)(x.q)
     columns = [small_solve(mass, jacobian[i]) for i in range(speed.size)]
     mobility = h * jnp.stack([jacobian @ c for c in columns], axis=1)
-    reaction = _box_reaction(mobility, speed, bound)
-    return _rest_exactly(plant, flow(x, reaction), jnp.abs(reaction) < bound)
+    # Break-away acts until a port slides, and again where it would pass through rest.
+    slid = speed - jnp.sign(before) * jnp.diagonal(mobility) * levels.dry
+    rests = (before == 0.0) | (before * slid < 0.0)
+    hold = levels.dry + jnp.where(rests, levels.stick, 0.0)
+    reaction, stuck = _box_reaction(mobility, speed, levels.dry, hold)
+    return _rest_exactly(plant, flow(x, reaction), stuck)
 
 
-def _box_reaction(mobility: Array, speed: Array, bound: Array) -> Array:
-    """Reaction within plus or minus bound that leaves `speed + mobility @ reaction` complementary."""
+def _box_reaction(
+    mobility: Array, speed: Array, dry: Array, hold: Array
+) -> tuple[Array, Array]:
+    """Reaction that leaves `speed + mobility @ reaction` complementary, and which ports it stops.
+
+    A port is held up to `hold`, the level at rest; one that breaks loose is dragged by `dry`.
+    """
     n = speed.size
     inverse = 1.0 / jnp.diagonal(mobility)
+
+    def answer(wanted: Array, dry: Array, hold: Array) -> Array:
+        return jnp.where(jnp.abs(wanted) < hold, wanted, sharp_clip(wanted, dry))
+
     if n == 1:
-        return sharp_clip(speed * -inverse, bound)
-    reaction = jnp.zeros(n)
+        wanted = speed * -inverse
+        return answer(wanted, dry, hold), jnp.abs(wanted) < hold
+    reaction = wanted = jnp.zeros(n)
     for _ in range(20):
         for i in range(n):
             slip = speed[i] + jnp.sum(mobility[i] * reaction)
-            wanted = reaction[i] - slip * inverse[i]
-            reaction = reaction.at[i].set(sharp_clip(wanted, bound[i]))
-    return reaction
+            wanted = wanted.at[i].set(reaction[i] - slip * inverse[i])
+            reaction = reaction.at[i].set(answer(wanted[i], dry[i], hold[i]))
+    return reaction, jnp.abs(wanted) < hold
 
 
 def _rest_exactly(plant: Plant, x: State, stuck: Array) -> State:

@@ -19,6 +19,7 @@ from jaxid.model import Plant
 from jaxid.readings import State, acceleration
 from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
+from jaxid.solvers import Adaptive
 
 # Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
 _FINE = 0.2
@@ -35,12 +36,20 @@ class Numerics:
         substeps: Integration steps between samples of the command.
         longest_delay: Samples of past command kept, for delays in a loop.
         segment: Samples after which an open-loop run restarts from the log; None: never.
+        solver: One of `jaxid.solvers.SOLVERS`, which takes the place of the fixed steps and smooths
+            dry friction; None: fixed steps.
     """
 
     set_valued: bool = True
     substeps: int = 1
     longest_delay: int = 0
     segment: int | None = None
+    solver: str | None = None
+
+    @property
+    def sticks(self) -> bool:
+        """Whether dry friction sticks exactly."""
+        return self.set_valued and self.solver is None
 
 
 class Replay(eqx.Module):
@@ -122,14 +131,21 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     else:
         columns = [np.interp(ticks, log.time, r) for r in log.reference.T]
         reference, times = np.stack(columns, axis=1), ticks
-    drive = Drive(
-        jnp.asarray(machine.gain), period, "zero_order", numerics.substeps, numerics.set_valued,
-        numerics.longest_delay,
-    )
     return Replay(
-        drive, machine.controller, machine.sensor, jnp.asarray(reference),
-        jnp.asarray(disturbance_at(machine.disturbance, times, log)), None,
-        jnp.asarray(log.position[0]), jnp.asarray(velocity), None, every,
+        _drive(machine, log, numerics, period, "zero_order"), machine.controller,
+        machine.sensor, jnp.asarray(reference), jnp.asarray(disturbance_at(machine.disturbance, times, log)),
+        None, jnp.asarray(log.position[0]), jnp.asarray(velocity), None, every,
+    )
+
+
+def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: str) -> Drive:
+    solver = None
+    if numerics.solver is not None:
+        sizes = float(np.std(log.position, axis=0).max()), float(machine.plant.velocity_scale)
+        solver = Adaptive.sized(numerics.solver, *sizes)
+    return Drive(
+        jnp.asarray(machine.gain), period, hold, numerics.substeps,
+        numerics.sticks, numerics.longest_delay, solver,
     )
 
 
@@ -180,10 +196,7 @@ def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) 
         command, every = _refined(command), _REFINE
         period, hold = period / every, "linear"
         numerics = replace(numerics, substeps=max(1, round(numerics.substeps / every)))
-    drive = Drive(
-        jnp.asarray(machine.gain), period, hold, numerics.substeps, numerics.set_valued,
-        numerics.longest_delay,
-    )
+    drive = _drive(machine, log, numerics, period, hold)
     restart = _segments(log, numerics.segment, every) if numerics.segment else None
     return Replay(
         drive, None, machine.sensor, None, None, jnp.asarray(command),

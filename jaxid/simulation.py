@@ -1,8 +1,9 @@
 """From plant, loop and input to a trajectory: a fixed-step scan, and diffrax.
 
-The scan serves sampled loops and fits; diffrax serves any of its solvers on the same right-hand
-side, adaptive where asked. A command that is held is held outside the integration step: a
-continuous controller is a different model from a sampled one.
+The scan over the samples serves sampled loops and fits; between samples it takes fixed steps or a
+solver of diffrax. `with_diffrax` serves a force that is any function of time, on the same right-hand
+side. A command that is held is held outside the integration step: a continuous controller is a
+different model from a sampled one.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from jaxid.readings import (
     vector_field,
 )
 from jaxid.sensors import Sensor
+from jaxid.solvers import RELATIVE, Adaptive
 
 # Largest product of step and fastest decay for which the fourth-order step keeps both trajectory
 # and gradient (2.78 is where it turns unstable; past 1 the gradient error grows beyond 1 %).
@@ -60,6 +62,7 @@ class Drive(eqx.Module):
         substeps: Integration steps a sample.
         set_valued: Whether dry friction sticks exactly (replay) or is smoothed (gradients).
         longest_delay: Samples of past command kept for delays in a closed loop.
+        solver: Takes the place of fixed steps where given; dry friction is then smoothed.
     """
 
     gain: Array
@@ -68,6 +71,7 @@ class Drive(eqx.Module):
     substeps: int = eqx.field(static=True, default=1)
     set_valued: bool = eqx.field(static=True, default=False)
     longest_delay: int = eqx.field(static=True, default=0)
+    solver: Adaptive | None = None
 
     def stepper(
         self, plant: Plant, x: State, ends: tuple[Array, ...]
@@ -82,6 +86,9 @@ class Drive(eqx.Module):
             x, ends: A state and the force at the ends of a sample, for their shapes; one force
                 where it is held.
         """
+        if self.solver is not None:
+            whole, solver = jnp.asarray(self.period), self.solver
+            return lambda x, ends, t: solver(plant, x, ends, t, whole)
         h = jnp.asarray(self.period / self.substeps)
         flow = affine_flow(plant, x, ends, jnp.zeros(()), h) if self.set_valued else None
 
@@ -109,6 +116,8 @@ def open_loop(
     velocity: Float[Array, " n"],
     sensor: Sensor | None = None,
     reset: tuple[Array, Array, Array] | None = None,
+    start: Array | float = 0.0,
+    own: tuple | None = None,
 ) -> Trajectory:
     """Simulate a plant under a logged command.
 
@@ -120,12 +129,14 @@ def open_loop(
         sensor: What reads the position; absent: exact.
         reset: Samples at which a segment starts (time,) bool, and the positions and velocities
             to restart from, (time, n); for multiple shooting.
+        start: Time of the first sample, from the start of the log [s].
+        own: Own states of the effects there; absent: as if the drive had long been at its force.
     """
-    start, end = interval_forces(plant, drive, command)
-    times = drive.period * jnp.arange(command.shape[0])
-    x0 = State(position, velocity, plant.initial_states(start[0]))
+    before, after = interval_forces(plant, drive, command)
+    times = start + drive.period * jnp.arange(command.shape[0])
+    x0 = State(position, velocity, plant.initial_states(before[0]) if own is None else own)
     held = drive.hold == "zero_order"
-    advance = drive.stepper(plant, x0, (start[0],) if held else (start[0], end[0]))
+    advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
     n = command.shape[0]
     flag, q_new, v_new = (
         (jnp.zeros(n, bool), jnp.zeros((n, 1)), jnp.zeros((n, 1))) if reset is None else reset
@@ -137,7 +148,7 @@ def open_loop(
             x = State(jnp.where(restart, q, x.q), jnp.where(restart, v, x.qd), x.own)
         return advance(x, (u0,) if held else (u0, u1), t), (x.q, x.qd)
 
-    _, (q, v) = jax.lax.scan(tick, x0, (start, end, times, flag, q_new, v_new))
+    _, (q, v) = jax.lax.scan(tick, x0, (before, after, times, flag, q_new, v_new))
     reading = q if sensor is None else sensor.read(q)
     return Trajectory(q, v, command, reading)
 
@@ -260,7 +271,7 @@ def with_diffrax(
         controller = (
             diffrax.ConstantStepSize()
             if step_length is not None
-            else diffrax.PIDController(rtol=1e-8, atol=1e-10)
+            else diffrax.PIDController(rtol=RELATIVE, atol=1e-10)
         )
     x0 = State(position, velocity, plant.initial_states(force(times[0])))
     solution = diffrax.diffeqsolve(

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import stepper_machines as machines
-from search_cases import COULOMB, PAIRS, SEARCH_CASES, UNSEEN, VISCOUS, SearchCase
+from search_cases import AT_REST, COULOMB, PAIRS, SEARCH_CASES, VISCOUS, SearchCase
 from search_setup import case_text, log_of, write_case
 
 from jaxid.discovery.discover import discover
 from jaxid.effects import EFFECTS
 
-FAST = ("coulomb_friction", "cogging", "input_delay", "hysteresis")
+FAST = ("coulomb_friction", "static_friction", "cogging", "input_delay", "hysteresis")
 
 
 def kinds_to_test():
@@ -31,7 +31,7 @@ def closed(d) -> float:
 
 
 def test_every_effect_has_a_case():
-    assert set(SEARCH_CASES) | set(UNSEEN) == {k for k in EFFECTS if ":" not in k}
+    assert set(SEARCH_CASES) == {k for k in EFFECTS if ":" not in k}
 
 
 @pytest.mark.parametrize("kind", kinds_to_test())
@@ -43,7 +43,7 @@ def test_the_missing_effect_is_found(kind, tmp_path):
     assert len(d.kinds) == 1
     assert kind in named
     assert d.kinds[0] in {kind, *case.also}
-    assert closed(d) >= 0.9
+    assert kind in AT_REST or closed(d) >= 0.9
     if d.kinds[0] != kind:
         return
     for name, true in case.values.items():

@@ -278,8 +278,9 @@ def test_refuses_what_it_does_not_know(machine: Machine, options: Any, message: 
         free_run(machine, 0.01, **options)
 
 
-def test_imports_neither_jax_nor_jaxid():
-    code = "import sys, stepper_machines; print([m for m in ('jax', 'jaxid') if m in sys.modules])"
+@pytest.mark.parametrize("module", ["stepper_machines", "hidden_oracle", "hidden_judge"])
+def test_imports_neither_jax_nor_jaxid(module: str):
+    code = f"import sys, {module}; print([m for m in ('jax', 'jaxid') if m in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True
     )

@@ -27,15 +27,6 @@ class Idle(Effect):
 """
 
 
-@pytest.fixture(autouse=True)
-def _effects_as_before():
-    """A user's effect stays registered for the process; tests must not see each other's."""
-    before = dict(EFFECTS)
-    yield
-    EFFECTS.clear()
-    EFFECTS.update(before)
-
-
 def own_case(tmp_path: Path, kind: str = "", dimension: str = "force", name: str = "Wind") -> str:
     write(tmp_path, OWN_EFFECT.format(kind=kind or "pass", dimension=dimension), "mine.py")
     return more(f'[[effects]]\nkind = "mine.py:{name}"\npressure = {{ guess = 3.0 }}\n')
@@ -45,11 +36,52 @@ def own_case(tmp_path: Path, kind: str = "", dimension: str = "force", name: str
 def test_own_effect_takes_part(tmp_path, kind, known_as):
     case = load_case(write(tmp_path, own_case(tmp_path, kind)))
     cls = case.effects[2].cls
-    assert EFFECTS[known_as] is cls
     assert cls.kind == known_as
+    assert case.own_effects == (cls,)
+    assert known_as not in EFFECTS  # it is this case's
     # the same class again: what was compiled for it still serves
     assert load_case(case.path).effects[2].cls is cls
     assert build_machine(case).parameters.names[-1] == f"{known_as}.pressure"
+
+
+def test_own_effects_of_two_cases_do_not_meet(tmp_path):
+    classes = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        path = write(tmp_path / name, own_case(tmp_path / name, 'kind = "wind"'))
+        classes += load_case(path).own_effects
+    assert classes[0] is not classes[1]
+    assert [c.kind for c in classes] == ["wind", "wind"]
+
+
+def test_candidates_are_no_part_of_the_model(tmp_path):
+    own_case(tmp_path)
+    case = load_case(write(tmp_path, more('[discover]\ncandidates = ["mine.py:Wind"]\n')))
+    assert [c.__name__ for c in case.candidates] == ["Wind"]
+    assert case.own_effects == case.candidates
+    assert len(case.effects) == 2
+
+
+CANDIDATE_FAULTS = {
+    "no such class": ('candidates = ["mine.py:Wnid"]', "candidates[1] = ", "did you mean 'Wind'?"),
+    "no such file": ('candidates = ["my.py:Wind"]', "does not exist", "there is: mine.py"),
+    "not a class": ('candidates = ["Wind"]', "names no class", "my_effects.py:MyEffect"),
+    "known": ('candidates = ["cogging"]', "takes part in every search", "leave it out"),
+    "no list": ('candidates = "mine.py:Wind"', "is not a list", "in [ ]"),
+    "no text": ("candidates = [3]", "candidates[1] = 3", "is not a text"),
+    "unknown key": ('candidate = ["mine.py:Wind"]', "unknown key", "did you mean 'candidates'?"),
+    "two of a kind": ('candidates = ["mine.py:Wind", "also.py:Wind"]', "of kind 'wind'", "another kind"),
+}
+
+
+@pytest.mark.parametrize("fault", CANDIDATE_FAULTS)
+def test_candidate_fault(tmp_path, fault):
+    line, *words = CANDIDATE_FAULTS[fault]
+    own_case(tmp_path, 'kind = "wind"')
+    if fault == "two of a kind":
+        write(tmp_path, (tmp_path / "mine.py").read_text(), "also.py")
+    told = message(tmp_path, more(f"[discover]\n{line}\n"))
+    assert all(word in told for word in words), told
 
 
 OWN_FAULTS = {

@@ -6,7 +6,7 @@ take longer than all of the search.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -16,6 +16,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
+from jaxid.discovery.own import check_foreign, is_foreign
 from jaxid.effects import EFFECTS
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual, sharpened
 from jaxid.estimators.least_squares import Transform
@@ -131,22 +132,27 @@ def scales_of(data: Prepared) -> Scales:
     )
 
 
-def build_union(machine: Machine, data: Prepared) -> Union:
-    """Add every registered effect that the plant does not have yet, at every joint.
+def build_union(machine: Machine, data: Prepared, own: Sequence[type[Effect]] = ()) -> Union:
+    """Add every effect that the plant does not have yet, at every joint.
 
     Args:
         machine: The baseline.
         data: The log to be searched, for scales.
+        own: Effects of the case beside those that are registered.
+
+    Raises:
+        InputError: If an effect that is not jaxid's own cannot be searched for.
     """
     scales = scales_of(data)
     plant, parameters = machine.plant, machine.parameters
+    missing = [_missing(plant, port, own) for port in range(data.q.shape[1])]
+    for cls in dict.fromkeys(cls for classes in missing for cls in classes):
+        if is_foreign(cls):
+            check_foreign(cls, machine, data, scales)
     base = np.arange(len(parameters.free))
     candidates = []
-    for port in range(data.q.shape[1]):
-        present = {e.kind for e in plant.effects if e.port == port}
-        for kind, cls in EFFECTS.items():
-            if kind in present:
-                continue
+    for port, classes in enumerate(missing):
+        for cls in classes:
             neutral = cls.neutral(scales)
             plant, free = free_effect(plant, cls(**neutral, port=port), machine.units)
             free = _limited(free, cls.limits(scales))
@@ -155,6 +161,12 @@ def build_union(machine: Machine, data: Prepared) -> Union:
             candidates.append(_candidate(cls, port, np.arange(first, first + len(free)), scales))
     union = machine.with_plant(sharpened(plant, data), parameters)
     return Union(union, base, tuple(candidates), scales)
+
+
+def _missing(plant: Plant, port: int, own: Sequence[type[Effect]]) -> list[type[Effect]]:
+    """Effects that a joint does not have yet."""
+    present = {e.kind for e in plant.effects if e.port == port}
+    return [cls for cls in (*EFFECTS.values(), *own) if cls.kind not in present]
 
 
 def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[Free]:

@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.discovery import candidates as cand
+from jaxid.discovery.breakaway import BreakAway, break_away
 from jaxid.discovery.screen import Score
-from jaxid.discovery.search import Search, Step
+from jaxid.discovery.search import RELEVANT, Search, Step
+from jaxid.discovery.separate import Proposal, proposals
 from jaxid.discovery.where import Where, locate
+from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
 from jaxid.estimators.output_error import output_error
 from jaxid.estimators.result import Estimate
@@ -80,6 +83,8 @@ class Discovery:
         gaps_before: By log, the fitted one first.
         gaps_after: The same after.
         noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
+        proposals: Experiments that would tell effects apart which this log cannot.
+        starts: How many starts from rest were looked at for break-away friction.
     """
 
     session: Session
@@ -92,6 +97,8 @@ class Discovery:
     gaps_before: tuple[Gap, ...]
     gaps_after: tuple[Gap, ...]
     noise_floor: np.ndarray
+    proposals: tuple[Proposal, ...] = ()
+    starts: int = 0
 
     @property
     def kinds(self) -> list[str]:
@@ -109,7 +116,7 @@ class Discovery:
         return discovery_table(self)
 
     def save(self, folder: str | Path, *, force: bool = False) -> Path:
-        """Write `discovery.json` and `report.html` to a folder.
+        """Write `discovery.json`, `report.html` and the proposed experiments to a folder.
 
         Raises:
             InputError: If the folder holds what jaxid did not make and `force` is not given.
@@ -146,33 +153,79 @@ def discover(
     progress("fitting what is there")
     baseline = inverse_dynamics(machine, data)
     floor = noise_floor(baseline.machine, session.fit.log, data)
-    union = cand.build_union(baseline.machine, data)
+    union = cand.build_union(baseline.machine, data, session.case.own_effects)
     search = Search(union, data, floor, tuple(v.data for v in session.validations), progress)
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
-    where = _where(search, steps[0])
+    where = _where(search, steps[0], session.fit.log)
     final, effects = _final_machine(baseline.machine, search, alternatives, steps)
     verdict = _verdict(effects, where, steps, search)
     before = baseline
     after = inverse_dynamics(final, data) if effects else before
+    at_rest = []
+    if verdict != "unexplained":
+        progress("looking at the starts from rest")
+        at_rest = _break_aways(session, search, after)
     if refit:
         progress("refitting in simulation")
         before = _refit(session.with_machine(before.machine), before)
         after = _refit(session.with_machine(after.machine), after) if effects else before
+    separating = proposals(session, search, effects, progress)
+    for c, b in at_rest:
+        if b.level > 0.0 and b.evidence > b.threshold and b.closed > RELEVANT:
+            where = where if effects else _at_starts(where, c, b)
+            after, found, step = _with_break_away(after, search, c, b)
+            steps.append(step)
+            effects, verdict = (*effects, found), "found"
     progress("simulating")
     old = gaps(before.machine, session.runs)
     new = gaps(after.machine, session.runs) if effects else old
     return Discovery(
         session, verdict, None if verdict == "nothing_missing" else where, effects,
-        tuple(_round(search, s) for s in steps), before, after, old, new, floor,
+        tuple(_round(search, s) for s in steps), before, after, old, new, floor, separating,
+        sum(len(b.times) for _, b in at_rest),
     )
 
 
-def _where(search: Search, baseline: Step) -> Where:
+def _break_aways(
+    session: Session, search: Search, estimate: Estimate
+) -> list[tuple[cand.Candidate, BreakAway]]:
+    """What the starts from rest say of each joint's break-away friction, where they say anything."""
+    missing = [c for c in search.rest() if c.kind == StaticFriction.kind]
+    found = [(c, break_away(estimate, session.fit.log, session.fit.data, c.port)) for c in missing]
+    return [(c, b) for c, b in found if b is not None]
+
+
+def _with_break_away(
+    estimate: Estimate, search: Search, c: cand.Candidate, b: BreakAway
+) -> tuple[Estimate, Found, Step]:
+    """An estimate with break-away friction beside it, as the starts from rest tell it."""
+    machine = estimate.machine
+    effect = StaticFriction(level=b.level, port=c.port)
+    plant, free = free_effect(machine.plant, effect, machine.units)
+    theta = np.append(estimate.theta, b.level)
+    machine = machine.with_plant(plant, machine.parameters.extended(free)).with_estimate(theta)
+    new = replace(estimate, machine=machine, theta=theta, precision=estimate.precision.beside(b.std))
+    score = Score(c, 0, np.array([b.level]), b.evidence)
+    found = Found(c.kind, c.port + 1, (free[0].name,), score, ())
+    return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
+
+
+def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
+    """Where break-away friction shows: at the starts from rest."""
+    text = f"joint {c.port + 1}: {len(b.times)} starts from rest come later than sliding friction explains"
+    spans = tuple((float(t), float(t)) for t in b.times)
+    return replace(where, joint=c.port + 1, variable="time", intervals=spans, text=text)
+
+
+def _where(search: Search, baseline: Step, log: Log) -> Where:
     """Where the baseline's residual lies, on the whole log."""
     whole = [ForceData.of(search.data)]
     e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta)
-    return locate(-e, jacobian[..., baseline.active], search.data)
+    wanted = None
+    if log.reference is not None:
+        wanted = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
+    return locate(-e, jacobian[..., baseline.active], search.data, wanted)
 
 
 def _verdict(

@@ -186,7 +186,8 @@ class Beside:
 
 def log_evidence(rows: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Gain in held-out log-likelihood (nats) where a sum of squares falls from before to after."""
-    return 0.5 * rows * np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
+    # Below 1e-12 of what was there, a sum of squares is rounding.
+    return -0.5 * rows * np.log(np.maximum(after / np.maximum(before, 1e-300), 1e-12))
 
 
 def flipped(

@@ -19,11 +19,13 @@ _KNOTS = 12
 # noise of one level that happens less than once in 10^9 windows.
 _WINDOW = 20
 _LOUD = 8.0
-# Measured acceleration and force carry the noise that the residual is made of: it depends on them
-# even where nothing is missing. They describe, where they explain so much more than position and
-# velocity do, but decide nothing.
+# Measured acceleration and force carry the noise that the residual is made of, and a loop echoes
+# in them whatever disturbs it: the residual depends on them even where they are not its cause. They
+# describe, where they explain so much more than all else does, but decide nothing.
 _OWN_NOISE = ("acceleration", "force")
 _FAR_MORE = 2.0
+# Intervals say where a residual lies if they hold most of its sum of squares.
+_MOSTLY = 0.5
 # A spectral line must carry this part of the variance, and stand above the median of its
 # neighbours by a factor that white noise exceeds once in 10^8.
 _LINE_PART = 0.05
@@ -86,7 +88,8 @@ def variables(data: Prepared, joint: int) -> dict[str, Float[np.ndarray, " kept"
 
 
 def locate(
-    residual: Float[np.ndarray, "kept n"], jacobian: Float[np.ndarray, "kept n p"], data: Prepared
+    residual: Float[np.ndarray, "kept n"], jacobian: Float[np.ndarray, "kept n p"], data: Prepared,
+    wanted: Float[np.ndarray, "kept n"] | None = None,
 ) -> Where:
     """Find the joint and variable that explain most of a residual.
 
@@ -94,12 +97,19 @@ def locate(
         residual: Measured minus modelled force at the kept samples.
         jacobian: Of the residual in the model's unknowns: what they can absorb does not count.
         data: The prepared log.
+        wanted: Velocity of the reference at the kept samples; absent: unknown.
     """
-    found = [_locate(residual[:, i], jacobian[:, i], data, i) for i in range(residual.shape[1])]
+    wanted = data.at_kept(data.qd) if wanted is None else wanted
+    found = [
+        _locate(residual[:, i], jacobian[:, i], data, wanted[:, i], i)
+        for i in range(residual.shape[1])
+    ]
     return max(found, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
 
 
-def _locate(e: np.ndarray, jacobian: np.ndarray, data: Prepared, joint: int) -> Where:
+def _locate(
+    e: np.ndarray, jacobian: np.ndarray, data: Prepared, wanted: np.ndarray, joint: int
+) -> Where:
     counts = data.moving[:, joint]
     named = variables(data, joint)
     hats = {name: _hats(x, counts) for name, x in named.items()}
@@ -120,20 +130,21 @@ def _locate(e: np.ndarray, jacobian: np.ndarray, data: Prepared, joint: int) -> 
         if name not in _OWN_NOISE:
             largest = np.maximum(largest, gain[1:])
     intervals = _loud(e, counts, data)
-    line = _line(left, whitener, data, joint)
-    best = _best(gains)
+    line, part = _line(left, whitener, data, wanted)
     limit = ev.threshold(largest)
-    line, part = line
-    # A variable of the motion that explains more says more than a line in the spectrum.
-    line = line if part > _explained(gains[best], counts) else None
-    if line is not None or _share(e, counts, data, intervals) > _explained(gains[best], counts):
+    # Position or velocity that explain more say more than a line in the spectrum, or than intervals.
+    clean = max((n for n in gains if n not in _OWN_NOISE), key=lambda n: gains[n])
+    explained = _explained(gains[clean], counts)
+    line = line if part > explained else None
+    if line is not None or _share(e, counts, data, intervals) > max(explained, _MOSTLY):
         best = "time"
+    else:
+        best = _best(gains, clean)
     return _describe(e, counts, named[best], best, joint, gains[best], limit, intervals, line, data)
 
 
-def _best(gains: dict[str, float]) -> str:
+def _best(gains: dict[str, float], clean: str) -> str:
     """The variable to name: one that carries the residual's noise must explain far more."""
-    clean = max((n for n in gains if n not in _OWN_NOISE), key=lambda n: gains[n])
     other = max(_OWN_NOISE, key=lambda n: gains[n])
     return other if gains[other] > _FAR_MORE * max(gains[clean], 0.0) else clean
 
@@ -237,9 +248,9 @@ def _share(
 
 
 def _line(
-    left: Float[np.ndarray, " row"], whitener: ev.Whitener, data: Prepared, joint: int
+    left: Float[np.ndarray, " row"], whitener: ev.Whitener, data: Prepared, wanted: np.ndarray
 ) -> tuple[float | None, float]:
-    """Frequency of a line in the whitened residual that the motion lacks [Hz], and its part of it."""
+    """Frequency of a line in the whitened residual that the wanted motion lacks [Hz], and its part."""
     if len(left) < 100:
         return None, 0.0
     # Rows that are left out stay as gaps: closed up, a line would shift and smear.
@@ -250,8 +261,7 @@ def _line(
     power[:5] = 0.0
     k = int(np.argmax(power))
     part = power[max(k - 2, 0) : k + 3].sum() / power.sum()
-    motion = data.at_kept(data.qd)[:, joint]
-    moved = np.abs(np.fft.rfft((motion - motion.mean()) * window)) ** 2
+    moved = np.abs(np.fft.rfft((wanted - wanted.mean()) * window)) ** 2
     if part < _LINE_PART or _stands_out(moved, k) or not _stands_out(power, k):
         return None, 0.0
     rate = 1.0 / (data.period * data.recipe.decimation)

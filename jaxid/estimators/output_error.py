@@ -24,6 +24,7 @@ from jaxid.parameters import scatter
 from jaxid.precision import assess, full_hessian
 from jaxid.replay import Numerics, Replay, make_replay, needed_steps, with_fitted_start
 from jaxid.simulation import Drive, needed_substeps
+from jaxid.solvers import RELATIVE
 
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
 # deviation is cut into segments.
@@ -31,10 +32,6 @@ _LOST = 0.5
 # The start of an open-loop run is fitted with the rest only where the residual's RMS is within this
 # factor of the position noise. Elsewhere the model's own error would bend the start, which the first
 # samples tell far better.
-_NOISE_LIMITED = 3.0
-# The start of an open-loop run is fitted with the rest only where the residual's RMS is within this
-# factor of the position noise. Elsewhere the model's own error would bend the start, which the
-# first samples tell far better.
 _NOISE_LIMITED = 3.0
 # So many segments then; each long enough to show friction, short enough not to drift away.
 _SEGMENTS = 40
@@ -160,19 +157,28 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple
     )
 
 
-def choose_numerics(machine: Machine, log: Log, *, segments: bool = True) -> Numerics:
+def choose_numerics(
+    machine: Machine, log: Log, *, segments: bool = True, solver: str | None = None
+) -> Numerics:
     """Integration that suits a machine and its log.
 
     Dry friction sticks exactly: its gradient is exact too, because the force is continuous where
-    sliding starts. Break-away friction breaks that, and is smoothed.
+    sliding starts. Break-away friction breaks that, and is smoothed; so does a solver of diffrax.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        segments: Whether an open-loop run may be cut into segments.
+        solver: One of `jaxid.solvers.SOLVERS`; None: fixed steps.
     """
     kinds = {e.kind for e in machine.plant.effects}
     numerics = Numerics(
-        set_valued="static_friction" not in kinds,
-        substeps=needed_steps(machine, log),
+        set_valued="static_friction" not in kinds and solver is None,
+        substeps=1 if solver else needed_steps(machine, log),
         longest_delay=12 if "input_delay" in kinds and machine.controller is not None else 0,
+        solver=solver,
     )
-    if not numerics.set_valued:
+    if not numerics.set_valued and solver is None:
         numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))
     if machine.controller is not None or not segments:
         return numerics
@@ -182,7 +188,7 @@ def choose_numerics(machine: Machine, log: Log, *, segments: bool = True) -> Num
     if np.isfinite(off) and off < _LOST * np.std(log.position):
         return numerics
     length = max(20, log.samples // _SEGMENTS)
-    return Numerics(numerics.set_valued, numerics.substeps, 0, length)
+    return replace(numerics, segment=length)
 
 
 def _sharp_steps(machine: Machine, log: Log) -> int:
@@ -202,8 +208,11 @@ def _failure(minimum: Minimum) -> str:
 
 def _notes(machine: Machine, numerics: Numerics, log: Log) -> tuple[str, ...]:
     where = "in the loop" if machine.controller is not None else "open loop"
-    how = "sticks exactly" if numerics.set_valued else "is smoothed"
-    notes = [f"simulated {where}, {numerics.substeps} step(s) a sample; dry friction {how}"]
+    how = "sticks exactly" if numerics.sticks else "is smoothed"
+    steps = f"{numerics.substeps} step(s) a sample"
+    if numerics.solver is not None:
+        steps = f"by diffrax's {numerics.solver}, each step within {RELATIVE:g}"
+    notes = [f"simulated {where}, {steps}; dry friction {how}"]
     if numerics.segment:
         seconds = numerics.segment * log.period
         notes.append(f"restarted from the log every {seconds:.3g} s: it drifts off otherwise")

@@ -12,14 +12,24 @@ from typing import Any
 import numpy as np
 
 from jaxid.controllers import CONTROLLERS
+from jaxid.effects import EFFECTS
 from jaxid.errors import InputError, suggest
-from jaxid.io.case_entries import EffectEntry, PlantEntry, read_effects, read_kind, read_plant
+from jaxid.io.case_entries import (
+    EffectEntry,
+    PlantEntry,
+    check_kinds,
+    read_candidates,
+    read_effects,
+    read_kind,
+    read_plant,
+)
 from jaxid.io.case_tables import (
     PLANNED_CONTROLLERS,
     STUDY,
     TOP,
     actuator_keys,
     controller_keys,
+    limits_keys,
     log_keys,
     preprocess_keys,
     sensor_keys,
@@ -28,6 +38,7 @@ from jaxid.io.case_tables import (
 )
 from jaxid.io.log import LOG_KEYS
 from jaxid.io.schema import Key, Keys, Spot, read_table
+from jaxid.model import Effect
 from jaxid.references import REFERENCES
 
 
@@ -62,7 +73,9 @@ class Case:
         preprocess: [preprocess], for `jaxid.preprocess.choose_recipe`.
         controller: [controller].
         sensor: [sensor].
+        limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
+        candidates: User's own effects that a search may name, from [discover].
         reference: [reference], for `jaxid.references.make_reference`.
         input: [input], likewise.
         simulation: [simulation].
@@ -78,7 +91,9 @@ class Case:
     preprocess: dict[str, Any] = field(default_factory=dict)
     controller: dict[str, Any] | None = None
     sensor: dict[str, Any] = field(default_factory=dict)
+    limits: dict[str, Any] = field(default_factory=dict)
     validations: tuple[Validation, ...] = ()
+    candidates: tuple[type[Effect], ...] = ()
     reference: dict[str, Any] | None = None
     input: dict[str, Any] | None = None
     simulation: dict[str, Any] = field(default_factory=dict)
@@ -88,6 +103,12 @@ class Case:
     def folder(self) -> Path:
         """Where relative file names of the case start from."""
         return self.path.parent
+
+    @property
+    def own_effects(self) -> tuple[type[Effect], ...]:
+        """User's effects that the case knows: those it declares, and the candidates."""
+        classes = (*(entry.cls for entry in self.effects), *self.candidates)
+        return tuple(dict.fromkeys(c for c in classes if EFFECTS.get(c.kind) is not c))
 
     @property
     def columns(self) -> dict[str, Any]:
@@ -134,12 +155,15 @@ def load_case(path: str | Path) -> Case:
         preprocess=read("preprocess", preprocess_keys(joints)),
         controller=_controller(tables, joints, file),
         sensor=read("sensor", sensor_keys(joints)),
+        limits=read("limits", limits_keys(joints)),
         validations=_validations(tables, joints, path),
+        candidates=read_candidates(tables.get("discover", {}), path),
         reference=_signal("reference", tables, joints, file),
         input=_signal("input", tables, joints, file),
         simulation=read("simulation", simulation_keys(joints)),
         study=read("study", STUDY),
     )
+    check_kinds(case.own_effects, file)
     _check_loop(case)
     return case
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,18 @@ from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.io.case_tables import PLANNED_EFFECTS, PLANNED_PLANTS, PLANT
 from jaxid.io.case_values import Value, read_value, read_values
-from jaxid.io.schema import Key, Spot, choice, count, flag, nearest, read_table, several, whole
+from jaxid.io.schema import (
+    Key,
+    Spot,
+    choice,
+    count,
+    flag,
+    nearest,
+    read_table,
+    several,
+    text,
+    whole,
+)
 from jaxid.io.user_effect import user_effect
 from jaxid.model import Effect, Plant, parameters_of
 from jaxid.plants import PLANTS
@@ -139,6 +151,35 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
     }
     _check_together(cls, parameters, spot)
     return EffectEntry(cls, parameters, joints)
+
+
+def read_candidates(table: Any, path: Path) -> tuple[type[Effect], ...]:
+    """Read [discover]: the user's own effects that a search may name.
+
+    Raises:
+        InputError: If one is no class of a file.
+    """
+    def own(value: Any, spot: Spot) -> type[Effect]:
+        kind = text(value, spot)
+        if kind in EFFECTS:
+            raise spot.refuse(kind, "takes part in every search", "leave it out")
+        return user_effect(kind, path.parent, spot)
+
+    keys = {"candidates": Key(several(own), 'a list such as ["my_effects.py:MyEffect"]')}
+    return read_table(table, keys, Spot(str(path), "[discover]")).get("candidates", ())
+
+
+def check_kinds(classes: Iterable[type[Effect]], file: str) -> None:
+    """Refuse two own effects of one kind: results go by kind.
+
+    Raises:
+        InputError: If there are.
+    """
+    known: dict[str, type[Effect]] = {}
+    for cls in classes:
+        if known.setdefault(cls.kind, cls) is not cls:
+            mend = "give one of them another kind"
+            raise Spot(file).fault(f"two effects of your own are of kind '{cls.kind}'", mend)
 
 
 def _check_keys(table: dict[str, Any], names: list[str], spot: Spot) -> None:

@@ -18,6 +18,7 @@ from jaxid.io.schema import (
     number,
     rows,
     several,
+    stretch,
     text,
     whole,
 )
@@ -44,7 +45,9 @@ TOP = {
     "preprocess": False,
     "controller": False,
     "sensor": False,
+    "limits": False,
     "validation": True,
+    "discover": False,
     "reference": False,
     "input": False,
     "simulation": False,
@@ -151,6 +154,15 @@ def sensor_keys(joints: int) -> Keys:
         "position_resolution": Key(by_joint(number("positive"), joints)),
         "position_noise": Key(by_joint(number("nonnegative"), joints)),
         "force_noise": Key(by_joint(number("nonnegative"), joints)),
+    }
+
+
+def limits_keys(joints: int) -> Keys:
+    """Keys of [limits]."""
+    return {
+        "stroke": Key(stretch(joints), "lowest and highest position"),
+        "speed": Key(by_joint(number("positive"), joints), "largest speed"),
+        "force": Key(by_joint(number("positive"), joints), "largest command, in its units"),
     }
 
 

@@ -12,6 +12,7 @@ from jaxid.discovery.screen import Score
 from jaxid.estimators.result import Estimate
 from jaxid.identification import Gap, Identification
 from jaxid.io.output import ready_folder, write_json, write_whole
+from jaxid.io.proposals import proposal_csv, proposal_json
 from jaxid.session import Session
 
 if TYPE_CHECKING:
@@ -174,6 +175,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "converged": result.converged,
         "where": where_json(result),
         "effects": [effect_json(e, result.after) for e in result.effects],
+        "experiments": [proposal_json(p, units) for p in result.proposals],
         "steps": [
             step_json(r) for k, r in enumerate(result.rounds)
             # The baseline, and what changed it; the last round mostly adds nothing.
@@ -214,10 +216,9 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
         return []
     present = {e.kind for e in result.session.machine.plant.effects}
     lines = []
-    if "static_friction" not in present:
+    if "static_friction" not in present and result.starts == 0:
         lines.append(
-            "break-away friction (static_friction) was not looked for: it acts at rest, and samples "
-            "at rest are left out of the balance"
+            "break-away friction (static_friction) was not looked for: too few starts from a clear rest"
         )
     for score in result.rounds[-1].step.scores:
         if score.reason and score.evidence > result.rounds[-1].step.threshold:
@@ -248,11 +249,19 @@ def save_identification(result: Identification, folder: Path, *, force: bool = F
     return folder
 
 
+def discovery_files(result: Discovery) -> list[str]:
+    """Names of what `save_discovery` writes."""
+    return ["discovery.json", "report.html", *[p.file for p in result.proposals if p.separates]]
+
+
 def save_discovery(result: Discovery, folder: Path, *, force: bool = False) -> Path:
-    """Write discovery.json and report.html."""
+    """Write discovery.json, report.html and a CSV for every experiment that is proposed."""
     from jaxid.report.build import discovery_report
 
-    ready_folder(folder, ["discovery.json", "report.html"], force=force)
+    ready_folder(folder, discovery_files(result), force=force)
+    for proposal in result.proposals:
+        if proposal.separates:
+            write_whole(folder / proposal.file, proposal_csv(proposal))
     write_whole(folder / "report.html", discovery_report(result))
     write_json(folder / "discovery.json", discovery_json(result))
     return folder

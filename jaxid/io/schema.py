@@ -227,6 +227,25 @@ def by_joint(read: Reader, joints: int) -> Reader:
     return read_either
 
 
+def stretch(joints: int) -> Reader:
+    """Two numbers, the lower first, for all joints; or a list with two a joint."""
+    ends = several(number(), shortest=2)
+
+    def read_pair(value: Any, spot: Spot) -> tuple[float, float]:
+        pair = ends(value, spot)
+        if len(pair) != 2 or not pair[0] < pair[1]:
+            mend = f"give the lower end and the upper, e.g. {spot.key} = [0.0, 0.2]"
+            raise spot.refuse(value, "is not a range", mend)
+        return pair
+
+    def read_either(value: Any, spot: Spot) -> Any:
+        if isinstance(value, list) and any(isinstance(v, list) for v in value):
+            return by_joint(read_pair, joints)(value, spot)
+        return read_pair(value, spot)
+
+    return read_either
+
+
 def columns(joints: int) -> Reader:
     """Names of columns: one (which may hold a matrix), or one a joint; as they are written."""
 

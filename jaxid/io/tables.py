@@ -69,6 +69,7 @@ def discovery_table(result: Discovery) -> str:
         others = ", ".join(a["kind"] for a in effect["alternatives"])
         told = f"; this log cannot tell it from {others}" if others else ""
         lines.append(f"effect:  {effect['kind']} (evidence {effect['evidence']:.0f} nats{told})")
+    lines += [f"experiment: {e['text']}" for e in content["experiments"]]
     gap = content["gap"]
     rows = [["step", "force gap, fit", "force gap, validation"]]
     for step in content["steps"]:

@@ -1,4 +1,7 @@
-"""A user's own effect: a class in a Python file beside the case."""
+"""A user's own effect: a class in a Python file beside the case.
+
+It belongs to the cases that name it: the registry of all cases is left as it was.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import zlib
 from pathlib import Path
 from types import ModuleType
 
-from jaxid.effects import EFFECTS, register
+from jaxid.effects import EFFECTS
 from jaxid.errors import suggest
 from jaxid.io.schema import Spot
 from jaxid.model import SIGNS, Effect, parameters_of
@@ -20,7 +23,7 @@ _LOADED: dict[Path, tuple[int, ModuleType]] = {}
 
 
 def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
-    """Import an effect and register it.
+    """Import an effect.
 
     Args:
         kind: "my_effects.py:MyEffect".
@@ -28,10 +31,11 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
         spot: Where the kind stands.
 
     Returns:
-        The class; `EFFECTS` holds it under its own `kind`, or under the text where it has none.
+        The class; its `kind` is the text where it gives none.
 
     Raises:
-        InputError: If there is no such file or class, it does not import, or it is no effect.
+        InputError: If there is no such file or class, it does not import, it is no effect, or its
+            kind is that of another.
     """
     file, _, name = kind.rpartition(":")
     path = (folder / file).resolve()
@@ -47,9 +51,10 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
         known = [n for n, c in vars(module).items() if _is_effect_of(c, module)]
         what = "is not a subclass of jaxid.model.Effect" if cls is not None else "is not there"
         raise spot.refuse(kind, f": {name} {what}", suggest(name, known))
+    if not hasattr(cls, "kind"):
+        cls.kind = kind
+    _check_kind(cls, module, kind, spot)
     _check_class(cls, kind, spot)
-    if EFFECTS.get(getattr(cls, "kind", "")) is not cls:
-        _register(cls, getattr(cls, "kind", kind), kind, spot)
     return cls
 
 
@@ -74,23 +79,15 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:
         sys.modules.pop(name, None)
-        _restore(before)
         raise spot.refuse(
             kind, f"cannot be imported ({type(error).__name__}: {error})", f"mend {path.name}"
         ) from error
-    # `register` lets a class be defined anew, which a user's class of the same name would pass.
-    taken = [k for k, cls in before.items() if EFFECTS[k] is not cls and cls.__module__ != name]
-    if taken:
-        _restore(before)
-        mend = "register it under a name of its own"
-        raise spot.refuse(kind, f"takes the name of an effect there is: {taken[0]}", mend)
+    finally:
+        # What it registers is its case's, not every case's.
+        EFFECTS.clear()
+        EFFECTS.update(before)
     _LOADED[path] = (changed, module)
     return module
-
-
-def _restore(before: dict[str, type[Effect]]) -> None:
-    EFFECTS.clear()
-    EFFECTS.update(before)
 
 
 def _check_class(cls: type[Effect], kind: str, spot: Spot) -> None:
@@ -109,12 +106,12 @@ def _check_class(cls: type[Effect], kind: str, spot: Spot) -> None:
             raise spot.refuse(kind, what, mend) from error
 
 
-def _register(cls: type[Effect], name: str, kind: str, spot: Spot) -> None:
-    known = EFFECTS.get(name)
-    if known is not None and known.__module__ != cls.__module__:
+def _check_kind(cls: type[Effect], module: ModuleType, kind: str, spot: Spot) -> None:
+    """Results go by kind: it must be one class's."""
+    same = [c for c in vars(module).values() if _is_effect_of(c, module) and c is not cls]
+    if any(getattr(c, "kind", None) == cls.kind for c in same):
+        what = f": another class of that file has its kind, {cls.kind}"
+        raise spot.refuse(kind, what, "each class has a kind of its own")
+    if EFFECTS.get(cls.kind, cls) is not cls:
         mend = "give the class another kind"
-        raise spot.refuse(kind, f"takes the name of an effect there is: {name}", mend)
-    try:
-        register(name)(cls)
-    except ValueError as error:
-        raise spot.refuse(kind, f": {error}", "each class has a kind of its own") from error
+        raise spot.refuse(kind, f"takes the name of an effect there is: {cls.kind}", mend)

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxid.io import results
+from jaxid.io.proposals import sentence
 from jaxid.report.data import (
     CandidateScore,
+    ExperimentView,
     LogView,
     ParameterRow,
     ReportData,
@@ -22,6 +24,7 @@ from jaxid.report.page import render
 
 if TYPE_CHECKING:
     from jaxid.discovery.discover import Discovery, Round
+    from jaxid.discovery.separate import Proposal
     from jaxid.estimators.result import Estimate
     from jaxid.identification import Gap, Identification
     from jaxid.session import Run, Session
@@ -63,6 +66,7 @@ def discovery_report(result: Discovery) -> str:
             where=content["where"],
             steps=tuple(_step(r) for r in result.rounds),
             where_plot=_where_plot(result),
+            experiments=tuple(_experiment(p, session) for p in result.proposals),
             views=_views(session, before, result.gaps_after),
             converged=result.converged,
             **_common(session, result.after, content["notes"]),
@@ -157,6 +161,23 @@ def _step(r: Round) -> SearchStep:
             CandidateScore(s.candidate.kind, s.evidence, s.candidate is added) for s in step.scores
         ),
         threshold=step.threshold,
+    )
+
+
+def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
+    units, limits = session.machine.units, proposal.limits
+    loop = proposal.signal == "reference"
+    # A command has no unit of its own where the gain turns it into a force.
+    own = np.all(session.machine.gain == 1.0)
+    ends = (limits.low, limits.high) if loop else (-limits.force, limits.force)
+    return ExperimentView(
+        text=sentence(proposal, units),
+        signal=proposal.signal,
+        unit=units.label("position") if loop else units.label("force") if own else "command",
+        time=proposal.time,
+        values=proposal.values if proposal.separates else None,
+        limits=np.stack(ends, axis=1),
+        speed=limits.speed if loop else None,
     )
 
 

@@ -110,6 +110,29 @@ class WherePlot(NamedTuple):
     high: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class ExperimentView:
+    """A proposed experiment, as it is drawn.
+
+    Args:
+        text: What to do and what to expect, or why nothing can be done.
+        signal: "reference" or "input".
+        unit: Its unit, or that of the command.
+        time: Ticks [s], (N,).
+        values: The signal by joint, (N, n); None where no experiment separates.
+        limits: Its range by joint, (n, 2).
+        speed: Largest speed by joint, drawn over the speed of a reference; None for an input.
+    """
+
+    text: str
+    signal: str
+    unit: str
+    time: np.ndarray
+    values: np.ndarray | None
+    limits: np.ndarray
+    speed: np.ndarray | None
+
+
 def si_units() -> dict[str, str]:
     """Units of a linear axis; the default of a report."""
     return {"position": "m", "velocity": "m/s", "force": "N", "time": "s"}
@@ -133,6 +156,7 @@ class ReportData:
         where: The `where` object of the JSON result, or None.
         steps: The search, step by step.
         where_plot: The residual over the variable that `where` names, or None.
+        experiments: Proposals that would tell effects apart which the log cannot.
         views: The logs to draw: first the fitted one, then the validations.
         units: Labels of position, velocity, force and time.
         notes: Remarks, warnings, proposals; one sentence or more each.
@@ -153,6 +177,7 @@ class ReportData:
     where: Mapping | None = None
     steps: tuple[SearchStep, ...] = ()
     where_plot: WherePlot | tuple | None = None
+    experiments: tuple[ExperimentView, ...] = ()
     views: tuple[LogView, ...] = ()
     units: Mapping[str, str] = field(default_factory=si_units)
     notes: tuple[str, ...] = ()

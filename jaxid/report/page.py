@@ -16,7 +16,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from jaxid.report import plots, tables
-from jaxid.report.data import LogView, ReportData
+from jaxid.report.data import ExperimentView, LogView, ReportData
 from jaxid.report.numbers import is_number, nats, pretty_unit, short
 
 _NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
@@ -73,6 +73,7 @@ def render(data: ReportData) -> str:
         where=tables.where_lines(data),
         notes=[tables.unbroken(note) for note in data.notes],
         where_figure=_where_figure(data),
+        experiments=[_experiment(data, view) for view in data.experiments],
         views=[_view_entry(data, view, i) for i, view in enumerate(data.views)],
     )
 
@@ -123,6 +124,14 @@ def _rankings(data: ReportData) -> list[dict]:
     return rankings
 
 
+def _experiment(data: ReportData, view: ExperimentView) -> dict:
+    entry = {"text": tables.unbroken(view.text), "image": None}
+    if view.values is not None:
+        words = f"Proposed {view.signal} over time"
+        entry["image"] = _picture(words, plots.plot_experiment, view, data.units)
+    return entry
+
+
 def _where_figure(data: ReportData) -> dict | None:
     if data.where_plot is None or len(data.where_plot[2]) == 0:
         return None
@@ -131,7 +140,7 @@ def _where_figure(data: ReportData) -> dict | None:
     return _image(figure, f"Mean force residual over {data.where_plot[0]}")
 
 
-def _picture(words: str, draw, view: LogView, units: Mapping, **options: object) -> dict:
+def _picture(words: str, draw, view: LogView | ExperimentView, units: Mapping, **options: object) -> dict:
     """Draw a plot over time twice: wide, and again for narrow screens."""
     image = _image(draw(view, units, **options), words)
     image["narrow"] = _image(draw(view, units, size=_NARROW, **options), words)["source"]

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from jaxid.report.axes import FONT, TEXT, bucket_count, dress, legend, span, time_axes, time_label
 from jaxid.report.curves import binned_mean, drawable, envelope, segments, thinned
-from jaxid.report.data import CandidateScore, LogView, SearchStep, WherePlot
+from jaxid.report.data import CandidateScore, ExperimentView, LogView, SearchStep, WherePlot
 from jaxid.report.numbers import is_number, nats, scaled_unit, short
 
 MEASURED = "#8a8a8a"
@@ -24,6 +24,7 @@ _IDLE = "#b4bcc4"
 # Darker shades for the means, which stand on a cloud of their own colour.
 _DARK = {BEFORE: "#7a3600", AFTER: "#00344f"}
 _MOST_POINTS = 4000
+_JOINTS = (AFTER, "#009e73", "#cc79a7", "#56b4e9")
 
 
 def plot_fit(
@@ -224,6 +225,45 @@ def plot_where(
     dress(ax, f"{plot.variable} [{x_unit}]", f"force residual [{unit}]")
     legend(ax)
     return figure
+
+
+def plot_experiment(
+    view: ExperimentView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
+) -> Figure:
+    """A proposed signal over time within its limits; below a reference, its speed.
+
+    Args:
+        view: The experiment; its values must be there.
+        units: Labels of "velocity" and "time".
+        size: Width and height [inch].
+
+    Returns:
+        The figure.
+    """
+    loop = view.speed is not None
+    figure, top, below = time_axes(size, 2 if loop else 1, ratios=(3, 2))
+    many, joints = bucket_count(size), view.values.shape[1]
+    factor, unit = scaled_unit(view.unit, [view.values])
+    for k, values in enumerate(view.values.T):
+        name = view.signal if joints == 1 else f"{view.signal}, joint {k + 1}"
+        top.plot(*envelope(view.time, values / factor, many), lw=1.2, label=name, color=_JOINTS[k % 4])
+    _limits(top, view.limits / factor)
+    dress(top, "" if loop else time_label(units), f"{view.signal} [{unit}]")
+    legend(top)
+    if loop:
+        speed = np.gradient(view.values, view.time, axis=0)
+        factor, unit = scaled_unit(units["velocity"], [speed])
+        for k, values in enumerate(speed.T):
+            below.plot(*envelope(view.time, values / factor, many), lw=1.0, color=_JOINTS[k % 4])
+        _limits(below, np.stack([-view.speed, view.speed], axis=1) / factor)
+        dress(below, time_label(units), f"velocity [{unit}]")
+    return figure
+
+
+def _limits(ax: Axes, limits: np.ndarray) -> None:
+    """Dashed lines at the ends of every joint's range."""
+    for k, value in enumerate(np.unique(limits)):
+        ax.axhline(value, color=BEFORE, lw=1.0, ls=(0, (4, 3)), label="limits" if k == 0 else None)
 
 
 def _simulated(view: LogView) -> list[tuple[str, str, np.ndarray]]:

@@ -1,0 +1,149 @@
+"""How often `discover` names what was hidden, and how often it names what is not there.
+
+    python benchmarks/discovery.py [--split test] [--groups effects,pairs] [--only cogging] [--resume]
+
+Every case of `tests/hidden_cases.py` goes through `jaxid.discover`; a line of JSON each, then the
+table as `discovery.md` and `discovery.json`. Exits with 1 where an aim is missed.
+"""
+
+import argparse
+import fcntl
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+from discovery_table import aims_hold, markdown, summary
+from hidden_cases import NOISES, SCALES, HiddenCase, cases
+from tqdm import tqdm
+
+ROOT = Path(__file__).parent.parent
+GROUPS = ("effects", "pairs", "nulls", "outside", "short")
+COLD = 5
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+}
+
+
+def main() -> int:
+    options = _options()
+    chosen = [c for c in cases(options.split, options.seeds) if _wanted(c, options)]
+    folder = Path(options.o)
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = folder / "cases.jsonl"
+    if lines.exists() and not options.resume:
+        print(f"{lines} exists; give --resume to go on, or another -o", file=sys.stderr)
+        return 2
+    done = {r["id"] for r in read(lines)}
+    if options.workers > 1:
+        os.environ |= ONE_THREAD
+    run([c for c in chosen if c.id not in done], lines, options.workers)
+    if options.cold:
+        measure_cold(chosen[:: max(1, len(chosen) // COLD)][:COLD], folder / "cold.json")
+    ids = {c.id for c in chosen}
+    cold = folder / "cold.json"
+    table = summary(
+        [r for r in read(lines) if r["id"] in ids], json.loads(cold.read_text()) if cold.exists() else []
+    )
+    (folder / "discovery.json").write_text(json.dumps(table, indent=1))
+    (folder / "discovery.md").write_text(markdown(table))
+    print(markdown(table))
+    return 0 if aims_hold(table) else 1
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    words = lambda text: tuple(text.split(","))
+    parser.add_argument("--split", choices=("test", "calibrate"), default="calibrate")
+    parser.add_argument("--groups", type=words, default=GROUPS, help="comma-separated")
+    parser.add_argument("--only", metavar="KIND", help="cases in whose name this stands")
+    parser.add_argument("--scales", type=words, default=(*SCALES, "coarse"))
+    parser.add_argument("--noise", type=lambda s: tuple(map(float, s.split(","))), default=NOISES)
+    parser.add_argument("--seeds", type=int, default=1, help="machines of each kind")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--cold", action="store_true", help=f"time {COLD} fresh commands too")
+    parser.add_argument("--resume", action="store_true", help="skip the cases that are done")
+    parser.add_argument("-o", metavar="DIR", default=str(ROOT / "results" / "discovery"))
+    return parser.parse_args()
+
+
+def _wanted(case: HiddenCase, options: argparse.Namespace) -> bool:
+    named = options.only is None or options.only in case.id
+    return (
+        named and case.group in options.groups and case.scale in options.scales
+        and case.noise in options.noise
+    )  # fmt: skip
+
+
+def read(lines: Path) -> list[dict]:
+    """Records so far; a line that an interruption cut short is left out."""
+    text = lines.read_text() if lines.exists() else ""
+    return [json.loads(line) for line in text.split("\n")[:-1] if line.endswith("}")]
+
+
+def run(chosen: Sequence[HiddenCase], lines: Path, workers: int) -> None:
+    """Run the cases, those of one shape in one process."""
+    groups: dict[tuple, list[HiddenCase]] = {}
+    for case in sorted(chosen, key=lambda c: (c.length, c.declared)):
+        groups.setdefault((case.scale, case.rate), []).append(case)
+    largest_first = sorted(groups.values(), key=len, reverse=True)
+    # A process a group: compiled code serves the whole group, and is given back after it.
+    pool = ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), max_tasks_per_child=1
+    )
+    with pool, tqdm(total=len(chosen), unit="case", desc="hidden cases") as bar:
+        before = len(read(lines))
+        left: set[Future] = {pool.submit(_work, group, str(lines)) for group in largest_first}
+        while left:
+            finished, left = wait(left, timeout=2.0, return_when="FIRST_COMPLETED")
+            for future in finished:
+                future.result()
+            bar.update(len(read(lines)) - before - bar.n)
+
+
+def _work(group: Sequence[HiddenCase], lines: str) -> None:
+    from hidden_run import run_case
+
+    with tempfile.TemporaryDirectory() as folder:
+        for k, case in enumerate(group):
+            record = run_case(case, Path(folder)) | {"warm": k > 0}
+            with open(lines, "a") as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                file.write(json.dumps(record) + "\n")
+
+
+def measure_cold(chosen: Sequence[HiddenCase], path: Path) -> None:
+    """Seconds of a fresh `jaxid discover`, refits in simulation and all."""
+    from hidden_run import write_files
+
+    command = Path(sys.executable).parent / "jaxid"
+    seconds = []
+    for case in _shown(chosen):
+        with tempfile.TemporaryDirectory() as folder:
+            words = write_files(case, Path(folder))
+            begin = time.perf_counter()
+            out = subprocess.run(
+                [command, "discover", *words, "--quiet"], capture_output=True, text=True
+            )
+            seconds.append(
+                {"id": case.id, "seconds": time.perf_counter() - begin, "status": out.returncode}
+            )
+    path.write_text(json.dumps(seconds))
+
+
+def _shown(chosen: Sequence[HiddenCase]) -> Iterator[HiddenCase]:
+    return iter(tqdm(chosen, unit="case", desc="fresh commands"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

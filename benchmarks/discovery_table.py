@@ -1,0 +1,189 @@
+"""The table of the discovery bench, from its records."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from statistics import median
+
+import hidden_judge as judge
+
+Record = dict
+# What the totals must reach: name -> bound, and whether it is a largest value.
+AIMS = {
+    "named right, all visible": (0.95, False),
+    "named right, worst effect": (0.85, False),
+    "false positives": (0.01, True),
+    "both named, visible pairs": (0.90, False),
+    "gap closed over truth's, median": (0.90, False),
+    "parameters within 3 deviations": (0.95, False),
+    "outside: unexplained and pointed at": (0.90, False),
+}
+
+
+def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
+    """All that the table says, as JSON can hold it."""
+    by = defaultdict(list)
+    for r in records:
+        by[r["group"]].append(r)
+    effects = _visible(by["effects"])
+    single, pairs, short = effects, _visible(by["pairs"]), _visible(by["short"])
+    kinds = {k: [r for r in effects if r["what"] == k] for k in dict.fromkeys(r["what"] for r in effects)}
+    named = [*single, *pairs, *short]
+    totals = {
+        "named right, all visible": share(judge.right(r) for r in [*single, *short]),
+        "named right, worst effect": min(
+            (share(judge.right(r) for r in rows) for rows in kinds.values()), default=None
+        ),
+        "false positives": share(judge.false_positive(r) for r in by["nulls"]),
+        "both named, visible pairs": share(judge.right(r) for r in pairs),
+        "gap closed over truth's, median": _median(_closings(named)),
+        "parameters within 3 deviations": share(
+            x <= judge.DEVIATIONS for r in named for x in judge.deviations(r)
+        ),
+        "outside: unexplained and pointed at": share(
+            judge.pointed_at(r) for r in _visible(by["outside"])
+        ),
+    }
+    return {
+        "counts": {group: len(rows) for group, rows in by.items()},
+        "totals": totals,
+        "effects": [_row(k, n, rows) for k, rs in kinds.items() for n, rows in _by_noise(rs)],
+        "pairs": [_row(k, "all", [r for r in pairs if r["what"] == k]) for k in _whats(pairs)],
+        "short": [_row(k, "all", [r for r in short if r["what"] == k]) for k in _whats(short)],
+        "invisible": [_sight(r) for r in records if r["oracle"] and not judge.visible(r)],
+        "tied": [_sight(r) for r in records if any(s["ties"] for s in r["oracle"].values())],
+        "wrong": [_wrong(r) for r in named if not judge.right(r)],
+        "false positives": [_wrong(r) for r in by["nulls"] if judge.false_positive(r)],
+        "outside": [_wrong(r) for r in _visible(by["outside"]) if not judge.pointed_at(r)],
+        "seconds": _seconds(records, cold),
+    }
+
+
+def aims_hold(table: dict) -> bool:
+    """Whether every aim that was measured is met."""
+    return all(holds(name, value) for name, value in table["totals"].items() if value is not None)
+
+
+def holds(name: str, value: float) -> bool:
+    """Whether a total meets its aim."""
+    bound, largest = AIMS[name]
+    return value <= bound if largest else value >= bound
+
+
+def share(truths: Iterable[bool]) -> float | None:
+    """Part that is true; None of nothing."""
+    truths = list(truths)
+    return sum(truths) / len(truths) if truths else None
+
+
+def markdown(table: dict) -> str:
+    """The table for people."""
+    parts = ["# Discovery on hidden effects", _lines("Cases", table["counts"]), "## Aims"]
+    rows = [
+        [name, _text(value), f"{'<=' if AIMS[name][1] else '>='} {AIMS[name][0]:g}",
+         "" if value is None else "yes" if holds(name, value) else "NO"]
+        for name, value in table["totals"].items()
+    ]  # fmt: skip
+    parts.append(_grid(["total", "is", "aim", "met"], rows))
+    for title in ("effects", "pairs", "short"):
+        parts += [f"## {title.capitalize()}, visible ones", _results(table[title])]
+    parts += ["## Seconds", _lines("discover", table["seconds"])]
+    for title in ("wrong", "false positives", "outside", "invisible", "tied"):
+        entries = [f"- {' | '.join(map(str, e.values()))}" for e in table[title]]
+        parts += [f"## {title.capitalize()}: {len(entries)}", "\n".join(entries)]
+    return "\n\n".join(p for p in parts if p) + "\n"
+
+
+def _visible(records: Iterable[Record]) -> list[Record]:
+    return [r for r in records if judge.visible(r)]
+
+
+def _whats(records: Iterable[Record]) -> list[str]:
+    return list(dict.fromkeys(r["what"] for r in records))
+
+
+def _by_noise(records: Sequence[Record]) -> list[tuple[str, list[Record]]]:
+    levels = sorted({r["noise"] for r in records})
+    rows = [(f"{n:g}", [r for r in records if r["noise"] == n]) for n in levels]
+    return [*rows, ("all", list(records))]
+
+
+def _row(what: str, noise: str, rows: Sequence[Record]) -> dict:
+    within = [x <= judge.DEVIATIONS for r in rows for x in judge.deviations(r)]
+    seconds = [r["seconds"] for r in rows if r.get("warm") and "seconds" in r]
+    return {
+        "what": what, "noise": noise, "visible": len(rows),
+        "right": sum(map(judge.right, rows)), "strictly": sum(map(judge.strictly_right, rows)),
+        "closed": _median(_closings(rows)), "within": share(within),
+        "seconds": _median(seconds), "longest": max(seconds, default=None),
+    }  # fmt: skip
+
+
+def _closings(rows: Iterable[Record]) -> list[float]:
+    """Of every case that the oracle sees: one in which nothing was named closes nothing."""
+    return [c for r in rows if (c := judge.closed(r)) is not None]
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return median(values) if values else None
+
+
+def _seconds(records: Sequence[Record], cold: Sequence[dict]) -> dict:
+    warm = [r["seconds"] for r in records if r.get("warm") and "seconds" in r]
+    first = [r["seconds"] for r in records if not r.get("warm") and "seconds" in r]
+    fresh = [c["seconds"] for c in cold]
+    return {
+        "in a warm process, median": _median(warm), "in a warm process, longest": max(warm, default=None),
+        "in a warm process, CPU, median": _median(
+            [r["cpu_seconds"] for r in records if r.get("warm") and "cpu_seconds" in r]
+        ),
+        "first in its process, median": _median(first),
+        "fresh command, median": _median(fresh), "fresh command, longest": max(fresh, default=None),
+    }  # fmt: skip
+
+
+def _sight(record: Record) -> dict:
+    said = [
+        f"{kind}: {min(s['evidence']):.3g} nats, {min(s['share']):.3f} of the force"
+        + (f", tied with {', '.join(s['ties'])}" if s["ties"] else "")
+        for kind, s in record["oracle"].items()
+    ]
+    return {"id": record["id"], "oracle": "; ".join(said)}
+
+
+def _wrong(record: Record) -> dict:
+    said = record["verdict"] + (f": {', '.join(record['named'])}" if record["named"] else "")
+    others = [k for group in record.get("alternatives", []) for k in group]
+    said += f" (or {', '.join(others)})" if others else ""
+    closed = judge.closed(record)
+    where = record.get("where")
+    return {
+        "id": record["id"], "said": said, "closed": "" if closed is None else f"{closed:.3f}",
+        "why": record.get("error") or (where["text"] if where and not record["named"] else ""),
+    }  # fmt: skip
+
+
+def confusions(table: dict) -> Counter:
+    """How often each hidden kind was called what."""
+    return Counter((w["id"].split("/")[1], w["said"]) for w in table["wrong"])
+
+
+def _results(rows: Sequence[dict]) -> str:
+    heads = ["hidden", "noise", "visible", "right", "strictly", "closed", "within 3 sd", "s", "longest s"]
+    return _grid(heads, [[_text(v) for v in row.values()] for row in rows])
+
+
+def _grid(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    if not rows:
+        return ""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _lines(title: str, values: dict) -> str:
+    return f"{title}: " + ", ".join(f"{name} {_text(value)}" for name, value in values.items()) + "."
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

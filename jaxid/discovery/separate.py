@@ -1,0 +1,262 @@
+"""The experiment that would tell two effects apart which a log cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+
+from jaxid import signals
+from jaxid.discovery import candidates as cand
+from jaxid.discovery.limits import Limits, Peaks
+from jaxid.discovery.rehearsal import Outcome, Stage, compared, exact
+from jaxid.discovery.rivals import Bench, Bounds, Duel, Pair, loss
+from jaxid.discovery.screen import Score
+from jaxid.discovery.shapes import Shapes, basis
+from jaxid.estimators.inverse_dynamics import ForceData
+from jaxid.precision import NoiseModel
+from jaxid.replay import needed_steps
+from jaxid.sensors import Sensor
+from jaxid.session import Session
+from jaxid.simulation import Drive, needed_substeps
+
+if TYPE_CHECKING:
+    from jaxid.discovery.discover import Found
+    from jaxid.discovery.search import Search
+
+# Ticks of the longest signal that is optimised: a longer log is met by a shorter experiment.
+_LONGEST = 30_000
+# Starts that are optimised, of those that look best, and evaluations for each.
+_OPTIMISED = 3
+_EVALUATIONS = 60
+# Order of the noise's model, as in the search.
+_ORDER = 20
+# Amplitudes tried until the machine keeps within its limits, whichever rival it is.
+_AMPLITUDES = (1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.15, 0.07)
+# Alternatives of one effect for which an experiment is sought: the next where one cannot be.
+_RIVALS = 2
+# Samples of past command that a loop keeps for a delay, as in a replay.
+_DELAYS = 12
+# A tour accelerates as hard as the log did at most; sines reach this factor of it.
+_HARDER = 2.0
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An experiment that would tell an effect from one that the log cannot tell it from.
+
+    Args:
+        named: The effect that was named.
+        rival: The other.
+        joints: Where each acts, 1-based.
+        signal: "reference" for a loop, "input" for open loop.
+        time: Ticks [s].
+        values: Reference or command at each, (ticks, n); None where no experiment was found.
+        start: Position at the start, at rest, (n,).
+        present: Evidence [nats] for the named effect over the other in the present log.
+        expected: The same in the proposed experiment, or for the other where that is the true one:
+            the smaller of the two, by playing it through.
+        needed: Evidence that it takes for the other to be ruled out.
+        limits: What the experiment had to keep to.
+        peaks: How far the machine goes in it, whichever effect is the true one.
+    """
+
+    named: str
+    rival: str
+    joints: tuple[int, int]
+    signal: str
+    time: Float[np.ndarray, " ticks"]
+    values: Float[np.ndarray, "ticks n"] | None
+    start: Float[np.ndarray, " n"]
+    present: float
+    expected: float
+    needed: float
+    limits: Limits
+    peaks: Peaks | None
+
+    @property
+    def separates(self) -> bool:
+        """Whether the experiment is expected to rule the wrong effect out."""
+        return self.values is not None and self.expected > self.needed
+
+    @property
+    def file(self) -> str:
+        """Name of its CSV."""
+        return f"separate_{_plain(self.named)}_from_{_plain(self.rival)}.csv"
+
+
+def _plain(kind: str) -> str:
+    """A kind as a part of a file name: a user's own may be a path."""
+    return "".join(c if c.isalnum() or c == "_" else "_" for c in kind.rpartition(":")[2])
+
+
+def proposals(
+    session: Session, search: Search, effects: tuple[Found, ...], progress: Callable[[str], None]
+) -> tuple[Proposal, ...]:
+    """An experiment for every effect that has alternatives.
+
+    The alternative nearest in evidence is the hardest to rule out; where nothing can, as between
+    effects that are one by another name, the next is tried too.
+
+    Args:
+        session: Case and logs.
+        search: The search, at its end.
+        effects: What it added, in its order.
+        progress: Called with a line at every stage.
+    """
+    out = []
+    for found, own in zip(effects, search.added, strict=True):
+        refitted = [s for s in found.alternatives if s.theta is not None]
+        for rival in sorted(refitted, key=lambda s: -s.total)[:_RIVALS]:
+            progress(f"an experiment to tell {own.kind} from {rival.candidate.kind}")
+            out.append(propose(session, search, own, rival))
+            if out[-1].separates:
+                break
+    return tuple(out)
+
+
+def propose(session: Session, search: Search, own: cand.Candidate, rival: Score) -> Proposal:
+    """The best experiment found that keeps within the limits, whether or not it suffices.
+
+    Args:
+        session: Case and logs.
+        search: The search, with `own` among its effects.
+        own: The effect that was named.
+        rival: Another in its place, refitted.
+    """
+    pair = Pair.of(search, own, rival)
+    log, data = session.fit.log, session.fit.data
+    limits = Limits.of(session.case.limits, session.machine, log, data)
+    present = compared(search.union, pair, search.samples, refit=False)
+    bench = _bench(session, search, pair)
+    stage = _stage(session, search, bench)
+    shapes, starts = _family(session, limits, bench)
+    best, outcome, peaks = None, None, None
+    for p in _optimised(starts, bench, Duel.of(pair), shapes, limits):
+        fitting = _within(stage, pair, shapes, p, limits)
+        if fitting is None:
+            continue
+        signal, reached = fitting
+        now = min(stage.outcomes(search.union, pair, signal), key=lambda o: o.short)
+        if outcome is None or now.short > outcome.short:
+            best, outcome, peaks = signal, now, reached
+    if outcome is None:
+        outcome = Outcome(0.0, present.needed)
+    tick = bench.drive.period
+    ticks = len(shapes.basis)
+    return Proposal(
+        *pair.kinds, (pair.ports[0] + 1, pair.ports[1] + 1),
+        "input" if bench.controller is None else "reference", tick * np.arange(ticks), best,
+        np.asarray(bench.start) if best is None or bench.controller is None else best[0],
+        present.nats, outcome.nats, outcome.needed, limits, peaks,
+    )
+
+
+def _bench(session: Session, search: Search, pair: Pair) -> Bench:
+    machine, log, data = session.machine, session.fit.log, session.fit.data
+    tick = log.period if machine.controller is None else machine.controller.period
+    delayed = "input_delay" in pair.kinds or any(e.kind == "input_delay" for e in pair.plant.effects)
+    hold = machine.hold if machine.controller is None else "zero_order"
+    drive = Drive(
+        jnp.asarray(machine.gain), tick, "linear" if hold == "band_limited" else hold,
+        longest_delay=_DELAYS if delayed and machine.controller is not None else 0,
+    )
+    picks = np.linspace(0, log.samples - 1, 50).astype(int)
+    q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    steps = [needed_substeps(pair.model(k), drive, q, jnp.zeros_like(q), u) for k in range(2)]
+    e, _ = cand.evaluate(search.union, search.samples, pair.thetas[0])
+    noise = [NoiseModel.fit(x, c, _ORDER) for x, c in zip(e.T, search.samples.moving.T, strict=True)]
+    whiten = [np.array([1.0, *-n.coefficients]) / n.innovation for n in noise]
+    return Bench(
+        replace(drive, substeps=max(steps)), machine.controller, jnp.asarray(log.position[0]),
+        max(1, round(log.period / tick)), log.period, ForceData.of(data),
+        jnp.asarray(data.recipe.rest_velocity), jnp.asarray(np.stack(whiten)),
+    )
+
+
+def _stage(session: Session, search: Search, bench: Bench) -> Stage:
+    """Play an experiment through with the sensors' noise, or as much more as the log shows."""
+    machine, log, recipe = session.machine, session.fit.log, session.recipe
+    sensor = machine.sensor
+    if sensor.position_std is None:
+        noise = jnp.asarray(signals.high_band_std(log.position, log.rate_hz))
+        sensor = Sensor(position_noise=noise, force_noise=sensor.force_noise)
+    e, _ = cand.evaluate(search.union, search.samples, search.theta)
+    counts = search.samples.moving
+    rms = np.sqrt(np.nanmean(np.where(counts, e, np.nan) ** 2, axis=0))
+    more = np.sqrt(np.maximum(rms**2 - search.floor**2, 0.0))[: log.force.shape[1]]
+    # White noise of which the band holds that much.
+    more = more / np.sqrt(2 * recipe.band_hz(log.rate_hz) * log.period) / np.abs(machine.gain)
+    stated = 0.0 if sensor.force_noise is None else np.asarray(sensor.force_noise)
+    steps = needed_steps(machine, log)
+    return Stage(exact(bench, steps), machine, recipe, sensor, np.hypot(more, stated))
+
+
+def _family(session: Session, limits: Limits, bench: Bench) -> tuple[Shapes, list[np.ndarray]]:
+    """Signals within the limits, and where to start."""
+    log, data, tick = session.fit.log, session.fit.data, bench.drive.period
+    ticks = min((log.samples - 1) * bench.every + 1, _LONGEST)
+    moving = data.at_kept(data.qdd)[data.moving.any(axis=1)]
+    hardest = _HARDER * float(np.abs(moving).max())
+    speed = float(limits.speed.max())
+    fastest = min(hardest / (2 * np.pi * speed), 0.5 * session.recipe.band_hz(log.rate_hz))
+    if bench.controller is None:
+        low, high, step = -limits.force, limits.force, np.full(limits.force.shape, np.inf)
+        own = log.force[:, 0] - log.force[0, 0]
+    else:
+        low, high, step = limits.low, limits.high, limits.speed * tick
+        own = None if log.reference is None else log.reference[:, 0] - log.reference[0, 0]
+    if own is not None:
+        own = np.interp(tick * np.arange(ticks), log.time - log.time[0], own)
+    stroke = float((high - low).max())
+    ways = (stroke, speed, hardest / _HARDER)
+    if bench.controller is None:  # a tour of forces: to and fro as slowly as the log lasts
+        pace = 20 * stroke / (ticks * tick)
+        ways = (stroke, pace, pace**2 / stroke)
+    functions, weights = basis(ticks, tick, fastest, ways, own)
+    shapes = Shapes.within(functions, low, high, step)
+    return shapes, [shapes.numbers(w) for w in weights]
+
+
+def _optimised(
+    starts: list[np.ndarray], bench: Bench, duel: Duel, shapes: Shapes, limits: Limits
+) -> list[np.ndarray]:
+    """The most promising starts, each improved, best first."""
+    bounds = Bounds.of(limits)
+
+    def both(p: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = loss(jnp.asarray(p), bench, duel, shapes, bounds)
+        # A loop that diverged is as bad as it gets, and tells no direction.
+        good = np.isfinite(value) & np.all(np.isfinite(slope))
+        return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))
+
+    ranked = sorted(starts, key=lambda p: both(p)[0])[:_OPTIMISED]
+    found = [
+        scipy.optimize.minimize(
+            both, p, jac=True, method="L-BFGS-B",
+            options={"maxfun": _EVALUATIONS, "maxiter": _EVALUATIONS},
+        )
+        for p in ranked
+    ]
+    return [f.x for f in sorted(found, key=lambda f: f.fun)]
+
+
+def _within(
+    stage: Stage, pair: Pair, shapes: Shapes, p: np.ndarray, limits: Limits
+) -> tuple[np.ndarray, Peaks] | None:
+    """The signal at the largest amplitude at which the machine keeps to its limits; None for none."""
+    for factor in _AMPLITUDES:
+        signal = np.asarray(_signal(shapes, jnp.asarray(shapes.smaller(p, factor))))
+        peaks = stage.peaks(pair, signal)
+        if not limits.broken(peaks):
+            return signal, peaks
+    return None
+
+
+_signal = eqx.filter_jit(lambda shapes, p: shapes(p))

@@ -1,0 +1,126 @@
+"""One hidden case through jaxid: what it said, and what the truth itself would have closed."""
+
+import math
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+from hidden_cases import HiddenCase
+from hidden_oracle import sights
+from search_setup import case_text, log_of, write_case
+from stepper import write_csv
+
+import jaxid
+from jaxid.gap import force_gap
+
+Record = dict
+
+
+def run_case(case: HiddenCase, folder: Path) -> Record:
+    """The oracle's say, then jaxid's, as what JSON can hold."""
+    seen = sights(case)
+    record = {
+        "id": case.id, "group": case.group, "what": case.what, "scale": case.scale,
+        "noise": case.noise, "seed": case.seed, "rate": case.rate, "hidden": list(case.hidden),
+        "declared": list(case.declared), "true": case.values,
+        "oracle": {
+            kind: {
+                "visible": s.visible, "evidence": s.evidence, "share": s.share, "ties": s.ties,
+            }
+            for kind, s in seen.items()
+        },
+    }  # fmt: skip
+    try:
+        return record | _searched(case, folder)
+    except jaxid.InputError as error:
+        return record | {"verdict": "refused", "named": [], "error": str(error)}
+    except Exception as error:  # the bench must survive it; it counts as wrong
+        return record | {"verdict": "crashed", "named": [], "error": repr(error)}
+
+
+def _searched(case: HiddenCase, folder: Path) -> Record:
+    logs = [log_of(case.setup(validation=v)) for v in ((False, True) if case.validated else (False,))]
+    path = write_case(folder, text_of(case))
+    begin, busy = time.perf_counter(), time.process_time()
+    d = jaxid.discover(path, logs[0], validate=logs[1:], refit=False)
+    seconds, busy = time.perf_counter() - begin, time.process_time() - busy
+    return {
+        "verdict": d.verdict, "named": d.kinds, "seconds": seconds, "cpu_seconds": busy,
+        "samples": logs[0].samples,
+        "evidence": [_number(e.score.total) for e in d.effects],
+        "alternatives": [[s.candidate.kind for s in e.alternatives] for e in d.effects],
+        "parameters": _parameters(case, d),
+        "gap": {
+            "before": [float(g.force.rms[0]) for g in d.gaps_before],
+            "after": [float(g.force.rms[0]) for g in d.gaps_after],
+            "floor": float(d.noise_floor[0]),
+            "truth": truth_gap(case, folder, logs) if case.hidden else None,
+        },
+        "where": None if d.where is None else {
+            "text": d.where.text, "variable": d.where.variable,
+            "intervals": [list(i) for i in d.where.intervals],
+            "frequency_hz": d.where.frequency_hz,
+        },
+        "outside": _outside(case),
+    }  # fmt: skip
+
+
+def text_of(case: HiddenCase) -> str:
+    """The case file that knows nothing of what is hidden."""
+    declared = [(kind, case.values[kind]) for kind in case.declared]
+    return case_text(
+        case.setup(), declared, off=case.off, inertia_known=case.inertia_known,
+        motion=case.size.motion, sensor=case.sensor,
+    )  # fmt: skip
+
+
+def truth_gap(case: HiddenCase, folder: Path, logs: list) -> list[float]:
+    """RMS force residual of the true machine, through jaxid's own preprocessing, by log."""
+    declared = [*case.values.items()]
+    text = case_text(case.setup(), declared, off=1.0, motion=case.size.motion, sensor=case.sensor)
+    known = re.sub(r"\{ guess = ([^}]+) \}", r"\1", text)
+    path = Path(folder) / "truth.toml"
+    path.write_text(known)
+    session = jaxid.open_session(path, logs[0], logs[1:], align_hold=True)
+    return [float(force_gap(r.machine(session.machine), r.data).rms[0]) for r in session.runs]
+
+
+def write_files(case: HiddenCase, folder: Path) -> list[str]:
+    """Case, log and validation as files; what `jaxid discover` takes."""
+    names = ["log.csv", "validation.csv"] if case.validated else ["log.csv"]
+    for k, name in enumerate(names):
+        write_csv(case.setup(validation=bool(k)).run(), Path(folder) / name)
+    words = [str(write_case(folder, text_of(case))), str(Path(folder) / "log.csv")]
+    return words + (["--validate", str(Path(folder) / names[1])] if case.validated else [])
+
+
+def _parameters(case: HiddenCase, d: object) -> dict[str, list]:
+    """Name -> true value, estimate, its standard deviation (null where it cannot be told)."""
+    names = d.after.machine.parameters.names
+    out = {}
+    for name, value, std in zip(names, d.after.theta, d.after.precision.std, strict=True):
+        true = _true(case, name)
+        if name == "cogging.phase" and true is not None:
+            turns = round((float(value) - true) / (2 * math.pi))
+            value = float(value) - 2 * math.pi * turns
+        out[name] = [true, _number(value), _number(std)]
+    return out
+
+
+def _true(case: HiddenCase, name: str) -> float | None:
+    if name == "inertia":
+        return case.setup().machine.inertia
+    kind, _, parameter = name.partition(".")
+    return case.values.get(kind, {}).get(parameter)
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _outside(case: HiddenCase) -> dict | None:
+    if case.group != "outside":
+        return None
+    machine = case.setup().machine
+    return {"bursts": [list(b) for b in machine.bursts], "clock": list(machine.clock_force)}
