@@ -28,13 +28,19 @@ def case_with_data(folder: Path, cases: tuple[str, ...], data: str, files: tuple
     root = os.environ.get("JAXID_DATA")
     if not root or not (Path(root) / data).is_dir():
         sys.exit(f"set JAXID_DATA to a folder that holds {data}/ with {', '.join(files)}")
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in cases:
-        shutil.copyfile(Path(__file__).parent / "cases" / name, folder / name)
+    copied(folder, cases)
     for name in files:
         link = folder / name
         link.unlink(missing_ok=True)
         link.symlink_to((Path(root) / data / name).resolve())
+    return folder
+
+
+def copied(folder: Path, cases: tuple[str, ...]) -> Path:
+    """A folder with case files in it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in cases:
+        shutil.copyfile(Path(__file__).parent / "cases" / name, folder / name)
     return folder
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from jaxid import signals
 from jaxid.io.log import Log
 
-# Where the surroundings of reversals are more of a log than this, they are not left out.
+# The surroundings of reversals that are left out are less of a log than this.
 _MOSTLY = 0.5
 
 
@@ -224,11 +224,9 @@ def prepare(
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
     reach = recipe.decimator.reach
     if recipe.derivatives == "spectral":
-        reach = max(reach, recipe.decimation - 1)
-        turns = _smeared(at_rest | _turning(qd), reach)
+        reach = _affordable(at_rest | _turning(qd), max(reach, recipe.decimation - 1))
         # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
-        at_rest = at_rest | (_turning(qd) & (turns.mean(axis=0) < _MOSTLY))
-        reach = reach if np.all(turns.mean(axis=0) < _MOSTLY) else 0
+        at_rest = at_rest | (_turning(qd) & (reach > 0))
     moving = ~_smeared(at_rest, reach)[kept]
     fitted = ~_smeared(_dwelling(at_rest, 2 * recipe.decimation), reach)[kept]
     held = recipe.align_hold and log.hold == "zero_order"
@@ -238,6 +236,15 @@ def prepare(
         hold, recipe, moving,
         fitted if recipe.keeps_reversals else moving, kept,
     )
+
+
+def _affordable(turns: np.ndarray, reach: int) -> int:
+    """How many samples about stops and reversals to leave out, so that most of a log remains."""
+    for part in (1.0, 0.75, 0.5, 0.25):
+        near = int(np.ceil(part * reach))
+        if np.all(_smeared(turns, near).mean(axis=0) < _MOSTLY):
+            return near
+    return 0
 
 
 def _turning(v: np.ndarray) -> np.ndarray:

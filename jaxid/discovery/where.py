@@ -15,6 +15,8 @@ from jaxid.discovery import evidence as ev
 from jaxid.preprocess import Prepared
 
 _KNOTS = 12
+# Samples that keep their sign together in a surrogate, at least: whitening leaves some correlation.
+_SHORTEST = 10
 # A window of this many samples is loud where its energy exceeds the median's by this factor: in
 # noise of one level that happens less than once in 10^9 windows.
 _WINDOW = 20
@@ -119,7 +121,7 @@ def _locate(
     white = whitener(e[:, None, None])
     left = white[:, 0] - base @ np.linalg.lstsq(base, white[:, 0], rcond=1e-9)[0]
     rng = np.random.default_rng(20240501)
-    surrogates = ev.flipped(left, max(2, len(left) // 100), 100, rng)
+    surrogates = ev.flipped(left, max(_SHORTEST, len(left) // 100), 100, rng)
     before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
     largest, gains = np.full(100, -np.inf), {}
     for name, hat in hats.items():

@@ -15,11 +15,14 @@ from jaxid import signals
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
 from jaxid.machine import Machine
-from jaxid.model import Plant
+from jaxid.model import Plant, carries_force, parameters_of
 from jaxid.parameters import scatter
 from jaxid.precision import Precision, assess
 from jaxid.preprocess import Prepared
 from jaxid.readings import residual_along
+
+# Factors on the guess of a shape, from which a fit starts too.
+_SHAPES = (0.3, 3.0)
 
 
 class ForceData(eqx.Module):
@@ -113,7 +116,11 @@ def inverse_dynamics(
     parameters = machine.parameters
     theta = parameters.guess if start is None else jnp.asarray(start)
     places, transform = parameters.places, Transform.of(parameters)
-    fit = _solve(plant, places, arrays, theta, transform, parameters.bounds)
+    fits = [
+        _solve(plant, places, arrays, at, transform, parameters.bounds)
+        for at in _starts(machine, theta)
+    ]
+    fit = min(fits, key=lambda f: np.nan_to_num(float(f.cost), nan=np.inf))
     for _ in range(2 if reweighted else 0):
         e = np.asarray(fit.residual).reshape(data.moving.shape)
         weight = jnp.asarray(np.sqrt(_bisquare(e, rows)) * rows)
@@ -134,6 +141,22 @@ def inverse_dynamics(
         samples=int(rows.sum()),
         steps=int(fit.steps),
     )
+
+
+def _starts(machine: Machine, theta: Array) -> list[Array]:
+    """The guesses, and the same with each shape (a width, a lag, a period) smaller and larger.
+
+    What enters in proportion is solved in one step from anywhere; a shape that starts far off lets
+    the strength beside it fall to zero, and is then without a slope.
+    """
+    out = [theta]
+    for k, f in enumerate(machine.parameters.free):
+        if f.path[0] != "effects":
+            continue
+        info = parameters_of(type(machine.plant.effects[f.path[1]]))[f.path[2]]
+        if not carries_force(info) and info.dimension != "1" and theta[k] > 0:
+            out += [theta.at[k].multiply(factor) for factor in _SHAPES]
+    return out
 
 
 def force_precision(
