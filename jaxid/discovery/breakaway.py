@@ -7,7 +7,7 @@ rest and under the logged command; the level is read off the moment at which it 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -17,10 +17,11 @@ import scipy.stats
 from jaxtyping import Array, Float
 
 from jaxid import signals
+from jaxid.controllers import Controller, Tick
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.result import Estimate
 from jaxid.io.log import Log
-from jaxid.machine import Machine
+from jaxid.machine import Machine, disturbance_at
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.preprocess import Prepared
@@ -46,6 +47,10 @@ _FOLDS = 4
 _TELLS = 3
 # For the better of two definitions of a rest.
 _FALSE_POSITIVE = 0.5e-3
+# A controller's law is taken for the one that made a log where it gives the logged command back to
+# within this many deviations of its noise, or this part of its RMS.
+_SAME = 1.5
+_NEARLY = 0.02
 
 
 class Starts(eqx.Module):
@@ -116,6 +121,7 @@ def break_away(
     if not _can_tell(machine, log):
         return None
     noise = _noise(machine, log, joint)
+    log = replace(log, force=_acted(machine, log))
     stills = sorted(set(_stills(noise, log, data, joint)))
     length = stills[-1] + max(_AFTER, 2 * stills[-1])
     all_starts = [_starts(machine.plant, log, data, noise, n, length, joint) for n in stills]
@@ -162,6 +168,34 @@ def _can_tell(machine: Machine, log: Log) -> bool:
     )
     faster = machine.controller is not None and machine.controller.period < 0.9 * log.period
     return not memory and not faster and log.hold != "band_limited"
+
+
+def _acted(machine: Machine, log: Log) -> np.ndarray:
+    """The command as it acted: what the controller makes of the readings, noise of the log left out.
+
+    At a start a single noisy sample above the level would set the simulation moving. The logged
+    command stands where there is no controller, or one that does not give it back.
+    """
+    if machine.controller is None or log.reference is None:
+        return log.force
+    extra = disturbance_at(machine.disturbance, log.time, log)
+    arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
+    made = np.asarray(_commands(machine.controller, *(jnp.asarray(a) for a in arrays)))
+    size = np.sqrt(np.mean(log.force**2, axis=0))
+    stated = machine.sensor.force_noise
+    noise = 0.0 if stated is None else np.asarray(stated)
+    off = np.sqrt(np.mean((made - log.force) ** 2, axis=0))
+    return np.where(off <= np.maximum(_SAME * noise, _NEARLY * size), made, log.force)
+
+
+@eqx.filter_jit
+def _commands(controller: Controller, position: Array, reference: Array, disturbance: Array) -> Array:
+    def tick(memory: tuple, now: tuple) -> tuple[tuple, Array]:
+        u, memory = controller.command(Tick(*now[:2]), memory, now[2])
+        return memory, u
+
+    start = controller.start(position[0], jnp.zeros_like(position[0]), reference[0])
+    return jax.lax.scan(tick, start, (position, reference, disturbance))[1]
 
 
 def _noise(machine: Machine, log: Log, joint: int) -> float:

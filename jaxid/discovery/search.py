@@ -16,7 +16,7 @@ from jaxid.preprocess import Prepared
 # An effect must close this part of what stands above the noise floor (in sum of squares, so half
 # of it in RMS), whatever its evidence: on measured data everything helps a little. One that is
 # there already goes where it closes less than a third of that.
-RELEVANT = 0.15
+_RELEVANT = 0.15
 _SUPERFLUOUS = 0.05
 # A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
 _SCATTER = 3.0
@@ -221,7 +221,7 @@ class Search:
             return more < 0
         now, _ = cand.evaluate(self.union, self.samples, self.theta)
         then, _ = cand.evaluate(self.union, self.samples, best.theta)
-        return self._closed(now, then) > RELEVANT
+        return self._closed(now, then) > _RELEVANT
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         return cand.refine(self.union, self.samples, theta, active)[0]
@@ -282,7 +282,7 @@ class Search:
                 return f"{free[i].name} runs to its limit, where it only imitates"
         old, _ = cand.evaluate(self.union, self.samples, self.theta)
         closed = self._closed(old, e)
-        if closed < RELEVANT:
+        if closed < _RELEVANT:
             return f"it closes only {100 * max(closed, 0) / 2:.1f} % of the gap"
         if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
             return "it does not help on the validation log"
