@@ -19,7 +19,7 @@ from jaxid.estimators.inverse_dynamics import (
     sharpened,
 )
 from jaxid.io.log import Log
-from jaxid.machine import Machine
+from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.preprocess import Prepared
 from jaxid.replay import Replay
@@ -111,8 +111,7 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
     """
     rate, recipe = log.rate_hz, data.recipe
     f = np.linspace(0, rate / 2, 2049)[1:]
-    sigma = machine.sensor.position_std
-    sigma = signals.high_band_std(log.position, rate) if sigma is None else np.asarray(sigma)
+    sigma = position_noise(machine, log)
     mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
     w = 2 * np.pi * f[:, None, None]
     impedance = -mass * w**2 + 1j * w * damping + stiffness

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxid import signals
 from jaxid.controllers import CONTROLLERS, Controller
 from jaxid.errors import InputError
 from jaxid.io.case import Case
@@ -186,6 +187,14 @@ def _log_period(case: Case, period: float | None) -> float:
         where = f"{case.path}, [controller]"
         raise InputError("the controller's period is not known", where=where, mend=mend)
     return period if period is not None else 1.0 / rate
+
+
+def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
+    """Standard deviation of a reading of each joint, as stated, else off the log's high band."""
+    stated = machine.sensor.position_std
+    if stated is None:
+        return signals.high_band_std(log.position, log.rate_hz)
+    return np.broadcast_to(np.asarray(stated), log.position.shape[1]).copy()
 
 
 def disturbance_at(

@@ -16,29 +16,19 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
 
-from jaxid import signals
-from jaxid.controllers import Controller, Tick
+from jaxid.discovery.starts import Starts, acted, starts_from_rest
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.result import Estimate
 from jaxid.io.log import Log
-from jaxid.machine import Machine, disturbance_at
+from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.preprocess import Prepared
-from jaxid.readings import drive_own_states
 from jaxid.replay import needed_steps
 from jaxid.simulation import Drive, open_loop
 
-# Readings that agree within this range, in standard deviations of their noise, are a rest: noise
-# alone does otherwise once in a thousand times. There must be as many of them as a reversal
-# without sticking could not keep together, and at least so many.
-_RANGE = 5.0
-_STILL = 3
-# Samples that follow a start, at least.
-_AFTER = 12
-# Fewest starts that can tell a level from a chance, and most that are run.
+# Fewest starts that can tell a level from a chance.
 _FEWEST = 4
-_MOST = 120
 # Levels tried at once, twice: over all that the log allows, then between neighbours of the best.
 _LEVELS = 40
 _FOLDS = 4
@@ -47,38 +37,6 @@ _FOLDS = 4
 _TELLS = 3
 # For the better of two definitions of a rest.
 _FALSE_POSITIVE = 0.5e-3
-# A controller's law is taken for the one that made a log where it gives the logged command back to
-# within this many deviations of its noise, or this part of its RMS.
-_SAME = 1.5
-_NEARLY = 0.02
-
-
-class Starts(eqx.Module):
-    """Moments in which a joint starts from rest, cut out of a log.
-
-    Args:
-        command: Logged command, (start, time, m).
-        position: Measured, (start, time, n).
-        rest: Mean reading at rest, (start, n).
-        time: Of the first sample [s], (start,).
-        own: Own states of the plant's effects at the first sample.
-        still: How many of the samples are at rest.
-    """
-
-    command: Array
-    position: Array
-    rest: Array
-    time: Array
-    own: tuple
-    still: Array
-
-    def padded(self, count: int) -> Starts:
-        """With the last start repeated, so that one compiled shape serves any number."""
-        more = count - len(self.time)
-        spread = eqx.tree_at(lambda s: s.still, self, jnp.full(len(self.time), self.still))
-        return jax.tree.map(
-            lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]), spread
-        )
 
 
 @dataclass(frozen=True)
@@ -117,16 +75,13 @@ def break_away(
         The finding; None where too few starts are seen, or where the state at rest is not known
         (presliding, or a controller faster than the log).
     """
-    machine = estimate.machine
-    if not _can_tell(machine, log):
+    if not _can_tell(estimate.machine, log):
         return None
-    noise = _noise(machine, log, joint)
-    log = replace(log, force=_acted(machine, log))
-    stills = sorted(set(_stills(noise, log, data, joint)))
-    length = stills[-1] + max(_AFTER, 2 * stills[-1])
-    all_starts = [_starts(machine.plant, log, data, noise, n, length, joint) for n in stills]
-    enough = [s for s in all_starts if len(s.time) >= _FEWEST]
-    most = max((len(s.time) for s in enough), default=0)
+    log = replace(log, force=acted(estimate.machine, log))
+    noise = float(position_noise(estimate.machine, log)[joint])
+    cuts = starts_from_rest(estimate.machine, log, data, noise, joint)
+    enough = [s for s in cuts if s.count >= _FEWEST]
+    most = max((s.count for s in enough), default=0)
     found = []
     for starts in enough:
         levels, fits = _fits(estimate, log, starts, 2 ** int(np.ceil(np.log2(most))), noise, joint)
@@ -138,7 +93,7 @@ def _fits(
     estimate: Estimate, log: Log, starts: Starts, padded: int, noise: float, joint: int
 ) -> tuple[np.ndarray, list[_Fit]]:
     """Fits at levels from none to the most that the log allows, denser about the best."""
-    machine, count = estimate.machine, len(starts.time)
+    machine, count = estimate.machine, starts.count
     filled = starts.padded(padded)
     drive = Drive(jnp.asarray(machine.gain), log.period, log.hold, needed_steps(machine, log), True)
     plant = machine.plant.with_effect(StaticFriction(level=0.0, port=joint))
@@ -168,88 +123,6 @@ def _can_tell(machine: Machine, log: Log) -> bool:
     )
     faster = machine.controller is not None and machine.controller.period < 0.9 * log.period
     return not memory and not faster and log.hold != "band_limited"
-
-
-def _acted(machine: Machine, log: Log) -> np.ndarray:
-    """The command as it acted: what the controller makes of the readings, noise of the log left out.
-
-    At a start a single noisy sample above the level would set the simulation moving. The logged
-    command stands where there is no controller, or one that does not give it back.
-    """
-    if machine.controller is None or log.reference is None:
-        return log.force
-    extra = disturbance_at(machine.disturbance, log.time, log)
-    arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
-    made = np.asarray(_commands(machine.controller, *(jnp.asarray(a) for a in arrays)))
-    size = np.sqrt(np.mean(log.force**2, axis=0))
-    stated = machine.sensor.force_noise
-    noise = 0.0 if stated is None else np.asarray(stated)
-    off = np.sqrt(np.mean((made - log.force) ** 2, axis=0))
-    return np.where(off <= np.maximum(_SAME * noise, _NEARLY * size), made, log.force)
-
-
-@eqx.filter_jit
-def _commands(controller: Controller, position: Array, reference: Array, disturbance: Array) -> Array:
-    def tick(memory: tuple, now: tuple) -> tuple[tuple, Array]:
-        u, memory = controller.command(Tick(*now[:2]), memory, now[2])
-        return memory, u
-
-    start = controller.start(position[0], jnp.zeros_like(position[0]), reference[0])
-    return jax.lax.scan(tick, start, (position, reference, disturbance))[1]
-
-
-def _noise(machine: Machine, log: Log, joint: int) -> float:
-    stated = machine.sensor.position_std
-    each = signals.high_band_std(log.position, log.rate_hz) if stated is None else np.asarray(stated)
-    return float(np.broadcast_to(each, log.position.shape[1])[joint])
-
-
-def _stills(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
-    """Samples that must agree for a rest, if reversals are as quick as is usual, or as slow as any.
-
-    Few find the short rests of a stiff loop, many are needed where motion is slow against noise.
-    """
-    v, a = data.qd[:, joint], np.abs(data.qdd[:, joint])
-    turns = np.flatnonzero(v[1:] * v[:-1] <= 0)
-    usual = float(np.sqrt(np.mean(a**2)))
-    slow = float(np.quantile(a[turns], 0.25)) if len(turns) else usual
-    halves = [np.sqrt(2 * _RANGE * noise / max(x, 1e-300)) / log.period for x in (usual, slow)]
-    return [max(_STILL, 1 + 2 * int(np.ceil(min(h, log.samples / 10)))) for h in halves]
-
-
-def _starts(
-    plant: Plant, log: Log, data: Prepared, noise: float, still: int, length: int, joint: int
-) -> Starts:
-    """Find and cut out where a joint leaves a rest, in the raw readings."""
-    after = length - still
-    ends = _departures(log.position[:, joint], noise, still, after)
-    rows = ends[:, None] + np.arange(1 - still, after + 1)
-    own = _own_states(plant, data)
-    return Starts(
-        jnp.asarray(log.force[rows]), jnp.asarray(log.position[rows]),
-        jnp.asarray(log.position[rows[:, :still]].mean(axis=1)),
-        jnp.asarray(log.time[rows[:, 0]] - log.time[0]), jax.tree.map(lambda a: a[rows[:, 0]], own),
-        jnp.asarray(still),
-    )
-
-
-def _departures(
-    q: Float[np.ndarray, " time"], noise: float, still: int, after: int
-) -> np.ndarray:
-    """Last samples of rests that are followed by motion, spread over the log if there are many."""
-    windows = np.lib.stride_tricks.sliding_window_view(q, still)
-    agree = np.ptp(windows, axis=1) <= _RANGE * noise
-    ends = np.flatnonzero(agree[:-1] & ~agree[1:]) + still - 1
-    ends = ends[ends + after < len(q)]
-    # Where it has not gone far soon after, it was noise that ended the rest.
-    moved = np.abs(q[ends + after] - q[ends]) > 2 * _RANGE * noise
-    ends = ends[moved]
-    return ends[np.unique(np.linspace(0, len(ends) - 1, min(len(ends), _MOST)).astype(int))]
-
-
-def _own_states(plant: Plant, data: Prepared) -> tuple:
-    arrays = (jnp.asarray(a) for a in (data.q, data.qd, data.qdd, data.force))
-    return eqx.filter_jit(drive_own_states)(plant, *arrays, data.period, data.start)
 
 
 @eqx.filter_jit

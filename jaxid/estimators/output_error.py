@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxid import signals
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
 from jaxid.io.log import Log
-from jaxid.machine import Machine
+from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess, full_hessian
@@ -136,8 +135,7 @@ def _with_start(
     replay = with_fitted_start(problem[0], fitted.plant, log)
     problem = (replay, *problem[1:5], minimum.theta, *problem[6:])
     rms = np.sqrt(np.mean(np.square(minimum.residual)))
-    stated = machine.sensor.position_std
-    noise = signals.high_band_std(log.position, log.rate_hz) if stated is None else np.asarray(stated)
+    noise = position_noise(machine, log)
     free = bool(rms <= _NOISE_LIMITED * np.max(noise))
     active = (np.arange(len(minimum.theta)) < p) | free
     return problem, active, _fit(*problem, active)

@@ -1,0 +1,158 @@
+"""Starts from rest, cut out of a log: when, from where, and under what command."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.controllers import Controller, Tick
+from jaxid.io.log import Log
+from jaxid.machine import Machine, disturbance_at
+from jaxid.model import Plant
+from jaxid.preprocess import Prepared
+from jaxid.readings import drive_own_states
+
+# Readings that agree within this range, in standard deviations of their noise, are a rest: noise
+# alone does otherwise once in a thousand times. There must be as many of them as a reversal
+# without sticking could not keep together, and at least so many.
+_RANGE = 5.0
+_STILL = 3
+# Samples that follow a start, at least.
+_AFTER = 12
+# Most that are kept of a log.
+_MOST = 120
+# A controller's law is taken for the one that made a log where it gives the logged command back to
+# within this many deviations of its noise, or this part of its RMS.
+_SAME = 1.5
+_NEARLY = 0.02
+
+
+class Starts(eqx.Module):
+    """Moments in which a joint starts from rest, cut out of a log.
+
+    Args:
+        command: Logged command, (start, time, m).
+        position: Measured, (start, time, n).
+        rest: Mean reading at rest, (start, n).
+        time: Of the first sample [s], (start,).
+        own: Own states of the plant's effects at the first sample.
+        still: How many of the samples are at rest.
+    """
+
+    command: Array
+    position: Array
+    rest: Array
+    time: Array
+    own: tuple
+    still: Array
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.time)
+
+    def padded(self, count: int) -> Starts:
+        """With the last start repeated, so that one compiled shape serves any number."""
+        more = count - len(self.time)
+        spread = eqx.tree_at(lambda s: s.still, self, jnp.full(len(self.time), self.still))
+        return jax.tree.map(
+            lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]), spread
+        )
+
+
+def starts_from_rest(
+    machine: Machine, log: Log, data: Prepared, noise: float, joint: int
+) -> list[Starts]:
+    """Find where a joint leaves a rest, by a lax and by a strict notion of one.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        data: The same, prepared.
+        noise: Standard deviation of a reading.
+        joint: 0-based.
+
+    Returns:
+        One or two cuts of one length.
+    """
+    stills = sorted(set(_stills(noise, log, data, joint)))
+    length = stills[-1] + max(_AFTER, 2 * stills[-1])
+    own = _own_states(machine.plant, data)
+    return [_cut(own, log, noise, still, length, joint) for still in stills]
+
+
+def _cut(
+    own: tuple, log: Log, noise: float, still: int, length: int, joint: int
+) -> Starts:
+    after = length - still
+    ends = _departures(log.position[:, joint], noise, still, after)
+    rows = ends[:, None] + np.arange(1 - still, after + 1)
+    return Starts(
+        jnp.asarray(log.force[rows]), jnp.asarray(log.position[rows]),
+        jnp.asarray(log.position[rows[:, :still]].mean(axis=1)),
+        jnp.asarray(log.time[rows[:, 0]] - log.time[0]), jax.tree.map(lambda a: a[rows[:, 0]], own),
+        jnp.asarray(still),
+    )
+
+
+def _stills(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
+    """Samples that must agree for a rest, if reversals are as quick as is usual, or as slow as any.
+
+    Few find the short rests of a stiff loop, many are needed where motion is slow against noise.
+    """
+    v, a = data.qd[:, joint], np.abs(data.qdd[:, joint])
+    turns = np.flatnonzero(v[1:] * v[:-1] <= 0)
+    usual = float(np.sqrt(np.mean(a**2)))
+    slow = float(np.quantile(a[turns], 0.25)) if len(turns) else usual
+    halves = [np.sqrt(2 * _RANGE * noise / max(x, 1e-300)) / log.period for x in (usual, slow)]
+    return [max(_STILL, 1 + 2 * int(np.ceil(min(h, log.samples / 10)))) for h in halves]
+
+
+def _departures(
+    q: Float[np.ndarray, " time"], noise: float, still: int, after: int
+) -> np.ndarray:
+    """Last samples of rests that are followed by motion, spread over the log if there are many."""
+    windows = np.lib.stride_tricks.sliding_window_view(q, still)
+    agree = np.ptp(windows, axis=1) <= _RANGE * noise
+    ends = np.flatnonzero(agree[:-1] & ~agree[1:]) + still - 1
+    ends = ends[ends + after < len(q)]
+    # Where it has not gone far soon after, it was noise that ended the rest.
+    moved = np.abs(q[ends + after] - q[ends]) > 2 * _RANGE * noise
+    ends = ends[moved]
+    return ends[np.unique(np.linspace(0, len(ends) - 1, min(len(ends), _MOST)).astype(int))]
+
+
+def _own_states(plant: Plant, data: Prepared) -> tuple:
+    arrays = (jnp.asarray(a) for a in (data.q, data.qd, data.qdd, data.force))
+    return eqx.filter_jit(drive_own_states)(plant, *arrays, data.period, data.start)
+
+
+def acted(machine: Machine, log: Log) -> np.ndarray:
+    """The command as it acted: what the controller makes of the readings, noise of the log left out.
+
+    At a start a single noisy sample above the level would set the simulation moving. The logged
+    command stands where there is no controller, or one that does not give it back.
+    """
+    if machine.controller is None or log.reference is None:
+        return log.force
+    extra = disturbance_at(machine.disturbance, log.time, log)
+    arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
+    made = np.asarray(_commands(machine.controller, *(jnp.asarray(a) for a in arrays)))
+    size = np.sqrt(np.mean(log.force**2, axis=0))
+    stated = machine.sensor.force_noise
+    noise = 0.0 if stated is None else np.asarray(stated)
+    off = np.sqrt(np.mean((made - log.force) ** 2, axis=0))
+    return np.where(off <= np.maximum(_SAME * noise, _NEARLY * size), made, log.force)
+
+
+@eqx.filter_jit
+def _commands(controller: Controller, position: Array, reference: Array, disturbance: Array) -> Array:
+    def tick(memory: tuple, now: tuple) -> tuple[tuple, Array]:
+        u, memory = controller.command(Tick(*now[:2]), memory, now[2])
+        return memory, u
+
+    start = controller.start(position[0], jnp.zeros_like(position[0]), reference[0])
+    return jax.lax.scan(tick, start, (position, reference, disturbance))[1]
