@@ -7,7 +7,8 @@ rest and under the logged command; the level is read off the moment at which it 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
 
-from jaxid.discovery.starts import Starts, acted, starts_from_rest
+from jaxid.discovery.starts import Starts, starts_from_rest
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.result import Estimate
 from jaxid.io.log import Log
@@ -28,7 +29,7 @@ from jaxid.replay import needed_steps
 from jaxid.simulation import Drive, open_loop
 
 # Fewest starts that can tell a level from a chance.
-_FEWEST = 4
+_FEWEST = 3
 # Levels tried at once, twice: over all that the log allows, then between neighbours of the best.
 _LEVELS = 40
 _FOLDS = 4
@@ -61,30 +62,30 @@ class BreakAway:
 
 
 def break_away(
-    estimate: Estimate, log: Log, data: Prepared, joint: int = 0
+    estimate: Estimate, logs: Sequence[tuple[Log, Prepared]], joint: int = 0
 ) -> BreakAway | None:
-    """Level of break-away friction above Coulomb's that the starts from rest of a log ask for.
+    """Level of break-away friction above Coulomb's that the starts from rest of some logs ask for.
 
     Args:
         estimate: The model without it; its parameters move within their covariance.
-        log: The log.
-        data: The same, prepared.
+        logs: Each with the same, prepared. What a rest is, the first decides.
         joint: 0-based.
 
     Returns:
         The finding; None where too few starts are seen, or where the state at rest is not known
         (presliding, or a controller faster than the log).
     """
-    if not _can_tell(estimate.machine, log):
+    machine = estimate.machine
+    if not all(_can_tell(machine, log) for log, _ in logs):
         return None
-    log = replace(log, force=acted(estimate.machine, log))
-    noise = float(position_noise(estimate.machine, log)[joint])
-    cuts = starts_from_rest(estimate.machine, log, data, noise, joint)
+    noise = float(position_noise(machine, logs[0][0])[joint])
+    cuts = starts_from_rest(machine, logs, noise, joint)
     enough = [s for s in cuts if s.count >= _FEWEST]
     most = max((s.count for s in enough), default=0)
     found = []
     for starts in enough:
-        levels, fits = _fits(estimate, log, starts, 2 ** int(np.ceil(np.log2(most))), noise, joint)
+        padded = 2 ** int(np.ceil(np.log2(most)))
+        levels, fits = _fits(estimate, logs[0][0], starts, padded, noise, joint)
         found.append(_judge(levels, fits, np.asarray(starts.time)))
     return max(found, key=lambda b: b.evidence, default=None)
 
@@ -214,9 +215,10 @@ class _Fit:
 def _judge(levels: np.ndarray, fits: list[_Fit], times: np.ndarray) -> BreakAway:
     """Held-out evidence, and the level with its deviation; the first level is none."""
     spread = min(f.spread for f in fits)
-    folds = np.arange(len(fits[0].e)) % _FOLDS
+    count = len(fits[0].e)
+    folds = np.arange(count) % min(_FOLDS, count)
     old, new = [], []
-    for k in range(_FOLDS):
+    for k in range(min(_FOLDS, count)):
         train, test = np.flatnonzero(folds != k), np.flatnonzero(folds == k)
         chosen = min(fits, key=lambda f: f.cost(spread, train))
         old.append(fits[0].losses(spread, train, test)[0])

@@ -192,7 +192,9 @@ def _break_aways(
 ) -> list[tuple[cand.Candidate, BreakAway]]:
     """What the starts from rest say of each joint's break-away friction, where they say anything."""
     missing = [c for c in search.rest() if c.kind == StaticFriction.kind]
-    found = [(c, break_away(estimate, session.fit.log, session.fit.data, c.port)) for c in missing]
+    period = session.fit.log.period
+    logs = [(r.log, r.data) for r in session.runs if abs(r.log.period / period - 1) < 1e-3]
+    found = [(c, break_away(estimate, logs, c.port)) for c in missing]
     return [(c, b) for c, b in found if b is not None]
 
 

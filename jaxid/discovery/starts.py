@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -64,24 +67,37 @@ class Starts(eqx.Module):
 
 
 def starts_from_rest(
-    machine: Machine, log: Log, data: Prepared, noise: float, joint: int
+    machine: Machine, logs: Sequence[tuple[Log, Prepared]], noise: float, joint: int
 ) -> list[Starts]:
     """Find where a joint leaves a rest, by a lax and by a strict notion of one.
 
     Args:
         machine: The machine.
-        log: The log.
-        data: The same, prepared.
+        logs: Each with the same, prepared; of one sampling time.
         noise: Standard deviation of a reading.
         joint: 0-based.
 
     Returns:
-        One or two cuts of one length.
+        One or two cuts of one length, the starts of all logs in each.
     """
-    stills = sorted(set(_stills(noise, log, data, joint)))
+    stills = sorted(set(_stills(noise, *logs[0], joint)))
     length = stills[-1] + max(_AFTER, 2 * stills[-1])
-    own = _own_states(machine.plant, data)
-    return [_cut(own, log, noise, still, length, joint) for still in stills]
+    ready = [
+        (_own_states(machine.plant, data), replace(log, force=_acted(machine, log)))
+        for log, data in logs
+    ]
+    return [
+        _joined([_cut(own, log, noise, still, length, joint) for own, log in ready])
+        for still in stills
+    ]
+
+
+def _joined(cuts: list[Starts]) -> Starts:
+    """The starts of several logs as one."""
+    still = cuts[0].still
+    own = jax.tree.map(lambda *a: jnp.concatenate(a), *[c.own for c in cuts])
+    parts = [[getattr(c, n) for c in cuts] for n in ("command", "position", "rest", "time")]
+    return Starts(*[jnp.concatenate(p) for p in parts], own, still)
 
 
 def _cut(
@@ -130,7 +146,7 @@ def _own_states(plant: Plant, data: Prepared) -> tuple:
     return eqx.filter_jit(drive_own_states)(plant, *arrays, data.period, data.start)
 
 
-def acted(machine: Machine, log: Log) -> np.ndarray:
+def _acted(machine: Machine, log: Log) -> np.ndarray:
     """The command as it acted: what the controller makes of the readings, noise of the log left out.
 
     At a start a single noisy sample above the level would set the simulation moving. The logged
