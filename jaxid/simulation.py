@@ -118,6 +118,7 @@ def open_loop(
     reset: tuple[Array, Array, Array] | None = None,
     start: Array | float = 0.0,
     own: tuple | None = None,
+    past: Float[Array, "earlier m"] | None = None,
 ) -> Trajectory:
     """Simulate a plant under a logged command.
 
@@ -131,8 +132,12 @@ def open_loop(
             to restart from, (time, n); for multiple shooting.
         start: Time of the first sample, from the start of the log [s].
         own: Own states of the effects there; absent: as if the drive had long been at its force.
+        past: Logged command before the first sample, for what a delay still holds back; absent:
+            as at the first sample.
     """
-    before, after = interval_forces(plant, drive, command)
+    earlier = 0 if past is None else past.shape[0]
+    known = command if past is None else jnp.concatenate([past, command])
+    before, after = (f[earlier:] for f in interval_forces(plant, drive, known))
     times = start + drive.period * jnp.arange(command.shape[0])
     x0 = State(position, velocity, plant.initial_states(before[0]) if own is None else own)
     held = drive.hold == "zero_order"

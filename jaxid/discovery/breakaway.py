@@ -142,10 +142,10 @@ def _runs(
 
         def one(s: Starts) -> Array:
             zero = jnp.zeros_like(s.rest)
-            q = open_loop(
-                now, drive, s.command, s.rest, zero, start=s.time, own=(*s.own, None)
-            ).position[:, joint]
-            e = s.position[:, joint] - q
+            run = open_loop(
+                now, drive, s.command, s.rest, zero, start=s.time, own=(*s.own, None), past=s.past
+            )
+            e = s.position[:, joint] - run.position[:, joint]
             at_rest = jnp.arange(e.size) < s.still
             return e - jnp.sum(jnp.where(at_rest, e, 0.0)) / s.still
 

@@ -266,7 +266,8 @@ def refine(
             at[moving] = np.asarray(transform.outward(jnp.asarray(x)))
             e, jacobian = evaluate(union, data, at)
             slope = np.asarray(transform.slope(jnp.asarray(at[moving])))
-            rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))
+            with np.errstate(invalid="ignore", over="ignore"):  # what diverged is made finite below
+                rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))
             latest[key] = (_finite(e * weight[..., 0]).ravel(), _finite(rows))
         return latest[key]
 

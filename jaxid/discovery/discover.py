@@ -11,7 +11,7 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.breakaway import BreakAway, break_away
 from jaxid.discovery.screen import Score
-from jaxid.discovery.search import Search, Step
+from jaxid.discovery.search import RELEVANT, Search, Step
 from jaxid.discovery.separate import Proposal, proposals
 from jaxid.discovery.where import Where, locate
 from jaxid.effects.friction import StaticFriction
@@ -172,7 +172,7 @@ def discover(
         after = _refit(session.with_machine(after.machine), after) if effects else before
     separating = proposals(session, search, effects, progress)
     for c, b in at_rest:
-        if b.level > 0.0 and b.evidence > b.threshold and b.closed > 0.0:
+        if b.level > 0.0 and b.evidence > b.threshold and b.closed > RELEVANT:
             where = where if effects else _at_starts(where, c, b)
             after, found, step = _with_break_away(after, search, c, b)
             steps.append(step)

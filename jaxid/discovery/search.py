@@ -16,7 +16,7 @@ from jaxid.preprocess import Prepared
 # An effect must close this part of what stands above the noise floor (in sum of squares, so half
 # of it in RMS), whatever its evidence: on measured data everything helps a little. One that is
 # there already goes where it closes less than a third of that.
-_RELEVANT = 0.15
+RELEVANT = 0.15
 _SUPERFLUOUS = 0.05
 # A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
 _SCATTER = 3.0
@@ -27,12 +27,13 @@ _CONFIRMED = 0.1
 _NUMERICS = 1e-3
 
 
-# Two effects are added at once where they gain more than the best single one with any partner, by
-# so many times what noise may, and by this part of what they gain.
+# Two effects are added at once where they close this part of the gap and gain more than the best
+# single one with any partner, by so many times what noise may, and by this part of what they gain.
 # An effect that keeps less than this part of what its linear screen promised is left out there.
 _CLEARLY = 3.0
 _KEPT = 0.5
-_MUCH = 0.1
+_MUCH = 0.33
+_MOST_OF_IT = 0.5
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,9 @@ class Search:
                 Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True)
             )
             both = self._refit(second, screened, beside=first)
-            if not both.reason and (one is None or both.total > one.total):
+            old, new = (cand.evaluate(self.union, self.samples, t)[0] for t in (self.theta, both.theta))
+            enough = self._closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
+            if enough and not both.reason:
                 first = replace(self._refit(first, screened), reason="")
                 return first, _after(both, first)
         return ()
@@ -223,7 +226,7 @@ class Search:
             return more < 0
         now, _ = cand.evaluate(self.union, self.samples, self.theta)
         then, _ = cand.evaluate(self.union, self.samples, best.theta)
-        return self._closed(now, then) > _RELEVANT
+        return self._closed(now, then) > RELEVANT
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         return cand.refine(self.union, self.samples, theta, active)[0]
@@ -284,7 +287,7 @@ class Search:
                 return f"{free[i].name} runs to its limit, where it only imitates"
         old, _ = cand.evaluate(self.union, self.samples, self.theta)
         closed = self._closed(old, e)
-        if closed < _RELEVANT:
+        if closed < RELEVANT:
             return f"it closes only {100 * max(closed, 0) / 2:.1f} % of the gap"
         if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
             return "it does not help on the validation log"

@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxid import signals
 from jaxid.controllers import Controller, Tick
+from jaxid.estimators.inverse_dynamics import ForceData
 from jaxid.io.log import Log
 from jaxid.machine import Machine, disturbance_at
 from jaxid.model import Plant
@@ -37,6 +39,7 @@ class Starts(eqx.Module):
     """Moments in which a joint starts from rest, cut out of a log.
 
     Args:
+        past: Logged command before each start, as far back as a delay reaches, (start, earlier, m).
         command: Logged command, (start, time, m).
         position: Measured, (start, time, n).
         rest: Mean reading at rest, (start, n).
@@ -45,6 +48,7 @@ class Starts(eqx.Module):
         still: How many of the samples are at rest.
     """
 
+    past: Array
     command: Array
     position: Array
     rest: Array
@@ -82,12 +86,13 @@ def starts_from_rest(
     """
     stills = sorted(set(_stills(noise, *logs[0], joint)))
     length = stills[-1] + max(_AFTER, 2 * stills[-1])
+    lead = int(np.ceil(float(machine.plant.command_delay()) / logs[0][0].period)) + 1
     ready = [
-        (_own_states(machine.plant, data), replace(log, force=_acted(machine, log)))
+        (_own_states(machine.plant, ForceData.of(data)), replace(log, force=_acted(machine, log)))
         for log, data in logs
     ]
     return [
-        _joined([_cut(own, log, noise, still, length, joint) for own, log in ready])
+        _joined([_cut(own, log, noise, still, length, lead, joint) for own, log in ready])
         for still in stills
     ]
 
@@ -96,18 +101,19 @@ def _joined(cuts: list[Starts]) -> Starts:
     """The starts of several logs as one."""
     still = cuts[0].still
     own = jax.tree.map(lambda *a: jnp.concatenate(a), *[c.own for c in cuts])
-    parts = [[getattr(c, n) for c in cuts] for n in ("command", "position", "rest", "time")]
+    parts = [[getattr(c, n) for c in cuts] for n in ("past", "command", "position", "rest", "time")]
     return Starts(*[jnp.concatenate(p) for p in parts], own, still)
 
 
 def _cut(
-    own: tuple, log: Log, noise: float, still: int, length: int, joint: int
+    own: tuple, log: Log, noise: float, still: int, length: int, lead: int, joint: int
 ) -> Starts:
     after = length - still
     ends = _departures(log.position[:, joint], noise, still, after)
     rows = ends[:, None] + np.arange(1 - still, after + 1)
+    earlier = np.maximum(rows[:, :1] + np.arange(-lead, 0), 0)
     return Starts(
-        jnp.asarray(log.force[rows]), jnp.asarray(log.position[rows]),
+        jnp.asarray(log.force[earlier]), jnp.asarray(log.force[rows]), jnp.asarray(log.position[rows]),
         jnp.asarray(log.position[rows[:, :still]].mean(axis=1)),
         jnp.asarray(log.time[rows[:, 0]] - log.time[0]), jax.tree.map(lambda a: a[rows[:, 0]], own),
         jnp.asarray(still),
@@ -141,9 +147,11 @@ def _departures(
     return ends[np.unique(np.linspace(0, len(ends) - 1, min(len(ends), _MOST)).astype(int))]
 
 
-def _own_states(plant: Plant, data: Prepared) -> tuple:
-    arrays = (jnp.asarray(a) for a in (data.q, data.qd, data.qdd, data.force))
-    return eqx.filter_jit(drive_own_states)(plant, *arrays, data.period, data.start)
+@eqx.filter_jit
+def _own_states(plant: Plant, data: ForceData) -> tuple:
+    """Own states of the effects along a log, under the command as it acts."""
+    u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
+    return drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
 
 
 def _acted(machine: Machine, log: Log) -> np.ndarray:

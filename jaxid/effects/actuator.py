@@ -94,5 +94,9 @@ class Saturation(Effect):
         return {"limit": 10 * scales.peak_force}
 
     @classmethod
+    def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
+        return {"limit": (0.0, 20 * scales.peak_force)}
+
+    @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         return [{"limit": scales.peak_force * s} for s in (0.97, 0.9, 0.8, 0.65, 0.5, 0.35)]
