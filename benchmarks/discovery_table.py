@@ -84,6 +84,7 @@ def markdown(table: dict) -> str:
         for name, value in table["totals"].items()
     ]  # fmt: skip
     parts.append(_grid(["total", "is", "aim", "met"], rows))
+    parts += ["## At a glance: named right of visible", glance(table)]
     for title in ("effects", "pairs", "short"):
         parts += [f"## {title.capitalize()}, visible ones", _results(table[title])]
     parts += ["## Seconds", _lines("discover", table["seconds"])]
@@ -91,6 +92,24 @@ def markdown(table: dict) -> str:
         entries = [f"- {' | '.join(map(str, e.values()))}" for e in table[title]]
         parts += [f"## {title.capitalize()}: {len(entries)}", "\n".join(entries)]
     return "\n\n".join(p for p in parts if p) + "\n"
+
+
+def glance(table: dict) -> str:
+    """Effect against noise, a line each: named right of visible, gap closed, seconds."""
+    noises = list(dict.fromkeys(r["noise"] for r in table["effects"]))
+    rows = []
+    for what in dict.fromkeys(r["what"] for r in table["effects"]):
+        own = {r["noise"]: r for r in table["effects"] if r["what"] == what}
+        cells = [f"{own[n]['right']}/{own[n]['visible']}" if n in own else "" for n in noises]
+        wrong = Counter(
+            w["said"] for w in table["wrong"] if w["id"].startswith(f"effects/{what}/")
+        )
+        rows.append(
+            [what, *cells, _text(own["all"]["closed"]), _text(own["all"]["seconds"]),
+             "; ".join(f"{said}: {n}" for said, n in wrong.items())]
+        )  # fmt: skip
+    heads = ["hidden", *[n if n == "all" else f"noise {n}" for n in noises], "closed", "s", "wrong"]
+    return _grid(heads, rows)
 
 
 def _visible(records: Iterable[Record]) -> list[Record]:
@@ -160,11 +179,6 @@ def _wrong(record: Record) -> dict:
         "id": record["id"], "said": said, "closed": "" if closed is None else f"{closed:.3f}",
         "why": record.get("error") or (where["text"] if where and not record["named"] else ""),
     }  # fmt: skip
-
-
-def confusions(table: dict) -> Counter:
-    """How often each hidden kind was called what."""
-    return Counter((w["id"].split("/")[1], w["said"]) for w in table["wrong"])
 
 
 def _results(rows: Sequence[dict]) -> str:

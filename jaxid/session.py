@@ -139,7 +139,8 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
     if left < 5 * max(len(machine.parameters.free), 4):
         raise InputError(
             f"too short: {log.samples} samples leave {max(left, 0)} after decimation by "
-            f"{recipe.decimation} and trimming {recipe.trim} at each end",
+            f"{recipe.decimation} and trimming {recipe.trim} at each end, as [preprocess] states or "
+            "the log's noise asks",
             where=log.source, mend="take a longer log, or lower decimation and trim in [preprocess]",
         )
     hold = None if machine.controller is None else machine.controller.period

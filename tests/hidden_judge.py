@@ -6,6 +6,7 @@ Record = Mapping
 DEVIATIONS = 3.0
 _HIT = 0.8  # part of the bursts that the intervals must hold
 _AIM = 0.05  # s, by which an interval may miss a burst: three periods of a band of 60 Hz
+_NOTHING = 0.02  # part of a gap: what acts at rest closes less of the force while moving
 _LINE = 0.02  # part by which a frequency may be off, and no less than a tenth of a hertz
 
 
@@ -60,12 +61,12 @@ def pointed_at(record: Record) -> bool:
 
 
 def closed(record: Record) -> float | None:
-    """Gap closed on the last log, over what the truth closes there; None where it closes nothing."""
+    """Gap closed on the last log, over what the truth closes there; None where that is nothing."""
     gap = record.get("gap")
     if not gap or not gap["truth"]:
         return None
     before, after, truth = (gap[k][-1] for k in ("before", "after", "truth"))
-    return (before - after) / (before - truth) if before > truth else None
+    return (before - after) / (before - truth) if before - truth > _NOTHING * before else None
 
 
 def deviations(record: Record) -> list[float]:

@@ -155,16 +155,12 @@ def test_limits_may_be_given_by_joint(tmp_path):
     assert load_case(write_case(tmp_path, text)).limits == {"stroke": ((0.0, 0.3),), "speed": (0.1,)}
 
 
-# Saturation is promised far more than it keeps; the search then refits nothing else.
-_NOT_LISTED = pytest.mark.xfail(strict=True, reason="search.alternatives lists no rival here")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "more"),
     [
         pytest.param(setups.curved, setups.WIDER, id="springs"),
-        pytest.param(setups.one_speed, "", id="friction", marks=_NOT_LISTED),
+        pytest.param(setups.one_speed, "", id="friction"),
     ],
 )
 def test_running_it_separates(make, more, tmp_path, capsys):

@@ -288,7 +288,8 @@ class Search:
         old, _ = cand.evaluate(self.union, self.samples, self.theta)
         closed = self._closed(old, e)
         if closed < RELEVANT:
-            return f"it closes only {100 * max(closed, 0) / 2:.1f} % of the gap"
+            part = 50 * closed  # in RMS, where little is closed
+            return f"it closes only {part:.1f} % of the gap" if part > 0.05 else "it closes none of the gap"
         if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
             return "it does not help on the validation log"
         return ""
