@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,8 @@ class Score:
         candidate: Which.
         start: Index of its best start.
         guess: Where its refit starts.
+        second: Where it starts too: of an effect in the drive, the start that by itself brings the
+            residual down most. A linear screen promises wonders of a start that touches few samples.
         evidence: Held-out gain in log-likelihood on the log [nats].
         validation: The same on the validation logs; None without any.
         theta: All unknowns of the union after its refit; None where it was only screened.
@@ -44,6 +46,7 @@ class Score:
     start: int
     guess: np.ndarray
     evidence: float
+    second: np.ndarray | None = None
     validation: float | None = None
     theta: np.ndarray | None = None
     reason: str = ""
@@ -171,6 +174,7 @@ def _score(
     null_before = out.held(base, surrogates)
     largest = np.full(surrogates.shape[1], -np.inf)
     best: dict[tuple[str, int], Score] = {}
+    alone: dict[tuple[str, int], tuple[float, np.ndarray]] = {}
     for p in points:
         extra = _independent(base, out.whitener(p.columns))
         if extra.shape[1] == 0:
@@ -185,7 +189,11 @@ def _score(
         key = (p.candidate.kind, p.candidate.port)
         if key not in best or gain > best[key].evidence:
             best[key] = Score(p.candidate, p.start, guess, gain)
-    out.scores = sorted(best.values(), key=lambda s: -s.evidence)
+        if offset is not None:
+            left = float(out.held(base, white + offset)[0])
+            alone[key] = min(alone.get(key, (np.inf, guess)), (left, guess), key=lambda a: a[0])
+    scores = [replace(s, second=alone[k][1]) if k in alone else s for k, s in best.items()]
+    out.scores = sorted(scores, key=lambda s: -s.evidence)
     out.threshold = ev.threshold(largest)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -239,10 +240,13 @@ class Search:
     def _refit(self, score: Score, screened: Screen, beside: Score | None = None) -> Score:
         new = [s for s in (beside, score) if s is not None]
         active = self._active([*self.added, *[s.candidate for s in new]])
-        theta = self.theta.copy()
-        for s in new:
-            theta[s.candidate.index] = s.guess
-        theta = self._fit(theta, active)
+        fits = []
+        for guesses in itertools.product(*[_starts(s) for s in new]):
+            theta = self.theta.copy()
+            for s, guess in zip(new, guesses, strict=True):
+                theta[s.candidate.index] = guess
+            fits.append(self._fit(theta, active))
+        theta = min(fits, key=self._squares)
         e, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = screened.held_out(e, jacobian[..., active])
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
@@ -250,6 +254,11 @@ class Search:
         index = np.concatenate([s.candidate.index for s in new])
         reason = self._objection(index, theta, e, validation, confirmed)
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
+
+    def _squares(self, theta: np.ndarray) -> float:
+        e, _ = cand.evaluate(self.union, self.samples, theta)
+        total = float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))
+        return total if np.isfinite(total) else np.inf
 
     def _validated(self, theta: np.ndarray) -> tuple[float | None, float | None]:
         """Gain on the validation logs, nothing refitted there.
@@ -340,6 +349,14 @@ class Search:
         # The floor is itself an estimate, and a search always finds something to close: at least
         # half of the residual counts as gap.
         return float((before - after) / max(before - floor, 0.5 * before))
+
+
+def _starts(score: Score) -> list[np.ndarray]:
+    """Where a refit of a candidate starts: once or twice."""
+    second = score.second
+    if second is None or np.array_equal(second, score.guess):
+        return [score.guess]
+    return [score.guess, second]
 
 
 def _after(both: Score, first: Score) -> Score:
