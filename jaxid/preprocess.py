@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from jaxid import signals
 from jaxid.io.log import Log
 
-# The surroundings of reversals that are left out are less of a log than this.
+# The surroundings of reversals that are left out are less of the motion than this.
 _MOSTLY = 0.5
 
 
@@ -224,7 +224,7 @@ def prepare(
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
     reach = recipe.decimator.reach
     if recipe.derivatives == "spectral":
-        reach = _affordable(at_rest | _turning(qd), max(reach, recipe.decimation - 1))
+        reach = _affordable(at_rest, _turning(qd), max(reach, recipe.decimation - 1))
         # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
         at_rest = at_rest | (_turning(qd) & (reach > 0))
     moving = ~_smeared(at_rest, reach)[kept]
@@ -238,11 +238,12 @@ def prepare(
     )
 
 
-def _affordable(turns: np.ndarray, reach: int) -> int:
-    """How many samples about stops and reversals to leave out, so that most of a log remains."""
+def _affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
+    """How many samples about stops and reversals to leave out, so that most of the motion remains."""
     for part in (1.0, 0.75, 0.5, 0.25):
         near = int(np.ceil(part * reach))
-        if np.all(_smeared(turns, near).mean(axis=0) < _MOSTLY):
+        lost = _smeared(at_rest | turning, near) & ~at_rest
+        if np.all(lost.sum(axis=0) < _MOSTLY * np.maximum((~at_rest).sum(axis=0), 1)):
             return near
     return 0
 

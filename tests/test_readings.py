@@ -10,7 +10,7 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.algebraic import iterated_integral, weak_motion
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
-from jaxid.readings import State, residual_along, set_valued_step, small_solve, step
+from jaxid.readings import State, _recurrence, residual_along, set_valued_step, small_solve, step
 from jaxid.simulation import Drive, open_loop
 
 MASS, DAMPING, STIFFNESS = 2.0, 3.0, 800.0
@@ -259,3 +259,19 @@ def test_weak_motion_is_the_double_integral_of_the_derivatives():
         direct = iterated_integral(jnp.asarray(t**2 * derivative), period, 2)[-1]
         # two quadratures of fourth order at w h = 0.01: 1e-8 / 30 each, of terms of order one
         np.testing.assert_allclose(np.asarray(value), np.asarray(direct), atol=1e-9)
+
+
+def test_presliding_that_slips_stays_at_its_level_however_the_speed_changes():
+    speed = jnp.linspace(0.0, 0.3, 40) ** 2 + 1e-4
+    stiff = 5e5  # per metre: slips within 2 um, far less than a sample's stroke
+    z = _recurrence(jnp.ones(()), -stiff * speed, stiff * speed, 1e-3)
+    # the speed's curvature between samples is all that is left
+    assert np.abs(np.asarray(z) - 1).max() < 1e-3
+
+
+def test_a_lag_follows_a_sine_to_the_order_of_the_cubic():
+    t, lag, omega = 1e-3 * jnp.arange(400), 4e-3, 2 * jnp.pi * 60.0
+    z = _recurrence(jnp.zeros(()), jnp.full(400, -1 / lag), jnp.sin(omega * t) / lag, 1e-3)
+    steady = (jnp.sin(omega * t) - lag * omega * jnp.cos(omega * t)) / (1 + (lag * omega) ** 2)
+    exact = steady + jnp.exp(-t / lag) * lag * omega / (1 + (lag * omega) ** 2)
+    assert np.abs(np.asarray(z - exact)).max() < 1e-3

@@ -24,8 +24,8 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
-from jaxid.preprocess import Prepared
 from jaxid.replay import needed_steps
+from jaxid.session import Run
 from jaxid.simulation import Drive, open_loop
 
 # Fewest starts that can tell a level from a chance.
@@ -38,6 +38,8 @@ _FOLDS = 4
 _TELLS = 3
 # For the better of two definitions of a rest.
 _FALSE_POSITIVE = 0.5e-3
+# Part of its squared residual that the median start must lose.
+_RELEVANT = 0.15
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class BreakAway:
         evidence: Held-out gain in log-likelihood over none [nats].
         threshold: What noise alone exceeds once in a thousand.
         closed: Part of its squared residual that the median start loses.
-        times: Of the starts [s].
+        times: When the joint left its rests in the first log [s].
+        count: Starts in all logs.
     """
 
     level: float
@@ -59,35 +62,46 @@ class BreakAway:
     threshold: float
     closed: float
     times: Float[np.ndarray, " start"]
+    count: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is more than chance, and more than a trifle."""
+        return self.level > 0.0 and self.evidence > self.threshold and self.closed > _RELEVANT
 
 
 def break_away(
-    estimate: Estimate, logs: Sequence[tuple[Log, Prepared]], joint: int = 0
-) -> BreakAway | None:
+    estimate: Estimate, runs: Sequence[Run], joint: int = 0
+) -> BreakAway | str:
     """Level of break-away friction above Coulomb's that the starts from rest of some logs ask for.
 
     Args:
         estimate: The model without it; its parameters move within their covariance.
-        logs: Each with the same, prepared. What a rest is, the first decides.
+        runs: The logs. What a rest is, the first decides; those held or sampled otherwise are
+            left out.
         joint: 0-based.
 
     Returns:
-        The finding; None where too few starts are seen, or where the state at rest is not known
-        (presliding, or a controller faster than the log).
+        The finding, or why there is none.
     """
     machine = estimate.machine
-    if not all(_can_tell(machine, log) for log, _ in logs):
-        return None
-    noise = float(position_noise(machine, logs[0][0])[joint])
-    cuts = starts_from_rest(machine, logs, noise, joint)
+    log = runs[0].log
+    unknown = _unknown(machine, log)
+    if unknown:
+        return unknown
+    alike = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
+    noise = float(position_noise(machine, log)[joint])
+    cuts = starts_from_rest(machine, alike, noise, joint)
     enough = [s for s in cuts if s.count >= _FEWEST]
     most = max((s.count for s in enough), default=0)
     found = []
     for starts in enough:
         padded = 2 ** int(np.ceil(np.log2(most)))
-        levels, fits = _fits(estimate, logs[0][0], starts, padded, noise, joint)
-        found.append(_judge(levels, fits, np.asarray(starts.time)))
-    return max(found, key=lambda b: b.evidence, default=None)
+        levels, fits = _fits(estimate, log, starts, padded, noise, joint)
+        leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
+        found.append(_judge(levels, fits, leaves[np.asarray(starts.log) == 0]))
+    few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
+    return max(found, key=lambda b: b.evidence, default=few)
 
 
 def _fits(
@@ -112,18 +126,20 @@ def _fits(
     fits = at(coarse)
     spread = min(f.spread for f in fits)
     best = int(np.argmin([f.cost(spread) for f in fits]))
-    # Uneven, so that no level is tried twice.
-    fine = np.linspace(coarse[max(best - 1, 0)], coarse[min(best + 1, _LEVELS - 1)], _LEVELS + 3)[1:-2]
+    # An even number between the neighbours, so that the best is not tried twice.
+    fine = np.linspace(coarse[max(best - 1, 0)], coarse[min(best + 1, _LEVELS - 1)], _LEVELS + 2)[1:-1]
     return np.concatenate([coarse, fine]), [*fits, *at(fine)]
 
 
-def _can_tell(machine: Machine, log: Log) -> bool:
-    """Whether what acts at a start is known: no presliding memory, no command between samples."""
-    memory = any(
-        e.adds_force and e.initial_state(jnp.zeros(())) is not None for e in machine.plant.effects
-    )
-    faster = machine.controller is not None and machine.controller.period < 0.9 * log.period
-    return not memory and not faster and log.hold != "band_limited"
+def _unknown(machine: Machine, log: Log) -> str:
+    """What of the moment of a start is not known; empty where all is."""
+    if any(e.adds_force and e.initial_state(jnp.zeros(())) is not None for e in machine.plant.effects):
+        return "the state of presliding friction at rest is not known"
+    if machine.controller is not None and machine.controller.period < 0.9 * log.period:
+        return "the command between the log's samples is not known"
+    if log.hold == "band_limited":
+        return "the command between the log's samples has no corner"
+    return ""
 
 
 @eqx.filter_jit
@@ -234,7 +250,7 @@ def _judge(levels: np.ndarray, fits: list[_Fit], times: np.ndarray) -> BreakAway
     variance = float((levels[order] - level) ** 2 @ weight) + step**2 / 12
     return BreakAway(
         level, float(np.sqrt(variance)), 0.5 * float(np.sum(old - new)),
-        float(scipy.stats.chi2.ppf(1 - _FALSE_POSITIVE, 1) / 2), _closed(old, new), times,
+        float(scipy.stats.chi2.ppf(1 - _FALSE_POSITIVE, 1) / 2), _closed(old, new), times, count,
     )
 
 

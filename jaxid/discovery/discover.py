@@ -11,7 +11,7 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.breakaway import BreakAway, break_away
 from jaxid.discovery.screen import Score
-from jaxid.discovery.search import RELEVANT, Search, Step
+from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separate import Proposal, proposals
 from jaxid.discovery.where import Where, locate
 from jaxid.effects.friction import StaticFriction
@@ -84,7 +84,7 @@ class Discovery:
         gaps_after: The same after.
         noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
         proposals: Experiments that would tell effects apart which this log cannot.
-        starts: How many starts from rest were looked at for break-away friction.
+        unseen: Why break-away friction was not looked for; empty where it was.
     """
 
     session: Session
@@ -98,7 +98,7 @@ class Discovery:
     gaps_after: tuple[Gap, ...]
     noise_floor: np.ndarray
     proposals: tuple[Proposal, ...] = ()
-    starts: int = 0
+    unseen: str = ""
 
     @property
     def kinds(self) -> list[str]:
@@ -162,17 +162,19 @@ def discover(
     verdict = _verdict(effects, where, steps, search)
     before = baseline
     after = inverse_dynamics(final, data) if effects else before
-    at_rest = []
-    if verdict != "unexplained":
-        progress("looking at the starts from rest")
-        at_rest = _break_aways(session, search, after)
     if refit:
         progress("refitting in simulation")
         before = _refit(session.with_machine(before.machine), before)
         after = _refit(session.with_machine(after.machine), after) if effects else before
     separating = proposals(session, search, effects, progress)
-    for c, b in at_rest:
-        if b.level > 0.0 and b.evidence > b.threshold and b.closed > RELEVANT:
+    unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
+    missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]
+    for c in missing:
+        progress("looking at the starts from rest")
+        b = break_away(after, session.runs, c.port)
+        if isinstance(b, str):
+            unseen = b
+        elif b.holds and len(effects) < max_effects:
             where = where if effects else _at_starts(where, c, b)
             after, found, step = _with_break_away(after, search, c, b)
             steps.append(step)
@@ -183,19 +185,8 @@ def discover(
     return Discovery(
         session, verdict, None if verdict == "nothing_missing" else where, effects,
         tuple(_round(search, s) for s in steps), before, after, old, new, floor, separating,
-        sum(len(b.times) for _, b in at_rest),
+        unseen,
     )
-
-
-def _break_aways(
-    session: Session, search: Search, estimate: Estimate
-) -> list[tuple[cand.Candidate, BreakAway]]:
-    """What the starts from rest say of each joint's break-away friction, where they say anything."""
-    missing = [c for c in search.rest() if c.kind == StaticFriction.kind]
-    period = session.fit.log.period
-    logs = [(r.log, r.data) for r in session.runs if abs(r.log.period / period - 1) < 1e-3]
-    found = [(c, break_away(estimate, logs, c.port)) for c in missing]
-    return [(c, b) for c, b in found if b is not None]
 
 
 def _with_break_away(
@@ -214,10 +205,16 @@ def _with_break_away(
 
 
 def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
-    """Where break-away friction shows: at the starts from rest."""
-    text = f"joint {c.port + 1}: {len(b.times)} starts from rest come later than sliding friction explains"
+    """Where break-away friction shows: at the starts from rest. There is no curve to it."""
+    text = f"joint {c.port + 1}: {b.count} starts from rest come later than sliding friction explains"
     spans = tuple((float(t), float(t)) for t in b.times)
-    return replace(where, joint=c.port + 1, variable="time", intervals=spans, text=text)
+    region = (float(b.times.min()), float(b.times.max())) if len(b.times) else where.region
+    none = np.zeros(0)
+    return replace(
+        where, joint=c.port + 1, variable="time", region=region, intervals=spans, text=text,
+        evidence=b.evidence, threshold=b.threshold, x=none, mean=none, low=none, high=none,
+        frequency_hz=None,
+    )
 
 
 def _where(search: Search, baseline: Step, log: Log) -> Where:

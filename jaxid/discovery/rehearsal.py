@@ -75,7 +75,7 @@ class Stage:
         rng = np.random.default_rng(20240501)
         noise = rng.standard_normal(signal.shape)
         runs = self.runs(pair, signal, noise)
-        logs = [self._log(run, signal, rng) for run in runs]
+        logs = [self._log(run, rng) for run in runs]
         pairs = (pair, pair.turned())
         return [self._outcome(union, p, log) for p, log in zip(pairs, logs, strict=True)]
 
@@ -83,7 +83,7 @@ class Stage:
         run = _played(self.bench, plant, self.sensor, jnp.asarray(signal), jnp.asarray(noise))
         return run
 
-    def _log(self, run: Trajectory, signal: np.ndarray, rng: np.random.Generator) -> Log:
+    def _log(self, run: Trajectory, rng: np.random.Generator) -> Log:
         command = np.asarray(run.command)
         command = command + self.floor * rng.standard_normal(command.shape)
         times = self.bench.period * np.arange(len(command))

@@ -17,7 +17,7 @@ from jaxid.preprocess import Prepared
 # An effect must close this part of what stands above the noise floor (in sum of squares, so half
 # of it in RMS), whatever its evidence: on measured data everything helps a little. One that is
 # there already goes where it closes less than a third of that.
-RELEVANT = 0.15
+_RELEVANT = 0.15
 _SUPERFLUOUS = 0.05
 # A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
 _SCATTER = 3.0
@@ -181,8 +181,10 @@ class Search:
             old, new = (cand.evaluate(self.union, self.samples, t)[0] for t in (self.theta, both.theta))
             enough = self._closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
             if enough and not both.reason:
-                first = replace(self._refit(first, screened), reason="")
-                return first, _after(both, first)
+                one = replace(self._refit(first, screened), reason="")
+                other = self._refit(second, screened)
+                # The first is added alone; each counts by what is lost without it.
+                return replace(_after(both, other), **_place(one)), _after(both, one)
         return ()
 
     def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:
@@ -227,7 +229,7 @@ class Search:
             return more < 0
         now, _ = cand.evaluate(self.union, self.samples, self.theta)
         then, _ = cand.evaluate(self.union, self.samples, best.theta)
-        return self._closed(now, then) > RELEVANT
+        return self._closed(now, then) > _RELEVANT
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         return cand.refine(self.union, self.samples, theta, active)[0]
@@ -296,7 +298,7 @@ class Search:
                 return f"{free[i].name} runs to its limit, where it only imitates"
         old, _ = cand.evaluate(self.union, self.samples, self.theta)
         closed = self._closed(old, e)
-        if closed < RELEVANT:
+        if closed < _RELEVANT:
             part = 50 * closed  # in RMS, where little is closed
             return f"it closes only {part:.1f} % of the gap" if part > 0.05 else "it closes none of the gap"
         if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
@@ -359,7 +361,13 @@ def _starts(score: Score) -> list[np.ndarray]:
     return [score.guess, second]
 
 
-def _after(both: Score, first: Score) -> Score:
-    """What the second of two adds to the first."""
-    validation = None if both.validation is None else both.validation - first.validation
-    return replace(both, evidence=both.evidence - first.evidence, validation=validation)
+def _after(both: Score, one: Score) -> Score:
+    """What two effects gain over one of them."""
+    validation = None if both.validation is None else both.validation - one.validation
+    return replace(both, evidence=both.evidence - one.evidence, validation=validation)
+
+
+def _place(score: Score) -> dict:
+    """All of a score but what it gained."""
+    names = ("candidate", "start", "guess", "second", "theta", "reason")
+    return {n: getattr(score, n) for n in names}

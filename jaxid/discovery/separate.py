@@ -194,7 +194,7 @@ def _stage(session: Session, search: Search, bench: Bench) -> Stage:
     # White noise of which the band holds that much.
     more = more / np.sqrt(2 * recipe.band_hz(log.rate_hz) * log.period) / np.abs(machine.gain)
     stated = 0.0 if sensor.force_noise is None else np.asarray(sensor.force_noise)
-    steps = needed_steps(machine, log)
+    steps = max(needed_steps(machine, log), bench.drive.substeps)
     return Stage(exact(bench, steps), machine, recipe, sensor, np.hypot(more, stated))
 
 

@@ -19,12 +19,15 @@ from jaxid.machine import Machine, disturbance_at
 from jaxid.model import Plant
 from jaxid.preprocess import Prepared
 from jaxid.readings import drive_own_states
+from jaxid.session import Run
 
 # Readings that agree within this range, in standard deviations of their noise, are a rest: noise
 # alone does otherwise once in a thousand times. There must be as many of them as a reversal
 # without sticking could not keep together, and at least so many.
 _RANGE = 5.0
 _STILL = 3
+# ... and at most about so many: where readings hardly move, no number of them would do.
+_LONGEST = 60
 # Samples that follow a start, at least.
 _AFTER = 12
 # Most that are kept of a log.
@@ -46,6 +49,7 @@ class Starts(eqx.Module):
         time: Of the first sample [s], (start,).
         own: Own states of the plant's effects at the first sample.
         still: How many of the samples are at rest.
+        log: Which log each is from, (start,).
     """
 
     past: Array
@@ -55,6 +59,7 @@ class Starts(eqx.Module):
     time: Array
     own: tuple
     still: Array
+    log: Array
 
     @property
     def count(self) -> int:
@@ -71,25 +76,28 @@ class Starts(eqx.Module):
 
 
 def starts_from_rest(
-    machine: Machine, logs: Sequence[tuple[Log, Prepared]], noise: float, joint: int
+    machine: Machine, runs: Sequence[Run], noise: float, joint: int
 ) -> list[Starts]:
     """Find where a joint leaves a rest, by a lax and by a strict notion of one.
 
     Args:
         machine: The machine.
-        logs: Each with the same, prepared; of one sampling time.
+        runs: Logs of one sampling time.
         noise: Standard deviation of a reading.
         joint: 0-based.
 
     Returns:
         One or two cuts of one length, the starts of all logs in each.
     """
-    stills = sorted(set(_stills(noise, *logs[0], joint)))
+    stills = sorted(set(_stills(noise, runs[0].log, runs[0].data, joint)))
     length = stills[-1] + max(_AFTER, 2 * stills[-1])
-    lead = int(np.ceil(float(machine.plant.command_delay()) / logs[0][0].period)) + 1
+    lead = int(np.ceil(float(machine.plant.command_delay()) / runs[0].log.period)) + 1
     ready = [
-        (_own_states(machine.plant, ForceData.of(data)), replace(log, force=_acted(machine, log)))
-        for log, data in logs
+        (
+            _own_states(machine.plant, ForceData.of(r.data)),
+            replace(r.log, force=_acted(r.machine(machine), r.log)),
+        )
+        for r in runs
     ]
     return [
         _joined([_cut(own, log, noise, still, length, lead, joint) for own, log in ready])
@@ -102,7 +110,8 @@ def _joined(cuts: list[Starts]) -> Starts:
     still = cuts[0].still
     own = jax.tree.map(lambda *a: jnp.concatenate(a), *[c.own for c in cuts])
     parts = [[getattr(c, n) for c in cuts] for n in ("past", "command", "position", "rest", "time")]
-    return Starts(*[jnp.concatenate(p) for p in parts], own, still)
+    which = jnp.repeat(jnp.arange(len(cuts)), jnp.asarray([c.count for c in cuts]))
+    return Starts(*[jnp.concatenate(p) for p in parts], own, still, which)
 
 
 def _cut(
@@ -116,7 +125,7 @@ def _cut(
         jnp.asarray(log.force[earlier]), jnp.asarray(log.force[rows]), jnp.asarray(log.position[rows]),
         jnp.asarray(log.position[rows[:, :still]].mean(axis=1)),
         jnp.asarray(log.time[rows[:, 0]] - log.time[0]), jax.tree.map(lambda a: a[rows[:, 0]], own),
-        jnp.asarray(still),
+        jnp.asarray(still), jnp.zeros(len(rows), int),
     )
 
 
@@ -130,13 +139,15 @@ def _stills(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
     usual = float(np.sqrt(np.mean(a**2)))
     slow = float(np.quantile(a[turns], 0.25)) if len(turns) else usual
     halves = [np.sqrt(2 * _RANGE * noise / max(x, 1e-300)) / log.period for x in (usual, slow)]
-    return [max(_STILL, 1 + 2 * int(np.ceil(min(h, log.samples / 10)))) for h in halves]
+    return [max(_STILL, 1 + 2 * int(np.ceil(min(h, _LONGEST / 2)))) for h in halves]
 
 
 def _departures(
     q: Float[np.ndarray, " time"], noise: float, still: int, after: int
 ) -> np.ndarray:
     """Last samples of rests that are followed by motion, spread over the log if there are many."""
+    if len(q) <= still + after:
+        return np.zeros(0, int)
     windows = np.lib.stride_tricks.sliding_window_view(q, still)
     agree = np.ptp(windows, axis=1) <= _RANGE * noise
     ends = np.flatnonzero(agree[:-1] & ~agree[1:]) + still - 1

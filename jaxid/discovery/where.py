@@ -6,7 +6,7 @@ like any candidate: on held-out time, against surrogates.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -47,6 +47,7 @@ class Where:
         explained: Part of the residual's variance that the variable explains on held-out time.
         evidence: Held-out gain in log-likelihood [nats].
         threshold: What noise alone exceeds once in a thousand.
+        clear: Whether position, velocity or time explain more than that.
         x, mean, low, high: The curve and its 95 % band, in force.
         frequency_hz: Of a spectral line; None without one.
     """
@@ -59,6 +60,7 @@ class Where:
     explained: float
     evidence: float
     threshold: float
+    clear: bool
     x: Float[np.ndarray, " bin"]
     mean: Float[np.ndarray, " bin"]
     low: Float[np.ndarray, " bin"]
@@ -69,8 +71,7 @@ class Where:
     def significant(self) -> bool:
         """Whether anything but noise is there."""
         loud = bool(self.intervals) and self.variable == "time"
-        clean = self.evidence > self.threshold and self.variable not in _OWN_NOISE
-        return clean or self.frequency_hz is not None or loud
+        return self.clear or self.frequency_hz is not None or loud
 
 
 def variables(data: Prepared, joint: int) -> dict[str, Float[np.ndarray, " kept"]]:
@@ -142,7 +143,8 @@ def _locate(
         best = "time"
     else:
         best = _best(gains, clean)
-    return _describe(e, counts, named[best], best, joint, gains[best], limit, intervals, line, data)
+    found = _describe(e, counts, named[best], best, joint, gains[best], limit, intervals, line)
+    return replace(found, clear=gains[clean] > limit)
 
 
 def _best(gains: dict[str, float], clean: str) -> str:
@@ -153,7 +155,7 @@ def _best(gains: dict[str, float], clean: str) -> str:
 
 def _describe(
     e: np.ndarray, counts: np.ndarray, x: np.ndarray, name: str, joint: int, gain: float,
-    limit: float, intervals: tuple, line: float | None, data: Prepared,
+    limit: float, intervals: tuple, line: float | None,
 ) -> Where:
     centre, mean, error = _binned(e, counts, x)
     peak = int(np.argmax(np.abs(mean) - error))
@@ -172,7 +174,7 @@ def _describe(
         text = f"joint {joint + 1}: the residual is loud in {len(intervals)} interval(s) of time"
     return Where(
         joint + 1, name, (float(centre[lo]), float(centre[hi])), intervals,
-        text, explained, gain, limit, centre, mean,
+        text, explained, gain, limit, gain > limit, centre, mean,
         mean - 1.96 * error, mean + 1.96 * error, line,
     )
 

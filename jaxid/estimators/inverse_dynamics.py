@@ -120,7 +120,10 @@ def inverse_dynamics(
         _solve(plant, places, arrays, at, transform, parameters.bounds)
         for at in _starts(machine, theta)
     ]
-    fit = min(fits, key=lambda f: np.nan_to_num(float(f.cost), nan=np.inf))
+    costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
+    # Of those that reach the lowest cost, to rounding, one that converged.
+    lowest = [f for f, c in zip(fits, costs, strict=True) if c <= min(costs) * (1 + 1e-6)]
+    fit = next((f for f in lowest if bool(f.converged)), lowest[0])
     for _ in range(2 if reweighted else 0):
         e = np.asarray(fit.residual).reshape(data.moving.shape)
         weight = jnp.asarray(np.sqrt(_bisquare(e, rows)) * rows)

@@ -24,10 +24,12 @@ def sentence(proposal: Proposal, units: Units) -> str:
             why = "none was found in which the machine keeps to them"
         return f"no experiment within these limits separates {p.named} from {p.rival} ({why}){wider}"
     start = ", ".join(f"{x:.4g}" for x in np.ravel(p.start))
+    speaks = "" if p.present >= 0 else f" for {p.rival}"
     return (
         f"to separate {p.named} from {p.rival} run {p.file} as the {p.signal}: "
         f"{p.time[-1]:.3g} s, from rest at {start} {units.label('position')}; "
         f"expected {_nats(p.expected)} nats, {_nats(p.needed)} wanted, this log has {_nats(abs(p.present))}"
+        f"{speaks}"
     )
 
 

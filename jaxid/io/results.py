@@ -216,12 +216,11 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
         return []
     present = {e.kind for e in result.session.machine.plant.effects}
     lines = []
-    if "static_friction" not in present and result.starts == 0:
-        lines.append(
-            "break-away friction (static_friction) was not looked for: too few starts from a clear rest"
-        )
-    for score in result.rounds[-1].step.scores:
-        if score.reason and score.evidence > result.rounds[-1].step.threshold:
+    if "static_friction" not in present and result.unseen:
+        lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
+    last = [r.step for r in result.rounds if r.step.added is None and r.step.dropped is None][-1]
+    for score in last.scores:
+        if score.reason and score.evidence > last.threshold:
             kind, nats = score.candidate.kind, score.evidence
             lines.append(f"{kind} was not added, at {nats:.0f} nats: {score.reason}")
     return lines[: most + 1]
