@@ -262,11 +262,10 @@ def test_weak_motion_is_the_double_integral_of_the_derivatives():
 
 
 def test_presliding_that_slips_stays_at_its_level_however_the_speed_changes():
-    speed = jnp.linspace(0.0, 0.3, 40) ** 2 + 1e-4
+    speed = jnp.linspace(1e-4, 0.3, 40)
     stiff = 5e5  # per metre: slips within 2 um, far less than a sample's stroke
     z = _recurrence(jnp.ones(()), -stiff * speed, stiff * speed, 1e-3)
-    # the speed's curvature between samples is all that is left
-    assert np.abs(np.asarray(z) - 1).max() < 1e-3
+    assert np.abs(np.asarray(z) - 1).max() < 1e-9
 
 
 def test_a_lag_follows_a_sine_to_the_order_of_the_cubic():
