@@ -213,9 +213,7 @@ class Search:
                 self.theta = self._fit(best.theta, self.active)
                 steps.append(Step(best, own, scores, limit, self.theta, self.active))
             elif best.candidate is not own:
-                near = mine.total > best.total - margin(best)
-                more = len(best.candidate.index) > len(own.index)
-                ties = (best, *ties) if near or not more else ()
+                ties = (best, *ties) if mine.total > best.total - margin(best) else ()
             found[k] = tuple(s for s in ties if s.candidate is not self.added[k])
         return found
 

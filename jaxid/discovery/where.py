@@ -169,7 +169,7 @@ def _describe(
     text = f"joint {joint + 1}: the residual depends on {name}"
     text += f", most between {centre[lo]:.3g} and {centre[hi]:.3g} (SI)"
     if line is not None:
-        text = f"joint {joint + 1}: the residual holds a line at {line:.3g} Hz that no motion explains"
+        text = f"joint {joint + 1}: the residual holds a line at {line:.3g} Hz that the wanted motion lacks"
     elif name == "time" and intervals:
         text = f"joint {joint + 1}: the residual is loud in {len(intervals)} interval(s) of time"
     return Where(
