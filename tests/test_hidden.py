@@ -30,25 +30,23 @@ def searched(case, folder):
     return record
 
 
-@pytest.mark.parametrize("case", QUICK, ids=lambda c: c.id)
+@pytest.mark.parametrize(
+    "case",
+    [*QUICK, *[pytest.param(c, marks=pytest.mark.slow) for c in SOME if c not in QUICK]],
+    ids=lambda c: c.id,
+)
 def test_a_hidden_effect_is_named(case, tmp_path):
     record = searched(case, tmp_path)
     assert judge.right(record), said(record)
-    assert judge.closed(record) >= 0.9
+    closed = judge.closed(record)
+    # what acts at rest closes nothing of the force while moving, and neither does its truth
+    assert case.what == "static_friction" if closed is None else closed >= 0.9
 
 
 def test_nothing_is_seen_in_a_complete_model(tmp_path):
     case = next(c for c in EVERY.values() if c.group == "nulls" and c.scale == "servo" and c.sensor)
     record = run_case(case, tmp_path)
     assert not judge.false_positive(record), said(record)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", SOME, ids=lambda c: c.id)
-def test_hidden_effects_are_named(case, tmp_path):
-    record = searched(case, tmp_path)
-    assert judge.right(record), said(record)
-    assert judge.closed(record) >= 0.9
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxid.discovery.own import check_foreign, is_foreign
 from jaxid.effects import EFFECTS
-from jaxid.estimators.inverse_dynamics import ForceData, force_residual, sharpened
+from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual, sharpened
 from jaxid.estimators.least_squares import Transform
 from jaxid.machine import Machine
 from jaxid.model import Effect, Plant, Scales, carries_force, parameters_of
@@ -189,18 +189,6 @@ def _candidate(cls: type[Effect], port: int, index: np.ndarray, scales: Scales) 
     )
 
 
-@eqx.filter_jit
-def _residual_and_jacobian(
-    plant: Plant, places: tuple, data: ForceData, theta: Array
-) -> tuple[Array, Array]:
-    def residual(theta: Array) -> tuple[Array, Array]:
-        e = force_residual(scatter(places, plant, theta), data)
-        return e, e
-
-    jacobian, e = jax.jacfwd(residual, has_aux=True)(theta)
-    return e, jacobian
-
-
 class Samples:
     """What a search looks at of a log: all of it, or pieces spread over a long one.
 
@@ -230,7 +218,7 @@ def evaluate_on(
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """The same on several logs or pieces, one after the other."""
     plant, places = union.machine.plant, union.machine.parameters.places
-    found = [_residual_and_jacobian(plant, places, a, jnp.asarray(theta)) for a in logs]
+    found = [force_and_columns(plant, places, a, jnp.asarray(theta)) for a in logs]
     e, jacobian = (np.concatenate([np.asarray(f[i]) for f in found]) for i in range(2))
     return e, jacobian
 

@@ -7,15 +7,14 @@ spoil the baseline without a word, or fail in the middle of compiled code.
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array
 
 from jaxid.errors import InputError
-from jaxid.estimators.inverse_dynamics import ForceData, force_residual, sharpened
+from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual, sharpened
 from jaxid.machine import Machine
 from jaxid.model import Effect, Plant, Scales, parameters_of
-from jaxid.parameters import Parameters, free_effect, scatter
+from jaxid.parameters import Parameters, free_effect
 from jaxid.preprocess import Prepared
 
 # So many kept samples tell whether an effect is sound.
@@ -59,7 +58,8 @@ def check_foreign(cls: type[Effect], machine: Machine, data: Prepared, scales: S
         raise InputError("starts(scales) is empty", where=where, mend="give at least one start")
     pieces = data.parts(3 * _ROWS, 3)
     part, plant = ForceData.of(pieces[len(pieces) // 2]), sharpened(machine.plant, data)
-    found = [_force_and_columns(*_with(plant, e, machine), part) for e in effects[:2]]
+    models = [_with(plant, e, machine) for e in effects[:2]]
+    found = [force_and_columns(model, places, part, theta) for model, places, theta in models]
     for which, arrays in zip(("neutral", "starts"), found, strict=True):
         if not all(np.all(np.isfinite(a)) for a in arrays):
             what = f"its force or a derivative of it is no number at the values of {which}"
@@ -85,15 +85,3 @@ def _with(plant: Plant, effect: Effect, machine: Machine) -> tuple[Plant, tuple,
 
 
 _force = eqx.filter_jit(force_residual)
-
-
-@eqx.filter_jit
-def _force_and_columns(
-    plant: Plant, places: tuple, theta: Array, part: ForceData
-) -> tuple[Array, Array]:
-    def residual(theta: Array) -> tuple[Array, Array]:
-        e = force_residual(scatter(places, plant, theta), part)
-        return e, e
-
-    jacobian, e = jax.jacfwd(residual, has_aux=True)(theta)
-    return e, jacobian

@@ -20,7 +20,7 @@ from jaxid.machine import Machine
 from jaxid.model import Plant
 from jaxid.preprocess import Recipe, prepare
 from jaxid.sensors import Sensor
-from jaxid.simulation import Trajectory, closed_loop, open_loop
+from jaxid.simulation import Trajectory
 
 
 @dataclass(frozen=True)
@@ -103,20 +103,7 @@ _MOTION = ("position", "velocity", "command")
 
 @eqx.filter_jit
 def _played(bench: Bench, plant: Plant, sensor: Sensor, signal: Array, noise: Array) -> Trajectory:
-    zero = jnp.zeros_like(bench.start)
-    if bench.controller is None:
-        run = open_loop(plant, bench.drive, signal, bench.start, zero)
-        reading = sensor.read(run.position, noise)
-        run = eqx.tree_at(lambda r: r.reading, run, reading)
-    else:
-        none = jnp.zeros((signal.shape[0], 1))
-        run = closed_loop(
-            plant, bench.drive, bench.controller, signal, none, signal[0], zero, sensor, noise
-        )
-    return eqx.tree_at(
-        lambda r: (r.position, r.velocity, r.command, r.reading), run,
-        tuple(getattr(run, n)[:: bench.every] for n in (*_MOTION, "reading")),
-    )
+    return bench.run(plant, signal, sensor, noise)
 
 
 def compared(union: cand.Union, pair: Pair, samples: cand.Samples, *, refit: bool = True) -> Outcome:

@@ -23,6 +23,7 @@ from jaxid.discovery.shapes import Shapes, largest
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.model import Plant
 from jaxid.parameters import scatter
+from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
 
 if TYPE_CHECKING:
@@ -131,14 +132,28 @@ class Bench(eqx.Module):
     rest: Float[Array, " n"]
     whiten: Float[Array, "n order"]
 
-    def run(self, plant: Plant, signal: Float[Array, "ticks n"]) -> Trajectory:
-        """Motion of a plant from rest under a reference or a command, at the samples of its log."""
+    def run(
+        self, plant: Plant, signal: Float[Array, "ticks n"], sensor: Sensor | None = None,
+        noise: Float[Array, "ticks n"] | None = None,
+    ) -> Trajectory:
+        """Motion of a plant from rest under a reference or a command, at the samples of its log.
+
+        Args:
+            plant: The plant.
+            signal: Reference or command at every tick.
+            sensor: What reads the position; absent: exact.
+            noise: Standard normal numbers for its noise; absent: none.
+        """
         zero = jnp.zeros_like(self.start)
         if self.controller is None:
             run = open_loop(plant, self.drive, signal, self.start, zero)
+            if sensor is not None:
+                run = eqx.tree_at(lambda r: r.reading, run, sensor.read(run.position, noise))
         else:
             none = jnp.zeros((signal.shape[0], 1))
-            run = closed_loop(plant, self.drive, self.controller, signal, none, signal[0], zero)
+            run = closed_loop(
+                plant, self.drive, self.controller, signal, none, signal[0], zero, sensor, noise
+            )
         return jax.tree.map(lambda a: a[:: self.every], run)
 
     def seen(self, run: Trajectory) -> tuple[ForceData, Float[Array, "kept n"]]:

@@ -12,7 +12,6 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from jaxid import signals
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.limits import Limits, Peaks
 from jaxid.discovery.rehearsal import Outcome, Stage, compared, exact
@@ -20,6 +19,7 @@ from jaxid.discovery.rivals import Bench, Bounds, Duel, Pair, loss
 from jaxid.discovery.screen import Score
 from jaxid.discovery.shapes import Shapes, basis
 from jaxid.estimators.inverse_dynamics import ForceData
+from jaxid.machine import position_noise
 from jaxid.precision import NoiseModel
 from jaxid.replay import needed_steps
 from jaxid.sensors import Sensor
@@ -185,7 +185,7 @@ def _stage(session: Session, search: Search, bench: Bench) -> Stage:
     machine, log, recipe = session.machine, session.fit.log, session.recipe
     sensor = machine.sensor
     if sensor.position_std is None:
-        noise = jnp.asarray(signals.high_band_std(log.position, log.rate_hz))
+        noise = jnp.asarray(position_noise(machine, log))
         sensor = Sensor(position_noise=noise, force_noise=sensor.force_noise)
     e, _ = cand.evaluate(search.union, search.samples, search.theta)
     counts = search.samples.moving

@@ -7,6 +7,7 @@ is solved in one step and what is not (a Stribeck velocity, a lag) by a few more
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -60,6 +61,20 @@ def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
     u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
     return data.decimator(residual_along(plant, data.q, data.qd, data.qdd, u, data.period, data.start))
+
+
+@eqx.filter_jit
+def force_and_columns(
+    plant: Plant, places: tuple, data: ForceData, theta: Array
+) -> tuple[Float[Array, "kept n"], Float[Array, "kept n p"]]:
+    """Force residual of a plant and its Jacobian in the unknowns at some places."""
+
+    def residual(theta: Array) -> tuple[Array, Array]:
+        e = force_residual(scatter(places, plant, theta), data)
+        return e, e
+
+    jacobian, e = jax.jacfwd(residual, has_aux=True)(theta)
+    return e, jacobian
 
 
 def measured_force(data: ForceData) -> Float[Array, "kept m"]:
