@@ -97,7 +97,16 @@ def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:
 
 
 def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray, " n"]:
-    """RMS force that the sensors' noise alone leaves in the band [N or N m], by joint.
+    """RMS force that the sensors' noise alone leaves in the band [N or N m], by joint."""
+    f, power = noise_density(machine, log, data)
+    return np.sqrt(np.trapezoid(power, f, axis=0))
+
+
+def noise_density(
+    machine: Machine, log: Log, data: Prepared,
+    force_noise: Float[np.ndarray, " m"] | None = None,
+) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f n"]]:
+    """One-sided density of the force that the sensors' noise alone leaves [N^2/Hz], by joint.
 
     Position noise passes the plant's impedance -M w^2 + i C w + K (linearised at a typical
     velocity) and both filters; force noise passes the parallel filter. The noise is the case's
@@ -108,6 +117,10 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
         machine: The machine; its parameters enter through the impedance only.
         log: The log.
         data: The same, prepared.
+        force_noise: Standard deviation of the logged force where the case states none.
+
+    Returns:
+        Frequencies up to half the log's sampling rate [Hz], and the density there.
     """
     rate, recipe = log.rate_hz, data.recipe
     f = np.linspace(0, rate / 2, 2049)[1:]
@@ -118,11 +131,12 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
     through = np.abs(_position_filter(f, recipe, rate)) * recipe.decimator.response(f, rate)
     density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
     power = np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
-    force_noise = machine.sensor.force_noise
+    stated = machine.sensor.force_noise
+    force_noise = force_noise if stated is None else stated
     if force_noise is not None:
         white = 2 * np.square(np.asarray(force_noise) * machine.gain) / rate
         power = power + white * recipe.decimator.response(f, rate)[:, None] ** 2
-    return np.sqrt(np.trapezoid(power, f, axis=0))
+    return f, power
 
 
 def _position_filter(f: np.ndarray, recipe: object, rate: float) -> np.ndarray:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.fft
+import scipy.linalg
 import scipy.signal
 from jaxtyping import Array, Bool, Float
 
@@ -66,6 +67,19 @@ class NoiseModel:
             if score < best_score:
                 best, best_score = cls(a, float(np.sqrt(variance))), score
         return best
+
+    @classmethod
+    def of_density(cls, power: Float[np.ndarray, " f"], rate_hz: float, order: int) -> NoiseModel:
+        """Model of noise with a known spectrum.
+
+        Args:
+            power: One-sided density at equal steps from zero to half the sampling rate [1/Hz].
+            rate_hz: Sampling rate.
+            order: Of the model.
+        """
+        r = np.fft.irfft(power)[: order + 1] * rate_hz / 2
+        a = scipy.linalg.solve_toeplitz(r[:-1], r[1:])
+        return cls(a, float(np.sqrt(r[0] - a @ r[1:])))
 
     def whiten(self, x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, "time k"]:
         """Innovation of each column, over its standard deviation."""

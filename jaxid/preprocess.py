@@ -17,6 +17,9 @@ from jaxid.io.log import Log
 
 # The surroundings of reversals that are left out are less of the motion than this.
 _MOSTLY = 0.5
+# Decimation keeps 1 / 0.4 samples a period of the band's edge, and of a short log so many in all.
+_A_PERIOD = 0.4
+_ENOUGH = 100
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,13 @@ class Recipe:
     def band_hz(self, rate_hz: float) -> float:
         """Edge of the band in which forces are compared."""
         return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
+
+    @property
+    def independent(self) -> float:
+        """Part of the kept samples whose noise is independent: half where the band is just filled."""
+        if self.edge is None:
+            return 0.5
+        return min(0.5, 0.5 * self.decimation * self.edge / (2 * _A_PERIOD))
 
     @property
     def decimator(self) -> signals.Decimator:
@@ -148,7 +158,7 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     edge = None if literal else _noise_cutoff(log)
     cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
     band = cutoff if literal else edge
-    decimation = int(stated.get("decimation", max(1, int(0.4 * rate / band))))
+    decimation = int(stated.get("decimation", _decimation(log, band)))
     q, qd, _ = differentiate(log.position, log.period, cutoff, 4, "central" if literal else "spectral")
     noise = signals.high_band_std(log.position, rate)
     # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
@@ -167,6 +177,15 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         keeps_reversals=literal,
         edge=None if literal else 2 * edge / rate,
     )
+
+
+def _decimation(log: Log, band_hz: float) -> int:
+    """One sample in how many to keep: as many as the band needs, and of a short log more.
+
+    What else is left out (ends, stops, reversals) is left out in whole samples; of twenty-five
+    kept ones too few would remain. Their noise is correlated, which whitening takes care of.
+    """
+    return max(1, min(int(_A_PERIOD * log.rate_hz / band_hz), log.samples // _ENOUGH))
 
 
 def _trim(log: Log, band_hz: float, decimation: int, literal: bool) -> int:

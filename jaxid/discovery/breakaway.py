@@ -18,7 +18,7 @@ import scipy.stats
 from jaxtyping import Array, Float
 
 from jaxid.discovery.starts import Starts, starts_from_rest
-from jaxid.effects.friction import StaticFriction
+from jaxid.effects.friction import CoulombFriction, StaticFriction
 from jaxid.estimators.result import Estimate
 from jaxid.io.log import Log
 from jaxid.machine import Machine, position_noise
@@ -133,6 +133,8 @@ def _fits(
 
 def _unknown(machine: Machine, log: Log) -> str:
     """What of the moment of a start is not known; empty where all is."""
+    if not any(e.kind == CoulombFriction.kind for e in machine.plant.effects):
+        return "there is no sliding friction that it could stand above"
     if any(e.adds_force and e.initial_state(jnp.zeros(())) is not None for e in machine.plant.effects):
         return "the state of presliding friction at rest is not known"
     if machine.controller is not None and machine.controller.period < 0.9 * log.period:

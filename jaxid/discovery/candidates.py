@@ -194,16 +194,26 @@ class Samples:
 
     Args:
         data: The log, prepared.
+        force_noise: Standard deviation of the declared force, (m,); None: not known.
     """
 
-    def __init__(self, data: Prepared) -> None:
+    def __init__(
+        self, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None
+    ) -> None:
         self.parts = data.parts(_MOST, _PIECES)
         self.arrays = [ForceData.of(p) for p in self.parts]
+        self.noisier = [] if force_noise is None else [_noisier(a, force_noise) for a in self.arrays]
         moving = [p.moving.copy() for p in self.parts]
         for m in moving[1:]:
             m[0] = False  # a piece does not continue the one before it
         self.moving = np.concatenate(moving)
         self.weight = np.concatenate([np.asarray(a.weight) for a in self.arrays])
+
+
+def _noisier(arrays: ForceData, force_noise: np.ndarray) -> ForceData:
+    """A log with the noise of its force once more on top."""
+    draw = np.random.default_rng(20240501).standard_normal(arrays.force.shape)
+    return eqx.tree_at(lambda a: a.force, arrays, arrays.force + force_noise * draw)
 
 
 def evaluate(

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.breakaway import BreakAway, break_away
+from jaxid.discovery.noise import sensor_colour
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separate import Proposal, proposals
@@ -154,7 +155,10 @@ def discover(
     baseline = inverse_dynamics(machine, data)
     floor = noise_floor(baseline.machine, session.fit.log, data)
     union = cand.build_union(baseline.machine, data, session.case.own_effects)
-    search = Search(union, data, floor, tuple(v.data for v in session.validations), progress)
+    colour = sensor_colour(baseline.machine, session.fit.log, data)
+    search = Search(
+        union, data, floor, colour, tuple(v.data for v in session.validations), progress
+    )
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
     where = _where(search, steps[0], session.fit.log)
@@ -224,7 +228,7 @@ def _where(search: Search, baseline: Step, log: Log) -> Where:
     wanted = None
     if log.reference is not None:
         wanted = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
-    return locate(-e, jacobian[..., baseline.active], search.data, wanted)
+    return locate(-e, jacobian[..., baseline.active], search.data, search.colour, wanted)
 
 
 def _verdict(
@@ -295,3 +299,4 @@ def _round(search: Search, step: Step) -> Round:
 def _rms(search: Search, samples: cand.Samples, theta: np.ndarray) -> np.ndarray:
     e, _ = cand.evaluate(search.union, samples, theta)
     return np.sqrt(np.nanmean(np.where(samples.moving, e, np.nan) ** 2, axis=0))
+

@@ -37,8 +37,14 @@ class Whitener:
         object.__setattr__(self, "_matrices", [_predictor(m, c) for m, c in pairs])
 
     @classmethod
-    def of(cls, e: Float[np.ndarray, "kept n"], counts: Bool[np.ndarray, "kept n"]) -> Whitener:
-        """Whitener for noise such as `e`."""
+    def of(
+        cls, e: Float[np.ndarray, "kept n"], counts: Bool[np.ndarray, "kept n"],
+        colour: tuple[NoiseModel, ...] = (),
+    ) -> Whitener:
+        """Whitener for noise such as `e`; from an expected colour, what of it is not so is fitted."""
+        if colour:
+            first = cls(colour, counts)
+            return first.then(cls.of(first.placed(first(e[..., None])[:, 0]), counts))
         return cls(tuple(NoiseModel.fit(x, c, 20) for x, c in zip(e.T, counts.T, strict=True)), counts)
 
     def then(self, after: Whitener) -> Whitener:

@@ -9,6 +9,8 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
+from jaxid.discovery.columns import independent, left_over, span, unit
+from jaxid.discovery.noise import fit_whitener
 from jaxid.discovery.pairs import Pairs, score_pairs
 
 if TYPE_CHECKING:
@@ -19,11 +21,6 @@ _SURROGATES = 200
 _STRETCH = 1 / 100
 # ... and no fewer samples than whitening may leave correlated.
 _SHORTEST = 10
-# A column that stands out of others by less than this part of itself is theirs: with smoothing
-# and filtering, what is collinear in physics is so to four digits in numbers.
-_NOTHING_NEW = 1e-3
-# Times that the colour of the noise is fitted again after filling it up; more change nothing.
-_FILLINGS = 2
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,9 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
     for c in rest:
         if c.many:
             points.extend(search.many(c))
-    whitener, noise = _noise(e, base, points, search.samples.moving)
+    counts = search.samples.moving
+    extra = _all_columns(e, base, points, counts)
+    whitener, noise = fit_whitener(e, base, extra, counts, search.colour)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
     length = max(_SHORTEST, int(out.rows * _STRETCH))
@@ -131,7 +130,7 @@ def _few_points(out: Screen, points: list[cand.Point], base: np.ndarray) -> list
     for p in points:
         if p.candidate.many and best.get((p.candidate.kind, p.candidate.port)) != p.start:
             continue
-        columns = _independent(base, out.whitener(p.columns))
+        columns = independent(base, out.whitener(p.columns))
         if columns.shape[1]:
             found.append((p, columns, out.whitener(p.offset[..., None]) if p.offset.any() else None))
     return found
@@ -147,7 +146,7 @@ def guess_pair(
     columns = [out.whitener(s[..., None]) for s in strengths if s is not None]
     if not columns:
         return tuple(p.candidate.starts[p.start] for p in pair)
-    both = _unit(np.concatenate([out.whitener(base), *columns], axis=1))
+    both = unit(np.concatenate([out.whitener(base), *columns], axis=1))
     norms = [np.linalg.norm(c) for c in columns]
     amounts = iter(-np.linalg.lstsq(both, white, rcond=None)[0][-len(columns) :] / norms)
     found = []
@@ -176,7 +175,7 @@ def _score(
     best: dict[tuple[str, int], Score] = {}
     alone: dict[tuple[str, int], tuple[float, np.ndarray]] = {}
     for p in points:
-        extra = _independent(base, out.whitener(p.columns))
+        extra = independent(base, out.whitener(p.columns))
         if extra.shape[1] == 0:
             continue
         offset = out.whitener(p.offset[..., None]) if p.offset.any() else None
@@ -217,63 +216,6 @@ def _guess(
     return np.where(c.amplitude, amount, 1.0) * c.starts[p.start]
 
 
-def _independent(base: np.ndarray, extra: np.ndarray) -> np.ndarray:
-    """What is new in the columns of `extra` beside the base, those left out that bring nothing."""
-    extra = _unit(extra)
-    q = np.linalg.qr(_unit(base))[0] if base.shape[1] else base
-    rest = extra - q @ (q.T @ extra)
-    return rest[:, np.linalg.norm(rest, axis=0) > _NOTHING_NEW]
-
-
-def _unit(columns: np.ndarray) -> np.ndarray:
-    norm = np.linalg.norm(columns, axis=0)
-    return columns[:, norm > 0] / norm[norm > 0]
-
-
-def _span(base: np.ndarray, extra: np.ndarray) -> np.ndarray:
-    """Orthonormal columns that span the base and what is new in the rest."""
-    q = np.linalg.qr(_unit(base))[0] if base.shape[1] else base
-    rest = _unit(_independent(base, extra))
-    if rest.shape[1] == 0:
-        return q
-    u, s, _ = np.linalg.svd(rest, full_matrices=False)
-    return np.concatenate([q, u[:, s > _NOTHING_NEW * s[0]]], axis=1)
-
-
-def _left(span: np.ndarray, e: np.ndarray) -> np.ndarray:
-    return e - span @ (span.T @ e)
-
-
-def _noise(
-    e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray
-) -> tuple[ev.Whitener, np.ndarray]:
-    """Whitener for the noise in a residual, and that noise as whitened rows.
-
-    The colour of the residual is partly the missing effect itself: whitened with that, the effect
-    would vanish. So every candidate has its say first. But that takes noise away too, where the
-    candidates look, and on a short log most of it: what they took is filled up with noise of unit
-    variance, once a first model of its colour is known, and the colour fitted again.
-    """
-    extra = _all_columns(e, base, points, counts)
-    left = np.zeros_like(e)
-    for i, rows in enumerate(counts.T):
-        left[rows, i] = _left(_span(base[rows, i], extra[rows, i]), e[rows, i])
-    whitener = ev.Whitener.of(left, counts)
-    for _ in range(_FILLINGS):
-        filled = whitener.placed(_filled(whitener, e, base, extra))
-        whitener = whitener.then(ev.Whitener.of(filled, counts))
-    return whitener, _filled(whitener, e, base, extra)
-
-
-def _filled(
-    whitener: ev.Whitener, e: np.ndarray, base: np.ndarray, extra: np.ndarray
-) -> np.ndarray:
-    q = _span(whitener(base), whitener(extra))
-    left = _left(q, whitener(e[..., None])[:, 0])
-    spread = np.sqrt(np.sum(left**2) / max(len(left) - q.shape[1], 1))
-    return left + q @ (spread * np.random.default_rng(20240501).standard_normal(q.shape[1]))
-
-
 def _all_columns(
     e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray
 ) -> np.ndarray:
@@ -284,10 +226,10 @@ def _all_columns(
         return columns
     gained = np.zeros(len(many))
     for i, rows in enumerate(counts.T):
-        own = _span(base[rows, i], columns[rows, i])
-        rest = _left(own, e[rows, i])
+        own = span(base[rows, i], columns[rows, i])
+        rest = left_over(own, e[rows, i])
         for k, p in enumerate(many):
-            fresh = _left(own, _unit(p.columns[rows, i]))
+            fresh = left_over(own, unit(p.columns[rows, i]))
             part = np.sum((np.linalg.qr(fresh)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
             gained[k] -= 0.5 * rows.sum() * np.log1p(-min(part, 1 - 1e-12))
     best = int(np.argmax(gained))

@@ -11,7 +11,9 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.choice import MODEST, TIE_NATS, few, margin, modest, simplest
+from jaxid.discovery.noise import NUMERICS
 from jaxid.discovery.screen import Score, Screen, guess_pair, screen_candidates
+from jaxid.precision import NoiseModel
 from jaxid.preprocess import Prepared
 
 # An effect must close this part of what stands above the noise floor (in sum of squares, so half
@@ -21,13 +23,10 @@ _RELEVANT = 0.15
 _SUPERFLUOUS = 0.05
 # A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
 _SCATTER = 3.0
+# ... and one that leaves less than this part of the noise's sum of squares explains noise.
+_LEAST = 0.25
 # The gain on the validation log must be at least this part of what the log itself promises.
 _CONFIRMED = 0.1
-# Part of the force that filtering, holding and integrating leave wrong in any model: an effect
-# that brings less (in RMS) cannot be told from them.
-_NUMERICS = 1e-3
-
-
 # Two effects are added at once where they close this part of the gap and gain more than the best
 # single one with any partner, by so many times what noise may, and by this part of what they gain.
 # An effect that keeps less than this part of what its linear screen promised is left out there.
@@ -66,6 +65,7 @@ class Search:
         union: Machine with all candidates.
         data: The log to fit, prepared.
         floor: RMS force that the sensors' noise alone leaves, by joint.
+        colour: Of that noise, by joint.
         validation: Logs that must confirm each effect.
         progress: Called with a line at every stage.
         added: Effects added, in order.
@@ -74,16 +74,20 @@ class Search:
     union: cand.Union
     data: Prepared
     floor: np.ndarray
+    colour: tuple[NoiseModel, ...] = ()
     validation: tuple[Prepared, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     added: list[cand.Candidate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.samples = cand.Samples(self.data)
-        self.validation_samples = [cand.Samples(d) for d in self.validation]
+        machine = self.union.machine
+        known = machine.sensor.force_noise
+        noise = None if known is None else np.asarray(known) * machine.gain
+        self.samples = cand.Samples(self.data, noise)
+        self.validation_samples = [cand.Samples(d, noise) for d in self.validation]
         force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
         rows = len(self.samples.moving) / len(force)
-        self.numerics = rows * float(np.sum((_NUMERICS * force) ** 2))
+        self.numerics = rows * float(np.sum((NUMERICS * force) ** 2))
         self.theta = self.union.neutral
         self._many: dict[tuple[str, int], list[cand.Point]] = {}
 
@@ -249,8 +253,10 @@ class Search:
         theta = min(fits, key=self._squares)
         e, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = screened.held_out(e, jacobian[..., active])
+        if any(not s.candidate.amplitude.any() for s in new):
+            after = after + self._swallowed(self.samples, theta, screened.whitener)
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
-        validation, confirmed = self._validated(theta)
+        validation, confirmed = self._validated(theta, new)
         index = np.concatenate([s.candidate.index for s in new])
         reason = self._objection(index, theta, e, validation, confirmed)
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
@@ -260,25 +266,46 @@ class Search:
         total = float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))
         return total if np.isfinite(total) else np.inf
 
-    def _validated(self, theta: np.ndarray) -> tuple[float | None, float | None]:
+    def _swallowed(
+        self, samples: cand.Samples, theta: np.ndarray, whitener: ev.Whitener
+    ) -> float:
+        """Noise of the logged force that a drive swallows and the present one does not.
+
+        The noise is on the log only; a drive that filters the logged force filters it too, and
+        would gain by that though it explains nothing. In whitened sum of squares.
+        """
+        if not samples.noisier:
+            return 0.0
+        squares = []
+        for at in (self.theta, theta):
+            e, _ = cand.evaluate(self.union, samples, at)
+            noisy, _ = cand.evaluate_on(self.union, samples.noisier, at)
+            squares.append(float(np.sum(whitener((noisy - e)[..., None]) ** 2)))
+        return squares[0] - squares[1]
+
+    def _validated(
+        self, theta: np.ndarray, new: Sequence[Score]
+    ) -> tuple[float | None, float | None]:
         """Gain on the validation logs, nothing refitted there.
 
         Returns:
-            Gain in log-likelihood [nats], each log with its own colour of noise, and the part by
-            which the sum of squared residuals falls, in the worst log.
+            Gain in log-likelihood [nats] by effects, each log with its own colour of noise, and the
+            part by which the sum of squared residuals falls, in the worst log.
         """
         if not self.validation:
             return None, None
         total, worst = 0.0, np.inf
         for samples in self.validation_samples:
-            old, new = (
+            old, fresh = (
                 np.where(samples.moving, cand.evaluate(self.union, samples, t)[0], 0.0)
                 for t in (self.theta, theta)
             )
-            whitener = ev.Whitener.of(new, samples.moving)
-            squares = [np.sum(whitener(e[..., None]) ** 2) for e in (old, new)]
+            whitener = ev.Whitener.of(fresh, samples.moving, self.colour)
+            squares = [np.sum(whitener(e[..., None]) ** 2) for e in (old, fresh)]
+            if any(not s.candidate.amplitude.any() for s in new):
+                squares[1] += self._swallowed(samples, theta, whitener)
             total += float(ev.log_evidence(int(whitener.rows.sum()), *squares))
-            worst = min(worst, 1 - float(np.sum(new**2) / np.sum(old**2)))
+            worst = min(worst, 1 - float(np.sum(fresh**2) / np.sum(old**2)))
         return total, worst
 
     def _objection(
@@ -294,6 +321,8 @@ class Search:
                 return f"{free[i].name} would have to be negative"
             if np.isfinite(free[i].upper) and theta[i] >= (1 - 1e-3) * free[i].upper:
                 return f"{free[i].name} runs to its limit, where it only imitates"
+        if self._below_noise(e):
+            return "it takes away what the sensors' noise alone must leave"
         old, _ = cand.evaluate(self.union, self.samples, self.theta)
         closed = self._closed(old, e)
         if closed < _RELEVANT:
@@ -317,7 +346,7 @@ class Search:
     def _costs(self, theta: np.ndarray, active: np.ndarray, limit: float) -> bool:
         """Whether a smaller model is worse by more than noise and by what is relevant."""
         e, jacobian = cand.evaluate(self.union, self.samples, self.theta)
-        now = Screen.of(ev.Whitener.of(e, self.samples.moving), e, jacobian[..., self.active])
+        now = Screen.of(ev.Whitener.of(e, self.samples.moving, self.colour), e, jacobian[..., self.active])
         less, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = now.held_out(less, jacobian[..., active])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
@@ -327,11 +356,16 @@ class Search:
         """Whether the residual is what the sensors' noise leaves, within the scatter of its RMS."""
         e, _ = cand.evaluate(self.union, self.samples, self.theta)
         for x, counts, floor in zip(e.T, self.samples.moving.T, self.floor, strict=True):
-            # The filter leaves about every other kept sample independent.
-            scatter = np.sqrt(1 / max(counts.sum(), 1))
+            scatter = np.sqrt(0.5 / max(self.data.recipe.independent * counts.sum(), 1))
             if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
                 return False
         return True
+
+    def _below_noise(self, e: np.ndarray) -> bool:
+        """Whether a residual is far less than the sensors' noise leaves: a model that follows noise."""
+        counts = self.samples.moving
+        squares = np.sum(np.where(counts, e, 0.0) ** 2)
+        return bool(squares < _LEAST * np.sum(counts.sum(axis=0) * np.square(self.floor)))
 
     def above_numerics(self, e: np.ndarray) -> bool:
         """Whether a residual is more than filtering and integrating leave wrong."""

@@ -9,9 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxid.discovery import evidence as ev
+from jaxid.discovery.noise import fit_whitener
+from jaxid.precision import NoiseModel
 from jaxid.preprocess import Prepared
 
 _KNOTS = 12
@@ -92,7 +94,7 @@ def variables(data: Prepared, joint: int) -> dict[str, Float[np.ndarray, " kept"
 
 def locate(
     residual: Float[np.ndarray, "kept n"], jacobian: Float[np.ndarray, "kept n p"], data: Prepared,
-    wanted: Float[np.ndarray, "kept n"] | None = None,
+    colour: tuple[NoiseModel, ...], wanted: Float[np.ndarray, "kept n"] | None = None,
 ) -> Where:
     """Find the joint and variable that explain most of a residual.
 
@@ -100,29 +102,34 @@ def locate(
         residual: Measured minus modelled force at the kept samples.
         jacobian: Of the residual in the model's unknowns: what they can absorb does not count.
         data: The prepared log.
+        colour: Of the noise that the sensors leave, by joint.
         wanted: Velocity of the reference at the kept samples; absent: unknown.
     """
     wanted = data.at_kept(data.qd) if wanted is None else wanted
     found = [
-        _locate(residual[:, i], jacobian[:, i], data, wanted[:, i], i)
+        _locate(residual[:, i], jacobian[:, i], data, colour[i], wanted[:, i], i)
         for i in range(residual.shape[1])
     ]
     return max(found, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
 
 
 def _locate(
-    e: np.ndarray, jacobian: np.ndarray, data: Prepared, wanted: np.ndarray, joint: int
+    e: np.ndarray, jacobian: np.ndarray, data: Prepared, colour: NoiseModel, wanted: np.ndarray,
+    joint: int,
 ) -> Where:
     counts = data.moving[:, joint]
     named = variables(data, joint)
     hats = {name: _hats(x, counts) for name, x in named.items()}
-    whitener = _whitener(e, jacobian, list(hats.values()), counts)
+    every = np.concatenate([*hats.values()], axis=1)
+    whitener, noise = fit_whitener(
+        e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,)
+    )
     blocks = whitener.blocks()
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])
     left = white[:, 0] - base @ np.linalg.lstsq(base, white[:, 0], rcond=1e-9)[0]
     rng = np.random.default_rng(20240501)
-    surrogates = ev.flipped(left, max(_SHORTEST, len(left) // 100), 100, rng)
+    surrogates = ev.flipped(noise, max(_SHORTEST, len(left) // 100), 100, rng)
     before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
     largest, gains = np.full(100, -np.inf), {}
     for name, hat in hats.items():
@@ -189,15 +196,6 @@ def _hats(x: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "kept knot"]:
     knots = np.unique(np.quantile(x[counts], np.linspace(0, 1, _KNOTS)))
     eye = np.eye(len(knots))
     return np.stack([np.interp(x, knots, row) for row in eye], axis=1)
-
-
-def _whitener(
-    e: np.ndarray, jacobian: np.ndarray, hats: list[np.ndarray], counts: Bool[np.ndarray, " kept"]
-) -> ev.Whitener:
-    columns = _independent(np.concatenate([jacobian, *hats], axis=1)[counts])
-    left = np.zeros_like(e)
-    left[counts] = e[counts] - columns @ np.linalg.lstsq(columns, e[counts], rcond=1e-9)[0]
-    return ev.Whitener.of(left[:, None], counts[:, None])
 
 
 def _independent(columns: np.ndarray) -> np.ndarray:
