@@ -6,7 +6,7 @@ jaxid takes part: what counts as visible is settled before jaxid sees the log.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from hidden_cases import HiddenCase
@@ -104,7 +104,7 @@ class View:
             baseline = np.zeros((len(force), 1))
         else:
             fade = faded(moving(log["true_velocity"]))
-        left = _explained_away(fade[:, None] * baseline, fade * force)
+        left = explained_away(fade[:, None] * baseline, fade * force)
         total = fade * gain * log["true_command"]
         whiten = Whitener(setup, fade)
         return cls(
@@ -121,9 +121,9 @@ class Whitener:
     spectrum: it is the smeared one that counts.
     """
 
-    def __init__(self, setup: Setup, fade: np.ndarray):
+    def __init__(self, setup: Setup, fade: np.ndarray, density: Callable | None = None):
         size = 2 * len(fade)  # so that the correlation does not wrap around
-        two_sided = noise_density(setup, np.fft.rfftfreq(size, 1.0 / setup.rate)) / 2.0
+        two_sided = (density or noise_density)(setup, np.fft.rfftfreq(size, 1.0 / setup.rate)) / 2.0
         noise = np.fft.irfft(two_sided, size)
         overlap = np.fft.irfft(np.abs(np.fft.rfft(fade, size)) ** 2, size)
         smeared = np.fft.rfft(noise * overlap).real[::2]
@@ -153,10 +153,11 @@ def noise_density(setup: Setup, f: np.ndarray) -> np.ndarray:
 
 def evidence_beyond(columns: np.ndarray, force: np.ndarray) -> float:
     """Half the sum of squares that no combination of the columns explains [nats]."""
-    return 0.5 * float(np.sum(_explained_away(columns, force) ** 2))
+    return 0.5 * float(np.sum(explained_away(columns, force) ** 2))
 
 
-def _explained_away(columns: np.ndarray, force: np.ndarray) -> np.ndarray:
+def explained_away(columns: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """What no combination of the columns explains of a force."""
     norm = np.linalg.norm(columns, axis=0)
     columns = columns[:, norm > 0] / norm[norm > 0]
     return force - columns @ np.linalg.lstsq(columns, force, rcond=1e-12)[0]

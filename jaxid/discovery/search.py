@@ -254,7 +254,7 @@ class Search:
         e, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = screened.held_out(e, jacobian[..., active])
         if any(not s.candidate.amplitude.any() for s in new):
-            after = after + self._swallowed(self.samples, theta, screened.whitener)
+            after = after / (1 - self._swallowed(self.samples, theta))
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
         validation, confirmed = self._validated(theta, new)
         index = np.concatenate([s.candidate.index for s in new])
@@ -266,22 +266,21 @@ class Search:
         total = float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))
         return total if np.isfinite(total) else np.inf
 
-    def _swallowed(
-        self, samples: cand.Samples, theta: np.ndarray, whitener: ev.Whitener
-    ) -> float:
-        """Noise of the logged force that a drive swallows and the present one does not.
+    def _swallowed(self, samples: cand.Samples, theta: np.ndarray) -> float:
+        """Part of the noise that a drive swallows and the present one does not, in whitened squares.
 
-        The noise is on the log only; a drive that filters the logged force filters it too, and
-        would gain by that though it explains nothing. In whitened sum of squares.
+        Noise of the logged force is on the log only. A drive that filters the force filters it
+        too, and would gain by that though it explains nothing.
         """
         if not samples.noisier:
             return 0.0
+        whitener = ev.Whitener(self.colour, samples.moving)
         squares = []
         for at in (self.theta, theta):
             e, _ = cand.evaluate(self.union, samples, at)
             noisy, _ = cand.evaluate_on(self.union, samples.noisier, at)
-            squares.append(float(np.sum(whitener((noisy - e)[..., None]) ** 2)))
-        return squares[0] - squares[1]
+            squares.append(float(np.mean(whitener((noisy - e)[..., None]) ** 2)))
+        return min(squares[0] - squares[1], 0.9)
 
     def _validated(
         self, theta: np.ndarray, new: Sequence[Score]
@@ -303,7 +302,7 @@ class Search:
             whitener = ev.Whitener.of(fresh, samples.moving, self.colour)
             squares = [np.sum(whitener(e[..., None]) ** 2) for e in (old, fresh)]
             if any(not s.candidate.amplitude.any() for s in new):
-                squares[1] += self._swallowed(samples, theta, whitener)
+                squares[1] /= 1 - self._swallowed(samples, theta)
             total += float(ev.log_evidence(int(whitener.rows.sum()), *squares))
             worst = min(worst, 1 - float(np.sum(fresh**2) / np.sum(old**2)))
         return total, worst
