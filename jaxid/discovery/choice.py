@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from jaxid.discovery.screen import Score
 
 # So many of the best candidates are refitted; a linear screen at a start is not the last word.
@@ -37,8 +39,19 @@ def modest(good: list[Score]) -> Score | None:
     return min(enough, key=lambda s: (len(s.candidate.index), -s.total))
 
 
-def simplest(good: list[Score]) -> tuple[Score, tuple[Score, ...]]:
-    """Of those that explain the log equally well, the simplest; and the others."""
-    equal = [s for s in good if s.total >= good[0].total - margin(good[0])]
+def simplest(
+    good: list[Score], undecided: Callable[[Score, Score], float]
+) -> tuple[Score, tuple[Score, ...]]:
+    """Of those that explain the log equally well, the simplest; and the others.
+
+    Args:
+        good: Refitted, best first.
+        undecided: Difference in evidence of two of them that chance alone may make [nats].
+    """
+    first = good[0]
+    equal = [
+        s for s in good
+        if s.total >= first.total - max(margin(first), undecided(first, s) if s is not first else 0.0)
+    ]
     best = min(equal, key=lambda s: (len(s.candidate.index), -s.total))
     return best, tuple(s for s in equal if s is not best)

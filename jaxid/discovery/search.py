@@ -10,23 +10,15 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
-from jaxid.discovery.choice import MODEST, TIE_NATS, few, margin, modest, simplest
-from jaxid.discovery.noise import NUMERICS
+from jaxid.discovery.choice import MODEST, few, margin, modest, simplest
 from jaxid.discovery.screen import Score, Screen, guess_pair, screen_candidates
+from jaxid.discovery.worth import RELEVANT, Worth
 from jaxid.precision import NoiseModel
 from jaxid.preprocess import Prepared
 
-# An effect must close this part of what stands above the noise floor (in sum of squares, so half
-# of it in RMS), whatever its evidence: on measured data everything helps a little. One that is
-# there already goes where it closes less than a third of that.
-_RELEVANT = 0.15
+# An effect that is there already goes where it closes less than this part of the gap: a third of
+# what it must close to be named.
 _SUPERFLUOUS = 0.05
-# A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
-_SCATTER = 3.0
-# ... and one that leaves less than this part of the noise's sum of squares explains noise.
-_LEAST = 0.25
-# The gain on the validation log must be at least this part of what the log itself promises.
-_CONFIRMED = 0.1
 # Two effects are added at once where they close this part of the gap and gain more than the best
 # single one with any partner, by so many times what noise may, and by this part of what they gain.
 # An effect that keeps less than this part of what its linear screen promised is left out there.
@@ -80,14 +72,8 @@ class Search:
     added: list[cand.Candidate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        machine = self.union.machine
-        known = machine.sensor.force_noise
-        noise = None if known is None else np.asarray(known) * machine.gain
-        self.samples = cand.Samples(self.data, noise)
-        self.validation_samples = [cand.Samples(d, noise) for d in self.validation]
-        force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
-        rows = len(self.samples.moving) / len(force)
-        self.numerics = rows * float(np.sum((NUMERICS * force) ** 2))
+        self.worth = Worth(self.union, self.data, self.validation, self.floor, self.colour)
+        self.samples = self.worth.samples
         self.theta = self.union.neutral
         self._many: dict[tuple[str, int], list[cand.Point]] = {}
 
@@ -142,7 +128,7 @@ class Search:
                 or of `own`'s.
             own: The effect that is to be replaced.
         """
-        if self._at_floor():
+        if self.worth.at_floor(self.theta):
             return (), (), 0.0
         self.progress(f"screening {len(self.rest())} effects")
         screened = screen_candidates(self, ahead=ahead)
@@ -182,8 +168,8 @@ class Search:
                 Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True)
             )
             both = self._refit(second, screened, beside=first)
-            old, new = (cand.evaluate(self.union, self.samples, t)[0] for t in (self.theta, both.theta))
-            enough = self._closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
+            old, new = (self.worth.residual(t) for t in (self.theta, both.theta))
+            enough = self.worth.closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
             if enough and not both.reason:
                 one = replace(self._refit(first, screened), reason="")
                 other = self._refit(second, screened)
@@ -211,13 +197,13 @@ class Search:
             if not good or mine is None:
                 found[k] = ()
                 continue
-            best, ties = simplest(good)
+            best, ties = simplest(good, self._undecided)
             if best.candidate is not own and self._takes_over(best, mine, own):
                 self.added = [best.candidate if c is own else c for c in kept]
                 self.theta = self._fit(best.theta, self.active)
                 steps.append(Step(best, own, scores, limit, self.theta, self.active))
             elif best.candidate is not own:
-                ties = (best, *ties) if mine.total > best.total - margin(best) else ()
+                ties = (best, *ties) if self._equal(mine, best) else ()
             found[k] = tuple(s for s in ties if s.candidate is not self.added[k])
         return found
 
@@ -227,11 +213,18 @@ class Search:
         One with more parameters has had its chance beside what is there, in the rounds before.
         """
         more = len(best.candidate.index) - len(own.index)
-        if more > 0 or mine.total > best.total - margin(best):
+        if more > 0 or self._equal(mine, best):
             return more < 0
-        now, _ = cand.evaluate(self.union, self.samples, self.theta)
-        then, _ = cand.evaluate(self.union, self.samples, best.theta)
-        return self._closed(now, then) > _RELEVANT
+        now, then = self.worth.residual(self.theta), self.worth.residual(best.theta)
+        return self.worth.closed(now, then) > RELEVANT
+
+    def _undecided(self, one: Score, two: Score) -> float:
+        """Difference in evidence of two fits that chance may make [nats]: two deviations of it."""
+        # Where one is true, its gain scatters about what is expected with twice that as variance.
+        return 2 * np.sqrt(2 * self.worth.apart(one.theta, two.theta))
+
+    def _equal(self, mine: Score, best: Score) -> bool:
+        return mine.total > best.total - max(margin(best), self._undecided(best, mine))
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         return cand.refine(self.union, self.samples, theta, active)[0]
@@ -250,86 +243,17 @@ class Search:
             for s, guess in zip(new, guesses, strict=True):
                 theta[s.candidate.index] = guess
             fits.append(self._fit(theta, active))
-        theta = min(fits, key=self._squares)
+        theta = min(fits, key=self.worth.squares)
         e, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = screened.held_out(e, jacobian[..., active])
-        if any(not s.candidate.amplitude.any() for s in new):
-            after = after / (1 - self._swallowed(self.samples, theta))
+        drive = any(not s.candidate.amplitude.any() for s in new)
+        if drive:
+            after = after / (1 - self.worth.swallowed(self.samples, self.theta, theta))
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
-        validation, confirmed = self._validated(theta, new)
+        validation, confirmed = self.worth.confirmed(self.theta, theta, drive=drive)
         index = np.concatenate([s.candidate.index for s in new])
-        reason = self._objection(index, theta, e, validation, confirmed)
+        reason = self.worth.objection(index, self.theta, theta, validation, confirmed)
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
-
-    def _squares(self, theta: np.ndarray) -> float:
-        e, _ = cand.evaluate(self.union, self.samples, theta)
-        total = float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))
-        return total if np.isfinite(total) else np.inf
-
-    def _swallowed(self, samples: cand.Samples, theta: np.ndarray) -> float:
-        """Part of the noise that a drive swallows and the present one does not, in whitened squares.
-
-        Noise of the logged force is on the log only. A drive that filters the force filters it
-        too, and would gain by that though it explains nothing.
-        """
-        if not samples.noisier:
-            return 0.0
-        whitener = ev.Whitener(self.colour, samples.moving)
-        squares = []
-        for at in (self.theta, theta):
-            e, _ = cand.evaluate(self.union, samples, at)
-            noisy, _ = cand.evaluate_on(self.union, samples.noisier, at)
-            squares.append(float(np.mean(whitener((noisy - e)[..., None]) ** 2)))
-        return min(squares[0] - squares[1], 0.9)
-
-    def _validated(
-        self, theta: np.ndarray, new: Sequence[Score]
-    ) -> tuple[float | None, float | None]:
-        """Gain on the validation logs, nothing refitted there.
-
-        Returns:
-            Gain in log-likelihood [nats] by effects, each log with its own colour of noise, and the
-            part by which the sum of squared residuals falls, in the worst log.
-        """
-        if not self.validation:
-            return None, None
-        total, worst = 0.0, np.inf
-        for samples in self.validation_samples:
-            old, fresh = (
-                np.where(samples.moving, cand.evaluate(self.union, samples, t)[0], 0.0)
-                for t in (self.theta, theta)
-            )
-            whitener = ev.Whitener.of(fresh, samples.moving, self.colour)
-            squares = [np.sum(whitener(e[..., None]) ** 2) for e in (old, fresh)]
-            if any(not s.candidate.amplitude.any() for s in new):
-                squares[1] /= 1 - self._swallowed(samples, theta)
-            total += float(ev.log_evidence(int(whitener.rows.sum()), *squares))
-            worst = min(worst, 1 - float(np.sum(fresh**2) / np.sum(old**2)))
-        return total, worst
-
-    def _objection(
-        self, index: np.ndarray, theta: np.ndarray, e: np.ndarray, validation: float | None,
-        confirmed: float | None,
-    ) -> str:
-        """Why what has these unknowns may not be named; empty where it may."""
-        free = self.union.machine.parameters.free
-        for i in index:
-            if not np.isfinite(theta[i]):
-                return "its fit diverged"
-            if free[i].sign == "nonnegative" and theta[i] <= 0.0:
-                return f"{free[i].name} would have to be negative"
-            if np.isfinite(free[i].upper) and theta[i] >= (1 - 1e-3) * free[i].upper:
-                return f"{free[i].name} runs to its limit, where it only imitates"
-        if self._below_noise(e):
-            return "it takes away what the sensors' noise alone must leave"
-        old, _ = cand.evaluate(self.union, self.samples, self.theta)
-        closed = self._closed(old, e)
-        if closed < _RELEVANT:
-            part = 50 * closed  # in RMS, where little is closed
-            return f"it closes only {part:.1f} % of the gap" if part > 0.05 else "it closes none of the gap"
-        if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
-            return "it does not help on the validation log"
-        return ""
 
     def _drop_superfluous(self, limit: float) -> list[Step]:
         """Drop effects whose loss costs less than noise, or less than is relevant."""
@@ -349,39 +273,7 @@ class Search:
         less, jacobian = cand.evaluate(self.union, self.samples, theta)
         after = now.held_out(less, jacobian[..., active])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
-        return lost > limit and self._closed(less, e) > _SUPERFLUOUS
-
-    def _at_floor(self) -> bool:
-        """Whether the residual is what the sensors' noise leaves, within the scatter of its RMS."""
-        e, _ = cand.evaluate(self.union, self.samples, self.theta)
-        for x, counts, floor in zip(e.T, self.samples.moving.T, self.floor, strict=True):
-            scatter = np.sqrt(0.5 / max(self.data.recipe.independent * counts.sum(), 1))
-            if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
-                return False
-        return True
-
-    def _below_noise(self, e: np.ndarray) -> bool:
-        """Whether a residual is far less than the sensors' noise leaves: a model that follows noise."""
-        counts = self.samples.moving
-        squares = np.sum(np.where(counts, e, 0.0) ** 2)
-        return bool(squares < _LEAST * np.sum(counts.sum(axis=0) * np.square(self.floor)))
-
-    def above_numerics(self, e: np.ndarray) -> bool:
-        """Whether a residual is more than filtering and integrating leave wrong."""
-        counts = self.samples.moving
-        floor = np.sum(counts.sum(axis=0) * np.square(self.floor))
-        return bool(np.sum(e[counts] ** 2) - floor > self.numerics)
-
-    def _closed(self, old: np.ndarray, new: np.ndarray) -> float:
-        """Part by which the gap above the noise floor closes, in sum of squares."""
-        counts = self.samples.moving
-        floor = np.sum(counts.sum(axis=0) * np.square(self.floor))
-        before, after = np.sum(old[counts] ** 2), np.sum(new[counts] ** 2)
-        if before - after < self.numerics:
-            return 0.0
-        # The floor is itself an estimate, and a search always finds something to close: at least
-        # half of the residual counts as gap.
-        return float((before - after) / max(before - floor, 0.5 * before))
+        return lost > limit and self.worth.closed(less, e) > _SUPERFLUOUS
 
 
 def _starts(score: Score) -> list[np.ndarray]:
