@@ -238,7 +238,7 @@ def _verdict(
         return "found"
     e, _ = cand.evaluate(search.union, search.samples, steps[0].theta)
     rms = np.sqrt(np.nanmean(np.where(search.samples.moving, e, np.nan) ** 2, axis=0))
-    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.above_numerics(e)
+    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.worth.above_numerics(steps[0].theta)
     return "unexplained" if above and where.significant else "nothing_missing"
 
 
@@ -291,7 +291,7 @@ def _length(gap: Gap) -> float:
 def _round(search: Search, step: Step) -> Round:
     fit, *others = (
         _rms(search, samples, step.theta)
-        for samples in [search.samples, *search.validation_samples]
+        for samples in [search.samples, *search.worth.others]
     )
     return Round(step, fit, np.max(others, axis=0) if others else None)
 
