@@ -127,9 +127,8 @@ def _locate(
     blocks = whitener.blocks()
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])
-    left = white[:, 0] - base @ np.linalg.lstsq(base, white[:, 0], rcond=1e-9)[0]
     rng = np.random.default_rng(20240501)
-    surrogates = ev.flipped(noise, max(_SHORTEST, len(left) // 100), 100, rng)
+    surrogates = ev.flipped(noise, max(_SHORTEST, len(noise) // 100), 100, rng)
     before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
     largest, gains = np.full(100, -np.inf), {}
     for name, hat in hats.items():
@@ -140,7 +139,9 @@ def _locate(
         if name not in _OWN_NOISE:
             largest = np.maximum(largest, gain[1:])
     intervals = _loud(e, counts, data)
-    line, part = _line(left, whitener, data, wanted)
+    # A fitted colour would whiten a line away; the sensors' own leaves it standing.
+    sensors = ev.Whitener((colour,), counts[:, None])
+    line, part = _line(_beyond(sensors, e, jacobian), sensors, data, wanted)
     limit = ev.threshold(largest)
     # Position or velocity that explain more say more than a line in the spectrum, or than intervals.
     clean = max((n for n in gains if n not in _OWN_NOISE), key=lambda n: gains[n])
@@ -205,6 +206,15 @@ def _independent(columns: np.ndarray) -> np.ndarray:
     return u[:, s > 1e-8 * s[0]] if len(s) else columns
 
 
+def _beyond(
+    whitener: ev.Whitener, e: Float[np.ndarray, " kept"], jacobian: Float[np.ndarray, "kept p"]
+) -> Float[np.ndarray, " row"]:
+    """What a model cannot absorb of its residual, whitened."""
+    base = _independent(whitener(jacobian[:, None]))
+    white = whitener(e[:, None, None])[:, 0]
+    return white - base @ np.linalg.lstsq(base, white, rcond=1e-9)[0]
+
+
 def _held(columns: np.ndarray, e: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     return ev.held_out(ev.grams(columns, blocks), *ev.products(columns, e, blocks))
 
@@ -267,7 +277,15 @@ def _line(
     if part < _LINE_PART or _stands_out(moved, k) or not _stands_out(power, k):
         return None, 0.0
     rate = 1.0 / (data.period * data.recipe.decimation)
-    return float(k * rate / n), float(part)
+    return float((k + _between(power, k)) * rate / n), float(part)
+
+
+def _between(power: Float[np.ndarray, " f"], k: int) -> float:
+    """By what part of a bin a line lies beside its highest one: the vertex of a parabola."""
+    if not 0 < k < len(power) - 1 or min(power[k - 1], power[k + 1]) <= 0:
+        return 0.0
+    low, top, high = np.log(power[k - 1 : k + 2])
+    return float(0.5 * (low - high) / (low - 2 * top + high))
 
 
 def _stands_out(power: np.ndarray, k: int) -> bool:
