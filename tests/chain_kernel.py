@@ -1,0 +1,96 @@
+"""Compiled loop of the ground-truth chain: masses in a row under set-valued dry friction.
+
+What acts on one mass is the axis's own (`stepper_kernel`); here the springs couple them. One step
+is drift, kick, drift (second order where all is smooth). Positions, and with them the springs,
+stand still in the kick, so that each mass stops, sticks and breaks away by itself, in closed form.
+"""
+
+import math
+
+import stepper_kernel as axis
+from numba import njit
+
+
+@njit(cache=True)
+def pull_of_springs(springs, q, pull):
+    """Fill `pull` with the springs' force on each mass [N], walls at 0.
+
+    Spring j joins mass j - 1 and mass j; its row of `springs` holds k, k2 and k3 of the force
+    k e + k2 e^2 + k3 e^3 at elongation e, which draws both ends together.
+    """
+    pull[:] = 0.0
+    before = 0.0
+    for j in range(q.size + 1):
+        here = q[j] if j < q.size else 0.0
+        e = here - before
+        force = e * (springs[j, 0] + e * (springs[j, 1] + e * springs[j, 2]))
+        if j < q.size:
+            pull[j] -= force
+        if j > 0:
+            pull[j - 1] += force
+        before = here
+
+
+@njit(cache=True)
+def advance(masses, springs, q, v, drive, pull, h):
+    """One step of h [s], in place: positions q [m] and velocities v [m/s]."""
+    half = 0.5 * h
+    for i in range(q.size):
+        q[i] += half * v[i]
+    pull_of_springs(springs, q, pull)
+    for i in range(q.size):
+        p = masses[i]
+        force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0)
+        hold = p.coulomb + p.stribeck + p.static
+        slip = axis.slip_level(p, abs(v[i]), 1.0)
+        middle = axis.kick(v[i], half, force + axis.velocity_force(p, v[i]), slip, hold, p.mass)
+        slip = axis.slip_level(p, abs(middle), 1.0)
+        v[i] = axis.kick(v[i], h, force + axis.velocity_force(p, middle), slip, hold, p.mass)
+        q[i] += half * v[i]
+
+
+@njit(cache=True)
+def run(
+    masses,
+    springs,
+    laws,
+    driven,
+    u,
+    reference,
+    bursts,
+    noise,
+    resolution,
+    period,
+    step,
+    q,
+    v,
+    drive,
+    pull,
+    reading,
+    truth,
+    memory,
+):
+    """Fill u, reading and truth (position, velocity, acceleration, force) tick by tick.
+
+    Shapes: u (time, drives), reference, noise and reading (time, masses), truth (time, masses, 4),
+    memory (drives, 2). `driven` holds the mass of each drive; `bursts` is empty.
+    """
+    steps = int(math.ceil(period / step - 1e-6))
+    h = period / steps
+    for k in range(u.shape[0]):
+        for i in range(q.size):
+            reading[k, i] = q[i] + noise[k, i]
+            if resolution > 0.0:
+                reading[k, i] = round(reading[k, i] / resolution) * resolution
+        for d in range(driven.size):
+            i = driven[d]
+            if laws[d].kind != axis.OPEN:
+                u[k, d] = axis.command(laws[d], k, reference[:, i], reading[:, i], memory[d], period)
+            drive[i] = masses[i].gain * u[k, d]
+        pull_of_springs(springs, q, pull)
+        for i in range(q.size):
+            force = drive[i] + pull[i]
+            truth[k, i, 0], truth[k, i, 1], truth[k, i, 3] = q[i], v[i], drive[i]
+            truth[k, i, 2] = axis.acceleration(masses[i], bursts, q[i], v[i], 0.0, force, 0.0)
+        for _ in range(steps):
+            advance(masses, springs, q, v, drive, pull, h)
