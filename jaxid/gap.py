@@ -31,20 +31,21 @@ class ForceGap:
 
     Args:
         residual: (kept, n) [N or N m]; NaN at rest.
-        measured: (kept, m), through the same filter.
+        measured: (kept, n), through the same filter; zero where no joint is driven.
         rms: By joint.
-        relative: 2-norm of the residual over that of the measured force, by joint.
+        relative: 2-norm of the residual over that of the measured force, by joint; NaN where none is
+            driven.
     """
 
     residual: Float[np.ndarray, "kept n"]
-    measured: Float[np.ndarray, "kept m"]
+    measured: Float[np.ndarray, "kept n"]
     rms: Float[np.ndarray, " n"]
     relative: Float[np.ndarray, " n"]
 
 
 @eqx.filter_jit
 def _force_gap(plant: Plant, data: ForceData) -> tuple[Array, Array]:
-    return -force_residual(plant, data), measured_force(data)
+    return -force_residual(plant, data), measured_force(plant, data)
 
 
 def force_gap(machine: Machine, data: Prepared) -> ForceGap:
@@ -52,10 +53,10 @@ def force_gap(machine: Machine, data: Prepared) -> ForceGap:
     residual, measured = _force_gap(sharpened(machine.plant, data), ForceData.of(data))
     residual = np.where(data.moving, np.asarray(residual), np.nan)
     counted = np.where(data.moving, np.asarray(measured), np.nan)
-    norm = np.sqrt(np.nansum(residual**2, axis=0))
+    norm, size = (np.sqrt(np.nansum(x**2, axis=0)) for x in (residual, counted))
     return ForceGap(
         residual, np.asarray(measured), np.sqrt(np.nanmean(residual**2, axis=0)),
-        norm / np.sqrt(np.nansum(counted**2, axis=0)),
+        norm / np.where(size > 0, size, np.nan),
     )
 
 
@@ -134,7 +135,8 @@ def noise_density(
     stated = machine.sensor.force_noise
     force_noise = force_noise if stated is None else stated
     if force_noise is not None:
-        white = 2 * np.square(np.asarray(force_noise) * machine.gain) / rate
+        by_drive = jnp.asarray(2 * np.square(np.asarray(force_noise) * machine.gain) / rate)
+        white = np.asarray(machine.plant.applied(by_drive, len(mass)))
         power = power + white * recipe.decimator.response(f, rate)[:, None] ** 2
     return f, power
 

@@ -87,10 +87,10 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
         raise InputError(what, where=f"{case.path}, [actuator]", mend=mend)
     plant, free = _bare_plant(case, true)
     for entry in case.effects:
-        for at in range(len(entry.joints)):
+        for at in range(len(entry.ports)):
             plant, more = _with_effect(plant, entry, at, case, true)
             free += more
-    gain = np.broadcast_to(np.asarray(case.gain, dtype=np.float64), (case.plant.joints,)).copy()
+    gain = np.broadcast_to(np.asarray(case.gain, dtype=np.float64), (case.plant.drives,)).copy()
     return Machine(
         plant=plant,
         parameters=Parameters(tuple(free)),
@@ -107,7 +107,7 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
     """The plant without effects, and its own unknowns."""
     entry = case.plant
     known: dict[str, Any] = {"gravity": entry.gravity, "vertical": entry.vertical}
-    known["sharpness"] = case.simulation.get("sharpness")
+    known |= {"sharpness": case.simulation.get("sharpness"), "actuated": entry.actuated}
     options = {
         name: value
         for name, value in known.items()
@@ -130,18 +130,15 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
 def _with_effect(
     plant: Plant, entry: EffectEntry, at: int, case: Case, true: bool
 ) -> tuple[Plant, list[Free]]:
-    """The plant with an effect on one of its joints, and the effect's unknowns."""
-    joint = entry.joints[at]
-    values = {name: of_joints[at] for name, of_joints in entry.parameters.items()}
-    effect = entry.cls(port=joint - 1, **{name: v.start(true) for name, v in values.items()})
-    place = f"[{joint}]" if case.plant.joints > 1 else ""
-    number = effect_name(plant, effect).removeprefix(effect.kind)
+    """The plant with an effect on one of its ports, and the effect's unknowns."""
+    values = {name: of_ports[at] for name, of_ports in entry.parameters.items()}
+    effect = entry.cls(port=entry.ports[at], **{name: v.start(true) for name, v in values.items()})
+    key = effect_name(plant, effect)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
         if name in values:
-            key = f"{effect.kind}{place}{number}.{name}"
             path = ("effects", len(plant.effects), name)
-            free += _free(values[name], key, path, info, case, true)
+            free += _free(values[name], f"{key}.{name}", path, info, case, true)
     return plant.with_effect(effect), free
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxid import smooth
+from jaxid.alike import acted, alike
 
 SIGNS = ("free", "nonnegative", "positive")
 
@@ -30,20 +31,24 @@ class ParameterInfo:
         sign: "free", "nonnegative" or "positive".
         doc: One line for the tables.
         optional: May be absent (None).
+        more: Of a list that is as long as the plant has joints, and so many more; None: no list.
     """
 
     dimension: str
     sign: str
     doc: str
     optional: bool = False
+    more: int | None = None
 
 
-def parameter(dimension: str, sign: str, doc: str, *, optional: bool = False) -> Any:
+def parameter(
+    dimension: str, sign: str, doc: str, *, optional: bool = False, more: int | None = None
+) -> Any:
     """Declare a field of a plant or effect as a physical parameter, a float64 array leaf.
 
     The conversion matters: a Python float is no array leaf and would silently count as known.
     """
-    info = ParameterInfo(dimension, sign, doc, optional)
+    info = ParameterInfo(dimension, sign, doc, optional, more)
     convert = _optional_array if optional else as_array
     if optional:
         return eqx.field(converter=convert, metadata={"parameter": info}, default=None)
@@ -75,7 +80,8 @@ class Signals(eqx.Module):
         y: Coordinate [m or rad].
         yd: Its velocity.
         ydd: Its acceleration.
-        u: Force of the drive after the effects declared before this one [N or N m].
+        u: Force of the drive after the effects declared before this one [N or N m]; zero where
+            none drives the port.
         t: Time from the start of the log [s].
         width: Velocity over which the sign is smoothed.
         dry_scale: Factor on every level of dry friction (drift).
@@ -178,6 +184,10 @@ class Effect(eqx.Module):
     # Whether the effect is a force beside the others, in proportion to those of its parameters
     # that carry a force. False for what sits in the drive or acts on other effects.
     adds_force: ClassVar[bool] = True
+    # Whether it changes what the drive of its joint delivers.
+    in_drive: ClassVar[bool] = False
+    # Whether it is the law of a spring: of a plant with springs, its place is an elongation.
+    of_spring: ClassVar[bool] = False
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
@@ -224,6 +234,7 @@ class Balance(eqx.Module):
         stick: Level above it at rest, by port.
         rates: Time derivatives of the effects' own states.
         drive: Force at the load of each drive, after all effects in its path [N or N m].
+        slides: Ports on which any effect is dry friction.
     """
 
     residual: Array
@@ -231,6 +242,7 @@ class Balance(eqx.Module):
     stick: Array
     rates: tuple
     drive: Array
+    slides: tuple[int, ...] = eqx.field(static=True)
 
 
 class Plant(eqx.Module):
@@ -241,6 +253,9 @@ class Plant(eqx.Module):
     """
 
     kind: ClassVar[str]
+    joints: ClassVar[int] = 1
+    # Whether no joint's acceleration enters the balance of another: there is nothing to solve then.
+    diagonal: ClassVar[bool] = False
     effects: eqx.AbstractVar[tuple[Effect, ...]]
     sharpness: eqx.AbstractVar[Array]
     velocity_scale: eqx.AbstractVar[Array]
@@ -250,12 +265,45 @@ class Plant(eqx.Module):
         raise NotImplementedError
 
     def ports(self, q: Array) -> Array:
-        """Coordinates on which effects act; joints by default."""
+        """Coordinates on which effects act: the joints, and behind them what else there is."""
         return q
+
+    def own_inertia(self) -> Array | None:
+        """What a force on each joint accelerates of it alone [kg or kg m^2]; None where that varies."""
+        return None
+
+    @classmethod
+    def springs(cls, joints: int) -> int:
+        """How many ports behind the joints are elongations of springs."""
+        return 0
+
+    def place(self, port: int) -> tuple[str, int]:
+        """What a port is called: a joint or a spring, counted from 1."""
+        return ("joint", port + 1) if port < self.joints else ("spring", port - self.joints + 1)
+
+    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+        """Joints in whose balance a force on a port stands; all by default."""
+        return tuple(range(joints))
+
+    def drive_of(self, port: int, drives: int) -> int | None:
+        """Index of the drive that acts on a port; None where there is none."""
+        return min(port, drives - 1)
+
+    def at_drives(self, x: Array) -> Array:
+        """Of a quantity by joint (its last axis), the joints that are driven, by drive."""
+        return x
 
     def applied(self, u: Array, coordinates: int) -> Array:
         """Generalized forces of the drives: one for each of the first coordinates by default."""
         return u if u.size == coordinates else jnp.zeros(coordinates, u.dtype).at[: u.size].add(u)
+
+    def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
+        """Whether a search may name such an effect on a port."""
+        return not effect.in_drive or self.drive_of(port, drives) is not None
+
+    def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
+        """Parameter of the plant, and its entry, that an effect on a port is by another name."""
+        return None
 
     def port_gravity(self, q: Array) -> Array:
         """Acceleration of gravity along each port [m/s^2]."""
@@ -270,13 +318,23 @@ class Plant(eqx.Module):
         """Velocity over which the sign is smoothed."""
         return self.sharpness * self.velocity_scale
 
-    def command_delay(self) -> Array:
-        """Total delay of the command [s]."""
-        return jnp.asarray(sum((e.command_delay() for e in self.effects), 0.0))
+    def command_delays(self, drives: int) -> Float[Array, " m"]:
+        """Total delay of the command of each drive [s]."""
+        total = [0.0] * drives
+        for e in self.effects:
+            j = self.drive_of(e.port, drives)
+            if j is not None:
+                total[j] = total[j] + e.command_delay()
+        return _stack(total)
 
     def initial_states(self, u: Array) -> tuple:
         """Own states of the effects where the drive has long been at `u`."""
-        return tuple(e.initial_state(u[min(e.port, u.size - 1)]) for e in self.effects)
+        drives = [self.drive_of(e.port, u.size) for e in self.effects]
+        zero = jnp.zeros((), u.dtype)
+        return tuple(
+            e.initial_state(zero if j is None else u[j])
+            for e, j in zip(self.effects, drives, strict=True)
+        )
 
     def with_effect(self, effect: Effect) -> Plant:
         """The same plant with one effect more, last on the drive."""
@@ -309,22 +367,34 @@ class Plant(eqx.Module):
         """
         y, yd, ydd = port_motion(self, q, qd, qdd)
         gravity, normal, width = self.port_gravity(q), self.port_normal(q), self.width
-        dry_scale = jnp.asarray(1.0 + sum((e.dry_drift(t) for e in self.effects), 0.0))
         # Sums by port and drive in lists: arrays updated in place compile much more slowly.
-        force, dry, stick = ([0.0] * y.size for _ in range(3))
+        force, dry, stick, dry_scale = ([x] * y.size for x in (0.0, 0.0, 0.0, 1.0))
+        for e in self.effects:
+            dry_scale[e.port] = dry_scale[e.port] + e.dry_drift(t)
         drive, rates = [u[j] for j in range(u.size)], []
-        for effect, state in zip(self.effects, states, strict=True):
-            i, j = effect.port, min(effect.port, u.size - 1)
-            x = Signals(
-                y[i], yd[i], ydd[i], drive[j], t, width, dry_scale, gravity[i], normal[i]
-            )
-            action = effect.act(x, state)
-            force[i], dry[i] = force[i] + action.force, dry[i] + action.dry
-            stick[i] = stick[i] + action.stick
-            drive[j] = drive[j] if action.drive is None else action.drive
-            rates.append(action.rate)
-        at_rest_only = _stack(stick) * dry_scale
-        levels = _stack(dry) * dry_scale
+        ports = [e.port for e in self.effects]
+        drives = [self.drive_of(i, u.size) for i in ports]
+        for run in alike(self.effects, drives):
+            signals = [
+                Signals(
+                    y[i], yd[i], ydd[i], jnp.zeros(()) if j is None else drive[j], t, width,
+                    jnp.asarray(dry_scale[i]), gravity[i], normal[i],
+                )
+                for i, j in ((ports[k], drives[k]) for k in run)
+            ]
+            actions = acted([self.effects[k] for k in run], signals, [states[k] for k in run])
+            for k, action in zip(run, actions, strict=True):
+                i, j = ports[k], drives[k]
+                force[i], dry[i] = force[i] + action.force, dry[i] + action.dry
+                stick[i] = stick[i] + action.stick
+                if j is not None and action.drive is not None:
+                    drive[j] = action.drive
+                rates.append(action.rate)
+        slides = tuple(
+            i for i in range(y.size) if not (isinstance(dry[i], float) and isinstance(stick[i], float))
+        )
+        scale = _stack(dry_scale)
+        at_rest_only, levels = _stack(stick) * scale, _stack(dry) * scale
         if reaction is None:
             held = levels
             # Not even added where it is nothing: its exponential would be evaluated all the same.
@@ -334,7 +404,7 @@ class Plant(eqx.Module):
         react = _pull_back(self, q, _stack(force) + reaction)
         u = _stack(drive)
         residual = self.inertial(q, qd, qdd) - react - self.applied(u, q.size)
-        return Balance(residual, levels, at_rest_only, tuple(rates), u)
+        return Balance(residual, levels, at_rest_only, tuple(rates), u, slides)
 
 
 def port_motion(

@@ -143,6 +143,19 @@ def free_effect(
 
 
 def effect_name(plant: Plant, effect: Effect) -> str:
-    """Key of an effect in results: its kind, numbered where the plant already has one there."""
+    """Key of an effect in results: kind and place, numbered where the plant already has one there."""
     same = sum(e.kind == effect.kind and e.port == effect.port for e in plant.effects)
-    return effect.kind if same == 0 else f"{effect.kind}#{same + 1}"
+    return label(plant, effect.kind, effect.port) + ("" if same == 0 else f"#{same + 1}")
+
+
+def label(plant: Plant, kind: str, port: int) -> str:
+    """A kind with its place, which on a machine of one joint says nothing: `cogging[2]`, `[spring 3]`."""
+    if not several_places(plant):
+        return kind
+    what, k = plant.place(port)
+    return f"{kind}[{k}]" if what == "joint" else f"{kind}[{what} {k}]"
+
+
+def several_places(plant: Plant) -> bool:
+    """Whether effects need a place to be told apart."""
+    return plant.joints + plant.springs(plant.joints) > 1

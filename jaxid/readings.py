@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import factorial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -70,8 +71,20 @@ def acceleration(
         r = plant.balance(x.q, x.qd, qdd, u, t, x.own, reaction).residual
         return r, r
 
-    mass, rest = jax.jacfwd(residual, has_aux=True)(jnp.zeros_like(x.q))
-    return small_solve(mass, -rest)
+    mass, rest = _mass(plant, residual, x.q)
+    return _solved(mass, -rest)
+
+
+def _mass(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple[Array, Any]:
+    """Derivative of a residual in the accelerations, (n, n), or (n,) where it is diagonal; and its aux."""
+    zero = jnp.zeros_like(q)
+    if plant.diagonal:
+        return jax.jvp(residual, (zero,), (jnp.ones_like(q),), has_aux=True)[1:]
+    return jax.jacfwd(residual, has_aux=True)(zero)
+
+
+def _solved(mass: Array, force: Float[Array, " n"]) -> Float[Array, " n"]:
+    return force / mass if mass.ndim == 1 else small_solve(mass, force)
 
 
 def derivative(
@@ -86,7 +99,9 @@ def derivative(
 def vector_field(t: Array, x: State, args: tuple[Plant, Callable[[Array], Array]]) -> State:
     """Right-hand side in diffrax's form: args are the plant and the force as function of time."""
     plant, force = args
-    return derivative(plant, x, force(t - plant.command_delay()), t)
+    drives = jax.eval_shape(force, t).size
+    late = [force(t - d)[j] for j, d in enumerate(plant.command_delays(drives))]
+    return derivative(plant, x, jnp.stack(late), t)
 
 
 def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
@@ -271,29 +286,58 @@ def set_valued_step(
         flow: `step` as a function of state and reaction (left out: zero), where there is a
             cheaper one.
     """
-    none = jnp.zeros_like(plant.ports(x.q))
+    ports = plant.ports(x.q).size
     if flow is None:
+        none = jnp.zeros(ports)
         flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
     free = flow(x)
-    _, speed, _ = port_motion(plant, free.q, free.qd, jnp.zeros_like(free.q))
-    _, before, _ = port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))
     midway, end = 0.5 * (x.qd + free.qd), u(jnp.asarray(1.0))
 
     def residual(qdd: Array) -> tuple[Array, Balance]:
-        levels = plant.balance(x.q, midway, qdd, end, t, x.own, none)
+        levels = plant.balance(x.q, midway, qdd, end, t, x.own, jnp.zeros(ports))
         return levels.residual, levels
 
     # The mass does not depend on the velocity: one balance gives it and the levels.
-    mass, levels = jax.jacfwd(residual, has_aux=True)(jnp.zeros_like(x.q))
-    jacobian = jax.jacfwd(plant.ports)(x.q)
-    columns = [small_solve(mass, jacobian[i]) for i in range(speed.size)]
-    mobility = h * jnp.stack([jacobian @ c for c in columns], axis=1)
+    mass, levels = _mass(plant, residual, x.q)
+    slides = levels.slides
+    if not slides:
+        return free
+    speed, before = (_port_speed(plant, at, slides) for at in (free, x))
+    mobility = h * _mobility(plant, mass, x.q, slides)
+    dry, stick = _picked(levels.dry, slides), _picked(levels.stick, slides)
     # Break-away acts until a port slides, and again where it would pass through rest.
-    slid = speed - jnp.sign(before) * jnp.diagonal(mobility) * levels.dry
+    own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
+    slid = speed - jnp.sign(before) * own * dry
     rests = (before == 0.0) | (before * slid < 0.0)
-    hold = levels.dry + jnp.where(rests, levels.stick, 0.0)
-    reaction, stuck = _box_reaction(mobility, speed, levels.dry, hold)
-    return _rest_exactly(plant, flow(x, reaction), stuck)
+    hold = dry + jnp.where(rests, stick, 0.0)
+    reaction, stuck = _box_reaction(mobility, speed, dry, hold)
+    return _rest_exactly(flow(x, _spread(reaction, slides, ports)), stuck, slides)
+
+
+def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
+    """Velocities of some ports."""
+    return _picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
+
+
+def _picked(x: Array, ports: tuple[int, ...]) -> Array:
+    return x if len(ports) == x.size else jnp.stack([x[i] for i in ports])
+
+
+def _spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
+    """Values of some ports among all; zero elsewhere."""
+    if len(ports) == size:
+        return x
+    zero = jnp.zeros((), x.dtype)
+    return jnp.stack([x[ports.index(i)] if i in ports else zero for i in range(size)])
+
+
+def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> Array:
+    """Acceleration of some ports per unit force on each; the diagonal where that is all there is."""
+    if mass.ndim == 1 and max(slides) < q.size:
+        return _picked(1.0 / mass, slides)
+    jacobian = jax.jacfwd(lambda q: _picked(plant.ports(q), slides))(q)
+    columns = [_solved(mass, row) for row in jacobian]
+    return jnp.stack([jacobian @ c for c in columns], axis=1)
 
 
 def _box_reaction(
@@ -304,12 +348,12 @@ def _box_reaction(
     A port is held up to `hold`, the level at rest; one that breaks loose is dragged by `dry`.
     """
     n = speed.size
-    inverse = 1.0 / jnp.diagonal(mobility)
+    inverse = 1.0 / (mobility if mobility.ndim == 1 else jnp.diagonal(mobility))
 
     def answer(wanted: Array, dry: Array, hold: Array) -> Array:
         return jnp.where(jnp.abs(wanted) < hold, wanted, sharp_clip(wanted, dry))
 
-    if n == 1:
+    if n == 1 or mobility.ndim == 1:
         wanted = speed * -inverse
         return answer(wanted, dry, hold), jnp.abs(wanted) < hold
     reaction = wanted = jnp.zeros(n)
@@ -321,10 +365,14 @@ def _box_reaction(
     return reaction, jnp.abs(wanted) < hold
 
 
-def _rest_exactly(plant: Plant, x: State, stuck: Array) -> State:
-    """Take the rounding off the velocity of ports that stick, where the ports are the joints."""
-    if stuck.size != x.qd.size:
-        return x
+def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:
+    """Take the rounding off the velocity of joints that stick."""
+    joints = [k for k, i in enumerate(slides) if i < x.qd.size]
+    if len(joints) == x.qd.size:
+        stuck = _picked(stuck, tuple(joints))
+    else:
+        held = {slides[k]: stuck[k] for k in joints}
+        stuck = jnp.stack([held.get(i, jnp.zeros((), bool)) for i in range(x.qd.size)])
     return State(x.q, jnp.where(stuck, 0.0, x.qd), x.own)
 
 
@@ -420,14 +468,21 @@ def residual_along(
         return balance.residual, balance.drive
 
     residual, drive = jax.vmap(at)(q, qd, qdd, u, times, own)
-    return residual / drive_ratio(drive, u)
+    return residual / drive_ratio(plant, drive, u, q.shape[1])
 
 
-def drive_ratio(drive: Float[Array, "time m"], u: Float[Array, "time m"]) -> Float[Array, ""]:
-    """Force at the load over declared force, root mean squares over a log.
+def drive_ratio(
+    plant: Plant, drive: Float[Array, "time m"], u: Float[Array, "time m"], joints: int
+) -> Float[Array, " n"]:
+    """Force at the load over declared force, root mean squares over a log, by joint.
 
     It turns a residual back into declared units. Left in units of the load, a drive gain of zero,
-    or a saturation at zero, would be a perfect fit to any log.
+    or a saturation at zero, would be a perfect fit to any log. Where no drive is, that of all drives
+    together counts: with a single one, all forces of the machine go in proportion to it.
     """
     tiny = 1e-300
-    return jnp.sqrt((jnp.sum(drive**2) + tiny) / (jnp.sum(u**2) + tiny))
+    squares = [jnp.sum(x**2, axis=0) for x in (drive, u)]
+    own = jnp.sqrt((squares[0] + tiny) / (squares[1] + tiny))
+    whole = jnp.sqrt((jnp.sum(squares[0]) + tiny) / (jnp.sum(squares[1]) + tiny))
+    places = [plant.drive_of(i, u.shape[1]) for i in range(joints)]
+    return jnp.stack([whole if j is None else own[j] for j in places])

@@ -59,7 +59,7 @@ class Replay(eqx.Module):
         drive: How the command acts.
         controller: The law; None: open loop.
         sensor: What the controller reads.
-        reference, disturbance: At every tick (closed loop).
+        reference, disturbance: By drive, at every tick (closed loop).
         command: Logged command (open loop), refined where it is band-limited.
         position, velocity: At the start.
         restart: Flags, positions and velocities of segments (open loop).
@@ -124,6 +124,12 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         raise InputError(
             f"{log.source}: the loop cannot be simulated without a reference; name its column "
             "as reference in [log], or leave out [controller] to simulate from the measured force."
+        )
+    driven = log.force.shape[1]
+    if log.reference.shape[1] not in (1, driven):
+        raise InputError(
+            f"{log.source}: the reference has {log.reference.shape[1]} columns for {driven} drives; "
+            "name one a drive in [log]."
         )
     ticks = log.time[0] + period * np.arange((log.samples - 1) * every + 1)
     if every == 1:

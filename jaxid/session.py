@@ -99,7 +99,7 @@ def open_session(
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
-        read = read_log(source, entry.columns, joints=case.plant.joints)
+        read = _read(case, source, entry.columns)
         findings += _check(case, read, machine)
         opened.append(Run(entry.name, read, _prepare(read, machine, recipe), entry.disturbance))
         names.add(entry.name)
@@ -116,7 +116,18 @@ def open_session(
 
 
 def _read(case: Case, log: Log | str | Path, columns: dict) -> Log:
-    return log if isinstance(log, Log) else read_log(log, columns, joints=case.plant.joints)
+    joints, drives = case.plant.joints, case.plant.drives
+    if not isinstance(log, Log):
+        return read_log(log, columns, joints=joints, drives=drives)
+    for name, width in (("position", joints), ("force", drives), ("reference", drives)):
+        values = getattr(log, name)
+        if values is not None and values.shape[1] != width:
+            what = "joint" if name == "position" else "drive"
+            raise InputError(
+                f"{name} has {values.shape[1]} column(s) where {width} belong", where=log.source,
+                mend=f"give one column a {what}, in the order of the {what}s",
+            )
+    return log
 
 
 def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
@@ -126,17 +137,20 @@ def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
         log, command_limit=limit, motion=units.motion,
         units={"position": units.position} if units.position else None,
     )
-    guess = next((f.guess for f in machine.parameters.free if f.name == "inertia"), None)
-    guess = float(np.asarray(machine.plant.inertia)) if guess is None else guess
-    slip = plausible_inertia(log, guess, float(machine.gain[0]), motion=units.motion)
-    findings += [slip] if slip is not None else []
+    plant, inertia = machine.plant, machine.plant.own_inertia()
+    if inertia is not None:
+        driven = plant.at_drives(np.arange(plant.joints))
+        slip = plausible_inertia(
+            log, np.asarray(inertia), machine.gain, motion=units.motion, driven=driven
+        )
+        findings += [slip] if slip is not None else []
     raise_on_error(findings)
     return findings
 
 
 def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
     left = log.samples // recipe.decimation - 2 * recipe.trim
-    if left < 5 * max(len(machine.parameters.free), 4):
+    if left * log.position.shape[1] < 5 * max(len(machine.parameters.free), 4):
         raise InputError(
             f"too short: {log.samples} samples leave {max(left, 0)} after decimation by "
             f"{recipe.decimation} and trimming {recipe.trim} at each end, as [preprocess] states or "

@@ -191,7 +191,7 @@ def delayed(
 
     Args:
         u: Command at the samples, (time, m).
-        delay: Delay [s]; the result is differentiable in it.
+        delay: Delay [s], one or one a column; the result is differentiable in it.
         period: Sampling time [s].
         hold: For how long each command is held [s]; zero where it is not. That is the sampling
             time of the controller, which may be shorter than the log's.
@@ -200,8 +200,8 @@ def delayed(
     def response(f: np.ndarray) -> Array:
         # Mean of the held command over its hold: its own lag and its own roll-off. Exact in the
         # band; interpolation between samples is 1 % off at a sixth of the sampling rate.
-        lag = jnp.exp(-2j * jnp.pi * jnp.asarray(f) * (delay + 0.5 * hold) / period)
-        return (lag * np.sinc(f * hold / period))[:, None]
+        lag = jnp.exp(-2j * jnp.pi * jnp.asarray(f)[:, None] * (delay + 0.5 * hold) / period)
+        return lag * np.sinc(f * hold / period)[:, None]
 
     return _through(u, 200, response)
 

@@ -167,14 +167,14 @@ def interval_forces(
     held command has zero gradient in it.
     """
     force = drive.gain * command
-    shift = plant.command_delay() / drive.period
+    n, drives = force.shape
+    shift = plant.command_delays(drives) / drive.period
     whole = jnp.floor(shift).astype(int)
     part = shift - whole
-    n = force.shape[0]
-    k = jnp.arange(n) - whole
+    k = jnp.arange(n)[:, None] - whole
 
     def at(k: Array) -> Array:
-        return force[jnp.clip(k, 0, n - 1)]
+        return jnp.take_along_axis(force, jnp.clip(k, 0, n - 1), axis=0)
 
     start = (1 - part) * at(k) + part * at(k - 1)
     if drive.hold == "zero_order":
@@ -186,7 +186,7 @@ def closed_loop(
     plant: Plant,
     drive: Drive,
     controller: Controller,
-    reference: Float[Array, "ticks n"],
+    reference: Float[Array, "ticks m"],
     disturbance: Float[Array, "ticks m"],
     position: Float[Array, " n"],
     velocity: Float[Array, " n"],
@@ -199,7 +199,7 @@ def closed_loop(
         plant: The plant.
         drive: How the command acts; `drive.period` is the controller's.
         controller: The law.
-        reference: At every tick.
+        reference: Of the joints that are driven, at every tick, (ticks, m).
         disturbance: Added to the command at every tick, before its limit.
         position, velocity: At the first tick.
         sensor: What the controller reads; absent: exact.
@@ -209,9 +209,9 @@ def closed_loop(
         One row a tick.
     """
     sensor = Sensor() if sensor is None else sensor
-    memory = controller.start(position, velocity, reference[0])
+    memory = controller.start(plant.at_drives(position), plant.at_drives(velocity), reference[0])
     times = drive.period * jnp.arange(reference.shape[0])
-    tick0 = Tick(sensor.read(position), reference[0])
+    tick0 = Tick(plant.at_drives(sensor.read(position)), reference[0])
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
     past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
     x0 = State(position, velocity, plant.initial_states(held))
@@ -221,7 +221,8 @@ def closed_loop(
         x, memory, past = carry
         reference, disturbance, noise, t = now
         reading = sensor.read(x.q, noise)
-        u, memory = controller.command(Tick(reading, reference), memory, disturbance)
+        seen = Tick(plant.at_drives(reading), reference)
+        u, memory = controller.command(seen, memory, disturbance)
         force, past = _delayed_force(plant, drive, u, past)
         new = advance(x, (force,), t)
         return (new, memory, past), (x.q, x.qd, u, reading)
@@ -237,10 +238,11 @@ def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[A
     if drive.longest_delay == 0:
         return force, past
     past = jnp.concatenate([force[None], past[:-1]])
-    shift = jnp.clip(plant.command_delay() / drive.period, 0.0, drive.longest_delay)
+    shift = jnp.clip(plant.command_delays(u.size) / drive.period, 0.0, drive.longest_delay)
     # Hat weights over the last samples: linear interpolation without a data-dependent index.
-    weight = jnp.maximum(0.0, 1.0 - jnp.abs(jnp.arange(drive.longest_delay + 1) - shift))
-    return weight @ past, past
+    samples = jnp.arange(drive.longest_delay + 1)[:, None]
+    weight = jnp.maximum(0.0, 1.0 - jnp.abs(samples - shift))
+    return jnp.sum(weight * past, axis=0), past
 
 
 def with_diffrax(

@@ -97,15 +97,16 @@ def _closed(
         )
     period = machine.controller.period
     every = max(1, round(1 / (rate * period)))
-    reference = make_reference(case.reference, 1 / period, duration, case.folder)
+    reference = _by_drive(make_reference(case.reference, 1 / period, duration, case.folder), machine)
     times = period * np.arange(len(reference))
     machine = _scaled(machine, reference, period)
     drive = _drive(case, machine, period)
     _refuse_coarse(case, machine, drive, reference)
+    noise = rng.standard_normal((len(reference), case.plant.joints))
     run = eqx.filter_jit(closed_loop)(
         machine.plant, drive, machine.controller, jnp.asarray(reference),
         jnp.asarray(disturbance_at(machine.disturbance, times)), jnp.asarray(position),
-        jnp.asarray(velocity), machine.sensor, jnp.asarray(rng.standard_normal(reference.shape)),
+        jnp.asarray(velocity), machine.sensor, jnp.asarray(noise),
     )
     pick = slice(None, None, every)
     log = _log(case, machine, times[pick], run.reading[pick], run.command[pick], rng, reference[pick])
@@ -122,6 +123,7 @@ def _open(
             mend="add an [input], or a [reference] and a [controller]",
         )
     command = make_reference(case.input, rate, duration, case.folder, where="input")
+    command = _by_drive(command, machine)
     drive = _drive(case, machine, 1 / rate)
     run = eqx.filter_jit(open_loop)(
         machine.plant, drive, jnp.asarray(command), jnp.asarray(position), jnp.asarray(velocity)
@@ -132,10 +134,16 @@ def _open(
     return Virtual(log, run, _columns(case, reference=False))
 
 
+def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:
+    """One signal for every drive, where there is one for all."""
+    return np.broadcast_to(signal, (len(signal), machine.gain.size))
+
+
 def _drive(case: Case, machine: Machine, period: float) -> Drive:
     """Exact sticking, unless the case states a sharpness: then friction is smoothed."""
     delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
-    longest = int(np.ceil(float(machine.plant.command_delay()) / period)) + 1 if delayed else 0
+    delays = machine.plant.command_delays(machine.gain.size)
+    longest = int(np.ceil(float(delays.max()) / period)) + 1 if delayed else 0
     hold = "linear" if machine.hold == "band_limited" else machine.hold
     return Drive(
         jnp.asarray(machine.gain), period, hold, int(case.simulation.get("substeps", 4)),
@@ -147,8 +155,9 @@ def _refuse_coarse(case: Case, machine: Machine, drive: Drive, reference: np.nda
     """Refuse a step too coarse for the smoothed sign: its trajectory only looks plausible."""
     if drive.set_valued:
         return
-    q = jnp.asarray(reference[:: max(1, len(reference) // 50)])
-    needed = needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), jnp.zeros_like(q))
+    u = jnp.zeros_like(jnp.asarray(reference[:: max(1, len(reference) // 50)]))
+    q = jnp.zeros((len(u), case.plant.joints))
+    needed = needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
     if needed > drive.substeps:
         raise InputError(
             f"[simulation] substeps = {drive.substeps} is too coarse for sharpness = "

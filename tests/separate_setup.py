@@ -14,6 +14,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Search
 from jaxid.discovery.separate import Proposal, propose
+from jaxid.discovery.union import build_union
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.gap import noise_floor
 from jaxid.session import open_session
@@ -95,7 +96,7 @@ def proposed(
     data = session.fit.data
     baseline = inverse_dynamics(session.machine, data)
     floor = noise_floor(baseline.machine, session.fit.log, data)
-    search = Search(cand.build_union(baseline.machine, data), data, floor)
+    search = Search(build_union(baseline.machine, data), data, floor)
     own, rival = (next(c for c in search.union.candidates if c.kind == kind) for kind in kinds)
     search.theta, search.added = _fitted(search, own), [own]
     score = Score(rival, 0, rival.starts[0], 0.0, theta=_fitted(search, rival))

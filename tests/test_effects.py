@@ -92,7 +92,7 @@ def test_break_away_holds_below_and_leaves_above():
 
 @each_row
 def test_delay_is_what_the_effect_says(row):
-    assert float(plant_of(row.effects).command_delay()) == row.values.get("delay", 0.0)
+    assert float(plant_of(row.effects).command_delays(1)[0]) == row.values.get("delay", 0.0)
 
 
 def test_residual_is_in_declared_units():

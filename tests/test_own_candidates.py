@@ -7,8 +7,8 @@ import stepper_machines as machines
 from search_cases import COULOMB, VISCOUS
 from search_setup import case_text, log_of, write_case
 
-from jaxid.discovery.candidates import build_union
 from jaxid.discovery.discover import discover
+from jaxid.discovery.union import build_union
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.session import open_session

@@ -159,9 +159,8 @@ def _runs(
         now = eqx.tree_at(lambda p: p.effects[-1].level, now, level)
 
         def one(s: Starts) -> Array:
-            zero = jnp.zeros_like(s.rest)
             run = open_loop(
-                now, drive, s.command, s.rest, zero, start=s.time, own=(*s.own, None), past=s.past
+                now, drive, s.command, s.rest, s.velocity, start=s.time, own=(*s.own, None), past=s.past
             )
             e = s.position[:, joint] - run.position[:, joint]
             at_rest = jnp.arange(e.size) < s.still

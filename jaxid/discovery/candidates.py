@@ -6,23 +6,21 @@ take longer than all of the search.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxid.discovery.own import check_foreign, is_foreign
-from jaxid.effects import EFFECTS
-from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual, sharpened
+from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual
 from jaxid.estimators.least_squares import Transform
 from jaxid.machine import Machine
-from jaxid.model import Effect, Plant, Scales, carries_force, parameters_of
-from jaxid.parameters import Free, Parameters, free_effect, scatter
+from jaxid.model import Effect, Plant, parameters_of
+from jaxid.parameters import Free, Parameters, scatter
 from jaxid.preprocess import Prepared
 
 # An effect with more starts than this is evaluated on a plant of its own, all starts at once.
@@ -40,7 +38,8 @@ class Candidate:
 
     Args:
         kind: Its name.
-        port: Index of the joint it acts on.
+        label: Kind and place, as results name it.
+        port: Where it acts: a joint from 0 on, or behind them a spring.
         index: Its unknowns in the union's vector.
         neutral: Values at which it does next to nothing.
         starts: Values to search from, (starts, parameters).
@@ -48,6 +47,7 @@ class Candidate:
     """
 
     kind: str
+    label: str
     port: int
     index: np.ndarray
     neutral: np.ndarray
@@ -96,97 +96,21 @@ class Union:
     Args:
         machine: Its plant carries every candidate; its parameters are the case's own, then theirs.
         base: Indices of the case's own unknowns.
-        candidates: By place and kind.
-        scales: Of the log.
+        candidates: By kind and place.
+        enters: Which unknowns stand in the balance of which joints, (joints, unknowns).
+        colours: Numbers of the unknowns such that no two of one number stand in one balance.
     """
 
     machine: Machine
     base: np.ndarray
     candidates: tuple[Candidate, ...]
-    scales: Scales
+    enters: Bool[np.ndarray, "n p"]
+    colours: tuple[int, ...]
 
     @property
     def neutral(self) -> np.ndarray:
         """The vector at which only the baseline acts."""
         return np.asarray(self.machine.parameters.guess)
-
-
-def scales_of(data: Prepared) -> Scales:
-    """How large the quantities of a prepared log are."""
-    moving = np.repeat(data.moving.any(axis=1), 1)
-    v, a = data.at_kept(data.qd)[moving], data.at_kept(data.qdd)[moving]
-    force = data.force - np.mean(data.force, axis=0)
-
-    def rms(x: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(x**2)))
-
-    return Scales(
-        position=float(np.ptp(data.q, axis=0).max() / 2),
-        velocity=rms(v),
-        acceleration=rms(a),
-        force=rms(force),
-        peak_velocity=float(np.abs(v).max()),
-        peak_force=float(np.abs(data.force).max()),
-        period=data.period,
-        duration=data.period * len(data.q),
-    )
-
-
-def build_union(machine: Machine, data: Prepared, own: Sequence[type[Effect]] = ()) -> Union:
-    """Add every effect that the plant does not have yet, at every joint.
-
-    Args:
-        machine: The baseline.
-        data: The log to be searched, for scales.
-        own: Effects of the case beside those that are registered.
-
-    Raises:
-        InputError: If an effect that is not jaxid's own cannot be searched for.
-    """
-    scales = scales_of(data)
-    plant, parameters = machine.plant, machine.parameters
-    missing = [_missing(plant, port, own) for port in range(data.q.shape[1])]
-    for cls in dict.fromkeys(cls for classes in missing for cls in classes):
-        if is_foreign(cls):
-            check_foreign(cls, machine, data, scales)
-    base = np.arange(len(parameters.free))
-    candidates = []
-    for port, classes in enumerate(missing):
-        for cls in classes:
-            neutral = cls.neutral(scales)
-            plant, free = free_effect(plant, cls(**neutral, port=port), machine.units)
-            free = _limited(free, cls.limits(scales))
-            first = len(parameters.free)
-            parameters = parameters.extended(free)
-            candidates.append(_candidate(cls, port, np.arange(first, first + len(free)), scales))
-    union = machine.with_plant(sharpened(plant, data), parameters)
-    return Union(union, base, tuple(candidates), scales)
-
-
-def _missing(plant: Plant, port: int, own: Sequence[type[Effect]]) -> list[type[Effect]]:
-    """Effects that a joint does not have yet."""
-    present = {e.kind for e in plant.effects if e.port == port}
-    return [cls for cls in (*EFFECTS.values(), *own) if cls.kind not in present]
-
-
-def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[Free]:
-    """Unknowns within the bounds that a search keeps."""
-    out = []
-    for f in free:
-        lower, upper = limits.get(f.name.rpartition(".")[2], (-np.inf, np.inf))
-        out.append(replace(f, lower=lower, upper=upper))
-    return out
-
-
-def _candidate(cls: type[Effect], port: int, index: np.ndarray, scales: Scales) -> Candidate:
-    neutral, infos = cls.neutral(scales), parameters_of(cls)
-    names = [n for n in infos if n in neutral]
-    return Candidate(
-        cls.kind, port, index,
-        np.asarray([neutral[n] for n in names], float),
-        np.asarray([[s[n] for n in names] for s in cls.starts(scales)], float),
-        np.asarray([cls.adds_force and carries_force(infos[n]) for n in names]),
-    )
 
 
 class Samples:
@@ -228,9 +152,10 @@ def evaluate_on(
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """The same on several logs or pieces, one after the other."""
     plant, places = union.machine.plant, union.machine.parameters.places
-    found = [force_and_columns(plant, places, a, jnp.asarray(theta)) for a in logs]
+    colours = union.colours if max(union.colours, default=-1) + 1 < len(theta) else None
+    found = [force_and_columns(plant, places, a, jnp.asarray(theta), colours) for a in logs]
     e, jacobian = (np.concatenate([np.asarray(f[i]) for f in found]) for i in range(2))
-    return e, jacobian
+    return e, jacobian if colours is None else jacobian[..., list(colours)] * union.enters
 
 
 def refine(
@@ -301,19 +226,24 @@ def points(
     few = [c for c in rest if not c.many]
     for k in range(max((len(c.starts) for c in few), default=0)):
         now = [c for c in few if k < len(c.starts)]
-        # Added forces are faint and can share an evaluation; each drive effect shifts the
-        # residual, and has one to itself.
-        forces = [c for c in now if c.amplitude.any() or np.allclose(c.starts[k], c.neutral)]
-        groups = [forces, *[[c] for c in now if all(c is not f for f in forces)]]
-        for group in groups:
+        # Added forces are faint and can share an evaluation. A drive effect shifts the residual of
+        # its joint, and shares one with those of its kind on other joints.
+        faint = [c for c in now if c.amplitude.any() or np.allclose(c.starts[k], c.neutral)]
+        shifting = [c for c in now if all(c is not f for f in faint)]
+        kinds = dict.fromkeys(c.kind for c in shifting)
+        for group in (faint, *([c for c in shifting if c.kind == kind] for kind in kinds)):
             if not group:
                 continue
             at = theta.copy()
             for c in group:
                 at[c.index] = c.probe(k)
             e, jacobian = evaluate(union, data, at)
-            shift = e - residual if not group[0].amplitude.any() else np.zeros_like(e)
-            found.extend(Point(c, k, shift, jacobian[..., c.index]) for c in group)
+            for c in group:
+                shift = np.zeros_like(e)
+                if not group[0].amplitude.any():
+                    own = slice(None) if len(group) == 1 else slice(c.port, c.port + 1)
+                    shift[:, own] = (e - residual)[:, own]
+                found.append(Point(c, k, shift, jacobian[..., c.index]))
     return found
 
 

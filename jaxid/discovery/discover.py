@@ -14,6 +14,7 @@ from jaxid.discovery.noise import sensor_colour
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separate import Proposal, proposals
+from jaxid.discovery.union import build_union
 from jaxid.discovery.where import Where, locate
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
@@ -41,14 +42,16 @@ class Found:
 
     Args:
         kind: Its name.
-        joint: 1-based.
+        label: Kind and place, as results name it.
+        place: "joint" or "spring", and which, 1-based.
         names: Names of its parameters in the estimate.
         score: Its evidence when it was added.
         alternatives: Effects that this log cannot tell from it.
     """
 
     kind: str
-    joint: int
+    label: str
+    place: tuple[str, int]
     names: tuple[str, ...]
     score: Score
     alternatives: tuple[Score, ...]
@@ -154,7 +157,7 @@ def discover(
     progress("fitting what is there")
     baseline = inverse_dynamics(machine, data)
     floor = noise_floor(baseline.machine, session.fit.log, data)
-    union = cand.build_union(baseline.machine, data, session.case.own_effects)
+    union = build_union(baseline.machine, data, session.case.own_effects)
     colour = sensor_colour(baseline.machine, session.fit.log, data)
     search = Search(
         union, data, floor, colour, tuple(v.data for v in session.validations), progress
@@ -204,7 +207,7 @@ def _with_break_away(
     machine = machine.with_plant(plant, machine.parameters.extended(free)).with_estimate(theta)
     new = replace(estimate, machine=machine, theta=theta, precision=estimate.precision.beside(b.std))
     score = Score(c, 0, np.array([b.level]), b.evidence)
-    found = Found(c.kind, c.port + 1, (free[0].name,), score, ())
+    found = Found(c.kind, c.label, plant.place(c.port), (free[0].name,), score, ())
     return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
 
 
@@ -227,8 +230,14 @@ def _where(search: Search, baseline: Step, log: Log) -> Where:
     e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta)
     wanted = None
     if log.reference is not None:
-        wanted = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
-    return locate(-e, jacobian[..., baseline.active], search.data, search.colour, wanted)
+        # A mass that is not driven has no wanted motion but its own.
+        wanted = search.data.at_kept(search.data.qd).copy()
+        driven = search.union.machine.plant.at_drives(np.arange(wanted.shape[1]))
+        wanted[:, driven] = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
+    # What joints share cannot be moved for one of them alone.
+    alone = np.sum(search.union.enters[:, baseline.active], axis=0) == 1
+    own = jacobian[..., baseline.active[alone]]
+    return locate(-e, own, search.data, search.colour, wanted)
 
 
 def _verdict(
@@ -257,7 +266,8 @@ def _final_machine(
         theta.extend(search.theta[c.index])
         score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
         names = tuple(f.name for f in free)
-        effects.append(Found(c.kind, c.port + 1, names, score, alternatives.get(k, ())))
+        place = plant.place(c.port)
+        effects.append(Found(c.kind, c.label, place, names, score, alternatives.get(k, ())))
     final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
     return final, tuple(effects)
 

@@ -35,6 +35,7 @@ class Whitener:
     def __post_init__(self) -> None:
         pairs = zip(self.noise, self.rows.T, strict=True)
         object.__setattr__(self, "_matrices", [_predictor(m, c) for m, c in pairs])
+        object.__setattr__(self, "_order", np.argsort(self._blocks(), kind="stable"))
 
     @classmethod
     def of(
@@ -60,21 +61,18 @@ class Whitener:
 
     def __call__(self, x: Float[np.ndarray, "kept n k"]) -> Float[np.ndarray, "row k"]:
         """Whitened rows, block after block of time."""
-        return np.concatenate([m @ x[:, i] for i, m in enumerate(self._matrices)])[self._order()]
+        return np.concatenate([m @ x[:, i] for i, m in enumerate(self._matrices)])[self._order]
 
     def placed(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, "kept n"]:
         """Rows back at their samples; zero where none counts."""
         out, own = np.zeros(self.rows.shape), np.empty_like(rows)
-        own[self._order()] = rows
+        own[self._order] = rows
         out.T[self.rows.T] = own
         return out
 
     def blocks(self) -> np.ndarray:
         """Block of time of every row, in rising order."""
         return np.sort(self._blocks())
-
-    def _order(self) -> np.ndarray:
-        return np.argsort(self._blocks(), kind="stable")
 
     def _blocks(self) -> np.ndarray:
         parts = []
@@ -169,17 +167,29 @@ class Beside:
         self.gram = grams(base, blocks)
         self.mixed, self.squares = products(base, e, blocks)
 
-    def held_out(
-        self, extra: Float[np.ndarray, "row j"], offset: Float[np.ndarray, "row 1"] | None = None
-    ) -> Float[np.ndarray, " r"]:
-        """With further columns, and with an offset that all residuals share."""
+    def crossed(
+        self, extra: Float[np.ndarray, "row j"]
+    ) -> tuple[Float[np.ndarray, "block k j"], Float[np.ndarray, "block j r"]]:
+        """Products of further columns with the base and with the residuals.
+
+        The residuals are many, and going through them takes most of the time: what is to be scored
+        is best brought together.
+        """
         slices = _slices(self.blocks)
-        cross = np.stack([self.base[b].T @ extra[b] for b in slices])
+        with_base = np.stack([self.base[b].T @ extra[b] for b in slices])
+        return with_base, np.stack([extra[b].T @ self.e[b] for b in slices])
+
+    def held_out(
+        self, extra: Float[np.ndarray, "row j"],
+        crossed: tuple[Float[np.ndarray, "block k j"], Float[np.ndarray, "block j r"]],
+        offset: Float[np.ndarray, "row 1"] | None = None,
+    ) -> Float[np.ndarray, " r"]:
+        """With further columns and their products, and with an offset that all residuals share."""
+        slices = _slices(self.blocks)
+        cross, with_residuals = crossed
         own = grams(extra, self.blocks)
         gram = np.block([[self.gram, cross], [np.swapaxes(cross, 1, 2), own]])
-        mixed = np.concatenate(
-            [self.mixed, np.stack([extra[b].T @ self.e[b] for b in slices])], axis=1
-        )
+        mixed = np.concatenate([self.mixed, with_residuals], axis=1)
         squares = self.squares
         if offset is not None:
             both = np.concatenate([self.base, extra], axis=1)

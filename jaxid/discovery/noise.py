@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxid import signals
-from jaxid.discovery.columns import left_over, span
+from jaxid.discovery.columns import left_over, span, stacked
 from jaxid.discovery.evidence import Whitener
 from jaxid.gap import noise_density
 from jaxid.io.log import Log
@@ -79,9 +79,11 @@ def fit_whitener(
         counts: Which samples count.
         colour: What the sensors should leave, by joint.
     """
+    scale = np.array([c.innovation for c in colour])
+    ready = [stacked(x, counts, scale) for x in (base, extra, e[..., None])]
     left = np.zeros_like(e)
-    for i, rows in enumerate(counts.T):
-        left[rows, i] = left_over(span(base[rows, i], extra[rows, i]), e[rows, i])
+    left.T[counts.T] = left_over(span(*ready[:2]), ready[2][:, 0])
+    left *= scale
     whitener = Whitener.of(left, counts, colour)
     for _ in range(_FILLINGS):
         filled = whitener.placed(_filled(whitener, e, base, extra))

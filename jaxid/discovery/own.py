@@ -28,14 +28,17 @@ def is_foreign(cls: type[Effect]) -> bool:
     return not cls.__module__.startswith("jaxid.")
 
 
-def check_foreign(cls: type[Effect], machine: Machine, data: Prepared, scales: Scales) -> None:
+def check_foreign(
+    cls: type[Effect], machine: Machine, data: Prepared, scales: Scales, port: int = 0
+) -> None:
     """Refuse an effect that a search could not handle.
 
     Args:
         cls: The class.
         machine: The baseline.
         data: The log to be searched.
-        scales: Of the log.
+        scales: Of the log, at that port.
+        port: Where it is tried.
 
     Raises:
         InputError: If it has no parameters, `starts` or `neutral` give something else than its
@@ -49,7 +52,7 @@ def check_foreign(cls: type[Effect], machine: Machine, data: Prepared, scales: S
     try:
         starts, neutral = cls.starts(scales), cls.neutral(scales)
         cls.limits(scales)
-        effects = [cls(**values) for values in (neutral, *starts)]
+        effects = [cls(**values, port=port) for values in (neutral, *starts)]
     except Exception as error:
         what = f"cannot be started ({type(error).__name__}: {error})"
         mend = f"let neutral(scales) and each of starts(scales) give a number for {', '.join(names)}"

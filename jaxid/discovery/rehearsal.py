@@ -61,7 +61,8 @@ class Stage:
 
     def runs(self, pair: Pair, signal: np.ndarray, noise: np.ndarray | None = None) -> list[Trajectory]:
         """Motion under each rival; the controller sees the sensor's noise, the position is true."""
-        noise = np.zeros_like(signal) if noise is None else noise
+        n = self.bench.start.size
+        noise = np.zeros((len(signal), n)) if noise is None else noise
         return [self._run(pair.model(k), signal, noise) for k in range(2)]
 
     def peaks(self, pair: Pair, signal: np.ndarray) -> Peaks:
@@ -73,7 +74,7 @@ class Stage:
     def outcomes(self, union: cand.Union, pair: Pair, signal: np.ndarray) -> list[Outcome]:
         """What the search would find: first where the named effect is true, then the other."""
         rng = np.random.default_rng(20240501)
-        noise = rng.standard_normal(signal.shape)
+        noise = rng.standard_normal((len(signal), self.bench.start.size))
         runs = self.runs(pair, signal, noise)
         logs = [self._log(run, rng) for run in runs]
         pairs = (pair, pair.turned())

@@ -41,7 +41,7 @@ class Pair:
 
     Args:
         kinds: Their names, the named one first.
-        port: Joint of each, 0-based.
+        labels: The same with their places.
         thetas: All unknowns of the union, with the one effect in place and with the other.
         active: Indices of the unknowns that each model fits.
         plant: The machine with both effects and what both models share, no other candidates.
@@ -115,7 +115,8 @@ class Bench(eqx.Module):
     Args:
         drive: How the command acts.
         controller: The law; None: the signal is the command itself.
-        start: Position at the start in open loop, (n,).
+        start: Position at the start, (n,); in a loop the joints that are driven start on the reference.
+        driven: Those joints, 0-based.
         every: The log holds one tick in so many.
         period: Of the log [s].
         data: Holds how forces are filtered; its arrays are not used.
@@ -126,6 +127,7 @@ class Bench(eqx.Module):
     drive: Drive
     controller: Controller | None
     start: Float[Array, " n"]
+    driven: tuple[int, ...] = eqx.field(static=True)
     every: int = eqx.field(static=True)
     period: float = eqx.field(static=True)
     data: ForceData
@@ -133,7 +135,7 @@ class Bench(eqx.Module):
     whiten: Float[Array, "n order"]
 
     def run(
-        self, plant: Plant, signal: Float[Array, "ticks n"], sensor: Sensor | None = None,
+        self, plant: Plant, signal: Float[Array, "ticks m"], sensor: Sensor | None = None,
         noise: Float[Array, "ticks n"] | None = None,
     ) -> Trajectory:
         """Motion of a plant from rest under a reference or a command, at the samples of its log.
@@ -151,10 +153,17 @@ class Bench(eqx.Module):
                 run = eqx.tree_at(lambda r: r.reading, run, sensor.read(run.position, noise))
         else:
             none = jnp.zeros((signal.shape[0], 1))
+            start = self.start_of(signal[0])
             run = closed_loop(
-                plant, self.drive, self.controller, signal, none, signal[0], zero, sensor, noise
+                plant, self.drive, self.controller, signal, none, start, zero, sensor, noise
             )
         return jax.tree.map(lambda a: a[:: self.every], run)
+
+    def start_of(self, first: Float[Array, " m"]) -> Float[Array, " n"]:
+        """Position at the start of a signal with this first value."""
+        if self.controller is None:
+            return self.start
+        return self.start.at[jnp.asarray(self.driven)].set(first)
 
     def seen(self, run: Trajectory) -> tuple[ForceData, Float[Array, "kept n"]]:
         """A motion as inverse dynamics takes it, and how much each sample counts."""
@@ -222,7 +231,7 @@ class Duel(eqx.Module):
 
 
 def expected(
-    bench: Bench, duel: Duel, signal: Float[Array, "ticks n"], bounds: Bounds
+    bench: Bench, duel: Duel, signal: Float[Array, "ticks m"], bounds: Bounds
 ) -> tuple[Float[Array, " 2"], Array]:
     """Evidence [nats] by which each rival, being true, would beat the other; and what limits cost."""
 

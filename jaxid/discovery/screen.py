@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
-from jaxid.discovery.columns import independent, left_over, span, unit
+from jaxid.discovery.columns import independent, left_over, orthonormal, span, stacked, unit
 from jaxid.discovery.noise import fit_whitener
 from jaxid.discovery.pairs import Pairs, score_pairs
 
@@ -21,6 +22,8 @@ _SURROGATES = 200
 _STRETCH = 1 / 100
 # ... and no fewer samples than whitening may leave correlated.
 _SHORTEST = 10
+# Points whose products are taken at once: few enough for memory, enough for matrix products to pay.
+_TOGETHER = 64
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,8 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
         if c.many:
             points.extend(search.many(c))
     counts = search.samples.moving
-    extra = _all_columns(e, base, points, counts)
+    scale = np.array([c.innovation for c in search.colour])
+    extra = _all_columns(e, base, points, counts, scale)
     whitener, noise = fit_whitener(e, base, extra, counts, search.colour)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
@@ -126,11 +130,11 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
 def _few_points(out: Screen, points: list[cand.Point], base: np.ndarray) -> list[tuple]:
     """Points to be paired, whitened: of an effect with many starts only the best one."""
     best = {(s.candidate.kind, s.candidate.port): s.start for s in out.scores}
-    found = []
+    found, q = [], orthonormal(base)
     for p in points:
         if p.candidate.many and best.get((p.candidate.kind, p.candidate.port)) != p.start:
             continue
-        columns = independent(base, out.whitener(p.columns))
+        columns = independent(q, out.whitener(p.columns))
         if columns.shape[1]:
             found.append((p, columns, out.whitener(p.offset[..., None]) if p.offset.any() else None))
     return found
@@ -174,14 +178,12 @@ def _score(
     largest = np.full(surrogates.shape[1], -np.inf)
     best: dict[tuple[str, int], Score] = {}
     alone: dict[tuple[str, int], tuple[float, np.ndarray]] = {}
-    for p in points:
-        extra = independent(base, out.whitener(p.columns))
-        if extra.shape[1] == 0:
-            continue
+    q = orthonormal(base)
+    for p, extra, crossed in _crossed(beside, q, out.whitener, points):
         offset = out.whitener(p.offset[..., None]) if p.offset.any() else None
-        after = beside.held_out(extra, offset)
+        after = beside.held_out(extra, crossed, offset)
         largest = np.maximum(largest, ev.log_evidence(out.rows, null_before, after[1:]))
-        guess = _guess(p, base, out.whitener, white if offset is None else white + offset, search)
+        guess = _guess(p, q, out.whitener, white if offset is None else white + offset, search)
         if guess is None:
             continue
         gain = float(ev.log_evidence(out.rows, out.before, after[:1])[0])
@@ -196,8 +198,22 @@ def _score(
     out.threshold = ev.threshold(largest)
 
 
+def _crossed(
+    beside: ev.Beside, q: np.ndarray, whitener: ev.Whitener, points: list[cand.Point]
+) -> Iterator[tuple[cand.Point, np.ndarray, tuple[np.ndarray, np.ndarray]]]:
+    """Points with their whitened columns beside the base, as far as these are new, and their products."""
+    for first in range(0, len(points), _TOGETHER):
+        some = points[first : first + _TOGETHER]
+        extras = [independent(q, whitener(p.columns)) for p in some]
+        ends = np.cumsum([0, *[x.shape[1] for x in extras]])
+        with_base, with_residuals = beside.crossed(np.concatenate(extras, axis=1))
+        for p, extra, a, b in zip(some, extras, ends[:-1], ends[1:], strict=True):
+            if a < b:
+                yield p, extra, (with_base[:, :, a:b], with_residuals[:, a:b])
+
+
 def _guess(
-    p: cand.Point, base: np.ndarray, whitener: ev.Whitener, white: np.ndarray, search: Search
+    p: cand.Point, q: np.ndarray, whitener: ev.Whitener, white: np.ndarray, search: Search
 ) -> np.ndarray | None:
     """Start of a candidate's refit: its shape, with the strength that least squares gives it.
 
@@ -207,31 +223,28 @@ def _guess(
     strength = p.strength
     if strength is None:
         return c.starts[p.start]
-    both = np.concatenate([base, whitener(strength[..., None])], axis=1)
-    norm = np.linalg.norm(both, axis=0)
-    norm = np.where(norm > 0, norm, 1.0)
-    amount = -np.linalg.lstsq(both / norm, white[:, 0], rcond=None)[0][-1] / norm[-1]
+    new = left_over(q, whitener(strength[..., None])[:, 0])
+    amount = -float(new @ white[:, 0]) / max(float(new @ new), 1e-300)
     if not _allowed(c, amount, search):
         return None
     return np.where(c.amplitude, amount, 1.0) * c.starts[p.start]
 
 
 def _all_columns(
-    e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray
+    e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
     """Columns of every candidate with few starts, and of a clear one with many."""
     columns = np.concatenate([p.columns for p in points if not p.candidate.many], axis=2)
     many = [p for p in points if p.candidate.many]
     if not many:
         return columns
+    own = span(*(stacked(x, counts, scale) for x in (base, columns)))
+    rest = left_over(own, stacked(e[..., None], counts, scale)[:, 0])
     gained = np.zeros(len(many))
-    for i, rows in enumerate(counts.T):
-        own = span(base[rows, i], columns[rows, i])
-        rest = left_over(own, e[rows, i])
-        for k, p in enumerate(many):
-            fresh = left_over(own, unit(p.columns[rows, i]))
-            part = np.sum((np.linalg.qr(fresh)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
-            gained[k] -= 0.5 * rows.sum() * np.log1p(-min(part, 1 - 1e-12))
+    for k, p in enumerate(many):
+        fresh = left_over(own, unit(stacked(p.columns, counts, scale)))
+        part = np.sum((np.linalg.qr(fresh)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
+        gained[k] = -0.5 * counts.sum() * np.log1p(-min(part, 1 - 1e-12))
     best = int(np.argmax(gained))
     # What the best of so many starts gains by chance, once in a thousand.
     chance = np.log(1000 * len(many)) + many[best].columns.shape[2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -52,12 +53,12 @@ class Proposal:
     """An experiment that would tell an effect from one that the log cannot tell it from.
 
     Args:
-        named: The effect that was named.
+        named: The effect that was named, with its place.
         rival: The other.
-        joints: Where each acts, 1-based.
+        places: Where each acts: "joint" or "spring", and which, 1-based.
         signal: "reference" for a loop, "input" for open loop.
         time: Ticks [s].
-        values: Reference or command at each, (ticks, n); None where no experiment was found.
+        values: Reference or command at each, (ticks, m); None where no experiment was found.
         start: Position at the start, at rest, (n,).
         present: Evidence [nats] for the named effect over the other in the present log.
         expected: The same in the proposed experiment, or for the other where that is the true one:
@@ -69,10 +70,10 @@ class Proposal:
 
     named: str
     rival: str
-    joints: tuple[int, int]
+    places: tuple[tuple[str, int], tuple[str, int]]
     signal: str
     time: Float[np.ndarray, " ticks"]
-    values: Float[np.ndarray, "ticks n"] | None
+    values: Float[np.ndarray, "ticks m"] | None
     start: Float[np.ndarray, " n"]
     present: float
     expected: float
@@ -93,7 +94,7 @@ class Proposal:
 
 def _plain(kind: str) -> str:
     """A kind as a part of a file name: a user's own may be a path."""
-    return "".join(c if c.isalnum() or c == "_" else "_" for c in kind.rpartition(":")[2])
+    return re.sub(r"\W+", "_", kind.rpartition(":")[2]).strip("_")
 
 
 def proposals(
@@ -114,7 +115,7 @@ def proposals(
     for found, own in zip(effects, search.added, strict=True):
         refitted = [s for s in found.alternatives if s.theta is not None]
         for rival in sorted(refitted, key=lambda s: -s.total)[:_RIVALS]:
-            progress(f"an experiment to tell {own.kind} from {rival.candidate.kind}")
+            progress(f"an experiment to tell {own.label} from {rival.candidate.label}")
             out.append(propose(session, search, own, rival))
             if out[-1].separates:
                 break
@@ -151,9 +152,9 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
     tick = bench.drive.period
     ticks = len(shapes.basis)
     return Proposal(
-        *pair.kinds, (pair.ports[0] + 1, pair.ports[1] + 1),
+        own.label, rival.candidate.label, tuple(pair.plant.place(p) for p in pair.ports),
         "input" if bench.controller is None else "reference", tick * np.arange(ticks), best,
-        np.asarray(bench.start) if best is None or bench.controller is None else best[0],
+        np.asarray(bench.start if best is None else bench.start_of(best[0])),
         present.nats, outcome.nats, outcome.needed, limits, peaks,
     )
 
@@ -175,6 +176,7 @@ def _bench(session: Session, search: Search, pair: Pair) -> Bench:
     whiten = [np.array([1.0, *-n.coefficients]) / n.innovation for n in noise]
     return Bench(
         replace(drive, substeps=max(steps)), machine.controller, jnp.asarray(log.position[0]),
+        tuple(int(i) for i in machine.plant.at_drives(np.arange(log.position.shape[1]))),
         max(1, round(log.period / tick)), log.period, ForceData.of(data),
         jnp.asarray(data.recipe.rest_velocity), jnp.asarray(np.stack(whiten)),
     )
@@ -190,7 +192,7 @@ def _stage(session: Session, search: Search, bench: Bench) -> Stage:
     e, _ = cand.evaluate(search.union, search.samples, search.theta)
     counts = search.samples.moving
     rms = np.sqrt(np.nanmean(np.where(counts, e, np.nan) ** 2, axis=0))
-    more = np.sqrt(np.maximum(rms**2 - search.floor**2, 0.0))[: log.force.shape[1]]
+    more = machine.plant.at_drives(np.sqrt(np.maximum(rms**2 - search.floor**2, 0.0)))
     # White noise of which the band holds that much.
     more = more / np.sqrt(2 * recipe.band_hz(log.rate_hz) * log.period) / np.abs(machine.gain)
     stated = 0.0 if sensor.force_noise is None else np.asarray(sensor.force_noise)
@@ -210,7 +212,9 @@ def _family(session: Session, limits: Limits, bench: Bench) -> tuple[Shapes, lis
         low, high, step = -limits.force, limits.force, np.full(limits.force.shape, np.inf)
         own = log.force[:, 0] - log.force[0, 0]
     else:
-        low, high, step = limits.low, limits.high, limits.speed * tick
+        low, high, step = (
+            session.machine.plant.at_drives(x) for x in (limits.low, limits.high, limits.speed * tick)
+        )
         own = None if log.reference is None else log.reference[:, 0] - log.reference[0, 0]
     if own is not None:
         own = np.interp(tick * np.arange(ticks), log.time - log.time[0], own)

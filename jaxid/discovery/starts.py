@@ -45,7 +45,9 @@ class Starts(eqx.Module):
         past: Logged command before each start, as far back as a delay reaches, (start, earlier, m).
         command: Logged command, (start, time, m).
         position: Measured, (start, time, n).
-        rest: Mean reading at rest, (start, n).
+        rest: Position at the first sample, (start, n): of the joint that rests its mean reading, of the
+            others, which may move, the filtered one.
+        velocity: There, (start, n); zero of the joint that rests.
         time: Of the first sample [s], (start,).
         own: Own states of the plant's effects at the first sample.
         still: How many of the samples are at rest.
@@ -56,6 +58,7 @@ class Starts(eqx.Module):
     command: Array
     position: Array
     rest: Array
+    velocity: Array
     time: Array
     own: tuple
     still: Array
@@ -91,16 +94,18 @@ def starts_from_rest(
     """
     stills = sorted(set(_stills(noise, runs[0].log, runs[0].data, joint)))
     length = stills[-1] + max(_AFTER, 2 * stills[-1])
-    lead = int(np.ceil(float(machine.plant.command_delay()) / runs[0].log.period)) + 1
+    delays = machine.plant.command_delays(runs[0].log.force.shape[1])
+    lead = int(np.ceil(float(delays.max()) / runs[0].log.period)) + 1
     ready = [
         (
             _own_states(machine.plant, ForceData.of(r.data)),
             replace(r.log, force=_acted(r.machine(machine), r.log)),
+            r.data,
         )
         for r in runs
     ]
     return [
-        _joined([_cut(own, log, noise, still, length, lead, joint) for own, log in ready])
+        _joined([_cut(*each, noise, still, length, lead, joint) for each in ready])
         for still in stills
     ]
 
@@ -109,21 +114,25 @@ def _joined(cuts: list[Starts]) -> Starts:
     """The starts of several logs as one."""
     still = cuts[0].still
     own = jax.tree.map(lambda *a: jnp.concatenate(a), *[c.own for c in cuts])
-    parts = [[getattr(c, n) for c in cuts] for n in ("past", "command", "position", "rest", "time")]
+    names = ("past", "command", "position", "rest", "velocity", "time")
+    parts = [[getattr(c, n) for c in cuts] for n in names]
     which = jnp.repeat(jnp.arange(len(cuts)), jnp.asarray([c.count for c in cuts]))
     return Starts(*[jnp.concatenate(p) for p in parts], own, still, which)
 
 
 def _cut(
-    own: tuple, log: Log, noise: float, still: int, length: int, lead: int, joint: int
+    own: tuple, log: Log, data: Prepared, noise: float, still: int, length: int, lead: int, joint: int
 ) -> Starts:
     after = length - still
     ends = _departures(log.position[:, joint], noise, still, after)
     rows = ends[:, None] + np.arange(1 - still, after + 1)
     earlier = np.maximum(rows[:, :1] + np.arange(-lead, 0), 0)
+    rest, velocity = data.q[rows[:, 0]].copy(), data.qd[rows[:, 0]].copy()
+    rest[:, joint] = log.position[rows[:, :still], joint].mean(axis=1)
+    velocity[:, joint] = 0.0
     return Starts(
         jnp.asarray(log.force[earlier]), jnp.asarray(log.force[rows]), jnp.asarray(log.position[rows]),
-        jnp.asarray(log.position[rows[:, :still]].mean(axis=1)),
+        jnp.asarray(rest), jnp.asarray(velocity),
         jnp.asarray(log.time[rows[:, 0]] - log.time[0]), jax.tree.map(lambda a: a[rows[:, 0]], own),
         jnp.asarray(still), jnp.zeros(len(rows), int),
     )
@@ -161,7 +170,8 @@ def _departures(
 @eqx.filter_jit
 def _own_states(plant: Plant, data: ForceData) -> tuple:
     """Own states of the effects along a log, under the command as it acts."""
-    u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
+    delays = plant.command_delays(data.force.shape[1])
+    u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     return drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
 
 

@@ -17,6 +17,7 @@ class ActuatorGain(Effect):
     """The force is gain times the declared one."""
 
     adds_force = False
+    in_drive = True
 
     gain: Array = parameter("1", "positive", "applied over declared force")
 
@@ -37,6 +38,7 @@ class ActuatorLag(Effect):
     """First-order lag between declared and applied force: T df/dt = u - f."""
 
     adds_force = False
+    in_drive = True
 
     time_constant: Array = parameter("time", "positive", "T")
 
@@ -60,6 +62,7 @@ class InputDelay(Effect):
     """The declared force acts later."""
 
     adds_force = False
+    in_drive = True
 
     delay: Array = parameter("time", "nonnegative", "delay")
 
@@ -83,6 +86,7 @@ class Saturation(Effect):
     """The force at the load is clipped to plus or minus limit."""
 
     adds_force = False
+    in_drive = True
 
     limit: Array = parameter("force", "positive", "largest force")
 

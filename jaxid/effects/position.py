@@ -24,6 +24,8 @@ class ConstantForce(Effect):
 class LinearStiffness(Effect):
     """-k q."""
 
+    of_spring = True
+
     coefficient: Array = parameter("force/position", "free", "k")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -34,6 +36,8 @@ class LinearStiffness(Effect):
 class QuadraticStiffness(Effect):
     """-k2 q^2."""
 
+    of_spring = True
+
     coefficient: Array = parameter("force/position2", "free", "k2")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -43,6 +47,8 @@ class QuadraticStiffness(Effect):
 @register("cubic_stiffness")
 class CubicStiffness(Effect):
     """-k3 q^3."""
+
+    of_spring = True
 
     coefficient: Array = parameter("force/position3", "free", "k3")
 

@@ -95,7 +95,8 @@ def weak_residual(
     Returns:
         One row a window, over t^4 / 12: a weighted mean of the residual force [N or N m].
     """
-    u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
+    delays = plant.command_delays(data.force.shape[1])
+    u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     own = drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
     times = data.start + data.period * jnp.arange(raw.shape[0])
     fast = jnp.abs(data.qd).max(axis=0)
@@ -124,7 +125,7 @@ def weak_residual(
 
     starts = jnp.arange(0, raw.shape[0] - length + 1, length // 2)
     span = data.period * (length - 1)
-    return jax.vmap(window)(starts) * 12 / span**4 / drive_ratio(drive, u)
+    return jax.vmap(window)(starts) * 12 / span**4 / drive_ratio(plant, drive, u, raw.shape[1])
 
 
 @eqx.filter_jit

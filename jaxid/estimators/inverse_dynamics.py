@@ -59,28 +59,42 @@ class ForceData(eqx.Module):
 
 def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
-    u = signals.delayed(data.force, plant.command_delay(), data.period, hold=data.hold)
+    delays = plant.command_delays(data.force.shape[1])
+    u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     return data.decimator(residual_along(plant, data.q, data.qd, data.qdd, u, data.period, data.start))
 
 
 @eqx.filter_jit
 def force_and_columns(
-    plant: Plant, places: tuple, data: ForceData, theta: Array
-) -> tuple[Float[Array, "kept n"], Float[Array, "kept n p"]]:
-    """Force residual of a plant and its Jacobian in the unknowns at some places."""
+    plant: Plant, places: tuple, data: ForceData, theta: Array, colours: tuple[int, ...] | None = None
+) -> tuple[Float[Array, "kept n"], Float[Array, "kept n c"]]:
+    """Force residual of a plant and its Jacobian in the unknowns at some places.
 
-    def residual(theta: Array) -> tuple[Array, Array]:
-        e = force_residual(scatter(places, plant, theta), data)
+    Args:
+        plant: The plant.
+        places: Of the unknowns.
+        data: The log.
+        theta: The unknowns.
+        colours: Column of the result in which each unknown's is; those that share one must not enter
+            the balance of the same joint. Absent: each has its own.
+    """
+    own = range(theta.size) if colours is None else colours
+    shared = np.zeros((theta.size, max(own, default=-1) + 1))
+    shared[np.arange(theta.size), list(own)] = 1.0
+
+    def residual(step: Array) -> tuple[Array, Array]:
+        moved = theta + (step if colours is None else shared @ step)
+        e = force_residual(scatter(places, plant, moved), data)
         return e, e
 
-    jacobian, e = jax.jacfwd(residual, has_aux=True)(theta)
+    jacobian, e = jax.jacfwd(residual, has_aux=True)(jnp.zeros(shared.shape[1]))
     return e, jacobian
 
 
-def measured_force(data: ForceData) -> Float[Array, "kept m"]:
-    """Declared force through the same filter [N or N m]."""
+def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
+    """Declared force by joint through the same filter [N or N m]; zero where none is driven."""
     u = signals.delayed(data.force, jnp.zeros(()), data.period, hold=data.hold)
-    return data.decimator(u)
+    return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
 
 
 def sharpened(plant: Plant, data: Prepared) -> Plant:
@@ -182,7 +196,8 @@ def force_precision(
     rows: np.ndarray,
 ) -> Precision:
     """Precision of a fit in the force domain."""
-    signal = float(np.linalg.norm(np.where(rows, np.asarray(measured_force(arrays)), 0.0)))
+    measured = np.asarray(measured_force(machine.plant, arrays))
+    signal = float(np.linalg.norm(np.where(rows, measured, 0.0)))
     scale = np.where(theta != 0, theta, 1.0)
     return assess(machine.parameters.names, jacobian, e, rows, signal, scale)
 

@@ -67,7 +67,7 @@ class Case:
         path: The file.
         plant: What [plant] says.
         effects: What [[effects]] say, in the order of the drive.
-        gain: Declared force per unit of the logged command: one, or one a joint.
+        gain: Declared force per unit of the logged command: one, or one a drive.
         transmission: R, rows of numbers; joint = R^-1 motor.
         log: [log], as `jaxid.io.log.read_log` takes it; empty where it is absent.
         preprocess: [preprocess], for `jaxid.preprocess.choose_recipe`.
@@ -139,27 +139,27 @@ def load_case(path: str | Path) -> Case:
     path = Path(path)
     tables, file = _tables(path), str(path)
     plant = read_plant(tables["plant"], file)
-    joints = plant.joints
+    joints, drives = plant.joints, plant.drives
 
     def read(name: str, keys: Keys) -> dict[str, Any]:
         return read_table(tables.get(name, {}), keys, Spot(file, f"[{name}]"))
 
-    actuator = _checked_transmission(read("actuator", actuator_keys(joints)), joints, file)
+    actuator = _checked_transmission(read("actuator", actuator_keys(drives)), drives, file)
     case = Case(
         path=path,
         plant=plant,
         effects=read_effects(tables.get("effects", []), plant, path),
         gain=actuator.get("gain", 1.0),
         transmission=actuator.get("transmission"),
-        log=_log(tables, joints, file),
+        log=_log(tables, plant, file),
         preprocess=read("preprocess", preprocess_keys(joints)),
-        controller=_controller(tables, joints, file),
-        sensor=read("sensor", sensor_keys(joints)),
-        limits=read("limits", limits_keys(joints)),
-        validations=_validations(tables, joints, path),
+        controller=_controller(tables, drives, file),
+        sensor=read("sensor", sensor_keys(joints, drives)),
+        limits=read("limits", limits_keys(joints, drives)),
+        validations=_validations(tables, plant, path),
         candidates=read_candidates(tables.get("discover", {}), path),
-        reference=_signal("reference", tables, joints, file),
-        input=_signal("input", tables, joints, file),
+        reference=_signal("reference", tables, drives, file),
+        input=_signal("input", tables, drives, file),
         simulation=read("simulation", simulation_keys(joints)),
         study=read("study", STUDY),
     )
@@ -225,11 +225,11 @@ def _checked_transmission(actuator: dict[str, Any], joints: int, file: str) -> d
     return actuator
 
 
-def _log(tables: Mapping[str, Any], joints: int, file: str) -> dict[str, Any]:
+def _log(tables: Mapping[str, Any], plant: PlantEntry, file: str) -> dict[str, Any]:
     if "log" not in tables:
         return {}
     spot = Spot(file, "[log]")
-    keys = log_keys(joints)
+    keys = log_keys(plant.joints, plant.drives)
     keys |= {name: Key(keys[name].read, keys[name].doc, True) for name in ("position", "force")}
     return _check_time(read_table(tables["log"], keys, spot), spot)
 
@@ -243,22 +243,22 @@ def _check_time(table: dict[str, Any], spot: Spot) -> dict[str, Any]:
     return table
 
 
-def _controller(tables: Mapping[str, Any], joints: int, file: str) -> dict[str, Any] | None:
+def _controller(tables: Mapping[str, Any], drives: int, file: str) -> dict[str, Any] | None:
     if "controller" not in tables:
         return None
     table, spot = tables["controller"], Spot(file, "[controller]")
     kind = read_kind(table, CONTROLLERS, PLANNED_CONTROLLERS, spot)
-    keys = {"kind": Key(lambda value, spot: value), **controller_keys(kind, joints)}
+    keys = {"kind": Key(lambda value, spot: value), **controller_keys(kind, drives)}
     return read_table(table, keys, spot)
 
 
-def _validations(tables: Mapping[str, Any], joints: int, path: Path) -> tuple[Validation, ...]:
+def _validations(tables: Mapping[str, Any], plant: PlantEntry, path: Path) -> tuple[Validation, ...]:
     base = tables.get("log", {})
     own = (tables.get("controller") or {}).get("disturbance")
     found: list[Validation] = []
     for k, table in enumerate(tables.get("validation", []), start=1):
         spot = Spot(str(path), f"[[validation]] {k}")
-        given = read_table(table, validation_keys(joints), spot)
+        given = read_table(table, validation_keys(plant.joints, plant.drives), spot)
         if given["name"] in [v.name for v in found]:
             raise spot.at("name").refuse(given["name"], "is taken", "give each its own name")
         columns = {key: value for key, value in given.items() if key in LOG_KEYS}
@@ -283,7 +283,7 @@ def _merged(base: dict[str, Any], columns: dict[str, Any], *, same_file: bool) -
 
 
 def _signal(
-    name: str, tables: Mapping[str, Any], joints: int, file: str
+    name: str, tables: Mapping[str, Any], drives: int, file: str
 ) -> dict[str, Any] | None:
     """[reference] or [input], checked by the family that it names; None where it says nothing."""
     if not tables.get(name):
@@ -294,8 +294,8 @@ def _signal(
         read = REFERENCES[kind].read(table, name)
     except InputError as error:
         raise InputError(f"{file}, {error}") from error
-    if len(read) not in (1, joints):
-        raise spot.fault(f"has values for {len(read)} joints", f"the plant has {joints}")
+    if len(read) not in (1, drives):
+        raise spot.fault(f"has values for {len(read)} joints", f"the plant drives {drives}")
     return dict(table)
 
 

@@ -9,10 +9,12 @@ from typing import Any
 
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
+from jaxid.io.case_places import check_places, read_ports
 from jaxid.io.case_tables import PLANNED_EFFECTS, PLANNED_PLANTS, PLANT
 from jaxid.io.case_values import Value, read_value, read_values
 from jaxid.io.schema import (
     Key,
+    Reader,
     Spot,
     choice,
     count,
@@ -24,9 +26,12 @@ from jaxid.io.schema import (
     whole,
 )
 from jaxid.io.user_effect import user_effect
-from jaxid.model import Effect, Plant, parameters_of
+from jaxid.model import Effect, ParameterInfo, Plant, parameters_of
 from jaxid.plants import PLANTS
 from jaxid.units import Units
+
+# Of a plant whose lists say how many joints it has.
+_MOST_JOINTS = 50
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,7 @@ class PlantEntry:
         vertical: Whether weight acts along the axis.
         gravity: Its acceleration [m/s^2]; None: the class's own.
         joints: How many there are.
+        actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
     """
 
     cls: type[Plant]
@@ -48,6 +54,12 @@ class PlantEntry:
     vertical: bool
     gravity: float | None
     joints: int
+    actuated: tuple[int, ...] | None = None
+
+    @property
+    def drives(self) -> int:
+        """How many drives there are."""
+        return self.joints if self.actuated is None else len(self.actuated)
 
 
 @dataclass(frozen=True)
@@ -56,13 +68,13 @@ class EffectEntry:
 
     Args:
         cls: Its class.
-        parameters: By name, one value for each of `joints`.
-        joints: On which joints it acts, 1-based.
+        parameters: By name, one value for each of `ports`.
+        ports: Where it acts: joints from 0 on, and behind them the springs.
     """
 
     cls: type[Effect]
     parameters: dict[str, tuple[Value, ...]]
-    joints: tuple[int, ...]
+    ports: tuple[int, ...]
 
 
 def read_kind(table: dict[str, Any], known: Any, planned: tuple[str, ...], spot: Spot) -> str:
@@ -84,13 +96,14 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
     """
     spot = Spot(file, "[plant]")
     cls = PLANTS[read_kind(table, PLANTS, PLANNED_PLANTS, spot)]
-    # Only plants of several joints say how many they have.
-    joints = getattr(cls, "joints", 1)
+    joints = _count_joints(table.get("parameters"), cls, spot)
     keys = {"kind": Key(lambda value, spot: value), **PLANT}
+    if "actuated" in cls.__dataclass_fields__:
+        keys["actuated"] = Key(_actuated(joints))
     keys["parameters"] = Key(lambda v, s: _plant_parameters(v, cls, joints, file))
     given = read_table(table, keys, spot)
     if "parameters" not in given:
-        needed = ", ".join(f"{name} = {{ guess = ... }}" for name in parameters_of(cls))
+        needed = ", ".join(f"{name} = {_shape(info)}" for name, info in parameters_of(cls).items())
         raise spot.fault("'parameters' is missing", f"add [plant.parameters] with {needed}")
     motion = given.get("motion", "linear")
     vertical = given.get("orientation") == "vertical"
@@ -98,14 +111,51 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         mend = 'leave orientation out, or set motion = "linear"; an unbalanced load is an effect'
         raise spot.at("orientation").refuse("vertical", "does not go with a rotary plant", mend)
     units = Units(motion, **given.get("units", {}))
-    return PlantEntry(cls, given["parameters"], units, vertical, given.get("gravity"), joints)
+    return PlantEntry(
+        cls, given["parameters"], units, vertical, given.get("gravity"), joints, given.get("actuated")
+    )
+
+
+def _shape(info: ParameterInfo) -> str:
+    """What a parameter looks like in a case."""
+    return "{ guess = ... }" if info.more is None else "[{ guess = ... }, ...]"
+
+
+def _count_joints(table: Any, cls: type[Plant], spot: Spot) -> int:
+    """How many joints a plant has: as many as its lists tell, or as its class says."""
+    name = next((n for n, info in parameters_of(cls).items() if info.more == 0), None)
+    if name is None:
+        return cls.joints
+    given = table.get(name) if isinstance(table, dict) else None
+    if isinstance(given, dict):
+        given = given.get("guess", given)
+    if given is None:  # told as missing when the table is read
+        return 1
+    spot = Spot(spot.file, "[plant.parameters]", name)
+    if not isinstance(given, list):
+        raise spot.refuse(given, "is not a list", f"give a list, even of one: {name} = [...]")
+    if not 1 <= len(given) <= _MOST_JOINTS:
+        mend = f"a {cls.kind} has 1 to {_MOST_JOINTS}"
+        raise spot.fault(f"has {count(len(given), 'entry', 'entries')}", mend)
+    return len(given)
+
+
+def _actuated(joints: int) -> Reader:
+    def read(value: Any, spot: Spot) -> tuple[int, ...]:
+        driven = several(whole(1))(value, spot)
+        check_places(value, driven, joints, "joint", spot)
+        return tuple(j - 1 for j in driven)
+
+    return read
 
 
 def _plant_parameters(
     table: Any, cls: type[Plant], joints: int, file: str
 ) -> dict[str, Value | tuple[Value, ...]]:
-    def reader(info: Any) -> Any:
+    def reader(info: ParameterInfo) -> Any:
         def read(value: Any, spot: Spot) -> Value | tuple[Value, ...]:
+            if info.more is not None:
+                return _plant_list(value, info, joints, spot)
             if isinstance(value, list) and joints > 1:
                 return read_values(value, info, joints, spot)
             return read_value(value, info, spot)
@@ -117,6 +167,22 @@ def _plant_parameters(
         for name, info in parameters_of(cls).items()
     }
     return read_table(table, keys, Spot(file, "[plant.parameters]"))
+
+
+def _plant_list(value: Any, info: ParameterInfo, joints: int, spot: Spot) -> tuple[Value, ...]:
+    """A list of the plant's: as long as it has joints, or longer by what the class says."""
+    entries = joints + info.more
+    whole_list = value if isinstance(value, list) else None
+    if isinstance(value, dict) and isinstance(value.get("guess"), list):
+        whole_list = value["guess"]
+    beside = "" if info.more == 0 else f": {info.more} more than joints"
+    if whole_list is None:
+        mend = f"give a list of {entries}{beside}"
+        raise spot.refuse(value, "is not a list", mend)
+    if len(whole_list) != entries:
+        mend = f"the plant has {count(joints, 'joint')}: give {count(entries, 'entry', 'entries')}{beside}"
+        raise spot.fault(f"has {count(len(whole_list), 'entry', 'entries')}", mend)
+    return read_values(value, info, entries, spot, "entry")
 
 
 def read_effects(tables: list, plant: PlantEntry, path: Path) -> tuple[EffectEntry, ...]:
@@ -137,20 +203,20 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
     spot = Spot(str(path), f"[[effects]] {index} ({cls.kind})")
     infos = parameters_of(cls)
     _check_keys(table, list(infos), spot)
-    joints = _joints(table, plant, spot)
-    if "shared" in table and flag(table["shared"], spot.at("shared")) and len(joints) > 1:
+    ports, what = read_ports(table, cls, plant, spot)
+    if "shared" in table and flag(table["shared"], spot.at("shared")) and len(ports) > 1:
         mend = "leave it out: each joint then has a value of its own"
         raise spot.at("shared").refuse(True, "is not available in this version", mend)
     for name, info in infos.items():
         if not info.optional and name not in table:
             raise spot.fault(f"'{name}' is missing", f"add {name}: {info.doc}; {_takes(cls)}")
     parameters = {
-        name: read_values(table[name], info, len(joints), spot.at(name))
+        name: read_values(table[name], info, len(ports), spot.at(name), what)
         for name, info in infos.items()
         if name in table
     }
     _check_together(cls, parameters, spot)
-    return EffectEntry(cls, parameters, joints)
+    return EffectEntry(cls, parameters, ports)
 
 
 def read_candidates(table: Any, path: Path) -> tuple[type[Effect], ...]:
@@ -192,30 +258,6 @@ def _check_keys(table: dict[str, Any], names: list[str], spot: Spot) -> None:
 def _takes(cls: type[Effect]) -> str:
     names = [n + (" (optional)" if i.optional else "") for n, i in parameters_of(cls).items()]
     return f"it takes {', '.join(names)}"
-
-
-def _joints(table: dict[str, Any], plant: PlantEntry, spot: Spot) -> tuple[int, ...]:
-    """Joints on which an effect acts, 1-based: all where none is named."""
-    places = [name for name in ("joint", "spring", "passive") if name in table]
-    if len(places) > 1:
-        raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
-    for name in ("spring", "passive"):
-        if name in table:
-            mend = f"leave {name} out: the effect then acts on the joint"
-            what = f"does not exist on kind = '{plant.cls.kind}'"
-            raise spot.at(name).refuse(table[name], what, mend)
-    if "joint" not in table:
-        return tuple(range(1, plant.joints + 1))
-    given, place = table["joint"], spot.at("joint")
-    several_joints = isinstance(given, list)
-    joints = several(whole(1))(given, place) if several_joints else (whole(1)(given, place),)
-    if max(joints) > plant.joints:
-        what = f"is out of range: the plant has {count(plant.joints, 'joint')}"
-        mend = f"joints count from 1 to {plant.joints}" if plant.joints > 1 else "leave joint out"
-        raise place.refuse(given, what, mend)
-    if len(set(joints)) < len(joints):
-        raise place.refuse(given, "names a joint twice", "name each joint once")
-    return joints
 
 
 def _check_together(

@@ -24,7 +24,7 @@ from jaxid.io.schema import (
 )
 
 # Names that the case file promises and this version does not have yet.
-PLANNED_PLANTS = ("chain", "flexible_axis", "micropositioning_stage", "serial_arm", "five_bar")
+PLANNED_PLANTS = ("flexible_axis", "micropositioning_stage", "serial_arm", "five_bar")
 PLANNED_EFFECTS = ("velocity_hysteresis", "backlash", "joint_flexibility")
 PLANNED_CONTROLLERS = ("flatness", "computed_torque", "adaptive")
 METHODS = (
@@ -83,35 +83,36 @@ STUDY: Keys = {
 }
 
 
-def log_keys(joints: int) -> Keys:
+def log_keys(joints: int, drives: int) -> Keys:
     """Keys of [log]."""
     names = Key(columns(joints), "name of its column")
+    of_drives = Key(columns(drives, "drive"), "name of its column")
     return {
         "time": Key(text, "name of its column"),
         "sample_rate": Key(number("positive"), "samples per second"),
         "position": names,
-        "force": names,
+        "force": of_drives,
         "hold": Key(choice(HOLDS)),
         "rows": Key(rows),
-        **dict.fromkeys(OPTIONAL_COLUMNS, names),
+        **{k: of_drives if k == "reference" else names for k in OPTIONAL_COLUMNS},
     }
 
 
-def validation_keys(joints: int) -> Keys:
+def validation_keys(joints: int, drives: int) -> Keys:
     """Keys of [[validation]]."""
     own = {
         "name": Key(text, "what it is called in results", required=True),
         "log": Key(text, "its file, relative to the case"),
         "disturbance": Key(DISTURBANCE),
     }
-    return {**own, **log_keys(joints)}
+    return {**own, **log_keys(joints, drives)}
 
 
 def actuator_keys(drives: int) -> Keys:
     """Keys of [actuator]."""
     row = several(number(), shortest=drives)
     return {
-        "gain": Key(by_joint(number("nonzero"), drives)),
+        "gain": Key(by_joint(number("nonzero"), drives, "drive")),
         "transmission": Key(several(row, shortest=drives)),
     }
 
@@ -128,12 +129,12 @@ def preprocess_keys(joints: int) -> Keys:
     }
 
 
-def controller_keys(kind: str, joints: int) -> Keys:
+def controller_keys(kind: str, drives: int) -> Keys:
     """Keys of [controller]: those of every controller, and the fields of the class of this kind."""
     keys = {
         "period": Key(number("positive"), "sampling time [s]"),
         "velocity_average": Key(whole(1), "samples"),
-        "limit": Key(by_joint(number("positive"), joints), "of the command"),
+        "limit": Key(by_joint(number("positive"), drives, "drive"), "of the command"),
         "disturbance": Key(DISTURBANCE),
     }
     shared = {field.name for field in fields(Controller)}
@@ -143,26 +144,26 @@ def controller_keys(kind: str, joints: int) -> Keys:
             required = field.default is MISSING and field.default_factory is MISSING
             sign = _CONTROLLER_SIGNS.get(field.name, "free")
             yes_or_no = field.type in (bool, "bool")
-            read = flag if yes_or_no else by_joint(number(sign), joints)
+            read = flag if yes_or_no else by_joint(number(sign), drives, "drive")
             own[field.name] = Key(read, f"it belongs to kind = '{kind}'", required)
     return {**own, **keys}
 
 
-def sensor_keys(joints: int) -> Keys:
+def sensor_keys(joints: int, drives: int) -> Keys:
     """Keys of [sensor]."""
     return {
         "position_resolution": Key(by_joint(number("positive"), joints)),
         "position_noise": Key(by_joint(number("nonnegative"), joints)),
-        "force_noise": Key(by_joint(number("nonnegative"), joints)),
+        "force_noise": Key(by_joint(number("nonnegative"), drives, "drive")),
     }
 
 
-def limits_keys(joints: int) -> Keys:
+def limits_keys(joints: int, drives: int) -> Keys:
     """Keys of [limits]."""
     return {
         "stroke": Key(stretch(joints), "lowest and highest position"),
         "speed": Key(by_joint(number("positive"), joints), "largest speed"),
-        "force": Key(by_joint(number("positive"), joints), "largest command, in its units"),
+        "force": Key(by_joint(number("positive"), drives, "drive"), "largest command, in its units"),
     }
 
 

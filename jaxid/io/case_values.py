@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from jaxid.io.schema import Key, Spot, number, read_table, shown
+from jaxid.io.schema import Key, Spot, count, number, read_table, shown
 from jaxid.model import ParameterInfo
 
 
@@ -76,7 +76,7 @@ def read_values(
     """Check a value for several places: one for each of them, or a list.
 
     Args:
-        value: A value, or a list of values.
+        value: A value, a list of values, or a table of lists.
         info: The parameter.
         places: How many there are.
         spot: Where it stands.
@@ -88,9 +88,20 @@ def read_values(
     Raises:
         InputError: If a list is not as long as there are places, or an entry cannot be.
     """
+    if isinstance(value, dict):
+        lists = {key: entry for key, entry in value.items() if isinstance(entry, list)}
+        for key, entries in lists.items():
+            _check_length(entries, places, spot.inside(key), what)
+        if lists:
+            rows = range(places)
+            value = [{k: v[i] if k in lists else v for k, v in value.items()} for i in rows]
     if not isinstance(value, list):
         return (read_value(value, info, spot),) * places
+    _check_length(value, places, spot, what)
+    return tuple(read_value(v, info, spot.entry(k)) for k, v in enumerate(value, start=1))
+
+
+def _check_length(value: list, places: int, spot: Spot, what: str) -> None:
     if len(value) != places:
         mend = f"give one value, or {places} in a list: one a {what}"
-        raise spot.refuse(value, f"has {len(value)} entries", mend)
-    return tuple(read_value(v, info, spot.entry(k)) for k, v in enumerate(value, start=1))
+        raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", mend)

@@ -111,7 +111,9 @@ def _frozen(values: Any) -> np.ndarray:
     return copy
 
 
-def read_log(path: str | Path, columns: dict[str, Any], *, joints: int | None = 1) -> Log:
+def read_log(
+    path: str | Path, columns: dict[str, Any], *, joints: int | None = 1, drives: int | None = None
+) -> Log:
     """Read a log and refuse what no estimator could use.
 
     Args:
@@ -119,6 +121,7 @@ def read_log(path: str | Path, columns: dict[str, Any], *, joints: int | None = 
         columns: The `[log]` table of a case: names of columns by quantity, and
             `sample_rate` [Hz] where there is no time, `hold`, `rows`.
         joints: Number of positions expected; None takes what there is.
+        drives: Number of forces and references expected; None: no more than positions.
 
     Returns:
         The log.
@@ -136,7 +139,7 @@ def read_log(path: str | Path, columns: dict[str, Any], *, joints: int | None = 
     groups = {
         key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()
     }
-    _check_widths(groups, names, joints, path)
+    _check_widths(groups, names, joints, drives, path)
     samples = rows[1] - rows[0]
     if samples < MINIMUM_SAMPLES:
         mend = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
@@ -224,25 +227,27 @@ def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
 
 
 def _check_widths(
-    groups: dict[str, np.ndarray], names: dict[str, list[str]], joints: int | None, path: Path
+    groups: dict[str, np.ndarray], names: dict[str, list[str]], joints: int | None,
+    drives: int | None, path: Path,
 ) -> None:
-    """One time, as many positions as joints, and no more forces than those."""
+    """One time, as many positions as joints, and as many forces as drives, or no more than those."""
     expected = groups["position"].shape[1] if joints is None else joints
+    most = expected if drives is None else drives
     for key, values in groups.items():
-        width = values.shape[1]
-        wrong = {
-            "time": width != 1,
-            "position": width != expected,
-            "force": width > expected,
-            "velocity": width != expected,
-            "acceleration": width != expected,
-            "reference": width > expected,
-        }.get(key, False)
-        if wrong:
-            needed = 1 if key == "time" else expected
+        width, needed, what = values.shape[1], expected, "joint"
+        if key == "time":
+            needed = 1
+        elif key in ("force", "reference"):
+            needed, what = most, "joint" if most == expected else "drive"
+            if drives is None:
+                needed = min(needed, width)
+        elif key not in ("position", "velocity", "acceleration"):
+            continue
+        if width != needed:
             where = f"{path}, [log] {key} = {names[key]}"
-            mend = "name one column a joint, in the order of the joints"
-            raise InputError(f"{width} column(s) where {needed} belong", where=where, mend=mend)
+            mend = f"name one column a {what}, in the order of the {what}s"
+            belongs = most if what == "drive" else needed
+            raise InputError(f"{width} column(s) where {belongs} belong", where=where, mend=mend)
 
 
 def _time(

@@ -43,7 +43,8 @@ def proposal_json(proposal: Proposal, units: Units) -> dict[str, Any]:
     period = float(p.time[1] - p.time[0])
     return {
         "separates": [p.named, p.rival],
-        "joints": list(p.joints),
+        "joints": [k if what == "joint" else None for what, k in p.places],
+        "springs": [k if what == "spring" else None for what, k in p.places],
         "possible": p.separates,
         "text": sentence(p, units),
         "nats": {"present": p.present, "expected": p.expected, "needed": p.needed},

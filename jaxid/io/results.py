@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.discovery.candidates import Candidate
 from jaxid.discovery.screen import Score
 from jaxid.estimators.result import Estimate
 from jaxid.identification import Gap, Identification
 from jaxid.io.output import ready_folder, write_json, write_whole
 from jaxid.io.proposals import proposal_csv, proposal_json
+from jaxid.model import Plant
+from jaxid.parameters import leaf, several_places
 from jaxid.session import Session
 
 if TYPE_CHECKING:
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
 def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:
     """Value, standard deviation, unit and identifiability by name; plant lists as lists."""
     out: dict[str, Any] = {}
+    plant = estimate.machine.plant
     rows = zip(
         estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
         strict=True,
@@ -36,12 +40,16 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
         if f.index is None:
             out[f.name] = entry
             continue
-        listed = out.setdefault(
-            f.name.partition("[")[0], {"value": [], "std": [], "unit": f.unit, "identifiable": []}
-        )
+        listed = out.setdefault(f.name.partition("[")[0], _known(leaf(plant, f.path), f.unit))
         for key in ("value", "std", "identifiable"):
-            listed[key].append(entry[key])
+            listed[key][f.index] = entry[key]
     return out
+
+
+def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
+    """A list of the plant's before its unknown entries are filled in."""
+    known = [float(v) for v in values]
+    return {"value": known, "std": [None] * len(known), "unit": unit, "identifiable": [True] * len(known)}
 
 
 def _one(x: np.ndarray | None) -> Any:
@@ -140,15 +148,21 @@ def effect_json(found: Found, estimate: Estimate) -> dict[str, Any]:
     own = parameters_json(estimate, found.names)
     return {
         "kind": found.kind,
-        "joint": found.joint,
+        found.place[0]: found.place[1],
         "parameters": {name.rpartition(".")[2]: entry for name, entry in own.items()},
         "evidence": found.score.evidence,
-        "alternatives": [_alternative(s) for s in found.alternatives],
+        "alternatives": [_alternative(s, estimate.machine.plant) for s in found.alternatives],
     }
 
 
-def _alternative(score: Score) -> dict[str, Any]:
-    return {"kind": score.candidate.kind, "evidence": score.evidence}
+def _alternative(score: Score, plant: Plant) -> dict[str, Any]:
+    c = score.candidate
+    return {"kind": c.kind, **_place(c, plant), "evidence": score.evidence}
+
+
+def _place(c: Candidate, plant: Plant) -> dict[str, int]:
+    """Joint or spring of a candidate, where the machine has several."""
+    return dict([plant.place(c.port)]) if several_places(plant) else {}
 
 
 def where_json(result: Discovery) -> dict[str, Any] | None:
@@ -177,7 +191,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "effects": [effect_json(e, result.after) for e in result.effects],
         "experiments": [proposal_json(p, units) for p in result.proposals],
         "steps": [
-            step_json(r) for k, r in enumerate(result.rounds)
+            step_json(r, result.session.machine.plant) for k, r in enumerate(result.rounds)
             # The baseline, and what changed it; the last round mostly adds nothing.
             if k == 0 or r.step.added or r.step.dropped
         ],
@@ -221,16 +235,18 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
     last = [r.step for r in result.rounds if r.step.added is None and r.step.dropped is None][-1]
     for score in last.scores:
         if score.reason and score.evidence > last.threshold:
-            kind, nats = score.candidate.kind, score.evidence
-            lines.append(f"{kind} was not added, at {nats:.0f} nats: {score.reason}")
+            name, nats = score.candidate.label, score.evidence
+            lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
     return lines[: most + 1]
 
 
-def step_json(r: Any) -> dict[str, Any]:
-    """One entry of `steps`: what was added (or dropped) and the gap after it."""
+def step_json(r: Any, plant: Plant) -> dict[str, Any]:
+    """One entry of `steps`: what was added (or dropped), where, and the gap after it."""
     step = r.step
+    changed = step.added.candidate if step.added else step.dropped
     out = {
         "added": step.added.candidate.kind if step.added else None,
+        **(_place(changed, plant) if changed else {}),
         "fit": _one(r.fit), "validation": _one(r.validation),
     }
     if step.dropped is not None:

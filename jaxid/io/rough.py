@@ -42,7 +42,9 @@ def correlation(one: Signal, other: Signal) -> float:
     return float(one @ other) / scale if scale > 0 else 0.0
 
 
-def implied_inertia(force: Signal, q: Signal, period: float) -> float | None:
+def implied_inertia(
+    force: Signal, q: Signal, period: float, others: Float[np.ndarray, "samples k"] | None = None
+) -> float | None:
     """Estimate an inertia roughly, with no knowledge of the machine.
 
     A regression lets viscous and dry friction, a spring and an offset have their share of the
@@ -54,18 +56,20 @@ def implied_inertia(force: Signal, q: Signal, period: float) -> float | None:
         force: Force at the load [N or N m].
         q: Position [m or rad].
         period: Sampling period [s].
+        others: Positions of other joints, which springs may join to this one; None without any.
 
     Returns:
         The inertia [kg or kg m^2]; None where no value is to be believed.
     """
     velocity = (q[2:] - q[:-2]) / (2.0 * period)
     acceleration = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / period**2
+    positions = [q[1:-1]] if others is None else [q[1:-1], *others[1:-1].T]
     tried = []
     for window in windows(q.size):
         # Force and acceleration pass the same means: the law between them stays as it was.
-        f, a, v, x = (smooth(s, window) for s in (force[1:-1], acceleration, velocity, q[1:-1]))
+        f, a, v, *x = (smooth(s, window) for s in (force[1:-1], acceleration, velocity, *positions))
         if a.std() > 0 and f.std() > 0:
-            explained, value = _regress(f, a, v, x)
+            explained, value = _regress(f, a, v, *x)
             tried.append((explained, value, float(f.std() / a.std())))
     best = max((explained for explained, _, _ in tried), default=0.0)
     told = [value if explained > 0.9 * best > 0.5 else None for explained, value, _ in tried]
@@ -82,9 +86,9 @@ def _plateau(values: list[float | None]) -> float | None:
     return None
 
 
-def _regress(f: Signal, a: Signal, v: Signal, x: Signal) -> tuple[float, float | None]:
+def _regress(f: Signal, a: Signal, v: Signal, *x: Signal) -> tuple[float, float | None]:
     """Share of the force explained, and the coefficient of the acceleration where it is told."""
-    columns = np.stack([a, v, np.sign(v), x], axis=1)
+    columns = np.stack([a, v, np.sign(v), *x], axis=1)
     columns = columns - columns.mean(axis=0)
     scale = columns.std(axis=0)
     scale[scale == 0] = 1.0

@@ -213,14 +213,14 @@ def several(read: Reader, *, shortest: int = 1) -> Reader:
     return read_list
 
 
-def by_joint(read: Reader, joints: int) -> Reader:
-    """One value for all joints, or a list with one a joint (a tuple then)."""
+def by_joint(read: Reader, joints: int, what: str = "joint") -> Reader:
+    """One value for all joints (or drives), or a list with one a joint (a tuple then)."""
 
     def read_either(value: Any, spot: Spot) -> Any:
         if not isinstance(value, list):
             return read(value, spot)
         if len(value) != joints:
-            mend = f"give {count(joints, 'value')}, one a joint"
+            mend = f"give {count(joints, 'value')}, one a {what}"
             raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", mend)
         return several(read)(value, spot)
 
@@ -246,15 +246,15 @@ def stretch(joints: int) -> Reader:
     return read_either
 
 
-def columns(joints: int) -> Reader:
-    """Names of columns: one (which may hold a matrix), or one a joint; as they are written."""
+def columns(joints: int, what: str = "joint") -> Reader:
+    """Names of columns: one (which may hold a matrix), or one a joint or drive; as they are written."""
 
     def read(value: Any, spot: Spot) -> str | list[str]:
         if isinstance(value, list) and value:
             names = several(text)(value, spot)
             if len(names) not in (1, joints) or len(set(names)) < len(names):
-                mend = f"name {count(joints, 'column')}, one a joint, each once"
-                raise spot.refuse(value, f"does not fit {count(joints, 'joint')}", mend)
+                mend = f"name {count(joints, 'column')}, one a {what}, each once"
+                raise spot.refuse(value, f"does not fit {count(joints, what)}", mend)
             return list(names)
         if not isinstance(value, str) or not value:
             mend = f'give the name of a column: {spot.key} = "..."'

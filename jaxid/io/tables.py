@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jaxid.io import results
 from jaxid.report.numbers import with_std
+from jaxid.report.tables import place_words
 
 if TYPE_CHECKING:
     from jaxid.discovery.discover import Discovery
@@ -34,11 +37,9 @@ def parameter_lines(estimate: Estimate) -> str:
 
 
 def _number(value: Any) -> str:
-    if value is None:
-        return "-"
     if isinstance(value, list):
         return ", ".join(_number(v) for v in value)
-    return f"{value:.4g}"
+    return "-" if value is None or not np.isfinite(value) else f"{value:.4g}"
 
 
 def identification_table(result: Identification) -> str:
@@ -65,17 +66,20 @@ def discovery_table(result: Discovery) -> str:
     lines = [f"verdict: {result.verdict}"]
     if content["where"]:
         lines.append(f"where:   {content['where']['text']}")
-    for effect in content["effects"]:
-        others = ", ".join(a["kind"] for a in effect["alternatives"])
+    for found in result.effects:
+        others = ", ".join(s.candidate.label for s in found.alternatives)
         told = f"; this log cannot tell it from {others}" if others else ""
-        lines.append(f"effect:  {effect['kind']} (evidence {effect['evidence']:.0f} nats{told})")
+        lines.append(f"effect:  {found.label} (evidence {found.score.evidence:.0f} nats{told})")
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
     gap = content["gap"]
     rows = [["step", "force gap, fit", "force gap, validation"]]
     for step in content["steps"]:
-        name = f"+ {step['added']}" if step["added"] else "baseline"
+        where = place_words(step)
+        where = f" ({where})" if where else ""
+        name = f"+ {step['added']}{where}" if step["added"] else "baseline"
         if "dropped" in step:
             name = (f"{name}, " if step["added"] else "") + f"- {step['dropped']}"
+            name += "" if step["added"] else where
         rows.append([name, f"{_number(step['fit'])} {gap['unit']}", _number(step["validation"])])
     lines += ["", aligned(rows), "", parameter_lines(result.after), *_blind(result.after), ""]
     lines.append(

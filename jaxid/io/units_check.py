@@ -186,6 +186,7 @@ def plausible_inertia(
     gain: ByJoint = 1.0,
     *,
     motion: str = "linear",
+    driven: Sequence[int] | np.ndarray | None = None,
 ) -> Finding | None:
     """Compare the inertia that the log implies with the guess, by its order of magnitude.
 
@@ -195,20 +196,23 @@ def plausible_inertia(
     Args:
         log: The log.
         guess: Inertia by joint [kg or kg m^2].
-        gain: Force per unit of the logged command, by joint.
+        gain: Force per unit of the logged command, by drive.
         motion: "linear" or "rotary".
+        driven: Joint of each drive, 0-based; absent: all, in their order.
 
     Returns:
         The first joint's finding, or None where nothing speaks against the units.
-        None too where a joint has no force of its own.
+        None too where it is not told which joints have a force of their own.
     """
     joints = log.position.shape[1]
-    if log.force.shape[1] != joints:
+    driven = np.arange(joints) if driven is None else driven
+    if log.force.shape[1] != len(driven):
         return None
     guesses = np.broadcast_to(np.asarray(guess, dtype=np.float64), joints)
     forces = log.force * np.asarray(gain, dtype=np.float64)
-    for joint in range(joints):
-        rough = implied_inertia(forces[:, joint], log.position[:, joint], log.period)
+    for force, joint in zip(forces.T, driven, strict=True):
+        others = np.delete(log.position, joint, axis=1)
+        rough = implied_inertia(force, log.position[:, joint], log.period, others)
         where = f"{log.source}, joint {joint + 1}"
         span = float(np.ptp(log.position[:, joint]))
         finding = _judge_inertia(rough, float(guesses[joint]), span, motion, where)

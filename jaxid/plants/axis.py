@@ -30,6 +30,9 @@ class Axis(Plant):
     velocity_scale: Array = eqx.field(converter=as_array, default=1.0, kw_only=True)
     vertical: bool = eqx.field(static=True, default=False, kw_only=True)
 
+    def own_inertia(self) -> Array:
+        return self.inertia
+
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         return self.inertia * (qdd + self.port_gravity(q))
 

@@ -136,6 +136,7 @@ def _view(run: Run, before: Gap | None, after: Gap, joint: int, joints: int) -> 
 
     return LogView(
         name=name,
+        joint=joint,
         time=log.time,
         position_measured=log.position[:, joint],
         position_simulated_before=simulated(before),
@@ -143,7 +144,7 @@ def _view(run: Run, before: Gap | None, after: Gap, joint: int, joints: int) -> 
         band_time=log.time[data.kept][rows],
         velocity=data.at_kept(data.qd)[rows, joint],
         position=data.at_kept(data.q)[rows, joint],
-        force_measured=after.force.measured[rows, min(joint, after.force.measured.shape[1] - 1)],
+        force_measured=after.force.measured[rows, joint],
         residual_before=None if before is None else before.force.residual[rows, joint],
         residual_after=after.force.residual[rows, joint],
     )
@@ -153,12 +154,12 @@ def _step(r: Round) -> SearchStep:
     step = r.step
     added = step.added.candidate if step.added else None
     return SearchStep(
-        added=added.kind if added else None,
-        dropped=step.dropped.kind if step.dropped else None,
+        added=added.label if added else None,
+        dropped=step.dropped.label if step.dropped else None,
         gap_fit=float(np.max(r.fit)),
         gap_validation=None if r.validation is None else float(np.max(r.validation)),
         candidates=tuple(
-            CandidateScore(s.candidate.kind, s.evidence, s.candidate is added) for s in step.scores
+            CandidateScore(s.candidate.label, s.evidence, s.candidate is added) for s in step.scores
         ),
         threshold=step.threshold,
     )
@@ -167,9 +168,10 @@ def _step(r: Round) -> SearchStep:
 def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
     units, limits = session.machine.units, proposal.limits
     loop = proposal.signal == "reference"
+    driven = session.machine.plant.at_drives
     # A command has no unit of its own where the gain turns it into a force.
     own = np.all(session.machine.gain == 1.0)
-    ends = (limits.low, limits.high) if loop else (-limits.force, limits.force)
+    ends = (driven(limits.low), driven(limits.high)) if loop else (-limits.force, limits.force)
     return ExperimentView(
         text=sentence(proposal, units),
         signal=proposal.signal,
@@ -177,7 +179,7 @@ def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
         time=proposal.time,
         values=proposal.values if proposal.separates else None,
         limits=np.stack(ends, axis=1),
-        speed=limits.speed if loop else None,
+        speed=driven(limits.speed) if loop else None,
     )
 
 

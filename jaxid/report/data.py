@@ -28,6 +28,7 @@ class LogView:
         force_measured: Force at the load there, low-passed, (K,).
         residual_before: Force measured minus force of the declared model, (K,) or None.
         residual_after: The same with the final model, (K,) or None.
+        joint: Which joint, 0-based.
     """
 
     name: str
@@ -41,6 +42,7 @@ class LogView:
     force_measured: np.ndarray
     residual_before: np.ndarray | None = None
     residual_after: np.ndarray | None = None
+    joint: int = 0
 
 
 @dataclass(frozen=True)

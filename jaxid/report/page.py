@@ -81,6 +81,7 @@ def render(data: ReportData) -> str:
 def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
     units = data.units
     floor = data.gap.get("noise_floor")
+    floor = floor[view.joint] if isinstance(floor, list) else floor
     floor = floor if is_number(floor) else None
     simulated = _simulated(view)
     residual = view.residual_before is not None or view.residual_after is not None

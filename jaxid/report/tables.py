@@ -69,7 +69,7 @@ def answer(data: ReportData) -> str:
             "unexplained": "Model and log disagree, and no known effect explains it",
         }
         lines = [openings.get(data.verdict, "The declared model was fitted to the log")]
-        # One line for each quantity: the table below has the other logs.
+        # One line for each quantity (and joint): the table below has the other logs.
         rows = {r.quantity: r for r in reversed(_gap_rows(data)) if is_number(r.after)}
         lines += [_gap_words(row) for row in reversed(rows.values())]
     return unbroken(" ".join(line if line[-1] in ".!?:;" else f"{line}." for line in lines))
@@ -117,7 +117,7 @@ def effect_entries(effects: Sequence[Mapping]) -> list[dict]:
             for name, p in (effect.get("parameters") or {}).items()
         ]
         others = [
-            {"kind": a.get("kind", ""), "evidence": nats(a.get("evidence"))}
+            {"kind": f"{a.get('kind', '')} {place_words(a)}".strip(), "evidence": nats(a.get("evidence"))}
             for a in effect.get("alternatives") or ()
         ]
         entries.append(

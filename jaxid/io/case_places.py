@@ -1,0 +1,72 @@
+"""Where the effects of a case act: on joints or springs, which count from 1."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from jaxid.io.schema import Spot, count, several, whole
+from jaxid.model import Effect
+
+if TYPE_CHECKING:
+    from jaxid.io.case_entries import PlantEntry
+
+
+def read_ports(
+    table: dict[str, Any], cls: type[Effect], plant: PlantEntry, spot: Spot
+) -> tuple[tuple[int, ...], str]:
+    """Ports on which an effect acts, 0-based, and what they are: all that suit where none is named.
+
+    Raises:
+        InputError: If a place that is named is none of the plant's, or none for such an effect.
+    """
+    places = [name for name in ("joint", "spring", "passive") if name in table]
+    if len(places) > 1:
+        raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
+    springs = plant.cls.springs(plant.joints)
+    for name in ("spring", "passive"):
+        if name in table and (name == "passive" or not springs):
+            mend = f"leave {name} out: the effect then acts on the joint"
+            what = f"does not exist on kind = '{plant.cls.kind}'"
+            raise spot.at(name).refuse(table[name], what, mend)
+    if "spring" in table:
+        if not cls.of_spring:
+            mend = "name a joint; on springs act the stiffness effects"
+            raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", mend)
+        chosen = _places(table, "spring", springs, spot)
+        return tuple(plant.joints + k for k in chosen), "spring"
+    if "joint" in table:
+        chosen = _places(table, "joint", plant.joints, spot)
+        undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]
+        if cls.in_drive and undriven:
+            driven = ", ".join(str(k + 1) for k in plant.actuated)
+            what = f"has no drive for {cls.kind} to sit in"
+            raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
+        return chosen, "joint"
+    if cls.of_spring and springs:
+        return tuple(range(plant.joints, plant.joints + springs)), "spring"
+    if cls.in_drive and plant.actuated is not None:
+        return plant.actuated, "joint"
+    return tuple(range(plant.joints)), "joint"
+
+
+def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[int, ...]:
+    """The joints or springs that a table names, 0-based."""
+    given, place = table[what], spot.at(what)
+    several_places = isinstance(given, list)
+    named = several(whole(1))(given, place) if several_places else (whole(1)(given, place),)
+    check_places(given, named, there, what, place)
+    return tuple(k - 1 for k in named)
+
+
+def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot: Spot) -> None:
+    """Refuse places beyond those that there are, or named twice.
+
+    Raises:
+        InputError: If there are any.
+    """
+    if max(named) > there:
+        fault = f"is out of range: the plant has {count(there, what)}"
+        mend = f"{what}s count from 1 to {there}" if there > 1 else f"leave {what} out"
+        raise spot.refuse(given, fault, mend)
+    if len(set(named)) < len(named):
+        raise spot.refuse(given, f"names a {what} twice", f"name each {what} once")
