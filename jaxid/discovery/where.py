@@ -17,8 +17,6 @@ from jaxid.precision import NoiseModel
 from jaxid.preprocess import Prepared
 
 _KNOTS = 12
-# Samples that keep their sign together in a surrogate, at least: whitening leaves some correlation.
-_SHORTEST = 10
 # A window of this many samples is loud where its energy exceeds the median's by this factor: in
 # noise of one level that happens less than once in 10^9 windows.
 _WINDOW = 20
@@ -128,7 +126,7 @@ def _locate(
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])
     rng = np.random.default_rng(20240501)
-    surrogates = ev.flipped(noise, max(_SHORTEST, len(noise) // 100), 100, rng)
+    surrogates = ev.flipped(noise, ev.stretch(len(noise)), 100, rng)
     before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
     largest, gains = np.full(100, -np.inf), {}
     for name, hat in hats.items():
