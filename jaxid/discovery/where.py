@@ -119,14 +119,16 @@ def _locate(
     named = variables(data, joint)
     hats = {name: _hats(x, counts) for name, x in named.items()}
     every = np.concatenate([*hats.values()], axis=1)
-    whitener, noise = fit_whitener(
+    whitener, _ = fit_whitener(
         e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,)
     )
     blocks = whitener.blocks()
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])
+    # Of the residual itself: what curves of six variables leave of it would look too quiet.
+    left = _beyond(whitener, e, jacobian)
     rng = np.random.default_rng(20240501)
-    surrogates = ev.flipped(noise, ev.stretch(len(noise)), 100, rng)
+    surrogates = ev.flipped(left, ev.stretch(len(left)), 100, rng)
     before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
     largest, gains = np.full(100, -np.inf), {}
     for name, hat in hats.items():
