@@ -56,7 +56,9 @@ def _searched(case: Case, folder: Path) -> Record:
         "seconds": seconds, "cpu_seconds": busy,
         "samples": logs[0].samples,
         "evidence": [_number(e.score.total) for e in d.effects],
-        "alternatives": [[_name(case, s) for s in e.alternatives] for e in d.effects],
+        "alternatives": [
+            [_name(case, s.candidate) for s in e.alternatives] for e in d.effects
+        ],
         "parameters": _parameters(case, d),
         "gap": {
             "before": [float(g.force.rms[0]) for g in d.gaps_before],
