@@ -2,8 +2,8 @@
 
     python benchmarks/discovery.py [--split test] [--groups effects,pairs] [--only cogging] [--resume]
 
-Every case of `tests/hidden_cases.py` goes through `jaxid.discover`; a line of JSON each, then the
-table as `discovery.md` and `discovery.json`. Exits with 1 where an aim is missed.
+Every case of `tests/hidden_cases.py` and `tests/hidden_chains.py` goes through `jaxid.discover`; a
+line of JSON each, then the table as `discovery.md` and `discovery.json`. Exits with 1 where an aim is missed.
 """
 
 import argparse
@@ -21,12 +21,16 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
+import hidden_cases
+import hidden_chains
 from discovery_table import aims_hold, markdown, summary
-from hidden_cases import NOISES, SCALES, HiddenCase, cases
+from hidden_cases import FIRST_SEED, NOISES, SCALES
+from hidden_run import Case
 from tqdm import tqdm
 
 ROOT = Path(__file__).parent.parent
-GROUPS = ("effects", "pairs", "nulls", "outside", "short")
+GROUPS = ("effects", "pairs", "nulls", "outside", "short", "chains", "chain_nulls")
+CHAINS = ("chain2", "chain3")
 COLD = 5
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
@@ -37,7 +41,7 @@ ONE_THREAD = {
 
 def main() -> int:
     options = _options()
-    chosen = [c for c in cases(options.split, options.seeds) if _wanted(c, options)]
+    chosen = [c for c in every(options.split, options.seeds) if _wanted(c, options)]
     folder = Path(options.o)
     folder.mkdir(parents=True, exist_ok=True)
     lines = folder / "cases.jsonl"
@@ -64,10 +68,10 @@ def main() -> int:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     words = lambda text: tuple(text.split(","))
-    parser.add_argument("--split", choices=("test", "calibrate"), default="calibrate")
+    parser.add_argument("--split", choices=tuple(FIRST_SEED), default="calibrate")
     parser.add_argument("--groups", type=words, default=GROUPS, help="comma-separated")
     parser.add_argument("--only", metavar="KIND", help="cases in whose name this stands")
-    parser.add_argument("--scales", type=words, default=(*SCALES, "coarse"))
+    parser.add_argument("--scales", type=words, default=(*SCALES, "coarse", *CHAINS))
     parser.add_argument("--noise", type=lambda s: tuple(map(float, s.split(","))), default=NOISES)
     parser.add_argument("--seeds", type=int, default=1, help="machines of each kind")
     parser.add_argument("--workers", type=int, default=2)
@@ -77,7 +81,13 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _wanted(case: HiddenCase, options: argparse.Namespace) -> bool:
+def every(split: str, seeds: int) -> list[Case]:
+    """All cases of a split, on an axis and on chains."""
+    chains = hidden_chains.cases(split, seeds) if split in hidden_chains.FIRST_SEED else ()
+    return [*hidden_cases.cases(split, seeds), *chains]
+
+
+def _wanted(case: Case, options: argparse.Namespace) -> bool:
     named = options.only is None or options.only in case.id
     return (
         named and case.group in options.groups and case.scale in options.scales
@@ -91,10 +101,10 @@ def read(lines: Path) -> list[dict]:
     return [json.loads(line) for line in text.split("\n")[:-1] if line.endswith("}")]
 
 
-def run(chosen: Sequence[HiddenCase], lines: Path, workers: int) -> None:
+def run(chosen: Sequence[Case], lines: Path, workers: int) -> None:
     """Run the cases, those of one shape in one process."""
-    groups: dict[tuple, list[HiddenCase]] = {}
-    for case in sorted(chosen, key=lambda c: (c.length, c.declared)):
+    groups: dict[tuple, list[Case]] = {}
+    for case in sorted(chosen, key=lambda c: (c.length, str(c.declared))):
         groups.setdefault((case.scale, case.rate), []).append(case)
     largest_first = sorted(groups.values(), key=len, reverse=True)
     # A process a group: compiled code serves the whole group, and is given back after it.
@@ -111,7 +121,7 @@ def run(chosen: Sequence[HiddenCase], lines: Path, workers: int) -> None:
             bar.update(len(read(lines)) - before - bar.n)
 
 
-def _work(group: Sequence[HiddenCase], lines: str) -> None:
+def _work(group: Sequence[Case], lines: str) -> None:
     from hidden_run import run_case
 
     with tempfile.TemporaryDirectory() as folder:
@@ -122,7 +132,7 @@ def _work(group: Sequence[HiddenCase], lines: str) -> None:
                 file.write(json.dumps(record) + "\n")
 
 
-def measure_cold(chosen: Sequence[HiddenCase], path: Path) -> None:
+def measure_cold(chosen: Sequence[Case], path: Path) -> None:
     """Seconds of a fresh `jaxid discover`, refits in simulation and all."""
     from hidden_run import write_files
 
@@ -141,7 +151,7 @@ def measure_cold(chosen: Sequence[HiddenCase], path: Path) -> None:
     path.write_text(json.dumps(seconds))
 
 
-def _shown(chosen: Sequence[HiddenCase]) -> Iterator[HiddenCase]:
+def _shown(chosen: Sequence[Case]) -> Iterator[Case]:
     return iter(tqdm(chosen, unit="case", desc="fresh commands"))
 
 

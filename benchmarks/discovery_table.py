@@ -25,15 +25,20 @@ def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
     for r in records:
         by[r["group"]].append(r)
     effects = _visible(by["effects"])
-    single, pairs, short = effects, _visible(by["pairs"]), _visible(by["short"])
-    kinds = {k: [r for r in effects if r["what"] == k] for k in dict.fromkeys(r["what"] for r in effects)}
-    named = [*single, *pairs, *short]
+    pairs, short, chains = (_visible(by[group]) for group in ("pairs", "short", "chains"))
+    kinds = {k: [r for r in effects if r["what"] == k] for k in _whats(effects)}
+    nulls = [*by["nulls"], *by["chain_nulls"]]
+    single = [*effects, *short, *chains]
+    named = [*single, *pairs]
     totals = {
-        "named right, all visible": share(judge.right(r) for r in [*single, *short]),
+        "named right, all visible": share(map(judge.right, single)),
         "named right, worst effect": min(
-            (share(judge.right(r) for r in rows) for rows in kinds.values()), default=None
+            (
+                share(judge.right(r) for r in [*effects, *chains] if r["what"] == k)
+                for k in _whats([*effects, *chains])
+            ), default=None,
         ),
-        "false positives": share(judge.false_positive(r) for r in by["nulls"]),
+        "false positives": share(map(judge.false_positive, nulls)),
         "both named, visible pairs": share(judge.right(r) for r in pairs),
         "gap closed over truth's, median": _median(_closings(named)),
         "parameters within 3 deviations": share(
@@ -49,10 +54,11 @@ def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
         "effects": [_row(k, n, rows) for k, rs in kinds.items() for n, rows in _by_noise(rs)],
         "pairs": [_row(k, "all", [r for r in pairs if r["what"] == k]) for k in _whats(pairs)],
         "short": [_row(k, "all", [r for r in short if r["what"] == k]) for k in _whats(short)],
+        "chains": [_row(k, "all", [r for r in chains if r["what"] == k]) for k in _whats(chains)],
         "invisible": [_sight(r) for r in records if r["oracle"] and not judge.visible(r)],
         "tied": [_sight(r) for r in records if any(s["ties"] for s in r["oracle"].values())],
         "wrong": [_wrong(r) for r in named if not judge.right(r)],
-        "false positives": [_wrong(r) for r in by["nulls"] if judge.false_positive(r)],
+        "false positives": [_wrong(r) for r in nulls if judge.false_positive(r)],
         "outside": [_wrong(r) for r in _visible(by["outside"]) if not judge.pointed_at(r)],
         "seconds": _seconds(records, cold),
     }
@@ -85,7 +91,7 @@ def markdown(table: dict) -> str:
     ]  # fmt: skip
     parts.append(_grid(["total", "is", "aim", "met"], rows))
     parts += ["## At a glance: named right of visible", glance(table)]
-    for title in ("effects", "pairs", "short"):
+    for title in ("effects", "pairs", "short", "chains"):
         parts += [f"## {title.capitalize()}, visible ones", _results(table[title])]
     parts += ["## Seconds", _lines("discover", table["seconds"])]
     for title in ("wrong", "false positives", "outside", "invisible", "tied"):

@@ -28,13 +28,13 @@ Log = Mapping[str, np.ndarray]
 def sights(case: ChainCase) -> dict[str, Sight]:
     """What shows of the hidden kind on the logs that are given; nothing for a null.
 
-    The ties name kind and place, as results do.
+    Kind and place are named as results name them, in the ties too.
     """
     if not case.hidden:
         return {}
     views = [view(case, v) for v in ((False, True) if case.validated else (False,))]
     seen = Sight(tuple(v.evidence for v in views), tuple(v.share for v in views), tuple(_ties(views)))
-    return {case.what: seen}
+    return {case.names[0]: seen}
 
 
 @dataclasses.dataclass(frozen=True)

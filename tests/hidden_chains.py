@@ -106,6 +106,18 @@ class ChainCase:
         return 1 + self.seed % (self.count + (self.sort == "spring"))
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """What is hidden, as results name it."""
+        return tuple(chain.name_of(kind, self.place) for kind in self.hidden)
+
+    @property
+    def truth(self) -> Values:
+        """True parameters by the names of results."""
+        lists = {n: getattr(self.machine, n) for n in ("mass", "damping", "stiffness")}
+        own = {f"{n}[{i}]": float(x) for n, xs in lists.items() for i, x in enumerate(xs, start=1)}
+        return own | {f"{kind}.{n}": x for kind, vs in self.values.items() for n, x in vs.items()}
+
+    @property
     def declared(self) -> tuple[chain.Place, ...]:
         """Kind and mass of what the case has: Coulomb friction wherever it is not hidden."""
         kind = "coulomb_friction"

@@ -5,24 +5,30 @@ import re
 import time
 from pathlib import Path
 
+import chain_oracle
+import chain_stepper
+import hidden_chains
+import hidden_oracle
 import numpy as np
+import stepper
 from hidden_cases import HiddenCase
-from hidden_oracle import sights
+from hidden_chains import ChainCase
 from search_setup import case_text, log_of, write_case
-from stepper import write_csv
 
 import jaxid
 from jaxid.gap import force_gap
+from jaxid.io.log import Log
 
 Record = dict
+Case = HiddenCase | ChainCase
 
 
-def run_case(case: HiddenCase, folder: Path) -> Record:
+def run_case(case: Case, folder: Path) -> Record:
     """The oracle's say, then jaxid's, as what JSON can hold."""
-    seen = sights(case)
+    seen = (chain_oracle if isinstance(case, ChainCase) else hidden_oracle).sights(case)
     record = {
         "id": case.id, "group": case.group, "what": case.what, "scale": case.scale,
-        "noise": case.noise, "seed": case.seed, "rate": case.rate, "hidden": list(case.hidden),
+        "noise": case.noise, "seed": case.seed, "rate": case.rate, "hidden": list(case.names),
         "declared": list(case.declared), "true": case.values,
         "oracle": {
             kind: {
@@ -39,17 +45,18 @@ def run_case(case: HiddenCase, folder: Path) -> Record:
         return record | {"verdict": "crashed", "named": [], "error": repr(error)}
 
 
-def _searched(case: HiddenCase, folder: Path) -> Record:
-    logs = [log_of(case.setup(validation=v)) for v in ((False, True) if case.validated else (False,))]
+def _searched(case: Case, folder: Path) -> Record:
+    logs = [logged(case, validation=v) for v in ((False, True) if case.validated else (False,))]
     path = write_case(folder, text_of(case))
     begin, busy = time.perf_counter(), time.process_time()
     d = jaxid.discover(path, logs[0], validate=logs[1:], refit=False)
     seconds, busy = time.perf_counter() - begin, time.process_time() - busy
     return {
-        "verdict": d.verdict, "named": d.kinds, "seconds": seconds, "cpu_seconds": busy,
+        "verdict": d.verdict, "named": [e.label for e in d.effects],
+        "seconds": seconds, "cpu_seconds": busy,
         "samples": logs[0].samples,
         "evidence": [_number(e.score.total) for e in d.effects],
-        "alternatives": [[s.candidate.kind for s in e.alternatives] for e in d.effects],
+        "alternatives": [[s.candidate.label for s in e.alternatives] for e in d.effects],
         "parameters": _parameters(case, d),
         "gap": {
             "before": [float(g.force.rms[0]) for g in d.gaps_before],
@@ -66,8 +73,19 @@ def _searched(case: HiddenCase, folder: Path) -> Record:
     }  # fmt: skip
 
 
-def text_of(case: HiddenCase) -> str:
+def logged(case: Case, *, validation: bool = False) -> Log:
+    """What a user would have of a run."""
+    if isinstance(case, HiddenCase):
+        return log_of(case.setup(validation=validation))
+    run, driven = case.run(validation=validation), case.machine.driven
+    reference = run["reference"][:, driven]
+    return Log(run["t"], run["position"], run["force"], reference=reference, source="chain.csv")
+
+
+def text_of(case: Case) -> str:
     """The case file that knows nothing of what is hidden."""
+    if isinstance(case, ChainCase):
+        return hidden_chains.text_of_chain(case)
     declared = [(kind, case.values[kind]) for kind in case.declared]
     return case_text(
         case.setup(), declared, off=case.off, inertia_known=case.inertia_known,
@@ -75,51 +93,51 @@ def text_of(case: HiddenCase) -> str:
     )  # fmt: skip
 
 
-def truth_gap(case: HiddenCase, folder: Path, logs: list) -> list[float]:
+def truth_gap(case: Case, folder: Path, logs: list) -> list[float]:
     """RMS force residual of the true machine, through jaxid's own preprocessing, by log."""
-    declared = [*case.values.items()]
-    text = case_text(case.setup(), declared, off=1.0, motion=case.size.motion, sensor=case.sensor)
-    known = re.sub(r"\{ guess = ([^}]+) \}", r"\1", text)
     path = Path(folder) / "truth.toml"
-    path.write_text(known)
+    path.write_text(_known(case))
     session = jaxid.open_session(path, logs[0], logs[1:], align_hold=True)
     return [float(force_gap(r.machine(session.machine), r.data).rms[0]) for r in session.runs]
 
 
-def write_files(case: HiddenCase, folder: Path) -> list[str]:
+def _known(case: Case) -> str:
+    """The case file that knows all."""
+    if isinstance(case, ChainCase):
+        return hidden_chains.text_of_chain(case, known=True)
+    declared = [*case.values.items()]
+    text = case_text(case.setup(), declared, off=1.0, motion=case.size.motion, sensor=case.sensor)
+    return re.sub(r"\{ guess = ([^}]+) \}", r"\1", text)
+
+
+def write_files(case: Case, folder: Path) -> list[str]:
     """Case, log and validation as files; what `jaxid discover` takes."""
     names = ["log.csv", "validation.csv"] if case.validated else ["log.csv"]
     for k, name in enumerate(names):
-        write_csv(case.setup(validation=bool(k)).run(), Path(folder) / name)
+        write = (chain_stepper if isinstance(case, ChainCase) else stepper).write_csv
+        write(case.setup(validation=bool(k)).run(), Path(folder) / name)
     words = [str(write_case(folder, text_of(case))), str(Path(folder) / "log.csv")]
     return words + (["--validate", str(Path(folder) / names[1])] if case.validated else [])
 
 
-def _parameters(case: HiddenCase, d: object) -> dict[str, list]:
+def _parameters(case: Case, d: object) -> dict[str, list]:
     """Name -> true value, estimate, its standard deviation (null where it cannot be told)."""
     names = d.after.machine.parameters.names
     out = {}
     for name, value, std in zip(names, d.after.theta, d.after.precision.std, strict=True):
-        true = _true(case, name)
-        if name == "cogging.phase" and true is not None:
+        true = case.truth.get(name)
+        if name.endswith(".phase") and true is not None:
             turns = round((float(value) - true) / (2 * math.pi))
             value = float(value) - 2 * math.pi * turns
         out[name] = [true, _number(value), _number(std)]
     return out
 
 
-def _true(case: HiddenCase, name: str) -> float | None:
-    if name == "inertia":
-        return case.setup().machine.inertia
-    kind, _, parameter = name.partition(".")
-    return case.values.get(kind, {}).get(parameter)
-
-
 def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _outside(case: HiddenCase) -> dict | None:
+def _outside(case: Case) -> dict | None:
     if case.group != "outside":
         return None
     machine = case.setup().machine

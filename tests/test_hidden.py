@@ -5,7 +5,7 @@ import pytest
 from hidden_cases import cases
 from hidden_run import run_case
 
-EVERY = {c.id: c for c in cases("test")}
+EVERY = {c.id: c for c in cases("seen")}
 NAMED = [c for c in EVERY.values() if c.group in ("effects", "pairs")]
 # One noise level for each kind and scale in turn; and quick ones, whose logs are short.
 SOME = [c for k, c in enumerate(NAMED) if k % 3 == (k // 3) % 3]

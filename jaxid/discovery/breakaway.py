@@ -18,12 +18,13 @@ import scipy.stats
 from jaxtyping import Array, Float
 
 from jaxid.discovery.starts import Starts, starts_from_rest
-from jaxid.effects.friction import CoulombFriction, StaticFriction
+from jaxid.effects.friction import CoulombFriction, StaticFriction, StribeckFriction
 from jaxid.estimators.result import Estimate
 from jaxid.io.log import Log
 from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
+from jaxid.preprocess import Prepared
 from jaxid.replay import needed_steps
 from jaxid.session import Run
 from jaxid.simulation import Drive, open_loop
@@ -38,6 +39,8 @@ _FOLDS = 4
 _TELLS = 3
 # For the better of two definitions of a rest.
 _FALSE_POSITIVE = 0.5e-3
+# The velocity of a Stribeck curve must exceed the slowest that counts as motion so many times.
+_RESOLVED = 2.0
 # Part of its squared residual that the median start must lose.
 _RELEVANT = 0.15
 
@@ -86,7 +89,7 @@ def break_away(
     """
     machine = estimate.machine
     log = runs[0].log
-    unknown = _unknown(machine, log)
+    unknown = _unknown(machine, log) or _blurred(estimate, runs[0].data, joint)
     if unknown:
         return unknown
     alike = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
@@ -141,6 +144,19 @@ def _unknown(machine: Machine, log: Log) -> str:
         return "the command between the log's samples is not known"
     if log.hold == "band_limited":
         return "the command between the log's samples has no corner"
+    return ""
+
+
+def _blurred(estimate: Estimate, data: Prepared, joint: int) -> str:
+    """Whether friction just above rest is not known, which delays starts too; empty where it is."""
+    machine = estimate.machine
+    for k, effect in enumerate(machine.plant.effects):
+        if effect.kind != StribeckFriction.kind or effect.port != joint:
+            continue
+        free = zip(machine.parameters.free, estimate.identifiable, strict=True)
+        told = all(t for f, t in free if f.path[:2] == ("effects", k))
+        if not told or float(effect.velocity) < _RESOLVED * data.recipe.rest_velocity[joint]:
+            return f"{effect.kind} is not resolved by the samples that move"
     return ""
 
 

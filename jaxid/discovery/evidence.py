@@ -16,6 +16,9 @@ from jaxtyping import Bool, Float
 from jaxid.precision import NoiseModel
 
 BLOCKS = 10
+# Rows that whitening may leave correlated; fewest stretches of a surrogate.
+_CORRELATED = 10
+_STRETCHES = 20
 # Probability with which noise alone may exceed the threshold for all candidates together.
 _FALSE_POSITIVE = 1e-3
 
@@ -204,6 +207,15 @@ def log_evidence(rows: int, before: np.ndarray, after: np.ndarray) -> np.ndarray
     """Gain in held-out log-likelihood (nats) where a sum of squares falls from before to after."""
     # Below 1e-12 of what was there, a sum of squares is rounding.
     return -0.5 * rows * np.log(np.maximum(after / np.maximum(before, 1e-300), 1e-12))
+
+
+def stretch(rows: int) -> int:
+    """How many rows keep their sign together in a surrogate.
+
+    As many as whitening may leave correlated, or a hundredth of a long log; of a short log fewer,
+    since of five stretches there are no two hundred surrogates.
+    """
+    return max(min(_CORRELATED, rows // _STRETCHES), rows // 100, 1)
 
 
 def flipped(

@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     from jaxid.discovery.search import Search
 
 _SURROGATES = 200
-# A stretch that keeps its sign in a surrogate: this part of the log.
-_STRETCH = 1 / 100
-# ... and no fewer samples than whitening may leave correlated.
-_SHORTEST = 10
 # Points whose products are taken at once: few enough for memory, enough for matrix products to pay.
 _TOGETHER = 64
 
@@ -119,7 +115,7 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
     whitener, noise = fit_whitener(e, base, extra, counts, search.colour)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
-    length = max(_SHORTEST, int(out.rows * _STRETCH))
+    length = ev.stretch(out.rows)
     surrogates = ev.flipped(noise, length, _SURROGATES, np.random.default_rng(20240501))
     _score(out, search, white, columns, surrogates, points)
     if ahead:

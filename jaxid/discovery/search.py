@@ -143,9 +143,12 @@ class Search:
             refitted.append(self._refit(score, screened))
         refitted.sort(key=lambda s: -s.total)
         rest = [s for s in screened.scores if all(s.candidate is not r.candidate for r in refitted)]
-        good = [s for s in refitted if not s.reason and s.evidence > screened.threshold]
-        one = modest(good)
         promised = {id(s.candidate): s.evidence for s in promising}
+        # The threshold's surrogates are not refitted. Few starts need the refit; what has a start
+        # everywhere must pass as they do.
+        passed = lambda s: min(s.evidence, promised[id(s.candidate)] if s.candidate.many else np.inf)
+        good = [s for s in refitted if not s.reason and passed(s) > screened.threshold]
+        one = modest(good)
         broken = [s.candidate for s in refitted if s.evidence < _KEPT * promised[id(s.candidate)]]
         two = self._two(screened, one, broken) if ahead else ()
         return two or ((one,) if one else ()), (*refitted, *rest), screened.threshold
@@ -171,10 +174,12 @@ class Search:
             old, new = (self.worth.residual(t) for t in (self.theta, both.theta))
             enough = self.worth.closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
             if enough and not both.reason:
-                one = replace(self._refit(first, screened), reason="")
-                other = self._refit(second, screened)
+                left = replace(self._refit(first, screened), reason="")
+                right = self._refit(second, screened)
                 # The first is added alone; each counts by what is lost without it.
-                return replace(_after(both, other), **_place(one)), _after(both, one)
+                added = replace(_after(both, right), **_place(left)), _after(both, left)
+                if min(s.evidence for s in added) > screened.threshold:
+                    return added
         return ()
 
     def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:

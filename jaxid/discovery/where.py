@@ -17,8 +17,6 @@ from jaxid.precision import NoiseModel
 from jaxid.preprocess import Prepared
 
 _KNOTS = 12
-# Samples that keep their sign together in a surrogate, at least: whitening leaves some correlation.
-_SHORTEST = 10
 # A window of this many samples is loud where its energy exceeds the median's by this factor: in
 # noise of one level that happens less than once in 10^9 windows.
 _WINDOW = 20
@@ -121,14 +119,16 @@ def _locate(
     named = variables(data, joint)
     hats = {name: _hats(x, counts) for name, x in named.items()}
     every = np.concatenate([*hats.values()], axis=1)
-    whitener, noise = fit_whitener(
+    whitener, _ = fit_whitener(
         e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,)
     )
     blocks = whitener.blocks()
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])
+    # Of the residual itself: what curves of six variables leave of it would look too quiet.
+    left = _beyond(whitener, e, jacobian)
     rng = np.random.default_rng(20240501)
-    surrogates = ev.flipped(noise, max(_SHORTEST, len(noise) // 100), 100, rng)
+    surrogates = ev.flipped(left, ev.stretch(len(left)), 100, rng)
     before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
     largest, gains = np.full(100, -np.inf), {}
     for name, hat in hats.items():
