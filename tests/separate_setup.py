@@ -11,6 +11,7 @@ from stepper import Loop
 from stepper_machines import Setup
 
 from jaxid.discovery import candidates as cand
+from jaxid.discovery.noise import sensor_colour
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Search
 from jaxid.discovery.separate import Proposal, propose
@@ -96,7 +97,8 @@ def proposed(
     data = session.fit.data
     baseline = inverse_dynamics(session.machine, data)
     floor = noise_floor(baseline.machine, session.fit.log, data)
-    search = Search(build_union(baseline.machine, data), data, floor)
+    colour = sensor_colour(baseline.machine, session.fit.log, data)
+    search = Search(build_union(baseline.machine, data), data, floor, colour)
     own, rival = (next(c for c in search.union.candidates if c.kind == kind) for kind in kinds)
     search.theta, search.added = _fitted(search, own), [own]
     score = Score(rival, 0, rival.starts[0], 0.0, theta=_fitted(search, rival))

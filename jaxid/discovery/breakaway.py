@@ -212,6 +212,9 @@ class _Fit:
 
     def __init__(self, e: np.ndarray, jacobian: np.ndarray, prior: np.ndarray, noise: float) -> None:
         self.e, self.jacobian, self.prior, self.noise = e, jacobian, prior, noise
+        # A start has one weight for all its samples: all that a fit needs of it are its products.
+        self.normal = np.einsum("itp,itq->ipq", jacobian, jacobian, optimize=True)
+        self.gradient = np.einsum("itp,it->ip", jacobian, e)
 
     @property
     def spread(self) -> float:
@@ -228,13 +231,13 @@ class _Fit:
         Returns:
             By start, and what the prior charges for the fit.
         """
-        p = self.prior.shape[0]
-        e, jacobian = self.e[train], self.jacobian[train]
+        e = self.e[train]
         outlying = 1 + np.mean(e**2, axis=1) / spread**2
-        weight = np.sqrt(_TELLS / e.shape[1] / outlying) / spread
-        matrix = np.concatenate([(weight[:, None, None] * jacobian).reshape(-1, p), self.prior])
-        target = np.concatenate([(weight[:, None] * e).ravel(), np.zeros(p)])
-        step = -np.linalg.lstsq(matrix, target, rcond=None)[0]
+        weight = _TELLS / e.shape[1] / outlying / spread**2
+        normal = np.tensordot(weight, self.normal[train], 1) + self.prior.T @ self.prior
+        scale = 1 / np.sqrt(np.diag(normal))
+        gradient = scale * (weight @ self.gradient[train])
+        step = -scale * np.linalg.solve(normal * np.outer(scale, scale), gradient)
         left = np.mean((self.e[test] + self.jacobian[test] @ step) ** 2, axis=1)
         return _TELLS * np.log1p(left / spread**2), float(np.sum((self.prior @ step) ** 2))
 

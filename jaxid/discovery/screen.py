@@ -237,10 +237,13 @@ def _all_columns(
     own = span(*(stacked(x, counts, scale) for x in (base, columns)))
     rest = left_over(own, stacked(e[..., None], counts, scale)[:, 0])
     gained = np.zeros(len(many))
-    for k, p in enumerate(many):
-        fresh = left_over(own, unit(stacked(p.columns, counts, scale)))
-        part = np.sum((np.linalg.qr(fresh)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
-        gained[k] = -0.5 * counts.sum() * np.log1p(-min(part, 1 - 1e-12))
+    for first in range(0, len(many), _TOGETHER):
+        some = [unit(stacked(p.columns, counts, scale)) for p in many[first : first + _TOGETHER]]
+        ends = np.cumsum([x.shape[1] for x in some])[:-1]
+        fresh = np.split(left_over(own, np.concatenate(some, axis=1)), ends, axis=1)
+        for k, new in enumerate(fresh, start=first):
+            part = np.sum((np.linalg.qr(new)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
+            gained[k] = -0.5 * counts.sum() * np.log1p(-min(part, 1 - 1e-12))
     best = int(np.argmax(gained))
     # What the best of so many starts gains by chance, once in a thousand.
     chance = np.log(1000 * len(many)) + many[best].columns.shape[2]

@@ -66,7 +66,7 @@ class Search:
     union: cand.Union
     data: Prepared
     floor: np.ndarray
-    colour: tuple[NoiseModel, ...] = ()
+    colour: tuple[NoiseModel, ...]
     validation: tuple[Prepared, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     added: list[cand.Candidate] = field(default_factory=list)
