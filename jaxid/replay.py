@@ -246,6 +246,10 @@ def start_velocity(log: Log) -> np.ndarray:
     return local_line(log, 0)[1]
 
 
+# More integration steps a sample than that no machine asks for: a fit has run away.
+MOST_STEPS = 2000
+
+
 def needed_steps(machine: Machine, log: Log) -> int:
     """Integration steps a sample that the smooth part of the plant asks for along a log."""
     period = machine.controller.period if machine.controller is not None else log.period

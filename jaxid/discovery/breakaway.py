@@ -25,7 +25,7 @@ from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.preprocess import Prepared
-from jaxid.replay import needed_steps
+from jaxid.replay import MOST_STEPS, needed_steps
 from jaxid.session import Run
 from jaxid.simulation import Drive, open_loop
 
@@ -92,6 +92,8 @@ def break_away(
     unknown = _unknown(machine, log) or _blurred(estimate, runs[0].data, joint)
     if unknown:
         return unknown
+    if needed_steps(machine, log) > MOST_STEPS:
+        return "the model found is too stiff to be simulated"
     alike = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
     noise = float(position_noise(machine, log)[joint])
     cuts = starts_from_rest(machine, alike, noise, joint)
