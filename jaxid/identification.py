@@ -17,7 +17,7 @@ from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulatio
 from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.replay import MOST_STEPS, make_replay, needed_steps, with_fitted_start
+from jaxid.replay import TooStiffError, make_replay, needed_steps, with_fitted_start
 from jaxid.session import Run, Session, open_session
 from jaxid.solvers import SOLVERS
 
@@ -146,8 +146,9 @@ def simulated(machine: Machine, log: Log) -> SimulationGap | None:
     if machine.controller is not None and log.reference is None:
         machine = replace(machine, controller=None)
     # Nothing is differentiated here: friction sticks exactly, break-away friction too.
-    steps = needed_steps(machine, log)
-    if steps > MOST_STEPS:
+    try:
+        steps = needed_steps(machine, log)
+    except TooStiffError:
         return None
     numerics = choose_numerics(machine, log, segments=False)
     numerics = replace(numerics, segment=None, set_valued=True, substeps=steps)

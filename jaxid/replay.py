@@ -246,16 +246,31 @@ def start_velocity(log: Log) -> np.ndarray:
     return local_line(log, 0)[1]
 
 
-# More integration steps a sample than that no machine asks for: a fit has run away.
-MOST_STEPS = 2000
+# More integration steps a sample than that no machine asks for: a fit or a guess has run away.
+_MOST_STEPS = 2000
+
+
+class TooStiffError(InputError):
+    """A machine so stiff, or so light, that simulating it would not end."""
 
 
 def needed_steps(machine: Machine, log: Log) -> int:
-    """Integration steps a sample that the smooth part of the plant asks for along a log."""
+    """Integration steps a sample that the smooth part of the plant asks for along a log.
+
+    Raises:
+        TooStiffError: If that is more than any sound machine asks for.
+    """
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
-    return max(1, int(np.ceil(float(_fastest(machine.plant, q, u)) * period / _FINE)))
+    steps = float(_fastest(machine.plant, q, u)) * period / _FINE
+    if not steps <= _MOST_STEPS:
+        raise TooStiffError(
+            f"the plant would need {steps:.2g} integration steps a sample", where=log.source,
+            mend="an inertia that is far too small, or a stiffness or damping far too large, does "
+            "that: check the guesses, or declare less",
+        )
+    return max(1, int(np.ceil(steps)))
 
 
 @eqx.filter_jit

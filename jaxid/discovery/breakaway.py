@@ -25,7 +25,7 @@ from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.preprocess import Prepared
-from jaxid.replay import MOST_STEPS, needed_steps
+from jaxid.replay import TooStiffError, needed_steps
 from jaxid.session import Run
 from jaxid.simulation import Drive, open_loop
 
@@ -92,7 +92,9 @@ def break_away(
     unknown = _unknown(machine, log) or _blurred(estimate, runs[0].data, joint)
     if unknown:
         return unknown
-    if needed_steps(machine, log) > MOST_STEPS:
+    try:
+        steps = needed_steps(machine, log)
+    except TooStiffError:
         return "the model found is too stiff to be simulated"
     alike = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
     noise = float(position_noise(machine, log)[joint])
@@ -102,7 +104,7 @@ def break_away(
     found = []
     for starts in enough:
         padded = 2 ** int(np.ceil(np.log2(most)))
-        levels, fits = _fits(estimate, log, starts, padded, noise, joint)
+        levels, fits = _fits(estimate, log, starts, padded, noise, joint, steps)
         leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
         found.append(_judge(levels, fits, leaves[np.asarray(starts.log) == 0]))
     few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
@@ -110,12 +112,13 @@ def break_away(
 
 
 def _fits(
-    estimate: Estimate, log: Log, starts: Starts, padded: int, noise: float, joint: int
+    estimate: Estimate, log: Log, starts: Starts, padded: int, noise: float, joint: int,
+    steps: int,
 ) -> tuple[np.ndarray, list[_Fit]]:
     """Fits at levels from none to the most that the log allows, denser about the best."""
     machine, count = estimate.machine, starts.count
     filled = starts.padded(padded)
-    drive = Drive(jnp.asarray(machine.gain), log.period, log.hold, needed_steps(machine, log), True)
+    drive = Drive(jnp.asarray(machine.gain), log.period, log.hold, steps, True)
     plant = machine.plant.with_effect(StaticFriction(level=0.0, port=joint))
     prior = _prior(estimate)
     places = machine.parameters.places

@@ -27,6 +27,7 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import parameters_of
 from jaxid.parameters import Parameters, free_effect
+from jaxid.replay import TooStiffError
 from jaxid.session import Session, open_session
 
 # A refit in simulation may cost this factor in the force domain, not more: then it has bent the
@@ -245,9 +246,9 @@ def _verdict(
 ) -> str:
     if effects:
         return "found"
-    e, _ = cand.evaluate(search.union, search.samples, steps[0].theta)
-    rms = np.sqrt(np.nanmean(np.where(search.samples.moving, e, np.nan) ** 2, axis=0))
-    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.worth.above_numerics(steps[0].theta)
+    baseline = steps[0].theta
+    rms = _rms(search, search.samples, baseline)
+    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.worth.above_numerics(baseline)
     return "unexplained" if above and where.significant else "nothing_missing"
 
 
@@ -281,7 +282,10 @@ def _refit(session: Session, start: Estimate) -> Estimate:
     blind = not bool(np.all(start.identifiable))
     if blind or session.fit.log.reference is None and session.machine.controller is not None:
         return start
-    estimate = output_error(session.machine, session.fit.log)
+    try:
+        estimate = output_error(session.machine, session.fit.log)
+    except TooStiffError as error:
+        return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
     if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
         note = f"output error: {estimate.message}; parameters are inverse dynamics'"
         return replace(start, notes=(*start.notes, note))

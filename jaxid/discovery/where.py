@@ -118,7 +118,7 @@ def _locate(
     counts = data.moving[:, joint]
     named = variables(data, joint)
     hats = {name: _hats(x, counts) for name, x in named.items()}
-    every = np.concatenate([*hats.values()], axis=1)
+    every = np.concatenate(list(hats.values()), axis=1)
     whitener, _ = fit_whitener(
         e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,)
     )
