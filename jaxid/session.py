@@ -132,14 +132,14 @@ def _read(case: Case, log: Log | str | Path, columns: dict) -> Log:
 
 def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
     limit = (case.controller or {}).get("limit")
-    units = machine.units
+    units, plant = machine.units, machine.plant
+    driven = plant.at_drives(np.arange(plant.joints))
     findings = check_log(
         log, command_limit=limit, motion=units.motion,
-        units={"position": units.position} if units.position else None,
+        units={"position": units.position} if units.position else None, driven=driven,
     )
-    plant, inertia = machine.plant, machine.plant.own_inertia()
+    inertia = plant.own_inertia()
     if inertia is not None:
-        driven = plant.at_drives(np.arange(plant.joints))
         slip = plausible_inertia(
             log, np.asarray(inertia), machine.gain, motion=units.motion, driven=driven
         )

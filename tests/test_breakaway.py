@@ -23,7 +23,7 @@ def found(name, folder, level, seed=0, duration=8.0):
     hidden = setup.with_effect("static_friction", level=level) if level else setup
     session = open_session(write_case(folder, text), log_of(hidden), align_hold=True)
     estimate = inverse_dynamics(session.machine, session.fit.data)
-    return break_away(estimate, session.runs)
+    return break_away(estimate, session.runs)[0]
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -48,7 +48,7 @@ def test_a_log_without_a_start_from_rest_says_nothing(tmp_path):
     text = case_text(setup, [*setup.machine.effects.items()])
     session = open_session(write_case(tmp_path, text), log_of(setup), align_hold=True)
     estimate = inverse_dynamics(session.machine, session.fit.data)
-    assert break_away(estimate, session.runs) .startswith("there are fewer than")
+    assert break_away(estimate, session.runs)[0].startswith("there are fewer than")
 
 
 def test_times_are_those_of_the_starts(tmp_path):

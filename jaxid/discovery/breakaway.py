@@ -74,58 +74,70 @@ class BreakAway:
 
 
 def break_away(
-    estimate: Estimate, runs: Sequence[Run], joint: int = 0
-) -> BreakAway | str:
+    estimate: Estimate, runs: Sequence[Run], joints: Sequence[int] = (0,)
+) -> list[BreakAway | str]:
     """Level of break-away friction above Coulomb's that the starts from rest of some logs ask for.
 
     Args:
         estimate: The model without it; its parameters move within their covariance.
         runs: The logs. What a rest is, the first decides; those held or sampled otherwise are
             left out.
-        joint: 0-based.
+        joints: 0-based, each looked at by itself.
 
     Returns:
-        The finding, or why there is none.
+        By joint the finding, or why there is none.
     """
     machine = estimate.machine
     log = runs[0].log
-    unknown = _unknown(machine, log) or _blurred(estimate, runs[0].data, joint)
-    if unknown:
-        return unknown
+    unknown = [_unknown(machine, log) or _blurred(estimate, runs[0].data, j) for j in joints]
     try:
         steps = needed_steps(machine, log)
     except TooStiffError:
-        return "the model found is too stiff to be simulated"
+        unknown = ["the model found is too stiff to be simulated"] * len(joints)
+    known = [j for j, why in zip(joints, unknown, strict=True) if not why]
     alike = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
-    noise = float(position_noise(machine, log)[joint])
-    cuts = starts_from_rest(machine, alike, noise, joint)
-    enough = [s for s in cuts if s.count >= _FEWEST]
-    most = max((s.count for s in enough), default=0)
-    found = []
-    for starts in enough:
-        padded = 2 ** int(np.ceil(np.log2(most)))
-        levels, fits = _fits(estimate, log, starts, padded, noise, joint, steps)
-        leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
-        found.append(_judge(levels, fits, leaves[np.asarray(starts.log) == 0]))
-    few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
-    return max(found, key=lambda b: b.evidence, default=few)
+    noise = position_noise(machine, log)
+    cuts = starts_from_rest(machine, alike, noise, known) if known else []
+    enough = [[s for s in of_joint if s.count >= _FEWEST] for of_joint in cuts]
+    most = max((s.count for of_joint in enough for s in of_joint), default=0)
+    found: dict[int, BreakAway | str] = {}
+    for k, (joint, of_joint) in enumerate(zip(known, enough, strict=True)):
+        few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
+        judged = []
+        for starts in of_joint:
+            padded = 2 ** int(np.ceil(np.log2(most)))
+            levels, fits = _fits(
+                estimate, log, starts, padded, float(noise[joint]), known, k, steps
+            )
+            leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
+            judged.append(_judge(levels, fits, leaves[np.asarray(starts.log) == 0]))
+        found[joint] = max(judged, key=lambda b: b.evidence, default=few)
+    return [why or found[j] for j, why in zip(joints, unknown, strict=True)]
 
 
 def _fits(
-    estimate: Estimate, log: Log, starts: Starts, padded: int, noise: float, joint: int,
-    steps: int,
+    estimate: Estimate, log: Log, starts: Starts, padded: int, noise: float, known: list[int],
+    which: int, steps: int,
 ) -> tuple[np.ndarray, list[_Fit]]:
-    """Fits at levels from none to the most that the log allows, denser about the best."""
+    """Fits at levels from none to the most that the log allows, denser about the best.
+
+    Args:
+        known: Joints that are looked at: one compiled plant serves them all.
+        which: Whose starts these are, among them.
+    """
     machine, count = estimate.machine, starts.count
     filled = starts.padded(padded)
     drive = Drive(jnp.asarray(machine.gain), log.period, log.hold, steps, True)
-    plant = machine.plant.with_effect(StaticFriction(level=0.0, port=joint))
+    plant = machine.plant
+    for joint in known:
+        plant = plant.with_effect(StaticFriction(level=0.0, port=joint))
     prior = _prior(estimate)
     places = machine.parameters.places
     theta = jnp.asarray(estimate.theta)
 
     def at(levels: np.ndarray) -> list[_Fit]:
-        both = _runs(plant, places, drive, filled, joint, jnp.asarray(levels), theta)
+        own = jnp.asarray(levels)[:, None] * jnp.asarray(np.eye(len(known))[which])
+        both = _runs(plant, places, drive, filled, jnp.asarray(known[which]), own, theta)
         e, jacobian = (np.asarray(a)[:, :count] for a in both)
         return [_Fit(x, j, prior, noise) for x, j in zip(e, jacobian, strict=True)]
 
@@ -167,21 +179,26 @@ def _blurred(estimate: Estimate, data: Prepared, joint: int) -> str:
 
 @eqx.filter_jit
 def _runs(
-    plant: Plant, places: tuple, drive: Drive, starts: Starts, joint: int, levels: Array, theta: Array
+    plant: Plant, places: tuple, drive: Drive, starts: Starts, joint: Array, levels: Array, theta: Array
 ) -> tuple[Array, Array]:
-    """Measured minus simulated position of every start at every level, and its Jacobian.
+    """Measured minus simulated position of every start of a joint at every level, and its Jacobian.
+
+    Args:
+        levels: (level, k), of the break-away friction that stands last in the plant.
 
     Returns:
         (level, start, time) and (level, start, time, p), the mean over the samples at rest taken off.
     """
+    few = levels.shape[1]
 
     def run(level: Array, theta: Array) -> Array:
         now = scatter(places, plant, theta)
-        now = eqx.tree_at(lambda p: p.effects[-1].level, now, level)
+        now = eqx.tree_at(lambda p: [e.level for e in p.effects[-few:]], now, list(level))
 
         def one(s: Starts) -> Array:
             run = open_loop(
-                now, drive, s.command, s.rest, s.velocity, start=s.time, own=(*s.own, None), past=s.past
+                now, drive, s.command, s.rest, s.velocity, start=s.time,
+                own=(*s.own, *[None] * few), past=s.past,
             )
             e = s.position[:, joint] - run.position[:, joint]
             at_rest = jnp.arange(e.size) < s.still

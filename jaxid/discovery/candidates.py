@@ -25,7 +25,8 @@ from jaxid.preprocess import Prepared
 
 # An effect with more starts than this is evaluated on a plant of its own, all starts at once.
 _FEW = 8
-# Of a long log a search looks at so many kept samples, in so many pieces spread over it.
+# Of a long log a search looks at so many kept samples, those of all joints counted, in so many
+# pieces spread over it.
 _MOST = 8_000
 _PIECES = 4
 # Strength at which the columns of an added force are taken, relative to the log's force.
@@ -124,7 +125,7 @@ class Samples:
     def __init__(
         self, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None
     ) -> None:
-        self.parts = data.parts(_MOST, _PIECES)
+        self.parts = data.parts(_MOST // data.q.shape[1], _PIECES)
         self.arrays = [ForceData.of(p) for p in self.parts]
         self.noisier = [] if force_noise is None else [_noisier(a, force_noise) for a in self.arrays]
         moving = [p.moving.copy() for p in self.parts]

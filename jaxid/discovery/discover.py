@@ -177,9 +177,10 @@ def discover(
     separating = proposals(session, search, effects, progress)
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
     missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]
-    for c in missing:
+    if missing:
         progress("looking at the starts from rest")
-        b = break_away(after, session.runs, c.port)
+    leaving = break_away(after, session.runs, [c.port for c in missing])
+    for c, b in zip(missing, leaving, strict=True):
         if isinstance(b, str):
             unseen = b
         elif b.holds and len(effects) < max_effects:

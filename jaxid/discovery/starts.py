@@ -30,8 +30,8 @@ _STILL = 3
 _LONGEST = 60
 # Samples that follow a start, at least.
 _AFTER = 12
-# Most that are kept of a log.
-_MOST = 120
+# Most that are kept, of all logs and joints together.
+_MOST = 192
 # A controller's law is taken for the one that made a log where it gives the logged command back to
 # within this many deviations of its noise, or this part of its RMS.
 _SAME = 1.5
@@ -79,22 +79,25 @@ class Starts(eqx.Module):
 
 
 def starts_from_rest(
-    machine: Machine, runs: Sequence[Run], noise: float, joint: int
-) -> list[Starts]:
-    """Find where a joint leaves a rest, by a lax and by a strict notion of one.
+    machine: Machine, runs: Sequence[Run], noise: Float[np.ndarray, " n"], joints: Sequence[int]
+) -> list[list[Starts]]:
+    """Find where joints leave a rest, by a lax and by a strict notion of one.
 
     Args:
         machine: The machine.
         runs: Logs of one sampling time.
-        noise: Standard deviation of a reading.
-        joint: 0-based.
+        noise: Standard deviation of a reading, by joint.
+        joints: 0-based.
 
     Returns:
-        One or two cuts of one length, the starts of all logs in each.
+        By joint one or two cuts, the starts of all logs in each; all of one length.
     """
-    stills = sorted(set(_stills(noise, runs[0].log, runs[0].data, joint)))
-    length = stills[-1] + max(_AFTER, 2 * stills[-1])
+    first = runs[0]
+    stills = [sorted(set(_stills(float(noise[j]), first.log, first.data, j))) for j in joints]
+    longest = max(of_joint[-1] for of_joint in stills)
+    length = longest + max(_AFTER, 2 * longest)
     delays = machine.plant.command_delays(runs[0].log.force.shape[1])
+    most = _MOST // (len(joints) * len(runs))
     lead = int(np.ceil(float(delays.max()) / runs[0].log.period)) + 1
     ready = [
         (
@@ -105,8 +108,11 @@ def starts_from_rest(
         for r in runs
     ]
     return [
-        _joined([_cut(*each, noise, still, length, lead, joint) for each in ready])
-        for still in stills
+        [
+            _joined([_cut(*each, float(noise[j]), still, length, lead, j, most) for each in ready])
+            for still in of_joint
+        ]
+        for j, of_joint in zip(joints, stills, strict=True)
     ]
 
 
@@ -121,10 +127,12 @@ def _joined(cuts: list[Starts]) -> Starts:
 
 
 def _cut(
-    own: tuple, log: Log, data: Prepared, noise: float, still: int, length: int, lead: int, joint: int
+    own: tuple, log: Log, data: Prepared, noise: float, still: int, length: int, lead: int, joint: int,
+    most: int,
 ) -> Starts:
     after = length - still
     ends = _departures(log.position[:, joint], noise, still, after)
+    ends = ends[np.unique(np.linspace(0, len(ends) - 1, min(len(ends), most)).astype(int))]
     rows = ends[:, None] + np.arange(1 - still, after + 1)
     earlier = np.maximum(rows[:, :1] + np.arange(-lead, 0), 0)
     rest, velocity = data.q[rows[:, 0]].copy(), data.qd[rows[:, 0]].copy()
@@ -154,7 +162,7 @@ def _stills(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
 def _departures(
     q: Float[np.ndarray, " time"], noise: float, still: int, after: int
 ) -> np.ndarray:
-    """Last samples of rests that are followed by motion, spread over the log if there are many."""
+    """Last samples of rests that are followed by motion."""
     if len(q) <= still + after:
         return np.zeros(0, int)
     windows = np.lib.stride_tricks.sliding_window_view(q, still)
@@ -163,8 +171,7 @@ def _departures(
     ends = ends[ends + after < len(q)]
     # Where it has not gone far soon after, it was noise that ended the rest.
     moved = np.abs(q[ends + after] - q[ends]) > 2 * _RANGE * noise
-    ends = ends[moved]
-    return ends[np.unique(np.linspace(0, len(ends) - 1, min(len(ends), _MOST)).astype(int))]
+    return ends[moved]
 
 
 @eqx.filter_jit

@@ -4,7 +4,7 @@
 readable numbers: a machine at rest, a command at its limit, the wrong unit.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ def check_log(
     motion: str = "linear",
     units: dict[str, str] | None = None,
     path: str | Path | None = None,
+    driven: Sequence[int] | np.ndarray | None = None,
 ) -> list[Finding]:
     """Look for the faults of a readable log.
 
@@ -41,6 +42,7 @@ def check_log(
         units: Labels of the case where the quantities are not mechanical; a foreign
             position unit leaves out the checks that need metres or radians.
         path: Name of the log in messages; its source where absent.
+        driven: Joints with a drive, 0-based, in the order of the drives; None: the first ones.
 
     Returns:
         What was found; empty for a sound log.
@@ -49,7 +51,7 @@ def check_log(
     findings = [*_movement(log, where), *_force(log, command_limit, where)]
     still = any(finding.severity == "error" for finding in findings)
     if not still:
-        findings += ratio_findings(log, motion, where)
+        findings += ratio_findings(log, motion, where, driven)
         label = (units or {}).get("position", "m")
         if label in ("m", "rad"):
             findings += magnitude_findings(log, motion, where)

@@ -72,15 +72,21 @@ _INERTIA = (
 )
 
 
-def ratio_findings(log: Log, motion: str, path: str) -> list[Finding]:
+def ratio_findings(
+    log: Log, motion: str, path: str, driven: Sequence[int] | np.ndarray | None = None
+) -> list[Finding]:
     """Compare the columns for velocity and reference with the position.
 
     Args:
         log: The log.
         motion: "linear" or "rotary".
         path: Name of the log in messages.
+        driven: Joints with a drive, 0-based, in the order of the references; None: the first ones.
     """
     findings = []
+    references = 0 if log.reference is None else log.reference.shape[1]
+    followed = range(references) if driven is None else driven
+    reference_of = dict(zip(followed, range(references), strict=False))
     for joint in range(log.position.shape[1]):
         q = log.position[:, joint]
         if np.ptp(q) == 0:
@@ -88,9 +94,9 @@ def ratio_findings(log: Log, motion: str, path: str) -> list[Finding]:
         if log.velocity is not None:
             where = f"{path}, velocity of joint {joint + 1}"
             findings += _compare_velocity(log.velocity[:, joint], q, log.period, motion, where)
-        if log.reference is not None and joint < log.reference.shape[1]:
+        if joint in reference_of:
             where = f"{path}, reference of joint {joint + 1}"
-            findings += _compare_reference(log.reference[:, joint], q, motion, where)
+            findings += _compare_reference(log.reference[:, reference_of[joint]], q, motion, where)
     return findings
 
 
