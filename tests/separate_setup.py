@@ -11,13 +11,10 @@ from stepper import Loop
 from stepper_machines import Setup
 
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.noise import sensor_colour
+from jaxid.discovery.discover import start_search
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Search
 from jaxid.discovery.separate import Proposal, propose
-from jaxid.discovery.union import build_union
-from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.gap import noise_floor
 from jaxid.session import open_session
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})
@@ -94,11 +91,7 @@ def proposed(
     """The experiment for a pair of effects, without the search that would find the pair."""
     case = write_case(folder, case_text(setup, declared, **options) + more)
     session = open_session(case, log_of(setup, initial_position=started(setup)), align_hold=True)
-    data = session.fit.data
-    baseline = inverse_dynamics(session.machine, data)
-    floor = noise_floor(baseline.machine, session.fit.log, data)
-    colour = sensor_colour(baseline.machine, session.fit.log, data)
-    search = Search(build_union(baseline.machine, data), data, floor, colour)
+    _, search = start_search(session)
     own, rival = (next(c for c in search.union.candidates if c.kind == kind) for kind in kinds)
     search.theta, search.added = _fitted(search, own), [own]
     score = Score(rival, 0, rival.starts[0], 0.0, theta=_fitted(search, rival))

@@ -154,15 +154,9 @@ def discover(
         InputError: If case or log are unsound.
     """
     session = open_session(case, log, validate, align_hold=True)
-    machine, data = session.machine, session.fit.data
+    data = session.fit.data
     progress("fitting what is there")
-    baseline = inverse_dynamics(machine, data)
-    floor = noise_floor(baseline.machine, session.fit.log, data)
-    union = build_union(baseline.machine, data, session.case.own_effects)
-    colour = sensor_colour(baseline.machine, session.fit.log, data)
-    search = Search(
-        union, data, floor, colour, tuple(v.data for v in session.validations), progress
-    )
+    baseline, search = start_search(session, progress)
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
     where = _where(search, steps[0], session.fit.log)
@@ -193,9 +187,22 @@ def discover(
     new = gaps(after.machine, session.runs) if effects else old
     return Discovery(
         session, verdict, None if verdict == "nothing_missing" else where, effects,
-        tuple(_round(search, s) for s in steps), before, after, old, new, floor, separating,
+        tuple(_round(search, s) for s in steps), before, after, old, new, search.floor, separating,
         unseen,
     )
+
+
+def start_search(
+    session: Session, progress: Callable[[str], None] = lambda text: None
+) -> tuple[Estimate, Search]:
+    """The baseline of a session in the force domain, and the search for what it lacks."""
+    machine, log, data = session.machine, session.fit.log, session.fit.data
+    baseline = inverse_dynamics(machine, data)
+    floor = noise_floor(baseline.machine, log, data)
+    colour = sensor_colour(baseline.machine, log, data)
+    union = build_union(baseline.machine, data, session.case.own_effects)
+    others = tuple(v.data for v in session.validations)
+    return baseline, Search(union, data, floor, colour, others, progress)
 
 
 def _with_break_away(

@@ -1,0 +1,173 @@
+"""What an effect is worth: the colour of the sensors' noise, and what only seems to explain."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import stepper_machines as machines
+from search_cases import COULOMB, VISCOUS
+from search_setup import case_text, log_of, write_case
+from stepper import Sensor
+
+from jaxid.discovery import candidates as cand
+from jaxid.discovery.discover import start_search
+from jaxid.discovery.evidence import Whitener, flipped, stretch
+from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
+from jaxid.discovery.where import _between
+from jaxid.estimators.inverse_dynamics import ForceData, force_residual
+from jaxid.gap import noise_density
+from jaxid.precision import NoiseModel
+from jaxid.session import open_session
+
+DELAY, LAG = "input_delay", "actuator_lag"
+
+
+def opened(folder, setup, declared=(VISCOUS, COULOMB), off=1.4, **options):
+    return open_session(
+        write_case(folder, case_text(setup, declared, off=off, **options)), log_of(setup), align_hold=True
+    )
+
+
+@pytest.fixture(scope="module")
+def axis(tmp_path_factory):
+    """A search on an axis that lacks nothing, its force noise stated."""
+    session = opened(tmp_path_factory.mktemp("axis"), machines.emps_like(3, 1.0, 6.0))
+    search = start_search(session)[1]
+    search.theta = fitted(search)
+    return session, search
+
+
+def fitted(search):
+    return cand.refine(search.union, search.samples, search.theta, search.active)[0]
+
+
+def with_values(search, kind, values):
+    theta = search.theta.copy()
+    theta[next(c for c in search.union.candidates if c.kind == kind).index] = values
+    return theta
+
+
+def test_model_of_a_density_is_the_process_that_has_it():
+    model, rate = NoiseModel(np.array([1.2, -0.5]), 0.3), 250.0
+    # Twice the variance a unit of frequency: the density is one-sided.
+    power = 2 * model.density(2048) / rate
+    found = NoiseModel.of_density(power, rate, 6)
+    np.testing.assert_allclose(found.coefficients, [1.2, -0.5, 0, 0, 0, 0], atol=1e-6)
+    assert found.innovation == pytest.approx(0.3, rel=1e-6)
+
+
+@pytest.mark.parametrize("noise", [1.0, 3.0, 10.0])
+def test_sensors_noise_is_white_behind_their_colour(noise, tmp_path, monkeypatch):
+    """The truth's residual on the stepper's log is the sensors' noise, of unit variance once whitened."""
+    # What numerics may leave wrong counts as noise too, and hides how well the sensors' is known.
+    monkeypatch.setattr("jaxid.discovery.noise.NUMERICS", 0.0)
+    setup = machines.emps_like(5, noise, 8.0)
+    session = opened(tmp_path, setup, [*setup.machine.effects.items()])
+    data = session.fit.data
+    truth = {"inertia": setup.machine.inertia} | {
+        f"{kind}.{name}": x for kind, xs in setup.machine.effects.items() for name, x in xs.items()
+    }
+    names = session.machine.parameters.names
+    machine = session.machine.with_estimate(np.array([truth[n] for n in names]))
+    (colour,) = sensor_colour(machine, session.fit.log, data)
+    e = np.asarray(force_residual(machine.plant, ForceData.of(data)))
+    white = Whitener((colour,), data.moving)(e[..., None])[:, 0]
+    # Some 1500 rows: 2 % of their deviation, 3 % of their correlation.
+    assert white.std() == pytest.approx(1.0, abs=0.06)
+    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
+
+
+def test_whitener_leaves_what_candidates_would_explain(axis):
+    """An effect that explains all of a residual must not be whitened away with it."""
+    _, search = axis
+    random = np.random.default_rng(2)
+    noise = 0.2 * random.standard_normal(search.samples.moving.shape)
+    slow = np.sin(np.linspace(0, 20, len(noise)))[:, None]
+    base = np.ones((*noise.shape, 1))
+    counts = search.samples.moving
+    whitener, _ = fit_whitener(noise + 5 * slow, base, slow[..., None], counts, search.colour)
+    alone, _ = fit_whitener(noise + 5 * slow, base, base, counts, search.colour)
+    kept = [np.sum(w(slow[..., None]) ** 2) for w in (whitener, alone)]
+    assert kept[0] > 5 * kept[1]
+
+
+def test_short_logs_have_shorter_stretches():
+    assert [stretch(n) for n in (10, 100, 200, 1000, 5000)] == [1, 5, 10, 10, 50]
+    rows = flipped(np.ones(12), 5, 300, np.random.default_rng(0))
+    assert set(np.unique(rows)) == {-1.0, 1.0}
+    assert np.all(rows[:5] == rows[0]), "a stretch keeps its sign together"
+
+
+def test_a_short_log_is_hardly_decimated(tmp_path):
+    long, short = machines.emps_like(3, 1.0, 8.0), machines.emps_like(3, 1.0, 0.2)
+    steps = [opened(tmp_path, s).recipe.decimation for s in (long, short)]
+    # As many as the band needs where there are plenty: about 140 Hz of a log at 1 kHz.
+    assert steps[0] > steps[1]
+    assert 200 // steps[1] >= 100
+
+
+def test_a_lag_swallows_noise_of_the_force_and_a_delay_does_not(tmp_path):
+    """Where all noise is the force's, what a lag leaves of it follows from its frequency response."""
+    setup = machines.emps_like(3, 1.0, 6.0)
+    sensor = Sensor(position_resolution=1e-10, position_noise=1e-10, force_noise=0.02)
+    session = opened(tmp_path, dataclasses.replace(setup, sensor=sensor))
+    search = start_search(session)[1]
+    search.theta, lag = fitted(search), 2e-3
+    lagging, delayed = with_values(search, LAG, lag), with_values(search, DELAY, 3e-3)
+    swallowed = [search.worth.swallowed(search.samples, search.theta, t) for t in (lagging, delayed)]
+    log, data = session.fit.log, session.fit.data
+    assert session.recipe.decimation == 1, "nothing is folded"
+    f, power = noise_density(search.union.machine, log, data)
+    numerics = np.mean((NUMERICS * (data.force - data.force.mean())) ** 2) / (log.rate_hz / 2)
+    share = power[:, 0] / (power[:, 0] + numerics)
+    expected = np.mean(share * (1 - 1 / (1 + (2 * np.pi * f * lag) ** 2)))
+    assert 0.2 < expected < 0.6
+    assert swallowed[0] == pytest.approx(expected, rel=0.1)
+    assert abs(swallowed[1]) < 0.01
+
+
+def test_nothing_is_known_to_be_swallowed_where_no_noise_is_stated(tmp_path):
+    session = opened(tmp_path, machines.emps_like(3, 1.0, 4.0), sensor=False)
+    search = start_search(session)[1]
+    lagging = with_values(search, LAG, 0.02)
+    assert search.worth.swallowed(search.samples, search.theta, lagging) == 0.0
+
+
+def test_models_are_as_far_apart_as_their_residuals_in_the_noise(axis):
+    _, search = axis
+    offset = [with_values(search, "constant_force", x) for x in (0.0, 0.5, 1.0)]
+    apart = [search.worth.apart(offset[0], x) for x in offset]
+    assert apart[0] == 0.0
+    # Half a squared distance: it goes with the square of the force.
+    assert apart[2] == pytest.approx(4 * apart[1], rel=1e-6)
+
+
+def test_what_takes_the_sensors_own_noise_away_is_turned_down(axis):
+    _, search = axis
+    index = next(c for c in search.union.candidates if c.kind == "constant_force").index
+    off = with_values(search, "constant_force", 5.0)
+    assert search.worth.objection(index, off, search.theta, None, None) == ""
+    with pytest.MonkeyPatch.context() as patch:
+        # As if the sensors had to leave a hundred times what is there.
+        patch.setattr(search.worth, "_noise", 100 * search.worth._noise)
+        patch.setattr(search.worth, "_numerics", 0.0)
+        why = search.worth.objection(index, off, search.theta, None, None)
+    assert why == "it takes away what the sensors' noise alone must leave"
+
+
+def test_many_starts_are_evaluated_once(axis, monkeypatch):
+    _, search = axis
+    cogging = next(c for c in search.union.candidates if c.many)
+    first = search.many(cogging)
+    monkeypatch.setattr(cand, "many_points", lambda *a: pytest.fail("evaluated again"))
+    assert search.many(cogging) is first
+
+
+@pytest.mark.parametrize("true", [40.0, 40.3, 39.6])
+def test_a_line_is_placed_between_the_bins(true):
+    n = 512
+    series = np.cos(2 * np.pi * true * np.arange(n) / n + 0.4)
+    power = np.abs(np.fft.rfft(series * np.hanning(n))) ** 2
+    k = int(np.argmax(power))
+    assert k + _between(power, k) == pytest.approx(true, abs=0.03)
+    assert _between(power, 0) == 0.0
