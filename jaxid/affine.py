@@ -68,6 +68,13 @@ def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
     return Affine(jax.tree.unflatten(jax.tree.structure(shape), offset), matrices)
 
 
+def depends(f: Callable, args: tuple) -> bool:
+    """Whether what a function returns depends on its arguments, or may."""
+    closed = jax.make_jaxpr(f)(*jax.tree.map(jnp.zeros_like, args))
+    entering = [_OTHER] * len(jax.tree.leaves(args))
+    return max(_follow(closed.jaxpr, entering), default=_CONSTANT) != _CONSTANT
+
+
 def _follow(jaxpr: Jaxpr, entering: list[int]) -> list[int]:
     """What becomes of the arguments in each output of a trace."""
     seen = dict(zip(jaxpr.invars, entering, strict=True))

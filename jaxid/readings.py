@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxid.affine import Affine, affine
+from jaxid.affine import Affine, affine, depends
 from jaxid.model import Balance, Plant, port_motion
 from jaxid.smooth import sharp_clip
 
@@ -273,7 +273,7 @@ def set_valued_step(
     """One step under set-valued friction: flow without it, then the reaction that stops or drags.
 
     The reaction of each port is the force, constant over the step, that brings the port to rest
-    at the step's end, clipped to the level of dry friction there; at rest it holds up to the
+    at the step's end, clipped to the level of dry friction halfway; at rest it holds up to the
     break-away level above that. Ports that are coupled through the mass matrix share their reactions by
     projected Gauss-Seidel sweeps; one port needs one.
 
@@ -291,27 +291,37 @@ def set_valued_step(
         none = jnp.zeros(ports)
         flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
     free = flow(x)
-    midway, end = 0.5 * (x.qd + free.qd), u(jnp.asarray(1.0))
+    end = u(jnp.asarray(1.0))
 
-    def residual(qdd: Array) -> tuple[Array, Balance]:
+    def residual(qdd: Array, midway: Array) -> tuple[Array, Balance]:
         levels = plant.balance(x.q, midway, qdd, end, t, x.own, jnp.zeros(ports))
         return levels.residual, levels
 
     # The mass does not depend on the velocity: one balance gives it and the levels.
-    mass, levels = _mass(plant, residual, x.q)
+    midway = 0.5 * (x.qd + free.qd)
+    mass, levels = _mass(plant, lambda qdd: residual(qdd, midway), x.q)
     slides = levels.slides
     if not slides:
         return free
     speed, before = (_port_speed(plant, at, slides) for at in (free, x))
     mobility = h * _mobility(plant, mass, x.q, slides)
-    dry, stick = _picked(levels.dry, slides), _picked(levels.stick, slides)
-    # Break-away acts until a port slides, and again where it would pass through rest.
-    own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
-    slid = speed - jnp.sign(before) * own * dry
-    rests = (before == 0.0) | (before * slid < 0.0)
-    hold = dry + jnp.where(rests, stick, 0.0)
-    reaction, stuck = _box_reaction(mobility, speed, dry, hold)
-    return _rest_exactly(flow(x, _spread(reaction, slides, ports)), stuck, slides)
+
+    def answered(levels: Balance) -> tuple[Array, Array]:
+        dry, stick = _picked(levels.dry, slides), _picked(levels.stick, slides)
+        # Break-away acts until a port slides, and again where it would pass through rest.
+        own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
+        slid = speed - jnp.sign(before) * own * dry
+        rests = (before == 0.0) | (before * slid < 0.0)
+        reaction, stuck = _box_reaction(mobility, speed, dry, dry + jnp.where(rests, stick, 0.0))
+        return _spread(reaction, slides, ports), stuck
+
+    reaction, stuck = answered(levels)
+    zero = jnp.zeros_like(x.q)
+    if depends(lambda v: residual(zero, v)[1].dry, (midway,)):
+        # Without friction motion begins too fast, and friction that falls with speed is too small.
+        slowed = free.qd + h * _solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
+        reaction, stuck = answered(residual(zero, 0.5 * (x.qd + slowed))[1])
+    return _rest_exactly(flow(x, reaction), stuck, slides)
 
 
 def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:

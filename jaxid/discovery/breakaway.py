@@ -100,17 +100,15 @@ def break_away(
     cuts = starts_from_rest(machine, alike, noise, known) if known else []
     enough = [[s for s in of_joint if s.count >= _FEWEST] for of_joint in cuts]
     most = max((s.count for of_joint in enough for s in of_joint), default=0)
+    padded = 2 ** int(np.ceil(np.log2(max(most, 1))))
     found: dict[int, BreakAway | str] = {}
-    for k, (joint, of_joint) in enumerate(zip(known, enough, strict=True)):
-        few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
+    for k, joint in enumerate(known):
         judged = []
-        for starts in of_joint:
-            padded = 2 ** int(np.ceil(np.log2(most)))
-            levels, fits = _fits(
-                estimate, log, starts, padded, float(noise[joint]), known, k, steps
-            )
+        for starts in enough[k]:
+            fits = _fits(estimate, log, starts, padded, float(noise[joint]), known, k, steps)
             leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
-            judged.append(_judge(levels, fits, leaves[np.asarray(starts.log) == 0]))
+            judged.append(_judge(*fits, leaves[np.asarray(starts.log) == 0]))
+        few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
         found[joint] = max(judged, key=lambda b: b.evidence, default=few)
     return [why or found[j] for j, why in zip(joints, unknown, strict=True)]
 

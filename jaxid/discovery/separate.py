@@ -37,7 +37,8 @@ _LONGEST = 30_000
 # Starts that are optimised, of those that look best, and evaluations for each.
 _OPTIMISED = 3
 _EVALUATIONS = 60
-# Integration steps in all evaluations together, and fewest evaluations: what is stiff gets fewer.
+# Integration steps of all joints in all evaluations together, and fewest evaluations: what is stiff
+# gets fewer.
 _STEPS = 5_000_000
 _FEWEST = 8
 # Order of the noise's model, as in the search.
@@ -246,7 +247,8 @@ def _optimised(
         good = np.isfinite(value) & np.all(np.isfinite(slope))
         return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))
 
-    affordable = max(_STEPS // (len(shapes.basis) * bench.drive.substeps), _FEWEST)
+    steps = len(shapes.basis) * bench.drive.substeps * bench.start.size
+    affordable = max(_STEPS // steps, _FEWEST)
     # The last start is the log's own signal where it has one: the surest to keep to its limits.
     looked_at = [starts[-1], *starts[:-1]][: affordable // 2]
     ranked = sorted(looked_at, key=lambda p: both(p)[0])[:_OPTIMISED]

@@ -1,0 +1,48 @@
+"""The step that sticks exactly, against the exact stepper: breaking loose, sliding and stopping."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import stepper
+
+from jaxid.effects import EFFECTS
+from jaxid.plants import Axis
+from jaxid.simulation import Drive, open_loop
+
+MASS, RATE, SECONDS = 2.5, 500.0, 0.6
+COULOMB = {"coulomb_friction": {"level": 11.8}}
+STRIBECK = COULOMB | {"stribeck_friction": {"level": 3.7, "velocity": 0.05}}
+BREAK_AWAY = COULOMB | {"static_friction": {"level": 3.7}}
+# Up through the level at which it breaks loose, and back down until it stops.
+COMMAND = 25.0 * np.sin(2 * np.pi * 1.3 * np.arange(round(SECONDS * RATE)) / RATE)
+
+
+def true_position(effects) -> np.ndarray:
+    machine = stepper.Machine(inertia=MASS, effects=effects)
+    loop = stepper.Loop(kind="open_loop", input=COMMAND)
+    return stepper.simulate(
+        machine, loop, stepper.Sensor(0.0, 0.0, 0.0), rate=RATE, duration=SECONDS
+    )["true_position"]
+
+
+def error(effects, substeps: int) -> float:
+    """Largest, over the largest position."""
+    plant = Axis(MASS, effects=tuple(EFFECTS[kind](**values) for kind, values in effects.items()))
+    drive = Drive(jnp.ones(1), 1 / RATE, substeps=substeps, set_valued=True)
+    run = open_loop(plant, drive, jnp.asarray(COMMAND)[:, None], jnp.zeros(1), jnp.zeros(1))
+    true = true_position(effects)
+    return float(np.abs(np.asarray(run.position)[:, 0] - true).max() / np.abs(true).max())
+
+
+@pytest.mark.parametrize("effects", [COULOMB, STRIBECK, BREAK_AWAY], ids=["coulomb", "stribeck", "static"])
+def test_motion_from_rest_is_the_exact_one(effects):
+    assert error(effects, 1) < 2e-3
+    assert error(effects, 8) < 3e-4
+
+
+def test_friction_that_falls_with_speed_is_taken_halfway():
+    """One look at the level, at the motion without friction, leaves an error of first order."""
+    coarse, fine = error(STRIBECK, 1), error(STRIBECK, 4)
+    # Taken once they are 1.1e-2 and 2.6e-3.
+    assert coarse < 5e-4
+    assert fine < 0.2 * coarse
