@@ -41,6 +41,8 @@ _EVALUATIONS = 60
 # gets fewer.
 _STEPS = 5_000_000
 _FEWEST = 8
+# Integration steps a tick of a pair that no log of such ticks can tell apart.
+_FASTEST = 32
 # Order of the noise's model, as in the search.
 _ORDER = 20
 # Amplitudes tried until the machine keeps within its limits, whichever rival it is.
@@ -71,6 +73,7 @@ class Proposal:
         needed: Evidence that it takes for the other to be ruled out.
         limits: What the experiment had to keep to.
         peaks: How far the machine goes in it, whichever effect is the true one.
+        steps: Integration steps a tick that the faster of the two asks for.
     """
 
     named: str
@@ -85,6 +88,12 @@ class Proposal:
     needed: float
     limits: Limits
     peaks: Peaks | None
+    steps: int
+
+    @property
+    def too_fast(self) -> bool:
+        """Whether what tells the two apart is over within a small part of a tick."""
+        return self.steps > _FASTEST
 
     @property
     def separates(self) -> bool:
@@ -144,7 +153,9 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
     stage = _stage(session, search, bench)
     shapes, starts = _family(session, limits, bench)
     best, outcome, peaks = None, None, None
-    for p in _optimised(starts, bench, Duel.of(pair), shapes, limits):
+    steps = bench.drive.substeps
+    promising = _optimised(starts, bench, Duel.of(pair), shapes, limits) if steps <= _FASTEST else []
+    for p in promising:
         fitting = _within(stage, pair, shapes, p, limits)
         if fitting is None:
             continue
@@ -160,7 +171,7 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
         own.label, rival.candidate.label, tuple(pair.plant.place(p) for p in pair.ports),
         "input" if bench.controller is None else "reference", tick * np.arange(ticks), best,
         np.asarray(bench.start if best is None else bench.start_of(best[0])),
-        present.nats, outcome.nats, outcome.needed, limits, peaks,
+        present.nats, outcome.nats, outcome.needed, limits, peaks, steps,
     )
 
 
