@@ -34,6 +34,9 @@ _FEWEST = 3
 # Levels tried at once, twice: over all that the log allows, then between neighbours of the best.
 _LEVELS = 40
 _FOLDS = 4
+# What is found must stay with so many times the integration steps: what one a sample leave wrong
+# may look like a late start where the readings are fine.
+_FINER = 8
 # A start tells its moment and its vigour, and what the model does wrong there is the same in all
 # samples that follow: so many of them count as independent.
 _TELLS = 3
@@ -102,14 +105,18 @@ def break_away(
     most = max((s.count for of_joint in enough for s in of_joint), default=0)
     padded = 2 ** int(np.ceil(np.log2(max(most, 1))))
     found: dict[int, BreakAway | str] = {}
+    few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
     for k, joint in enumerate(known):
-        judged = []
-        for starts in enough[k]:
-            fits = _fits(estimate, log, starts, padded, float(noise[joint]), known, k, steps)
-            leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
-            judged.append(_judge(*fits, leaves[np.asarray(starts.log) == 0]))
-        few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
-        found[joint] = max(judged, key=lambda b: b.evidence, default=few)
+        for finer in (1, _FINER):
+            judged = []
+            for starts in enough[k]:
+                own = float(noise[joint])
+                fits = _fits(estimate, log, starts, padded, own, known, k, finer * steps)
+                leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
+                judged.append(_judge(*fits, leaves[np.asarray(starts.log) == 0]))
+            found[joint] = max(judged, key=lambda b: b.evidence, default=few)
+            if not (judged and found[joint].holds):
+                break
     return [why or found[j] for j, why in zip(joints, unknown, strict=True)]
 
 
