@@ -16,6 +16,15 @@ from chain_oracle import (
 from chain_stepper import elongations, name_of
 from hidden_chains import KINDS, NOISES, ChainCase, cases, text_of_chain, write_files
 from hidden_oracle import Sight, Whitener
+from hidden_run import logged, text_of
+from search_setup import write_case
+
+from jaxid.discovery import candidates as cand
+from jaxid.discovery.discover import start_search, where_of
+from jaxid.discovery.search import Step
+from jaxid.discovery.where import variables
+from jaxid.plants.chain import Chain
+from jaxid.session import open_session
 
 EVERY = [*cases("test")]
 HIDING = [c for c in EVERY if c.hidden]
@@ -179,3 +188,18 @@ def test_files_hold_what_the_case_names(tmp_path):
     assert len(paths) == 3
     log = np.loadtxt(paths[2], delimiter=",", skiprows=1)
     np.testing.assert_allclose(log[:, 1], HIDING[3].run(validation=True)["position"][:, 0], rtol=1e-9)
+
+
+def test_where_points_at_the_spring(tmp_path):
+    """Not at a position, nor at the moments in which a cubic spring is far from its line."""
+    case = next(c for c in cases("calibrate") if c.what == "cubic_stiffness" and c.place == 2)
+    session = open_session(write_case(tmp_path, text_of(case)), logged(case), align_hold=True)
+    _, search = start_search(session)
+    search.theta = cand.refine(search.union, search.samples, search.theta, search.active)[0]
+    step = Step(None, None, (), 0.0, search.theta, search.active)
+    where = where_of(search, step, session.fit.log)
+    assert where.significant
+    assert where.variable == "elongation of spring 2"
+    assert where.joint in (1, 2)
+    assert where.region[1] > where.region[0]
+    assert "force" not in variables(session.fit.data, 0, Chain(*np.ones((2, 3)), np.ones(4), actuated=(1,)))

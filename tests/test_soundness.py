@@ -290,3 +290,14 @@ def test_tx40_is_sound(measured):
     # Chosen: what a guess for an arm of this size might be, at the joints.
     guess = [1.0, 1.0, 0.3, 0.1, 0.1, 0.05]
     assert plausible_inertia(joint_side, guess, motion="rotary") is None
+
+
+def test_a_reference_belongs_to_the_joint_that_is_driven():
+    """Of two joints only the second has a drive: its reference is not the first one's position."""
+    log = axis_log()
+    follower = np.column_stack([0.3 * log.position[:, 0], log.position[:, 0]])
+    both = dataclasses.replace(log, position=follower, velocity=None)
+    assert not [f for f in check_log(both, driven=[1]) if "reference" in f.what]
+    assert [f.where for f in check_log(both) if "reference" in f.what] == [
+        f"{both.source}, reference of joint 1"
+    ]

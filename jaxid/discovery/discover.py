@@ -159,7 +159,7 @@ def discover(
     baseline, search = start_search(session, progress)
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
-    where = _where(search, steps[0], session.fit.log)
+    where = where_of(search, steps[0], session.fit.log)
     final, effects = _final_machine(baseline.machine, search, alternatives, steps)
     verdict = _verdict(effects, where, steps, search)
     before = baseline
@@ -233,7 +233,7 @@ def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
     )
 
 
-def _where(search: Search, baseline: Step, log: Log) -> Where:
+def where_of(search: Search, baseline: Step, log: Log) -> Where:
     """Where the baseline's residual lies, on the whole log."""
     whole = [ForceData.of(search.data)]
     e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta)
@@ -246,7 +246,7 @@ def _where(search: Search, baseline: Step, log: Log) -> Where:
     # What joints share cannot be moved for one of them alone.
     alone = np.sum(search.union.enters[:, baseline.active], axis=0) == 1
     own = jacobian[..., baseline.active[alone]]
-    return locate(-e, own, search.data, search.colour, wanted)
+    return locate(-e, own, search.data, search.colour, wanted, search.union.machine.plant)
 
 
 def _verdict(

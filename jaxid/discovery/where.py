@@ -6,13 +6,15 @@ like any candidate: on held-out time, against surrogates.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.noise import fit_whitener
+from jaxid.model import Plant
 from jaxid.precision import NoiseModel
 from jaxid.preprocess import Prepared
 
@@ -28,6 +30,7 @@ _OWN_NOISE = ("acceleration", "force")
 _FAR_MORE = 2.0
 # Intervals say where a residual lies if they hold most of its sum of squares.
 _MOSTLY = 0.5
+_SAYS_MORE = 2.0
 # A spectral line must carry this part of the variance, and stand above the median of its
 # neighbours by a factor that white noise exceeds once in 10^8.
 _LINE_PART = 0.05
@@ -47,7 +50,7 @@ class Where:
         explained: Part of the residual's variance that the variable explains on held-out time.
         evidence: Held-out gain in log-likelihood [nats].
         threshold: What noise alone exceeds once in a thousand.
-        clear: Whether position, velocity or time explain more than that.
+        clear: Whether position, elongation, velocity or time explain more than that.
         x, mean, low, high: The curve and its 95 % band, in force.
         frequency_hz: Of a spectral line; None without one.
     """
@@ -74,25 +77,50 @@ class Where:
         return self.clear or self.frequency_hz is not None or loud
 
 
-def variables(data: Prepared, joint: int) -> dict[str, Float[np.ndarray, " kept"]]:
-    """What a residual may depend on, at the kept samples."""
+def variables(
+    data: Prepared, joint: int, plant: Plant | None = None
+) -> dict[str, Float[np.ndarray, " kept"]]:
+    """What a residual may depend on, at the kept samples.
+
+    Args:
+        data: The prepared log.
+        joint: 0-based.
+        plant: Its springs stretch by more than one position, and not every joint need have a drive;
+            left out: an axis.
+    """
     v = data.at_kept(data.qd)[:, joint]
     time = data.times
     flips = np.flatnonzero(np.diff(np.sign(v)) != 0)
     last = np.maximum.accumulate(np.where(np.isin(np.arange(len(v)), flips + 1), time, time[0]))
+    drive = 0 if plant is None else plant.drive_of(joint, data.force.shape[1])
+    force = {} if drive is None else {"force": data.at_kept(data.force)[:, drive]}
     return {
         "velocity": v,
         "position": data.at_kept(data.q)[:, joint],
         "acceleration": data.at_kept(data.qdd)[:, joint],
-        "force": data.at_kept(data.force)[:, min(joint, data.force.shape[1] - 1)],
+        **force,
+        **({} if plant is None else _elongations(plant, data.at_kept(data.q), joint)),
         "time since reversal": time - last,
         "time": time,
     }
 
 
+def _elongations(
+    plant: Plant, q: Float[np.ndarray, "kept n"], joint: int
+) -> dict[str, Float[np.ndarray, " kept"]]:
+    """Of the springs between a joint and another; of one to a wall it is the position."""
+    n = q.shape[1]
+    if plant.springs(n) == 0:
+        return {}
+    ports, slope = np.asarray(jax.vmap(plant.ports)(q)), np.asarray(jax.jacfwd(plant.ports)(q[0]))
+    between = [k for k in range(n, ports.shape[1]) if slope[k, joint] and np.count_nonzero(slope[k]) > 1]
+    return {f"elongation of spring {k - n + 1}": ports[:, k] for k in between}
+
+
 def locate(
     residual: Float[np.ndarray, "kept n"], jacobian: Float[np.ndarray, "kept n p"], data: Prepared,
     colour: tuple[NoiseModel, ...], wanted: Float[np.ndarray, "kept n"] | None = None,
+    plant: Plant | None = None,
 ) -> Where:
     """Find the joint and variable that explain most of a residual.
 
@@ -102,10 +130,11 @@ def locate(
         data: The prepared log.
         colour: Of the noise that the sensors leave, by joint.
         wanted: Velocity of the reference at the kept samples; absent: unknown.
+        plant: As `variables` takes it.
     """
     wanted = data.at_kept(data.qd) if wanted is None else wanted
     found = [
-        _locate(residual[:, i], jacobian[:, i], data, colour[i], wanted[:, i], i)
+        _locate(residual[:, i], jacobian[:, i], data, colour[i], wanted[:, i], i, plant)
         for i in range(residual.shape[1])
     ]
     return max(found, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
@@ -113,10 +142,10 @@ def locate(
 
 def _locate(
     e: np.ndarray, jacobian: np.ndarray, data: Prepared, colour: NoiseModel, wanted: np.ndarray,
-    joint: int,
+    joint: int, plant: Plant | None,
 ) -> Where:
     counts = data.moving[:, joint]
-    named = variables(data, joint)
+    named = variables(data, joint, plant)
     hats = {name: _hats(x, counts) for name, x in named.items()}
     every = np.concatenate(list(hats.values()), axis=1)
     whitener, _ = fit_whitener(
@@ -147,25 +176,28 @@ def _locate(
     clean = max((n for n in gains if n not in _OWN_NOISE), key=lambda n: gains[n])
     explained = _explained(gains[clean], counts)
     line = line if part > explained else None
-    if line is not None or _share(e, counts, data, intervals) > max(explained, _MOSTLY):
+    clear = gains[clean] > limit
+    # A curve that is there says more than the times at which it is far from zero.
+    said = _SAYS_MORE * explained if clear else explained
+    if line is not None or _share(e, counts, data, intervals) > max(said, _MOSTLY):
         best = "time"
     else:
         best = _best(gains, clean)
-    found = _describe(e, counts, named[best], best, joint, gains[best], limit, intervals, line)
-    return replace(found, clear=gains[clean] > limit)
+    gain = gains[best]
+    return _describe(e, counts, named[best], best, joint, gain, limit, clear, intervals, line)
 
 
 def _best(gains: dict[str, float], clean: str) -> str:
     """The variable to name: one that carries the residual's noise must explain far more."""
-    other = max(_OWN_NOISE, key=lambda n: gains[n])
+    other = max((n for n in _OWN_NOISE if n in gains), key=lambda n: gains[n])
     return other if gains[other] > _FAR_MORE * max(gains[clean], 0.0) else clean
 
 
 def _describe(
     e: np.ndarray, counts: np.ndarray, x: np.ndarray, name: str, joint: int, gain: float,
-    limit: float, intervals: tuple, line: float | None,
+    limit: float, clear: bool, intervals: tuple, line: float | None,
 ) -> Where:
-    centre, mean, error = _binned(e, counts, x)
+    centre, mean, error, ends = _binned(e, counts, x)
     peak = int(np.argmax(np.abs(mean) - error))
     strong = np.abs(mean) > 0.5 * np.abs(mean[peak])
     lo, hi = peak, peak
@@ -173,16 +205,16 @@ def _describe(
         lo -= 1
     while hi < len(mean) - 1 and strong[hi + 1] and mean[hi + 1] * mean[peak] > 0:
         hi += 1
+    region = float(ends[lo, 0]), float(ends[hi, 1])
     explained = _explained(gain, counts)
     text = f"joint {joint + 1}: the residual depends on {name}"
-    text += f", most between {centre[lo]:.3g} and {centre[hi]:.3g} (SI)"
+    text += f", most between {region[0]:.3g} and {region[1]:.3g} (SI)"
     if line is not None:
         text = f"joint {joint + 1}: the residual holds a line at {line:.3g} Hz that the wanted motion lacks"
     elif name == "time" and intervals:
         text = f"joint {joint + 1}: the residual is loud in {len(intervals)} interval(s) of time"
     return Where(
-        joint + 1, name, (float(centre[lo]), float(centre[hi])), intervals,
-        text, explained, gain, limit, gain > limit, centre, mean,
+        joint + 1, name, region, intervals, text, explained, gain, limit, clear, centre, mean,
         mean - 1.96 * error, mean + 1.96 * error, line,
     )
 
@@ -221,8 +253,8 @@ def _held(columns: np.ndarray, e: np.ndarray, blocks: np.ndarray) -> np.ndarray:
 
 def _binned(
     e: np.ndarray, counts: np.ndarray, x: np.ndarray, bins: int = 30
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean of e in bins of x with equal counts, and the error of that mean."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float[np.ndarray, "bin 2"]]:
+    """Of bins of x with equal counts the median, the mean of e and its error, and both ends."""
     order = np.argsort(x[counts])
     parts = [p for p in np.array_split(order, bins) if len(p)]
     es, xs = e[counts], x[counts]
@@ -230,7 +262,8 @@ def _binned(
     mean = np.array([np.mean(es[p]) for p in parts])
     # Neighbours in time are correlated: count a fifth of the samples as independent.
     error = np.array([np.std(es[p]) / np.sqrt(max(len(p) / 5, 1)) for p in parts])
-    return centre, mean, error
+    ends = np.array([(xs[p].min(), xs[p].max()) for p in parts])
+    return centre, mean, error, ends
 
 
 def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[float, float], ...]:

@@ -191,5 +191,5 @@ def _where_plot(result: Discovery) -> WherePlot | None:
     unit = {
         "velocity": label("position/time"), "position": label("position"),
         "acceleration": label("position/time2"), "force": label("force"),
-    }.get(w.variable, "s")
+    }.get(w.variable, label("position") if w.variable.startswith("elongation") else "s")
     return WherePlot(w.variable, unit, w.x, w.mean, w.low, w.high)
