@@ -10,9 +10,9 @@ import numpy as np
 
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS
-from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import alone
 from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
 from jaxid.io.case import Case
 from jaxid.io.log import Log
@@ -114,7 +114,7 @@ def identify(
             mend="give at least one parameter as { guess = ... }",
         )
     progress(f"fitting by {method}")
-    estimate = METHODS[method](session, **options)
+    estimate = alone(METHODS[method](session, **options))
     progress("simulating")
     return Identification(
         session, estimate, gaps(estimate.machine, session.runs),
@@ -155,10 +155,3 @@ def simulated(machine: Machine, log: Log) -> SimulationGap | None:
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     gap = simulation_gap(machine, replay, log)
     return gap if np.all(np.isfinite(gap.rms)) and np.all(gap.relative < 1e3) else None
-
-
-def force_start(session: Session) -> np.ndarray | None:
-    """Start for a simulation fit from inverse dynamics, where that tells all unknowns."""
-    estimate = inverse_dynamics(session.machine, session.fit.data)
-    good = estimate.converged and bool(np.all(estimate.identifiable))
-    return estimate.theta if good else None

@@ -23,6 +23,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import ForceData, sharpened
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import Plant
@@ -154,6 +155,11 @@ def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
     Raises:
         InputError: If too few windows are left.
     """
+    return alone(algebraic_steps(machine, log, data))
+
+
+def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimate]:
+    """`algebraic`, as what is to be solved."""
     plant, arrays = sharpened(machine.plant, data), ForceData.of(data)
     length = int(min(_WINDOW_PERIODS / (data.recipe.cutoff_hz * log.period), log.samples / 8))
     starts = np.arange(0, log.samples - length + 1, length // 2)
@@ -166,11 +172,11 @@ def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
             f"only {int(rows.sum())} windows of {length * log.period:.3g} s hold no rest",
             where=log.source, mend="take a log with longer motion, or use inverse_dynamics",
         )
-    fit = _solve(
+    fit = yield Solve(_solve, (
         plant, parameters.places, arrays, jnp.asarray(log.position), length,
         jnp.asarray(rows, dtype=float), parameters.guess, Transform.of(parameters),
         parameters.bounds,
-    )
+    ))
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))

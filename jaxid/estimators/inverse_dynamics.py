@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from jaxid import signals
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.machine import Machine
 from jaxid.model import Plant, carries_force, parameters_of
 from jaxid.parameters import scatter
@@ -139,16 +140,22 @@ def inverse_dynamics(
         Gautier (1986) and Janot, Vandanjon & Gautier (2014) for filtered inverse dynamics; Tukey's
         bisquare with constant 4.685 for the weights.
     """
+    return alone(inverse_dynamics_steps(machine, data, reweighted=reweighted, start=start))
+
+
+def inverse_dynamics_steps(
+    machine: Machine, data: Prepared, *, reweighted: bool = False, start: Array | None = None
+) -> Steps[Estimate]:
+    """`inverse_dynamics`, one solve at a time."""
     plant = sharpened(machine.plant, data)
     rows = data.fitted
     arrays = ForceData.of(data, rows)
     parameters = machine.parameters
     theta = parameters.guess if start is None else jnp.asarray(start)
     places, transform = parameters.places, Transform.of(parameters)
-    fits = [
-        _solve(plant, places, arrays, at, transform, parameters.bounds)
-        for at in _starts(machine, theta)
-    ]
+    fits = []
+    for at in _starts(machine, theta):
+        fits.append((yield Solve(_solve, (plant, places, arrays, at, transform, parameters.bounds))))
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
     # Of those that reach the lowest cost, to rounding, one that converged.
     lowest = [f for f, c in zip(fits, costs, strict=True) if c <= min(costs) * (1 + 1e-6)]
@@ -157,7 +164,7 @@ def inverse_dynamics(
         e = np.asarray(fit.residual).reshape(data.moving.shape)
         weight = jnp.asarray(np.sqrt(_bisquare(e, rows)) * rows)
         arrays = eqx.tree_at(lambda a: a.weight, arrays, weight)
-        fit = _solve(plant, places, arrays, fit.theta, transform, parameters.bounds)
+        fit = yield Solve(_solve, (plant, places, arrays, fit.theta, transform, parameters.bounds))
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, arrays, np.asarray(fit.theta), e, jacobian, rows)

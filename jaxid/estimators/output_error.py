@@ -16,6 +16,7 @@ from jaxtyping import Array
 
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.io.log import Log
 from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
@@ -88,6 +89,16 @@ def output_error(
     Returns:
         The estimate; its covariance takes the residual's colour into account.
     """
+    return alone(
+        output_error_steps(machine, log, start=start, numerics=numerics, hessian=hessian)
+    )
+
+
+def output_error_steps(
+    machine: Machine, log: Log, *, start: np.ndarray | None = None, numerics: Numerics | None = None,
+    hessian: bool = False,
+) -> Steps[Estimate]:
+    """`output_error`, one solve at a time."""
     machine = machine if start is None else machine.with_estimate(start)
     numerics = numerics or choose_numerics(machine, log)
     replay = make_replay(machine, log, numerics)
@@ -96,15 +107,16 @@ def output_error(
     p = len(machine.parameters.free)
     problem = _problem(machine, replay, log, nuisance)
     active = np.arange(p + nuisance) < p
-    minimum = _fit(*problem, active)
+    minimum = yield Solve(_fit, (*problem, active))
     if nuisance:
-        problem, active, minimum = _with_start(machine, log, problem, minimum)
+        problem, active = _with_start(machine, log, problem, minimum)
+        minimum = yield Solve(_fit, (*problem, active))
     e = np.asarray(minimum.residual).reshape(log.position.shape)
     jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
     theta = np.asarray(minimum.theta)
     counts = np.ones(e.shape, bool)
     names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
-    full = np.asarray(_hessian(*problem[:5], minimum.theta)) if hessian else None
+    full = np.asarray((yield Solve(_hessian, (*problem[:5], minimum.theta)))) if hessian else None
     precision = assess(
         names, jacobian[..., active], e, counts,
         float(np.linalg.norm(log.position - log.position.mean(axis=0))),
@@ -128,8 +140,8 @@ def output_error(
 
 def _with_start(
     machine: Machine, log: Log, problem: tuple, minimum: Minimum
-) -> tuple[tuple, np.ndarray, Minimum]:
-    """Fit again from a start that suits the fitted plant; with the start where noise is all that is left."""
+) -> tuple[tuple, np.ndarray]:
+    """A fit from a start that suits the fitted plant; of the start too where noise is all that is left."""
     p = len(machine.parameters.free)
     fitted = machine.with_estimate(np.asarray(minimum.theta)[:p])
     replay = with_fitted_start(problem[0], fitted.plant, log)
@@ -138,7 +150,7 @@ def _with_start(
     noise = position_noise(machine, log)
     free = bool(rms <= _NOISE_LIMITED * np.max(noise))
     active = (np.arange(len(minimum.theta)) < p) | free
-    return problem, active, _fit(*problem, active)
+    return problem, active
 
 
 def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple:

@@ -54,6 +54,11 @@ class Estimate:
         """Which parameters the log can tell."""
         return self.precision.identifiable
 
+    @property
+    def told(self) -> bool:
+        """Whether the solver converged and the log tells all parameters."""
+        return self.converged and bool(np.all(self.identifiable))
+
     def value(self, name: str) -> float:
         """Estimate of one parameter.
 
