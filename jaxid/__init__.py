@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jaxid.io.log import read_log as read_log
     from jaxid.plants import PLANTS as PLANTS
     from jaxid.session import open_session as open_session
+    from jaxid.studies.study import study as study
 
 # Loaded on first use: importing JAX takes a second, and much of jaxid (its help, its checks of
 # bad input) does without.
@@ -25,6 +26,7 @@ _HOMES = {
     "identify": ("jaxid.identification", "identify"),
     "simulate": ("jaxid.virtual", "simulate"),
     "check": ("jaxid.checks", "check"),
+    "study": ("jaxid.studies.study", "study"),
     "load_case": ("jaxid.io.case", "load_case"),
     "read_log": ("jaxid.io.log", "read_log"),
     "Log": ("jaxid.io.log", "Log"),

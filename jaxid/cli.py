@@ -71,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     _check(commands)
     _identify(commands)
     _discover(commands)
+    _study(commands)
     return parser
 
 
@@ -133,6 +134,18 @@ def _discover(commands: argparse._SubParsersAction) -> None:
     _logs(parser)
     _validate(parser)
     parser.add_argument("--max-effects", metavar="N", type=int, default=5, help="default: 5")
+
+
+def _study(commands: argparse._SubParsersAction) -> None:
+    what = "simulate and identify a case over and over: bias, spread, and whether intervals hold the truth"
+    parser = _add(commands, "study", what, _run_study)
+    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("-o", metavar="DIR", help="where chunks and results go; absent: only printed")
+    parser.add_argument(
+        "--runs", metavar="N", type=int, help="at each level of noise; absent: the case's, or 100"
+    )
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything drawn; default: 0")
+    parser.add_argument("--resume", action="store_true", help="go on with what was interrupted")
 
 
 @contextmanager
@@ -240,6 +253,33 @@ def _run_discover(args: argparse.Namespace) -> int:
     from jaxid.io.results import discovery_files
 
     return _finish(args, result, *discovery_files(result))
+
+
+def _run_study(args: argparse.Namespace) -> int:
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}", mend="give zero or more")
+    from tqdm import tqdm
+
+    from jaxid.studies.study import study
+
+    with tqdm(disable=args.quiet or not sys.stderr.isatty(), leave=False, unit="run") as bar:
+
+        def tell(done: int, runs: int) -> None:
+            if bar.total is None:
+                bar.reset(total=runs)
+                bar.initial = done
+            bar.update(done - bar.n)
+
+        result = study(
+            args.case, runs=args.runs, seed=args.seed, folder=args.o, resume=args.resume,
+            force=args.force, progress=tell,
+        )
+    print(result)
+    if args.o is not None:
+        from jaxid.studies.result import FILES
+
+        print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in FILES)}")
+    return 0
 
 
 def _run_demo(args: argparse.Namespace) -> int:

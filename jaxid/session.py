@@ -115,6 +115,26 @@ def open_session(
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
 
 
+def session_around(
+    case: Case, machine: Machine, log: Log, recipe: Recipe | None = None
+) -> Session:
+    """A session around a simulated log, which no file was read for and nothing can be wrong with.
+
+    Args:
+        case: The case.
+        machine: At the start of a fit.
+        log: The log.
+        recipe: How to filter it; absent: chosen from it.
+
+    Raises:
+        InputError: If the log is too short, or moves too little.
+    """
+    recipe = recipe or choose_recipe(log, case.preprocess)
+    data = _prepare(log, machine, recipe)
+    run = Run("fit", log, data, machine.disturbance)
+    return Session(case, _scaled(machine, data), run, (), recipe, ())
+
+
 def _read(case: Case, log: Log | str | Path, columns: dict) -> Log:
     joints, drives = case.plant.joints, case.plant.drives
     if not isinstance(log, Log):

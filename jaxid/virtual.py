@@ -8,13 +8,17 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxid.errors import InputError
+from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
 from jaxid.io.output import write_whole
 from jaxid.machine import Machine, build_machine, disturbance_at
+from jaxid.model import Plant
 from jaxid.references import make_reference
+from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, Trajectory, closed_loop, needed_substeps, open_loop
 
 
@@ -68,70 +72,103 @@ def simulate(case: Case | str | Path, *, seed: int = 0) -> Virtual:
     Raises:
         InputError: If the case does not say what to simulate.
     """
-    case = case if isinstance(case, Case) else load_case(case)
-    where = str(case.path)
-    setting = case.simulation
-    for key in ("duration", "sample_rate"):
-        if key not in setting:
-            raise InputError(
-                f"[simulation] has no {key}", where=where, mend=f"add {key} = ... to [simulation]"
-            )
-    rate, duration = float(setting["sample_rate"]), float(setting["duration"])
-    machine = build_machine(case, true=True, period=1 / rate)
-    joints = case.plant.joints
-    position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
-    velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
-    rng = np.random.default_rng(seed)
-    if machine.controller is None:
-        return _open(case, machine, rate, duration, position, velocity, rng)
-    return _closed(case, machine, rate, duration, position, velocity, rng)
+    scene = Scene.of(case if isinstance(case, Case) else load_case(case))
+    return alone(scene.virtual(scene.machine, np.random.default_rng(seed)))
 
 
-def _closed(
-    case: Case, machine: Machine, rate: float, duration: float, position: np.ndarray,
-    velocity: np.ndarray, rng: np.random.Generator,
-) -> Virtual:
-    if not case.reference:
-        raise InputError(
-            "there is nothing to follow", where=str(case.path), mend="add a [reference]"
-        )
-    period = machine.controller.period
-    every = max(1, round(1 / (rate * period)))
-    reference = _by_drive(make_reference(case.reference, 1 / period, duration, case.folder), machine)
-    times = period * np.arange(len(reference))
-    machine = _scaled(machine, reference, period)
-    drive = _drive(case, machine, period)
-    _refuse_coarse(case, machine, drive, reference)
-    noise = rng.standard_normal((len(reference), case.plant.joints))
-    run = eqx.filter_jit(closed_loop)(
-        machine.plant, drive, machine.controller, jnp.asarray(reference),
-        jnp.asarray(disturbance_at(machine.disturbance, times)), jnp.asarray(position),
-        jnp.asarray(velocity), machine.sensor, jnp.asarray(noise),
-    )
-    pick = slice(None, None, every)
-    log = _log(case, machine, times[pick], run.reading[pick], run.command[pick], rng, reference[pick])
-    return Virtual(log, run, _columns(case, reference=True))
+@dataclass(frozen=True)
+class Scene:
+    """What a case says of a simulation, ready to run with any values of its parameters.
+
+    Args:
+        case: The case.
+        machine: At its true values where it has any.
+        drive: How the command acts.
+        signal: Reference (in a loop) or input at every tick, by drive.
+        position, velocity: At the start.
+        every: The log holds one tick in so many.
+    """
+
+    case: Case
+    machine: Machine
+    drive: Drive
+    signal: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    every: int = 1
+
+    @classmethod
+    def of(cls, case: Case) -> Scene:
+        """The scene of a case.
+
+        Raises:
+            InputError: If the case does not say what to simulate.
+        """
+        where, setting = str(case.path), case.simulation
+        for key in ("duration", "sample_rate"):
+            if key not in setting:
+                raise InputError(
+                    f"[simulation] has no {key}", where=where, mend=f"add {key} = ... to [simulation]"
+                )
+        rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+        machine = build_machine(case, true=True, period=1 / rate)
+        joints = case.plant.joints
+        position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
+        velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
+        if machine.controller is None:
+            if not case.input:
+                raise InputError(
+                    "nothing drives the plant", where=where,
+                    mend="add an [input], or a [reference] and a [controller]",
+                )
+            command = make_reference(case.input, rate, duration, case.folder, where="input")
+            drive = _drive(case, machine, 1 / rate)
+            return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
+        if not case.reference:
+            raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
+        period = machine.controller.period
+        reference = _by_drive(make_reference(case.reference, 1 / period, duration, case.folder), machine)
+        machine = _scaled(machine, reference, period)
+        drive = _drive(case, machine, period)
+        _refuse_coarse(case, machine, drive, reference)
+        every = max(1, round(1 / (rate * period)))
+        return cls(case, machine, drive, reference, position, velocity, every)
+
+    def virtual(self, machine: Machine, rng: np.random.Generator) -> Steps[Virtual]:
+        """The log of a machine like the scene's, one run at a time.
+
+        Args:
+            machine: Its plant and its sensor count.
+            rng: Draws the sensors' noise.
+        """
+        noise = rng.standard_normal((len(self.signal), self.case.plant.joints))
+        times = self.drive.period * np.arange(len(self.signal))
+        start = (jnp.asarray(self.position), jnp.asarray(self.velocity))
+        signal, sensor = jnp.asarray(self.signal), (machine.sensor, jnp.asarray(noise))
+        looped = machine.controller is not None
+        if looped:
+            extra = jnp.asarray(disturbance_at(machine.disturbance, times))
+            args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
+            run = yield Solve(_closed_run, args)
+        else:
+            run = yield Solve(_open_run, (machine.plant, self.drive, signal, *start, *sensor))
+        pick = slice(None, None, self.every)
+        reference = self.signal[pick] if looped else None
+        reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
+        log = _log(self.case, machine, times[pick], reading, command, rng, reference)
+        return Virtual(log, run, _columns(self.case, reference=looped))
 
 
-def _open(
-    case: Case, machine: Machine, rate: float, duration: float, position: np.ndarray,
-    velocity: np.ndarray, rng: np.random.Generator,
-) -> Virtual:
-    if not case.input:
-        raise InputError(
-            "nothing drives the plant", where=str(case.path),
-            mend="add an [input], or a [reference] and a [controller]",
-        )
-    command = make_reference(case.input, rate, duration, case.folder, where="input")
-    command = _by_drive(command, machine)
-    drive = _drive(case, machine, 1 / rate)
-    run = eqx.filter_jit(open_loop)(
-        machine.plant, drive, jnp.asarray(command), jnp.asarray(position), jnp.asarray(velocity)
-    )
-    reading = machine.sensor.read(run.position, jnp.asarray(rng.standard_normal(run.position.shape)))
-    times = np.arange(len(command)) / rate
-    log = _log(case, machine, times, reading, run.command, rng, None)
-    return Virtual(log, run, _columns(case, reference=False))
+_closed_run = eqx.filter_jit(closed_loop)
+
+
+@eqx.filter_jit
+def _open_run(
+    plant: Plant, drive: Drive, command: Array, position: Array, velocity: Array, sensor: Sensor,
+    noise: Array,
+) -> Trajectory:
+    run = open_loop(plant, drive, command, position, velocity)
+    return eqx.tree_at(lambda r: r.reading, run, sensor.read(run.position, noise))
 
 
 def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:

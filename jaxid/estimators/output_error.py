@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -67,6 +68,28 @@ def _hessian(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array
 ) -> Array:
     return full_hessian(position_residual(replay, places, plant, measured, weight), theta)
+
+
+def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndarray:
+    """Derivative of the simulated position in the unknowns where they stand, (time, n, p).
+
+    Args:
+        machine: The machine.
+        log: Whose input drives it.
+        numerics: How to integrate.
+    """
+    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
+    unknown = machine.parameters
+    measured = jnp.asarray(log.position)
+    return -np.asarray(_jacobian(replay, unknown.places, machine.plant, measured, unknown.guess))
+
+
+@eqx.filter_jit
+def _jacobian(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, theta: Array
+) -> Array:
+    residual = position_residual(replay, places, plant, measured, jnp.ones(measured.shape))
+    return jax.jacfwd(residual)(theta)
 
 
 def output_error(

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from jaxid.discovery.discover import Discovery
     from jaxid.estimators.result import Estimate
     from jaxid.identification import Identification
+    from jaxid.studies.result import Study
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
@@ -128,3 +129,22 @@ def check_table(result: Any) -> str:
     ]
     table = ["", aligned(rows)] if len(rows) > 1 else []
     return "\n".join(["the log is sound", head, how, *table, *blind, *_notes(content["warnings"])])
+
+
+def study_table(result: Study) -> str:
+    """What `study` prints."""
+    part = lambda x: "-" if not np.isfinite(x) else f"{100 * x:.1f} %"
+    keys = ("bias", "spread", "std", "bound")
+    rows = [["estimator", "noise", "parameter", "bias", "spread", "reported", "bound", "unit",
+             "68 %", "95 %", "failed"]]  # fmt: skip
+    for r in result.summary:
+        numbers = [*[_number(r[k]) for k in keys], r["unit"]]
+        parts = [part(r[k]) for k in ("coverage_68", "coverage_95", "failed")]
+        rows.append([r["estimator"], f"{r['noise']:g}", r["parameter"], *numbers, *parts])
+    runs, levels = result.table.sizes["run"], result.table.sizes["noise"]
+    lines = [f"{result.title}: {runs} runs at {levels} level(s) of noise, {result.seconds:.3g} s of work"]
+    lines += ["", aligned(rows)]
+    for k, f in enumerate(result.failures):
+        lines += ["", "failed:"] if k == 0 else []
+        lines += [f"  {f['estimator']} at noise {f['noise']:g}: {f['runs']} of {runs}: {f['why']}"]
+    return "\n".join(lines)

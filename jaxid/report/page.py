@@ -50,15 +50,9 @@ def render(data: ReportData) -> str:
     Returns:
         The whole page.
     """
-    folder = resources.files("jaxid.report")
-    style = (folder / "page.css").read_text(encoding="utf-8")
-    page = (folder / "page.html").read_text(encoding="utf-8")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(page).render(
+    return filled(
+        "page.html",
         data=data,
-        style=Markup(style),
         verdict=tables.verdict_words(data),
         verdict_class=tables.verdict_class(data),
         answer=tables.answer(data),
@@ -76,6 +70,17 @@ def render(data: ReportData) -> str:
         experiments=[_experiment(data, view) for view in data.experiments],
         views=[_view_entry(data, view, i) for i, view in enumerate(data.views)],
     )
+
+
+def filled(template: str, **entries: object) -> str:
+    """A page of this folder with its entries, and with the style that all of them share."""
+    folder = resources.files("jaxid.report")
+    style = (folder / "page.css").read_text(encoding="utf-8")
+    page = (folder / template).read_text(encoding="utf-8")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(page).render(style=Markup(style), **entries)
 
 
 def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
@@ -101,7 +106,7 @@ def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
     if residual and len(view.band_time):
         for variable in ("velocity", "position", "time"):
             figure = plots.plot_residual_against(view, units, variables=(variable,))
-            entry["against"].append(_image(figure, f"{view.name}: force residual over {variable}"))
+            entry["against"].append(image(figure, f"{view.name}: force residual over {variable}"))
     return entry
 
 
@@ -121,7 +126,7 @@ def _rankings(data: ReportData) -> list[dict]:
             )
             figure = plots.plot_candidates(step)
             title = f"Step {number}: {tables.step_words(number, step)}"
-            rankings.append({"title": title, "image": _image(figure, words)})
+            rankings.append({"title": title, "image": image(figure, words)})
     return rankings
 
 
@@ -138,18 +143,23 @@ def _where_figure(data: ReportData) -> dict | None:
         return None
     region = (data.where or {}).get("region")
     figure = plots.plot_where(data.where_plot, data.units, region)
-    return _image(figure, f"Mean force residual over {data.where_plot[0]}")
+    return image(figure, f"Mean force residual over {data.where_plot[0]}")
 
 
 def _picture(words: str, draw, view: LogView | ExperimentView, units: Mapping, **options: object) -> dict:
     """Draw a plot over time twice: wide, and again for narrow screens."""
-    image = _image(draw(view, units, **options), words)
-    image["narrow"] = _image(draw(view, units, size=_NARROW, **options), words)["source"]
-    return image
+    wide = image(draw(view, units, **options), words)
+    wide["narrow"] = image(draw(view, units, size=_NARROW, **options), words)["source"]
+    return wide
 
 
-def _image(figure: Figure, words: str) -> dict:
-    """Turn a figure into what an img element needs."""
+def image(figure: Figure, words: str) -> dict:
+    """Turn a figure into what an img element needs.
+
+    Args:
+        figure: The figure.
+        words: What it shows, for those who cannot see it.
+    """
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     figure.set_dpi(_RASTER_DPI)

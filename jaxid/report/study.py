@@ -1,0 +1,73 @@
+"""The report of a study as one HTML page that needs neither network nor scripts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.report.numbers import pretty_unit, short
+from jaxid.report.page import filled, image
+from jaxid.report.study_plots import plot_coverage, plot_errors, plot_scatter
+
+if TYPE_CHECKING:
+    from jaxid.studies.result import Study
+
+
+def study_report(result: Study) -> str:
+    """The page.
+
+    Args:
+        result: What it shows.
+    """
+    rows, table = result.summary, result.table
+    figures = [
+        (
+            "Error against noise",
+            "The RMS error of all runs that were used, bias included. Dotted: the mean σ that the estimator "
+            "reports. Dashed: what no unbiased estimate from the readings can go below, the start and "
+            "the command known exactly.",
+            image(plot_errors(rows), "RMS error of every estimator over noise, by parameter"),
+        ),
+        (
+            "Do the intervals hold the truth?",
+            "Bars are what this number of runs leaves uncertain (95 %).",
+            image(plot_coverage(rows), "Coverage of 95 % intervals, by parameter"),
+        ),
+    ]
+    for level, noise in enumerate(table.noise.values):
+        title = f"Errors in units of their reported σ, noise {noise:g}"
+        words = "Beyond 4.5 σ everything is counted in the outermost bar."
+        figures.append((title, words, image(plot_scatter(table, level), title)))
+    return filled(
+        "study.html", title=result.title, rows=[_line(r) for r in rows], failures=result.failures,
+        runs=table.sizes["run"], seconds=short(result.seconds, 3), figures=figures,
+        noises=", ".join(f"{n:g}" for n in table.noise.values), answer=_answer(result),
+    )
+
+
+def _line(row: dict) -> dict:
+    percent = lambda x: f"{100 * x:.1f}" if np.isfinite(x) else "–"
+    number = lambda x: short(x, 3) if np.isfinite(x) else "–"
+    return {
+        **row, "unit": pretty_unit(row["unit"]), "noise": f"{row['noise']:g}", "true": number(row["true"]),
+        **{k: number(row[k]) for k in ("bias", "spread", "rmse", "std", "bound")},
+        **{k: percent(row[k]) for k in ("coverage_68", "coverage_95", "failed")},
+    }
+
+
+def _answer(result: Study) -> str:
+    """The study in a sentence or two."""
+    rows = [r for r in result.summary if r["used"]]
+    if not rows:
+        return "No run gave an estimate."
+    held = {}
+    for r in rows:
+        held.setdefault(r["estimator"], []).append(r["coverage_95"])
+    parts = [f"{name}: {100 * np.mean(x):.0f} %" for name, x in held.items()]
+    failed = sum(f["runs"] for f in result.failures)
+    fits = result.table["converged"].size
+    return (
+        f"95 % intervals held the truth, over all parameters and noises, in: {'; '.join(parts)}. "
+        f"{failed} of {fits} fits failed."
+    )

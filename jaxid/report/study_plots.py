@@ -1,0 +1,143 @@
+"""The figures of a study: error against noise, coverage, and how errors spread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib.ticker
+import numpy as np
+import scipy.stats
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxid.report.axes import FONT, TEXT, dress
+from jaxid.report.numbers import pretty_unit
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+_MARKS = ("o", "s", "^", "D", "v", "P")
+_COLUMNS = 3
+
+
+def plot_errors(rows: Sequence[dict]) -> Figure:
+    """RMS error of every estimator against noise, a panel for each parameter, with the bound.
+
+    Args:
+        rows: `Study.summary`.
+    """
+    names, panels, figure = _panels(rows)
+    for name, ax in zip(names, panels, strict=True):
+        own = [r for r in rows if r["parameter"] == name]
+        noises = np.array(sorted({r["noise"] for r in own}))
+        for k, estimator in enumerate(_estimators(rows)):
+            line = {r["noise"]: r for r in own if r["estimator"] == estimator}
+            values = np.array([line[n]["rmse"] for n in noises])
+            style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5}
+            ax.plot(noises, values, lw=1.3, label=estimator, **style)
+            stated = np.array([line[n]["std"] for n in noises])
+            ax.plot(noises, stated, lw=0.9, ls=":", color=COLOURS[k % 6])
+        bound = np.array([next(r["bound"] for r in own if r["noise"] == n) for n in noises])
+        if np.any(np.isfinite(bound)):
+            ax.plot(noises, bound, color=TEXT, lw=1.0, ls="--", label="Cramér–Rao bound")
+        dress(ax, "noise, times the sensor's", f"{name}\nRMS error [{pretty_unit(own[0]['unit'])}]")
+        _logarithmic(ax, noises)
+    _legend(figure, panels[0], [("reported σ", ":")])
+    return figure
+
+
+def plot_coverage(rows: Sequence[dict]) -> Figure:
+    """Part of the 95 % intervals that hold the truth, with the scatter that the runs leave.
+
+    Args:
+        rows: `Study.summary`.
+    """
+    names, panels, figure = _panels(rows)
+    estimators = _estimators(rows)
+    for name, ax in zip(names, panels, strict=True):
+        own = [r for r in rows if r["parameter"] == name]
+        noises = sorted({r["noise"] for r in own})
+        for k, estimator in enumerate(estimators):
+            line = {r["noise"]: r for r in own if r["estimator"] == estimator and r["used"]}
+            at = np.array([noises.index(n) for n in line]) + 0.12 * (k - 0.5 * (len(estimators) - 1))
+            held = np.array([r["coverage_95"] for r in line.values()])
+            ends = np.array([_proportion(r["coverage_95"], r["used"]) for r in line.values()]).reshape(-1, 2)
+            style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5}
+            ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=COLOURS[k % 6], lw=1.2)
+            ax.plot(at, 100 * held, ls="", label=estimator, **style)
+        ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
+        dress(ax, "noise, times the sensor's", f"{name}\nin the 95 % interval [%]")
+        ax.set_ylim(0, 103)
+        ax.set_xlim(-0.5, len(noises) - 0.5)
+        ax.set_xticks(range(len(noises)), [f"{n:g}" for n in noises])
+    _legend(figure, panels[0])
+    return figure
+
+
+def plot_scatter(table: xr.Dataset, level: int) -> Figure:
+    """Errors of all runs at one level of noise, against the estimators' own deviation.
+
+    Args:
+        table: `Study.table`.
+        level: Index of the noise.
+    """
+    names = [str(n) for n in table.parameter.values]
+    figure, panels = _grid(len(names))
+    reach = np.linspace(-4.5, 4.5, 200)
+    for k, (name, ax) in enumerate(zip(names, panels, strict=True)):
+        own = table.isel(noise=level, parameter=k)
+        for i, estimator in enumerate(table.estimator.values):
+            one = own.isel(estimator=i)
+            used = one["converged"].values.astype(bool) & np.isfinite(one["std"].values)
+            z = ((one["estimate"] - one["truth"]) / one["std"]).values[used]
+            if len(z):
+                bins = np.linspace(-4.5, 4.5, max(11, min(41, 2 * int(np.sqrt(len(z))) + 1)))
+                style = {"color": COLOURS[i % 6], "lw": 1.4, "histtype": "step", "density": True}
+                ax.hist(np.clip(z, -4.5, 4.5), bins, label=str(estimator), **style)
+        ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
+        dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
+    _legend(figure, panels[0])
+    return figure
+
+
+def _panels(rows: Sequence[dict]) -> tuple[list[str], list[Axes], Figure]:
+    names = list(dict.fromkeys(r["parameter"] for r in rows))
+    figure, panels = _grid(len(names))
+    return names, panels, figure
+
+
+def _grid(count: int) -> tuple[Figure, list[Axes]]:
+    columns = min(count, _COLUMNS)
+    lines = -(-count // columns)
+    figure = Figure(figsize=(3.8 * columns, 2.9 * lines + 0.5), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    for ax in axes[count:]:
+        ax.remove()
+    return figure, list(axes[:count])
+
+
+def _estimators(rows: Sequence[dict]) -> list[str]:
+    return list(dict.fromkeys(r["estimator"] for r in rows))
+
+
+def _logarithmic(ax: Axes, noises: np.ndarray) -> None:
+    ax.set_yscale("log")
+    if len(noises) > 1 and noises.min() > 0:
+        ax.set_xscale("log")
+        ax.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
+    ax.set_xticks(noises, [f"{n:g}" for n in noises])
+
+
+def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, str]] = ()) -> None:
+    handles, labels = ax.get_legend_handles_labels()
+    for label, dash in more:
+        handles.append(ax.plot([], [], color=TEXT, lw=0.9, ls=dash)[0])
+        labels.append(label)
+    figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=FONT)
+
+
+def _proportion(part: float, of: int) -> tuple[float, float]:
+    """95 % interval of a proportion: Wilson (1927)."""
+    z = 1.96
+    middle = (part + z**2 / (2 * of)) / (1 + z**2 / of)
+    half = z / (1 + z**2 / of) * np.sqrt(part * (1 - part) / of + z**2 / (4 * of**2))
+    return middle - half, middle + half

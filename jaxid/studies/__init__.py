@@ -1,0 +1,1 @@
+"""Monte-Carlo studies: a case simulated and identified over and over."""

@@ -1,0 +1,191 @@
+"""What a study is to do: which estimators, noise, draws and starts, in which chunks."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError
+from jaxid.estimators import METHODS
+from jaxid.io.case import Case
+from jaxid.machine import Machine, build_machine
+from jaxid.virtual import Scene
+
+_RUNS = 100
+# Memory that the runs of one chunk may take [bytes], and most runs in one: more gain nothing.
+_MEMORY = 512 * 2**20
+_LARGEST = 64
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A study, ready to run.
+
+    Args:
+        case: The case.
+        scene: What is simulated.
+        machine: Where fits start, before the starts are spread.
+        estimators: Names of methods.
+        noise: Factors on the noise of the case's [sensor].
+        draw: Relative spread of the true values: each is multiplied by exp(draw * N(0, 1)).
+        start_spread: Likewise of the values that a fit starts from.
+        runs: At each level of noise.
+        chunk: Runs that are simulated and solved together.
+        seed: Of everything drawn.
+    """
+
+    case: Case
+    scene: Scene
+    machine: Machine
+    estimators: tuple[str, ...]
+    noise: tuple[float, ...]
+    draw: float
+    start_spread: float
+    runs: int
+    chunk: int
+    seed: int
+
+    @classmethod
+    def of(cls, case: Case, *, runs: int | None = None, seed: int = 0) -> Plan:
+        """The study of a case.
+
+        Args:
+            case: The case; its [study] may be left out.
+            runs: In place of the case's.
+            seed: Of everything drawn.
+
+        Raises:
+            InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has
+                nothing to act on, or an estimator is not there.
+        """
+        scene, setting = Scene.of(case), case.study
+        machine = build_machine(case, period=1 / float(case.simulation["sample_rate"]))
+        where = str(case.path)
+        if not machine.parameters.free:
+            raise InputError(
+                "nothing is unknown", where=where, mend="give at least one parameter as { guess = ... }"
+            )
+        estimators = tuple(setting.get("estimators", ("output_error",)))
+        for name in estimators:
+            if name not in METHODS:
+                raise InputError(
+                    f"estimator {name!r} is not available in this version", where=f"{where}, [study]",
+                    mend=f"choose from {', '.join(METHODS)}",
+                )
+        noise = tuple(float(x) for x in setting.get("noise", (1.0,)))
+        sensor = scene.machine.sensor
+        if sensor.position_noise is None and sensor.force_noise is None and set(noise) != {1.0}:
+            raise InputError(
+                "there is no noise to multiply", where=f"{where}, [study] noise",
+                mend="give position_noise or force_noise in [sensor]",
+            )
+        runs = int(setting.get("runs", _RUNS) if runs is None else runs)
+        if runs < 1:
+            raise InputError(f"{runs} runs", where=where, mend="give one or more")
+        chunk = int(setting.get("chunk", _fitting(scene, machine, runs)))
+        return cls(
+            case, scene, machine, estimators, noise, float(setting.get("draw", 0.0)),
+            float(setting.get("start_spread", 0.0)), runs, chunk, seed,
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Of the parameters."""
+        return self.machine.parameters.names
+
+    @property
+    def truth(self) -> Float[np.ndarray, " p"]:
+        """True values, before they are spread."""
+        return np.asarray(self.scene.machine.parameters.guess)
+
+    @property
+    def chunks(self) -> list[tuple[int, range]]:
+        """Level of noise and runs of each chunk, in order."""
+        starts = range(0, self.runs, self.chunk)
+        return [
+            (level, range(first, min(first + self.chunk, self.runs)))
+            for level in range(len(self.noise)) for first in starts
+        ]  # fmt: skip
+
+    def drawn(self, run: int) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+        """True values of a run, where its fit starts, and what draws its noise.
+
+        They depend on the seed and the run's number alone: every level of noise sees the same draws.
+        """
+        rng = np.random.default_rng([self.seed, run])
+        own, start = rng.standard_normal((2, len(self.names)))
+        guess = np.asarray(self.machine.parameters.guess)
+        lower, upper = (np.asarray(b) for b in self.machine.parameters.bounds)
+        started = np.clip(guess * np.exp(self.start_spread * start), lower, upper)
+        return self.truth * np.exp(self.draw * own), started, rng
+
+    @property
+    def manifest(self) -> dict:
+        """What must be the same for chunks to belong together."""
+        from importlib.metadata import version
+
+        packages = ("jaxid", "jax", "jaxlib", "numpy", "scipy")
+        return {
+            "case": self.case.path.name, "fingerprint": _fingerprint(self.case),
+            "estimators": list(self.estimators), "noise": list(self.noise), "draw": self.draw,
+            "start_spread": self.start_spread, "runs": self.runs, "chunk": self.chunk,
+            "seed": self.seed, "parameters": self.names,
+            "versions": {p: version(p) for p in packages},
+        }
+
+
+def _fitting(scene: Scene, machine: Machine, runs: int) -> int:
+    """Runs that are solved together: as many as memory holds on every core, not more than there are."""
+    samples, joints = len(scene.signal), scene.case.plant.joints
+    # Residual, Jacobian and trajectory, kept twice over by the solver.
+    each = 8 * samples * joints * 2 * (len(machine.parameters.free) + 10)
+    shared = -(-runs // cores())
+    return int(np.clip(_MEMORY // each, 1, min(_LARGEST, shared)))
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _fingerprint(case: Case) -> str:
+    """Of the case file and of every file that it names and that is there."""
+    text = case.path.read_bytes()
+    digest = hashlib.sha256(text)
+    for path in sorted(_named(case)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _named(case: Case) -> set[Path]:
+    found: set[Path] = set()
+
+    def look(value: object) -> None:
+        if isinstance(value, dict):
+            for entry in value.values():
+                look(entry)
+        elif isinstance(value, (list, tuple)):
+            for entry in value:
+                look(entry)
+        elif isinstance(value, str):
+            path = case.folder / value.partition(":")[0]
+            if value and path.is_file():
+                found.add(path)
+
+    import tomllib
+
+    look(tomllib.loads(case.path.read_text(encoding="utf-8")))
+    return found
+
+
+def same(one: dict, other: dict) -> str:
+    """What of two manifests differs, in words; empty where they belong together."""
+    words = {"fingerprint": "the case or a file that it names"}
+    keys = [k for k in one if json.dumps(one[k]) != json.dumps(other.get(k))]
+    return ", ".join(words.get(k, k) for k in keys)

@@ -1,0 +1,158 @@
+"""What a study found: the table of all runs, and what it says of every estimator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.stats
+import xarray as xr
+
+from jaxid.io.output import ready_folder, write_json, write_whole
+
+if TYPE_CHECKING:
+    from jaxid.studies.plan import Plan
+    from jaxid.studies.runs import Arrays
+
+FILES = ("study.nc", "summary.json", "report.html")
+# Nominal coverage of the intervals that are counted.
+COVERAGES = (0.68, 0.95)
+
+
+@dataclass(frozen=True)
+class Study:
+    """What `study` returns.
+
+    Args:
+        table: Every run: `estimate`, `std`, `identifiable` (estimator, noise, run, parameter),
+            `converged`, `steps`, `message` (estimator, noise, run), `truth` and `start` (run,
+            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter). SI.
+        seconds: That all chunks took, added up over the threads; of those resumed, then.
+        title: Name of the case.
+    """
+
+    table: xr.Dataset
+    seconds: float
+    title: str
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """A row for every estimator, noise and parameter; see `summarised`."""
+        return summarised(self.table)
+
+    @property
+    def failures(self) -> list[dict[str, Any]]:
+        """Why runs failed, and how many by that, for every estimator and noise."""
+        out = []
+        t = self.table
+        for k, name in enumerate(t.estimator.values):
+            for level, noise in enumerate(t.noise.values):
+                own = t.isel(estimator=k, noise=level)
+                bad = own["message"].values[~own["converged"].values.astype(bool)]
+                out += [
+                    {"estimator": str(name), "noise": float(noise), "why": str(why), "runs": count}
+                    for why, count in Counter(bad.tolist()).most_common()
+                ]
+        return out
+
+    def __str__(self) -> str:
+        from jaxid.io.tables import study_table
+
+        return study_table(self)
+
+    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+        """Write `study.nc` (NetCDF), `summary.json` and `report.html` to a folder.
+
+        Raises:
+            InputError: If the folder holds what jaxid did not make and `force` is not given.
+        """
+        from jaxid.report.study import study_report
+
+        folder = ready_folder(Path(folder), FILES, force=force)
+        write_whole(folder / "study.nc", bytes(self.table.to_netcdf(engine="scipy")))
+        words = {"case": self.title, "seconds": self.seconds}
+        write_json(folder / "summary.json", words | {"rows": self.summary, "failures": self.failures})
+        write_whole(folder / "report.html", study_report(self))
+        return folder
+
+
+def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
+    """One table of all chunks, in their order."""
+    levels = [[c for c, (level, _) in zip(chunks, plan.chunks, strict=True) if level == k]
+              for k in range(len(plan.noise))]  # fmt: skip
+
+    def by_run(name: str) -> np.ndarray:
+        whole = [np.concatenate([c[name] for c in own], axis=1) for own in levels]
+        return np.stack(whole, axis=1)
+
+    each, run = ("estimator", "noise", "run", "parameter"), ("estimator", "noise", "run")
+    once = {n: np.concatenate([c[n] for c in levels[0]]) for n in ("truth", "start")}
+    free = plan.machine.parameters.free
+    table = xr.Dataset(
+        {
+            "estimate": (each, by_run("estimate")),
+            "std": (each, by_run("std")),
+            "identifiable": (each, by_run("identifiable").astype(np.int8)),
+            "converged": (run, by_run("converged").astype(np.int8)),
+            "steps": (run, by_run("steps").astype(np.int32)),
+            "message": (run, by_run("message").astype(object)),
+            "truth": (("run", "parameter"), once["truth"]),
+            "start": (("run", "parameter"), once["start"]),
+            "bound": (("noise", "parameter"), bound),
+            "unit": (("parameter",), np.array([f.unit for f in free], dtype=object)),
+        },
+        coords={
+            "estimator": np.array(plan.estimators, dtype=object), "noise": list(plan.noise),
+            "run": np.arange(plan.runs, dtype=np.int32), "parameter": np.array(plan.names, dtype=object),
+        },
+        attrs={"case": plan.case.path.name, "seed": plan.seed},
+    )
+    seconds = float(sum(c["seconds"] for c in chunks))
+    return Study(table, seconds, plan.case.path.stem)
+
+
+def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
+    """Bias, spread and coverage of every estimator, noise and parameter.
+
+    Returns:
+        Rows with `runs` and `used` (converged, and the parameter told); `failed`, the part that is
+        not; and of those used `bias` (mean error), `bias_std` (its own deviation), `spread`
+        (standard deviation of the error), `rmse`, `std` (mean of those reported), `bound`
+        (Cramer-Rao), and `coverage_68`, `coverage_95`: the part of intervals of that nominal coverage
+        that hold the truth. NaN where there is nothing to say it of.
+    """
+    rows = []
+    for i, estimator in enumerate(table.estimator.values):
+        for level, noise in enumerate(table.noise.values):
+            for k, name in enumerate(table.parameter.values):
+                own = table.isel(estimator=i, noise=level, parameter=k)
+                truth, std = own["truth"].values, own["std"].values
+                error = own["estimate"].values - truth
+                used = own["converged"].values.astype(bool) & np.isfinite(error) & np.isfinite(std)
+                rows.append({
+                    "estimator": str(estimator), "noise": float(noise), "parameter": str(name),
+                    "unit": str(own["unit"].values), "true": float(np.mean(truth)),
+                    "runs": len(used), "used": int(used.sum()), "failed": float(1 - used.mean()),
+                    **_moments(error[used], std[used]), "bound": float(own["bound"].values),
+                })  # fmt: skip
+    return rows
+
+
+def _moments(error: np.ndarray, std: np.ndarray) -> dict[str, float]:
+    if not len(error):
+        coverages = [f"coverage_{_percent(c)}" for c in COVERAGES]
+        return dict.fromkeys(("bias", "bias_std", "spread", "rmse", "std", *coverages), np.nan)
+    spread = float(np.std(error, ddof=1)) if len(error) > 1 else np.nan
+    widths = {c: scipy.stats.norm.ppf(0.5 + 0.5 * c) for c in COVERAGES}
+    return {
+        "bias": float(np.mean(error)), "bias_std": spread / np.sqrt(len(error)), "spread": spread,
+        "rmse": float(np.sqrt(np.mean(error**2))), "std": float(np.mean(std)),
+        **{f"coverage_{_percent(c)}": float(np.mean(np.abs(error) <= w * std)) for c, w in widths.items()},
+    }
+
+
+def _percent(part: float) -> int:
+    return round(100 * part)

@@ -1,0 +1,133 @@
+"""One run of a study, and a chunk of them solved together."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.estimators import METHODS
+from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Steps, alone, together
+from jaxid.machine import Machine
+from jaxid.preprocess import Recipe, choose_recipe
+from jaxid.replay import Numerics
+from jaxid.session import session_around
+from jaxid.studies.plan import Plan
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How all runs at one level of noise are filtered and integrated: alike, so as to share code."""
+
+    recipe: Recipe
+    numerics: Numerics | None
+
+
+@dataclass
+class Runner:
+    """Runs chunks of a plan; threads may share one.
+
+    Args:
+        plan: The study.
+    """
+
+    plan: Plan
+    _ways: dict[int, Ways] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def ways(self, level: int) -> Ways:
+        """How runs at a level of noise are filtered and integrated, as the first of them asks."""
+        with self._lock:
+            if level not in self._ways:
+                plan = self.plan
+                machine = noisier(plan.scene.machine, plan.noise[level])
+                log = alone(plan.scene.virtual(machine, plan.drawn(0)[2])).log
+                recipe = choose_recipe(log, plan.case.preprocess)
+                fits = "output_error" in plan.estimators
+                self._ways[level] = Ways(recipe, choose_numerics(machine, log) if fits else None)
+        return self._ways[level]
+
+    def chunk(self, number: int) -> Arrays:
+        """All runs of a chunk, as arrays by estimator and run.
+
+        Returns:
+            `estimate` and `std` (method, run, p), NaN where there is none; `converged` and
+            `identifiable`; `steps`; `message` (method, run); `truth` and `start` (run, p); `seconds`
+            that the chunk took.
+        """
+        began = time.perf_counter()
+        level, runs = self.plan.chunks[number]
+        ways = self.ways(level)
+        found = together([self._run(level, k, ways) for k in runs], self.plan.chunk)
+        for outcome in found:
+            if isinstance(outcome, Exception):
+                raise outcome
+        out = {name: np.stack([row[name] for row in found], axis=1) for name in _BY_METHOD}
+        drawn = [self.plan.drawn(k) for k in runs]
+        out["truth"], out["start"] = (np.stack([d[i] for d in drawn]) for i in range(2))
+        out["seconds"] = np.asarray(time.perf_counter() - began)
+        return out
+
+    def _run(self, level: int, number: int, ways: Ways) -> Steps[Arrays]:
+        plan = self.plan
+        truth, start, rng = plan.drawn(number)
+        factor = plan.noise[level]
+        true = noisier(plan.scene.machine.with_estimate(truth), factor)
+        machine = noisier(plan.machine.with_estimate(start), factor)
+        rows = []
+        try:
+            virtual = yield from plan.scene.virtual(true, rng)
+            session = session_around(plan.case, machine, virtual.log, ways.recipe)
+        except InputError as error:
+            rows = [_failed(plan, str(error)) for _ in plan.estimators]
+            return _stacked(rows)
+        for method in plan.estimators:
+            options = {"numerics": ways.numerics} if method == "output_error" else {}
+            try:
+                estimate = yield from METHODS[method](session, **options)
+                rows.append(_row(estimate))
+            except (InputError, np.linalg.LinAlgError) as error:
+                rows.append(_failed(plan, str(error)))
+        return _stacked(rows)
+
+
+_BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message")
+
+
+def noisier(machine: Machine, factor: float) -> Machine:
+    """A machine whose sensors have so many times the noise; their resolution stays."""
+    sensor = machine.sensor
+    scaled = {
+        n: None if getattr(sensor, n) is None else factor * jnp.asarray(getattr(sensor, n))
+        for n in ("position_noise", "force_noise")
+    }
+    return replace(machine, sensor=replace(sensor, **scaled))
+
+
+def _row(estimate: Estimate) -> Arrays:
+    told = estimate.identifiable & np.all(np.isfinite(estimate.theta))
+    return {
+        "estimate": np.where(told, estimate.theta, np.nan), "std": np.where(told, estimate.std, np.nan),
+        "identifiable": told, "converged": np.asarray(estimate.converged),
+        "steps": np.asarray(estimate.steps), "message": np.asarray(estimate.message),
+    }
+
+
+def _failed(plan: Plan, why: str) -> Arrays:
+    none = np.full(len(plan.names), np.nan)
+    return {
+        "estimate": none, "std": none, "identifiable": np.zeros(len(none), bool),
+        "converged": np.asarray(False), "steps": np.asarray(0), "message": np.asarray(why),
+    }
+
+
+def _stacked(rows: list[Arrays]) -> Arrays:
+    return {name: np.stack([row[name] for row in rows]) for name in _BY_METHOD}
