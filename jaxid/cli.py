@@ -297,3 +297,7 @@ def _finish(args: argparse.Namespace, result: object, *files: str) -> int:
         result.save(args.o, force=args.force)
         print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in files)}")
     return 0 if getattr(result, "converged", True) else 1
+
+
+if __name__ == "__main__":
+    entry()

@@ -1,0 +1,272 @@
+"""Studies: the same bits however they are cut short, nothing dropped, and numbers that mean what they say."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+from cli_setup import run
+from search_setup import write_case
+
+import jaxid
+from jaxid.errors import InputError
+from jaxid.estimators.steps import Solve, alone, together
+from jaxid.studies.result import summarised
+
+AXIS = """
+[plant]
+kind = "axis"
+[plant.parameters]
+inertia = { guess = 1.4, true = 2.0 }
+[[effects]]
+kind = "viscous_friction"
+coefficient = { guess = 5.0, true = 3.0 }
+[sensor]
+position_noise = 3e-5
+[input]
+kind = "multisine"
+band_hz = [0.5, 4.0]
+period = 2.0
+amplitude = 8.0
+[simulation]
+duration = 2.0
+sample_rate = 200.0
+[preprocess]
+cutoff_hz = 20.0
+"""
+STUDY = """
+[study]
+estimators = ["inverse_dynamics", "algebraic"]
+noise = [0.5, 1.0]
+runs = 7
+chunk = 3
+start_spread = 0.2
+draw = 0.1
+"""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A study that nothing interrupted, on disk."""
+    folder = tmp_path_factory.mktemp("study")
+    case = write_case(folder, AXIS + STUDY)
+    return case, jaxid.study(case, folder=folder / "out", seed=3), folder / "out"
+
+
+def read(folder) -> xr.Dataset:
+    with xr.open_dataset(folder / "study.nc", engine="scipy") as table:
+        return table.load()
+
+
+def test_the_table_is_what_others_read(whole):
+    _, study, folder = whole
+    table = read(folder)
+    assert table["estimate"].dims == ("estimator", "noise", "run", "parameter")
+    assert table["estimate"].shape == (2, 2, 7, 2)
+    assert [str(n) for n in table.parameter.values] == ["inertia", "viscous_friction.coefficient"]
+    assert [str(u) for u in table["unit"].values] == ["kg", "N s/m"]
+    np.testing.assert_array_equal(table["estimate"], study.table["estimate"])
+    rows = json.loads((folder / "summary.json").read_text())["rows"]
+    assert len(rows) == 2 * 2 * 2
+    assert "All numbers" in (folder / "report.html").read_text()
+
+
+def test_draws_are_spread_about_truth_and_guess(whole):
+    table = whole[1].table
+    truth, start = table["truth"].values, table["start"].values
+    assert len(np.unique(truth[:, 0])) == len(np.unique(start[:, 0])) == 7
+    assert np.abs(np.log(truth / [2.0, 3.0])).max() < 0.5
+    assert np.abs(np.log(start / [1.4, 5.0])).max() < 1.0
+    # Estimates follow the truth of their own run.
+    error = np.abs(table["estimate"] / table["truth"] - 1).isel(parameter=0)
+    assert float(error.max()) < 0.02
+
+
+def test_noise_scales_the_errors(whole):
+    table = whole[1].table
+    spread = (table["estimate"] - table["truth"]).std("run")
+    ratio = (spread.isel(noise=1) / spread.isel(noise=0)).sel(parameter="inertia").values
+    # Both levels see the same draws, so that errors double to first order. (The error of the friction
+    # goes with the draw of its truth: the log starts at rest.)
+    np.testing.assert_allclose(ratio, 2.0, rtol=0.2)
+
+
+def test_resumed_to_the_same_bits(whole, tmp_path):
+    case, _, folder = whole
+    out = tmp_path / "out"
+    jaxid.study(case, folder=out, seed=3)
+    for number in (0, 4, 5):
+        (out / "chunks" / f"{number:06d}.npz").unlink()
+    for name in ("study.nc", "summary.json", "report.html"):
+        (out / name).unlink()
+    jaxid.study(case, folder=out, seed=3, resume=True)
+    assert (out / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
+
+
+def test_a_run_does_not_depend_on_those_beside_it(whole):
+    case, study, _ = whole
+    few = jaxid.study(case, runs=2, seed=3)
+    np.testing.assert_array_equal(few.table["estimate"], study.table["estimate"].isel(run=slice(2)))
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_to_the_same_bits(whole, tmp_path):
+    case, _, folder = whole
+    out, command = tmp_path / "out", [sys.executable, "-m", "jaxid.cli", "study", str(case), "--seed", "3"]
+    with subprocess.Popen([*command, "-o", str(out)]) as process:
+        while process.poll() is None and len(list(out.glob("chunks/*.npz"))) < 2:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert not (out / "study.nc").exists()
+    there = {p.name: p.read_bytes() for p in out.glob("chunks/*.npz")}
+    assert 2 <= len(there) < 6
+    subprocess.run([*command, "-o", str(out), "--resume"], check=True, stdout=subprocess.DEVNULL)
+    assert all((out / "chunks" / name).read_bytes() == content for name, content in there.items())
+    assert (out / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
+
+
+REFUSED = {
+    "another study is there": ({}, None, "holds a study already"),
+    "another seed": ({"seed": 4, "resume": True}, None, "another one: seed differ"),
+    "other runs": ({"runs": 3, "seed": 3, "resume": True}, None, "another one: runs differ"),
+    "a changed case": ({"resume": True, "seed": 3}, "draw = 0.1", "the case or a file that it names"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_what_does_not_belong_together_is_refused(whole, fault, tmp_path):
+    case, _, folder = whole
+    options, without, message = REFUSED[fault]
+    if without:
+        case = write_case(tmp_path, case.read_text().replace(without, "draw = 0.2"))
+    with pytest.raises(InputError, match=message):
+        jaxid.study(case, folder=folder, **options)
+
+
+def test_nothing_to_resume(whole, tmp_path):
+    with pytest.raises(InputError, match="holds no study"):
+        jaxid.study(whole[0], folder=tmp_path / "empty", resume=True)
+    with pytest.raises(InputError, match="nothing to resume"):
+        jaxid.study(whole[0], resume=True)
+
+
+def test_a_broken_chunk_is_named(whole, tmp_path):
+    out = tmp_path / "out"
+    jaxid.study(whole[0], folder=out, runs=2, seed=3)
+    (out / "chunks" / "000001.npz").write_bytes(b"half")
+    with pytest.raises(InputError, match=r"000001\.npz.*remove this file"):
+        jaxid.study(whole[0], folder=out, runs=2, seed=3, resume=True)
+
+
+def test_a_run_that_fails_is_a_row_that_says_so(tmp_path):
+    """Windows of the algebraic method need motion; a log that mostly rests has none."""
+    sines = AXIS[AXIS.index("[input]") : AXIS.index("[simulation]")]
+    text = AXIS.replace(sines, PULSE).replace("[sensor]", COULOMB) + STUDY
+    study = jaxid.study(write_case(tmp_path, text), runs=2)
+    failed = [r for r in study.summary if r["estimator"] == "algebraic"]
+    assert all(r["failed"] == 1.0 and r["used"] == 0 and np.isnan(r["rmse"]) for r in failed)
+    assert all(f["runs"] == 2 and "hold no rest" in f["why"] for f in study.failures)
+    assert {f["estimator"] for f in study.failures} == {"algebraic"}
+    assert "hold no rest" in str(study)
+
+
+PULSE = '[input]\nkind = "trapezoid"\nstart = 0.0\ntargets = [6.0, 0.0]\nspeed = 200.0\nacceleration = 5e3\n'
+COULOMB = '[[effects]]\nkind = "coulomb_friction"\nlevel = 4.0\n[sensor]'
+
+
+def test_bound_is_that_of_the_closed_form(tmp_path):
+    """Of a mass alone q = s / m: the bound is sigma m^2 / |s|."""
+    text = AXIS.replace(AXIS[AXIS.index("[[effects]]") : AXIS.index("[sensor]")], "")
+    case = write_case(tmp_path, text + '[study]\nestimators = ["inverse_dynamics"]\n')
+    study = jaxid.study(case, runs=2)
+    clean = jaxid.simulate(write_case(tmp_path, text.replace("position_noise = 3e-5", "")))
+    size = np.linalg.norm(clean.log.position)
+    assert study.table["bound"].item() == pytest.approx(3e-5 * 2.0 / size, rel=1e-3)
+
+
+def made_up(errors, std, converged=None) -> xr.Dataset:
+    each = ("estimator", "noise", "run", "parameter")
+    shape = (1, 1, len(errors), 1)
+    converged = np.ones(len(errors)) if converged is None else converged
+    return xr.Dataset(
+        {
+            "estimate": (each, 5.0 + np.reshape(errors, shape)), "std": (each, np.full(shape, std)),
+            "converged": (each[:3], np.reshape(converged, shape[:3])),
+            "message": (each[:3], np.full(shape[:3], "converged", object)),
+            "truth": (each[2:], np.full((len(errors), 1), 5.0)),
+            "bound": (("noise", "parameter"), np.full((1, 1), np.nan)),
+            "unit": (("parameter",), np.array(["kg"], object)),
+        },
+        coords={"estimator": ["a"], "noise": [1.0], "parameter": ["m"]},
+    )
+
+
+def test_summary_of_known_errors():
+    errors = np.array([-0.1, 0.1, 0.3, 0.5, 9.0])
+    (row,) = summarised(made_up(errors, 0.2, converged=[1, 1, 1, 1, 0]))
+    assert (row["runs"], row["used"], row["failed"]) == (5, 4, pytest.approx(0.2))
+    assert row["bias"] == pytest.approx(0.2)
+    assert row["spread"] == pytest.approx(np.std(errors[:4], ddof=1))
+    assert row["rmse"] == pytest.approx(np.sqrt(np.mean(errors[:4] ** 2)))
+    assert (row["coverage_68"], row["coverage_95"]) == (0.5, 0.75)
+
+
+def test_coverage_of_sound_intervals_is_nominal():
+    (row,) = summarised(made_up(np.random.default_rng(1).normal(0, 0.2, 20_000), 0.2))
+    assert row["coverage_68"] == pytest.approx(0.68, abs=0.015)
+    assert row["coverage_95"] == pytest.approx(0.95, abs=0.007)
+
+
+def test_steps_alone_and_together():
+    def twice(x, y):
+        return {"sum": x + y}
+
+    def steps(x, fails=False):
+        first = yield Solve(twice, (np.asarray(x), np.ones(2)))
+        if fails:
+            raise InputError("this one ends", mend="let it")
+        second = yield Solve(twice, (np.asarray(first["sum"]), np.asarray(first["sum"])))
+        return np.asarray(second["sum"])
+
+    xs = [np.array([k, -k], float) for k in range(5)]
+    found = together([steps(x, fails=k == 3) for k, x in enumerate(xs)], 2)
+    assert isinstance(found[3], InputError)
+    for k in (0, 1, 2, 4):
+        np.testing.assert_array_equal(found[k], 2 * (xs[k] + 1))
+        np.testing.assert_array_equal(alone(steps(xs[k])), found[k])
+
+
+FAULTS = {
+    "no sensor": ("[sensor]\nposition_noise = 3e-5", "", "no noise to multiply"),
+    "nothing unknown": ("{ guess = 1.4, true = 2.0 }", "1.4", None),
+    "no simulation": ("duration = 2.0\n", "", "no duration"),
+    "an estimator that is not there": ('"algebraic"', '"power"', "'power' is not available"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_one_line(fault, capsys, tmp_path):
+    old, new, message = FAULTS[fault]
+    text = (AXIS + STUDY).replace(old, new)
+    if message is None:
+        text = text.replace("{ guess = 5.0, true = 3.0 }", "3.0")
+        message = "nothing is unknown"
+    ran = run(capsys, "study", write_case(tmp_path, text), folder=tmp_path / "out")
+    assert ran.status == 2
+    assert message in ran.err
+    assert ran.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_prints_and_writes(capsys, tmp_path):
+    case = write_case(tmp_path, AXIS + STUDY)
+    ran = run(capsys, "study", case, "--runs", 2, folder=tmp_path / "out")
+    assert ran.status == 0
+    assert "inverse_dynamics" in ran.out
+    assert {"study.nc", "summary.json", "report.html"} <= {p.name for p in ran.folder.iterdir()}
+    assert run(capsys, "study", case, "--runs", 0).status == 2
