@@ -146,6 +146,9 @@ def _study(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything drawn; default: 0")
     parser.add_argument("--resume", action="store_true", help="go on with what was interrupted")
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask scheduler, whose workers share the work"
+    )
 
 
 @contextmanager
@@ -272,7 +275,7 @@ def _run_study(args: argparse.Namespace) -> int:
 
         result = study(
             args.case, runs=args.runs, seed=args.seed, folder=args.o, resume=args.resume,
-            force=args.force, progress=tell,
+            force=args.force, scheduler=args.scheduler, progress=tell,
         )
     print(result)
     if args.o is not None:

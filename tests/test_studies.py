@@ -1,6 +1,7 @@
 """Studies: the same bits however they are cut short, nothing dropped, and numbers that mean what they say."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -128,6 +129,34 @@ def test_killed_and_resumed_to_the_same_bits(whole, tmp_path):
     subprocess.run([*command, "-o", str(out), "--resume"], check=True, stdout=subprocess.DEVNULL)
     assert all((out / "chunks" / name).read_bytes() == content for name, content in there.items())
     assert (out / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::DeprecationWarning")
+def test_a_worker_that_dies_loses_nothing(whole, tmp_path):
+    """Two workers of a Dask cluster; the one that is given work first is killed under it."""
+    from distributed import LocalCluster
+
+    case, _, folder = whole
+    killed = []
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    with LocalCluster(**options, worker_dashboard_address=None) as cluster:
+
+        def kill(done: int, runs: int) -> None:
+            if not killed and done:
+                killed.append(next(iter(cluster.workers.values())).pid)
+                os.kill(killed[0], signal.SIGKILL)
+
+        out = tmp_path / "out"
+        jaxid.study(case, folder=out, seed=3, scheduler=cluster.scheduler_address, progress=kill)
+    assert killed
+    assert (out / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
+
+
+def test_a_scheduler_that_does_not_answer(whole, monkeypatch):
+    monkeypatch.setattr("jaxid.studies.remote._PATIENCE", 1)
+    with pytest.raises(InputError, match="no scheduler answers at tcp://127.0.0.1:9"):
+        jaxid.study(whole[0], runs=2, scheduler="tcp://127.0.0.1:9")
 
 
 REFUSED = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -158,12 +159,13 @@ def _fingerprint(case: Case) -> str:
     """Of the case file and of every file that it names and that is there."""
     text = case.path.read_bytes()
     digest = hashlib.sha256(text)
-    for path in sorted(_named(case)):
+    for path in named_files(case):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
-def _named(case: Case) -> set[Path]:
+def named_files(case: Case) -> list[Path]:
+    """Files that a case names and that are there, in a fixed order."""
     found: set[Path] = set()
 
     def look(value: object) -> None:
@@ -178,10 +180,8 @@ def _named(case: Case) -> set[Path]:
             if value and path.is_file():
                 found.add(path)
 
-    import tomllib
-
     look(tomllib.loads(case.path.read_text(encoding="utf-8")))
-    return found
+    return sorted(found)
 
 
 def same(one: dict, other: dict) -> str:

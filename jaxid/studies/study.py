@@ -18,6 +18,7 @@ from jaxid.io.case import Case, load_case
 from jaxid.io.output import ready_folder, write_json, write_whole
 from jaxid.machine import position_noise
 from jaxid.studies.plan import Plan, cores, same
+from jaxid.studies.remote import solved_by
 from jaxid.studies.result import FILES, Study, gathered
 from jaxid.studies.runs import Arrays, Runner, noisier
 
@@ -36,6 +37,7 @@ def study(
     folder: str | Path | None = None,
     resume: bool = False,
     force: bool = False,
+    scheduler: str | None = None,
     progress: Told = lambda done, runs: None,
 ) -> Study:
     """Simulate and identify a case over and over.
@@ -49,6 +51,8 @@ def study(
             memory only.
         resume: Go on where an interrupted study in that folder stopped: to the same bits.
         force: Write into a folder that jaxid did not make.
+        scheduler: Address of a Dask scheduler whose workers run the chunks; absent: this machine, all
+            cores.
         progress: Called with the number of runs done, and of all.
 
     Raises:
@@ -66,7 +70,9 @@ def study(
     total = plan.runs * len(plan.noise)
     done = sum(len(plan.chunks[number][1]) for number in kept)
     progress(done, total)
-    for number, arrays in _solved(plan, [k for k in range(len(plan.chunks)) if k not in kept]):
+    missing = [k for k in range(len(plan.chunks)) if k not in kept]
+    solved = _solved(plan, missing) if scheduler is None else solved_by(plan, missing, scheduler)
+    for number, arrays in solved:
         kept[number] = arrays
         if where is not None:
             write_whole(_path(where, number), _packed(arrays))
