@@ -29,7 +29,7 @@ from jaxid.session import Session
 from jaxid.simulation import Drive, needed_substeps
 
 if TYPE_CHECKING:
-    from jaxid.discovery.discover import Found
+    from jaxid.discovery.result import Found
     from jaxid.discovery.search import Search
 
 # Ticks of the longest signal that is optimised: a longer log is met by a shorter experiment.

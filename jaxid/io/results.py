@@ -19,7 +19,7 @@ from jaxid.parameters import leaf, several_places
 from jaxid.session import Session
 
 if TYPE_CHECKING:
-    from jaxid.discovery.discover import Discovery, Found
+    from jaxid.discovery.result import Discovery, Found
 
 
 def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:

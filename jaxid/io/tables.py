@@ -12,7 +12,7 @@ from jaxid.report.numbers import with_std
 from jaxid.report.tables import place_words
 
 if TYPE_CHECKING:
-    from jaxid.discovery.discover import Discovery
+    from jaxid.discovery.result import Discovery
     from jaxid.estimators.result import Estimate
     from jaxid.identification import Identification
     from jaxid.studies.result import Study

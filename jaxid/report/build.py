@@ -23,7 +23,7 @@ from jaxid.report.data import (
 from jaxid.report.page import render
 
 if TYPE_CHECKING:
-    from jaxid.discovery.discover import Discovery, Round
+    from jaxid.discovery.result import Discovery, Round
     from jaxid.discovery.separate import Proposal
     from jaxid.estimators.result import Estimate
     from jaxid.identification import Gap, Identification

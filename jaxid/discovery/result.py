@@ -1,0 +1,113 @@
+"""What `discover` returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.discovery.screen import Score
+from jaxid.discovery.where import Where
+from jaxid.estimators.result import Estimate
+from jaxid.identification import Gap
+from jaxid.session import Session
+
+if TYPE_CHECKING:
+    from jaxid.discovery.search import Step
+    from jaxid.discovery.separate import Proposal
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was added.
+
+    Args:
+        kind: Its name.
+        label: Kind and place, as results name it.
+        place: "joint" or "spring", and which, 1-based.
+        names: Names of its parameters in the estimate.
+        score: Its evidence when it was added.
+        alternatives: Effects that this log cannot tell from it.
+    """
+
+    kind: str
+    label: str
+    place: tuple[str, int]
+    names: tuple[str, ...]
+    score: Score
+    alternatives: tuple[Score, ...]
+
+
+@dataclass(frozen=True)
+class Round:
+    """One step of the search with its gap.
+
+    Args:
+        step: The step.
+        fit: RMS force residual on the log, by joint.
+        validation: The worst of the validation logs; None without any.
+    """
+
+    step: Step
+    fit: np.ndarray
+    validation: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What `discover` returns.
+
+    Args:
+        session: Case and logs.
+        verdict: "found", "nothing_missing" or "unexplained".
+        where: Where the baseline's residual lies; None where nothing is missing.
+        effects: Effects added, in order.
+        rounds: The search.
+        before: The refitted baseline.
+        after: The last refit, effects included.
+        gaps_before: By log, the fitted one first.
+        gaps_after: The same after.
+        noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
+        proposals: Experiments that would tell effects apart which this log cannot.
+        unseen: Why break-away friction was not looked for; empty where it was.
+    """
+
+    session: Session
+    verdict: str
+    where: Where | None
+    effects: tuple[Found, ...]
+    rounds: tuple[Round, ...]
+    before: Estimate
+    after: Estimate
+    gaps_before: tuple[Gap, ...]
+    gaps_after: tuple[Gap, ...]
+    noise_floor: np.ndarray
+    proposals: tuple[Proposal, ...] = ()
+    unseen: str = ""
+
+    @property
+    def kinds(self) -> list[str]:
+        """Names of the effects added."""
+        return [e.kind for e in self.effects]
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last refit did."""
+        return self.after.converged
+
+    def __str__(self) -> str:
+        from jaxid.io.tables import discovery_table
+
+        return discovery_table(self)
+
+    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+        """Write `discovery.json`, `report.html` and the proposed experiments to a folder.
+
+        Raises:
+            InputError: If the folder holds what jaxid did not make and `force` is not given.
+        """
+        from jaxid.io.results import save_discovery
+
+        return save_discovery(self, Path(folder), force=force)
