@@ -5,7 +5,6 @@ together. Each is whitened by itself: neighbours read each other's position nois
 which is small beside the noise of the drive and is left out. Neither jax nor jaxid takes part.
 """
 
-import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 
@@ -15,6 +14,7 @@ from hidden_chains import ChainCase, ChainSetup
 from hidden_oracle import (
     TIED_NATS,
     Sight,
+    View,
     Whitener,
     evidence_beyond,
     explained_away,
@@ -37,29 +37,7 @@ def sights(case: ChainCase) -> dict[str, Sight]:
     return {case.names[0]: seen}
 
 
-@dataclasses.dataclass(frozen=True)
-class ChainView:
-    """One log, whitened: rows of unit noise, those of all masses one after the other.
-
-    Attributes:
-        force: Of the hidden effect (rows,).
-        columns: What the case's own unknowns can explain (rows, columns).
-        rivals: What other effects of one parameter can, each (rows,).
-        share: Unexplained force over the force that moves the masses it acts on.
-    """
-
-    force: np.ndarray
-    columns: np.ndarray
-    rivals: dict[str, np.ndarray]
-    share: float
-
-    @property
-    def evidence(self) -> float:
-        """Log-likelihood of the effect beyond the best baseline [nats]."""
-        return evidence_beyond(self.columns, self.force)
-
-
-def view(case: ChainCase, validation: bool) -> ChainView:
+def view(case: ChainCase, validation: bool) -> View:
     """The hidden effect as one log shows it."""
     setup = case.setup(validation=validation)
     log = setup.run()
@@ -76,14 +54,14 @@ def view(case: ChainCase, validation: bool) -> ChainView:
     total = (fades * moving_force(setup.machine, log))[:, acts]
     share = np.linalg.norm(left.reshape(own.shape)[:, acts]) / np.linalg.norm(total)
     others = dict(zip(rivals, rows[:, end:].T, strict=True))
-    return ChainView(rows[:, 0], rows[:, 1:end], others, float(share))
+    return View(rows[:, 0], rows[:, 1:end], others, float(share))
 
 
 def _flat(fades: np.ndarray, forces: Sequence[np.ndarray]) -> np.ndarray:
     return np.column_stack([(fades * force).ravel() for force in forces])
 
 
-def _ties(views: Sequence[ChainView]) -> list[str]:
+def _ties(views: Sequence[View]) -> list[str]:
     """Rivals that leave next to nothing, one set of parameters for all logs."""
     names = list(views[0].rivals)
     stacked = [np.column_stack([v.force, *(v.rivals[name] for name in names)]) for v in views]

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -75,12 +75,12 @@ def render(data: ReportData) -> str:
 def filled(template: str, **entries: object) -> str:
     """A page of this folder with its entries, and with the style that all of them share."""
     folder = resources.files("jaxid.report")
-    style = (folder / "page.css").read_text(encoding="utf-8")
-    page = (folder / template).read_text(encoding="utf-8")
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        loader=FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
     )
-    return environment.from_string(page).render(style=Markup(style), **entries)
+    style = (folder / "page.css").read_text(encoding="utf-8")
+    return environment.get_template(template).render(style=Markup(style), **entries)
 
 
 def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
