@@ -115,6 +115,26 @@ def test_a_run_does_not_depend_on_those_beside_it(whole):
 
 
 @pytest.mark.slow
+def test_discover_names_what_is_hidden_from_the_model(tmp_path):
+    """Simulated with a constant force that the model does not have: estimators are biased by it."""
+    more = '[[effects]]\nkind = "constant_force"\nlevel = 2.0\n[sensor]'
+    text = AXIS.replace("[sensor]", more).replace("duration = 2.0", "duration = 10.0")
+    text += '[study]\nestimators = ["discover"]\nhidden = ["constant_force"]\nruns = 3\n'
+    study = jaxid.study(write_case(tmp_path, text))
+    assert [(n["what"], n["runs"]) for n in study.named] == [("constant_force", 3)]
+    assert [str(n) for n in study.table.parameter.values] == ["inertia", "viscous_friction.coefficient"]
+    assert "constant_force" in str(study)
+    study.save(tmp_path / "out")
+    assert "What discover named" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_what_is_hidden_must_be_there(tmp_path):
+    text = AXIS + '[study]\nhidden = ["cogging"]\n'
+    with pytest.raises(InputError, match="'cogging' is not among the effects.*viscous_friction"):
+        jaxid.study(write_case(tmp_path, text))
+
+
+@pytest.mark.slow
 def test_killed_and_resumed_to_the_same_bits(whole, tmp_path):
     case, _, folder = whole
     out, command = tmp_path / "out", [sys.executable, "-m", "jaxid.cli", "study", str(case), "--seed", "3"]
@@ -227,6 +247,7 @@ def made_up(errors, std, converged=None) -> xr.Dataset:
             "estimate": (each, 5.0 + np.reshape(errors, shape)), "std": (each, np.full(shape, std)),
             "converged": (each[:3], np.reshape(converged, shape[:3])),
             "message": (each[:3], np.full(shape[:3], "converged", object)),
+            "named": (each[:3], np.full(shape[:3], "", object)),
             "truth": (each[2:], np.full((len(errors), 1), 5.0)),
             "bound": (("noise", "parameter"), np.full((1, 1), np.nan)),
             "unit": (("parameter",), np.array(["kg"], object)),

@@ -61,6 +61,19 @@ def discover(
         InputError: If case or log are unsound.
     """
     session = open_session(case, log, validate, align_hold=True)
+    return explore(session, max_effects=max_effects, refit=refit, progress=progress)
+
+
+def explore(
+    session: Session, *, max_effects: int = 5, refit: bool = True,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Discovery:
+    """`discover` on what is open already.
+
+    Args:
+        session: Case and logs, prepared with the hold aligned.
+        max_effects, refit, progress: As there.
+    """
     data = session.fit.data
     progress("fitting what is there")
     baseline, search = start_search(session, progress)

@@ -74,7 +74,8 @@ PLANT: Keys = {
     "units": Key(inline({"position": Key(text), "force": Key(text)})),
 }
 STUDY: Keys = {
-    "estimators": Key(several(choice(METHODS))),
+    "estimators": Key(several(choice((*METHODS, "discover")))),
+    "hidden": Key(several(text)),
     "noise": Key(several(number("nonnegative"))),
     "draw": Key(number("nonnegative")),
     "start_spread": Key(number("nonnegative")),

@@ -144,6 +144,9 @@ def study_table(result: Study) -> str:
     runs, levels = result.table.sizes["run"], result.table.sizes["noise"]
     lines = [f"{result.title}: {runs} runs at {levels} level(s) of noise, {result.seconds:.3g} s of work"]
     lines += ["", aligned(rows)]
+    for k, n in enumerate(result.named):
+        lines += ["", "named:"] if k == 0 else []
+        lines += [f"  noise {n['noise']:g}: {n['runs']} of {runs}: {n['what']}"]
     for k, f in enumerate(result.failures):
         lines += ["", "failed:"] if k == 0 else []
         lines += [f"  {f['estimator']} at noise {f['noise']:g}: {f['runs']} of {runs}: {f['why']}"]

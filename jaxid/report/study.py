@@ -40,7 +40,8 @@ def study_report(result: Study) -> str:
         words = "Beyond 4.5 σ everything is counted in the outermost bar."
         figures.append((title, words, image(plot_scatter(table, level), title)))
     return filled(
-        "study.html", title=result.title, rows=[_line(r) for r in rows], failures=result.failures,
+        "study.html", title=result.title, rows=[_line(r) for r in rows],
+        failures=result.failures, named=result.named,
         runs=table.sizes["run"], seconds=short(result.seconds, 3), figures=figures,
         noises=", ".join(f"{n:g}" for n in table.noise.values), answer=_answer(result),
     )

@@ -6,11 +6,10 @@ import hashlib
 import json
 import os
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
@@ -18,6 +17,7 @@ from jaxid.io.case import Case
 from jaxid.machine import Machine, build_machine
 from jaxid.virtual import Scene
 
+DISCOVER = "discover"
 _RUNS = 100
 # Memory that the runs of one chunk may take [bytes], and most runs in one: more gain nothing.
 _MEMORY = 512 * 2**20
@@ -30,9 +30,10 @@ class Plan:
 
     Args:
         case: The case.
+        model: The case without the effects that are hidden from the estimators.
         scene: What is simulated.
-        machine: Where fits start, before the starts are spread.
-        estimators: Names of methods.
+        machine: Of the model, where fits start, before the starts are spread.
+        estimators: Names of methods, or "discover".
         noise: Factors on the noise of the case's [sensor].
         draw: Relative spread of the true values: each is multiplied by exp(draw * N(0, 1)).
         start_spread: Likewise of the values that a fit starts from.
@@ -42,6 +43,7 @@ class Plan:
     """
 
     case: Case
+    model: Case
     scene: Scene
     machine: Machine
     estimators: tuple[str, ...]
@@ -66,18 +68,19 @@ class Plan:
                 nothing to act on, or an estimator is not there.
         """
         scene, setting = Scene.of(case), case.study
-        machine = build_machine(case, period=1 / float(case.simulation["sample_rate"]))
         where = str(case.path)
+        model = _without(case, setting.get("hidden", ()))
+        machine = build_machine(model, period=1 / float(case.simulation["sample_rate"]))
         if not machine.parameters.free:
             raise InputError(
                 "nothing is unknown", where=where, mend="give at least one parameter as { guess = ... }"
             )
         estimators = tuple(setting.get("estimators", ("output_error",)))
         for name in estimators:
-            if name not in METHODS:
+            if name not in (*METHODS, DISCOVER):
                 raise InputError(
                     f"estimator {name!r} is not available in this version", where=f"{where}, [study]",
-                    mend=f"choose from {', '.join(METHODS)}",
+                    mend=f"choose from {', '.join((*METHODS, DISCOVER))}",
                 )
         noise = tuple(float(x) for x in setting.get("noise", (1.0,)))
         sensor = scene.machine.sensor
@@ -91,7 +94,7 @@ class Plan:
             raise InputError(f"{runs} runs", where=where, mend="give one or more")
         chunk = int(setting.get("chunk", _fitting(scene, machine, runs)))
         return cls(
-            case, scene, machine, estimators, noise, float(setting.get("draw", 0.0)),
+            case, model, scene, machine, estimators, noise, float(setting.get("draw", 0.0)),
             float(setting.get("start_spread", 0.0)), runs, chunk, seed,
         )
 
@@ -101,9 +104,9 @@ class Plan:
         return self.machine.parameters.names
 
     @property
-    def truth(self) -> Float[np.ndarray, " p"]:
-        """True values, before they are spread."""
-        return np.asarray(self.scene.machine.parameters.guess)
+    def own(self) -> list[int]:
+        """Where the model's parameters stand among those of what is simulated."""
+        return [self.scene.machine.parameters.names.index(name) for name in self.names]
 
     @property
     def chunks(self) -> list[tuple[int, range]]:
@@ -115,16 +118,18 @@ class Plan:
         ]  # fmt: skip
 
     def drawn(self, run: int) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
-        """True values of a run, where its fit starts, and what draws its noise.
+        """True values of all that is simulated in a run, where its fit starts, and what draws its noise.
 
         They depend on the seed and the run's number alone: every level of noise sees the same draws.
         """
         rng = np.random.default_rng([self.seed, run])
-        own, start = rng.standard_normal((2, len(self.names)))
+        truth = np.asarray(self.scene.machine.parameters.guess)
+        truth = truth * np.exp(self.draw * rng.standard_normal(len(truth)))
+        start = rng.standard_normal(len(self.names))
         guess = np.asarray(self.machine.parameters.guess)
         lower, upper = (np.asarray(b) for b in self.machine.parameters.bounds)
         started = np.clip(guess * np.exp(self.start_spread * start), lower, upper)
-        return self.truth * np.exp(self.draw * own), started, rng
+        return truth, started, rng
 
     @property
     def manifest(self) -> dict:
@@ -134,11 +139,23 @@ class Plan:
         packages = ("jaxid", "jax", "jaxlib", "numpy", "scipy")
         return {
             "case": self.case.path.name, "fingerprint": _fingerprint(self.case),
-            "estimators": list(self.estimators), "noise": list(self.noise), "draw": self.draw,
+            "estimators": list(self.estimators), "hidden": list(self.case.study.get("hidden", ())),
+            "noise": list(self.noise), "draw": self.draw,
             "start_spread": self.start_spread, "runs": self.runs, "chunk": self.chunk,
             "seed": self.seed, "parameters": self.names,
             "versions": {p: version(p) for p in packages},
         }
+
+
+def _without(case: Case, hidden: tuple[str, ...]) -> Case:
+    kinds = [e.cls.kind for e in case.effects]
+    for kind in hidden:
+        if kind not in kinds:
+            raise InputError(
+                f"{kind!r} is not among the effects of this case", where=f"{case.path}, [study] hidden",
+                mend=f"name what is to be hidden from the model: {', '.join(kinds)}",
+            )
+    return replace(case, effects=tuple(e for e in case.effects if e.cls.kind not in hidden))
 
 
 def _fitting(scene: Scene, machine: Machine, runs: int) -> int:

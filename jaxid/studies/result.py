@@ -28,7 +28,7 @@ class Study:
 
     Args:
         table: Every run: `estimate`, `std`, `identifiable` (estimator, noise, run, parameter),
-            `converged`, `steps`, `message` (estimator, noise, run), `truth` and `start` (run,
+            `converged`, `steps`, `message`, `named` (estimator, noise, run), `truth` and `start` (run,
             parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter). SI.
         seconds: That all chunks took, added up over the threads; of those resumed, then.
         title: Name of the case.
@@ -45,16 +45,23 @@ class Study:
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """Why runs failed, and how many by that, for every estimator and noise."""
+        """`why` runs failed, and how many by that, for every estimator and noise."""
+        return self._counted("message", "why", converged=False)
+
+    @property
+    def named(self) -> list[dict[str, Any]]:
+        """`what` discover named, or its verdict, and in how many runs, for every noise."""
+        return [r for r in self._counted("named", "what", converged=True) if r["what"]]
+
+    def _counted(self, variable: str, key: str, *, converged: bool) -> list[dict[str, Any]]:
         out = []
-        t = self.table
-        for k, name in enumerate(t.estimator.values):
-            for level, noise in enumerate(t.noise.values):
-                own = t.isel(estimator=k, noise=level)
-                bad = own["message"].values[~own["converged"].values.astype(bool)]
+        for k, name in enumerate(self.table.estimator.values):
+            for level, noise in enumerate(self.table.noise.values):
+                own = self.table.isel(estimator=k, noise=level)
+                words = own[variable].values[own["converged"].values.astype(bool) == converged]
                 out += [
-                    {"estimator": str(name), "noise": float(noise), "why": str(why), "runs": count}
-                    for why, count in Counter(bad.tolist()).most_common()
+                    {"estimator": str(name), "noise": float(noise), key: str(word), "runs": count}
+                    for word, count in Counter(words.tolist()).most_common()
                 ]
         return out
 
@@ -74,7 +81,8 @@ class Study:
         folder = ready_folder(Path(folder), FILES, force=force)
         write_whole(folder / "study.nc", bytes(self.table.to_netcdf(engine="scipy")))
         words = {"case": self.title, "seconds": self.seconds}
-        write_json(folder / "summary.json", words | {"rows": self.summary, "failures": self.failures})
+        words |= {"rows": self.summary, "failures": self.failures, "named": self.named}
+        write_json(folder / "summary.json", words)
         write_whole(folder / "report.html", study_report(self))
         return folder
 
@@ -99,6 +107,7 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
             "converged": (run, by_run("converged").astype(np.int8)),
             "steps": (run, by_run("steps").astype(np.int32)),
             "message": (run, by_run("message").astype(object)),
+            "named": (run, by_run("named").astype(object)),
             "truth": (("run", "parameter"), once["truth"]),
             "start": (("run", "parameter"), once["start"]),
             "bound": (("noise", "parameter"), bound),

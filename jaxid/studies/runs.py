@@ -17,8 +17,8 @@ from jaxid.estimators.steps import Steps, alone, together
 from jaxid.machine import Machine
 from jaxid.preprocess import Recipe, choose_recipe
 from jaxid.replay import Numerics
-from jaxid.session import session_around
-from jaxid.studies.plan import Plan
+from jaxid.session import Session, session_around
+from jaxid.studies.plan import DISCOVER, Plan
 
 Arrays = dict[str, np.ndarray]
 
@@ -60,8 +60,8 @@ class Runner:
 
         Returns:
             `estimate` and `std` (method, run, p), NaN where there is none; `converged` and
-            `identifiable`; `steps`; `message` (method, run); `truth` and `start` (run, p); `seconds`
-            that the chunk took.
+            `identifiable`; `steps`; `message` and `named` (method, run); `truth` and `start` (run, p);
+            `seconds` that the chunk took.
         """
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
@@ -72,7 +72,8 @@ class Runner:
                 raise outcome
         out = {name: np.stack([row[name] for row in found], axis=1) for name in _BY_METHOD}
         drawn = [self.plan.drawn(k) for k in runs]
-        out["truth"], out["start"] = (np.stack([d[i] for d in drawn]) for i in range(2))
+        out["truth"] = np.stack([truth[self.plan.own] for truth, _, _ in drawn])
+        out["start"] = np.stack([start for _, start, _ in drawn])
         out["seconds"] = np.asarray(time.perf_counter() - began)
         return out
 
@@ -85,21 +86,25 @@ class Runner:
         rows = []
         try:
             virtual = yield from plan.scene.virtual(true, rng)
-            session = session_around(plan.case, machine, virtual.log, ways.recipe)
+            session = session_around(plan.model, machine, virtual.log, ways.recipe)
         except InputError as error:
             rows = [_failed(plan, str(error)) for _ in plan.estimators]
             return _stacked(rows)
         for method in plan.estimators:
             options = {"numerics": ways.numerics} if method == "output_error" else {}
             try:
-                estimate = yield from METHODS[method](session, **options)
-                rows.append(_row(estimate))
+                if method == DISCOVER:
+                    aligned = replace(ways.recipe, align_hold=True)
+                    whole = session_around(plan.model, machine, virtual.log, aligned)
+                    rows.append(_found(plan, whole))
+                    continue
+                rows.append(_row((yield from METHODS[method](session, **options))))
             except (InputError, np.linalg.LinAlgError) as error:
                 rows.append(_failed(plan, str(error)))
         return _stacked(rows)
 
 
-_BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message")
+_BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message", "named")
 
 
 def noisier(machine: Machine, factor: float) -> Machine:
@@ -118,7 +123,19 @@ def _row(estimate: Estimate) -> Arrays:
         "estimate": np.where(told, estimate.theta, np.nan), "std": np.where(told, estimate.std, np.nan),
         "identifiable": told, "converged": np.asarray(estimate.converged),
         "steps": np.asarray(estimate.steps), "message": np.asarray(estimate.message),
+        "named": np.asarray(""),
     }
+
+
+def _found(plan: Plan, session: Session) -> Arrays:
+    """What `discover` makes of a run: the model's own parameters, and what it names beside them."""
+    from jaxid.discovery.discover import explore
+
+    found = explore(session, refit=False)
+    at = [found.after.names.index(name) for name in plan.names]
+    row = {name: x[at] if np.ndim(x) else x for name, x in _row(found.after).items()}
+    named = " + ".join(sorted(e.label for e in found.effects)) or found.verdict
+    return row | {"named": np.asarray(named)}
 
 
 def _failed(plan: Plan, why: str) -> Arrays:
@@ -126,6 +143,7 @@ def _failed(plan: Plan, why: str) -> Arrays:
     return {
         "estimate": none, "std": none, "identifiable": np.zeros(len(none), bool),
         "converged": np.asarray(False), "steps": np.asarray(0), "message": np.asarray(why),
+        "named": np.asarray(""),
     }
 
 

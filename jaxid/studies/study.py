@@ -166,11 +166,11 @@ def _bound(plan: Plan) -> np.ndarray:
     jacobian = position_jacobian(alone_driven, log, numerics)
     for level, factor in enumerate(plan.noise):
         noise = position_noise(noisier(machine, factor), log)
-        rows = (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, len(plan.names))
+        rows = (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, jacobian.shape[-1])
         scale = np.linalg.norm(rows, axis=0)
         if not np.all(np.isfinite(scale)) or np.any(scale == 0):
             continue
         values, vectors = np.linalg.eigh((rows / scale).T @ (rows / scale))
         if values[0] > 1e-12 * values[-1]:
-            out[level] = np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale
+            out[level] = (np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)[plan.own]
     return out
