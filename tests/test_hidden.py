@@ -11,9 +11,15 @@ NAMED = [c for c in EVERY.values() if c.group in ("effects", "pairs")]
 SOME = [c for k, c in enumerate(NAMED) if k % 3 == (k // 3) % 3]
 NULLS = [c for c in EVERY.values() if c.group == "nulls"][::7]
 OUTSIDE = [c for c in EVERY.values() if c.group == "outside"][1::3]
+# Missed when first looked at: by a log whose own fit absorbs the effect, and by a limit that no sample
+# reaches, whose column was the residual itself.
+MISSED = [c for c in cases("seen_too") if c.seed in (6050, 6052)]
 QUICK = [
-    next(c for c in NAMED if c.what == kind and c.scale == "servo" and c.noise == 1.0)
-    for kind in ("constant_force", "cogging")
+    MISSED[0],
+    *(
+        next(c for c in NAMED if c.what == kind and c.scale == "servo" and c.noise == 1.0)
+        for kind in ("constant_force", "cogging")
+    ),
 ]
 
 
@@ -32,7 +38,7 @@ def searched(case, folder):
 
 @pytest.mark.parametrize(
     "case",
-    [*QUICK, *[pytest.param(c, marks=pytest.mark.slow) for c in SOME if c not in QUICK]],
+    [*QUICK, *[pytest.param(c, marks=pytest.mark.slow) for c in (MISSED[1], *SOME) if c not in QUICK]],
     ids=lambda c: c.id,
 )
 def test_a_hidden_effect_is_named(case, tmp_path):

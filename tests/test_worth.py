@@ -13,6 +13,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.discover import start_search
 from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
+from jaxid.discovery.screen import _felt
 from jaxid.discovery.where import _between
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.gap import noise_density
@@ -171,3 +172,36 @@ def test_a_line_is_placed_between_the_bins(true):
     k = int(np.argmax(power))
     assert k + _between(power, k) == pytest.approx(true, abs=0.03)
     assert _between(power, 0) == 0.0
+
+
+def test_a_limit_that_no_sample_reaches_is_not_felt(tmp_path):
+    """Its column is the residual itself, faintly: at length one it would whiten the missing effect away."""
+    hidden = machines.emps_like(3, 1.0, 6.0).with_effect("quadratic_drag", coefficient=800.0)
+    search = start_search(opened(tmp_path, hidden))[1]
+    search.theta = fitted(search)
+    e, _ = cand.evaluate(search.union, search.samples, search.theta)
+    counts, scale = search.samples.moving, np.array([c.innovation for c in search.colour])
+    saturation = next(c for c in search.union.candidates if c.kind == "saturation")
+    far = dataclasses.replace(saturation, starts=np.array([1.2 * saturation.starts[0]]))
+    near = dataclasses.replace(saturation, starts=np.array([0.7 * saturation.starts[0]]))
+    felt = [
+        _felt(*cand.points(search.union, [c], search.samples, search.theta, e), counts, scale)
+        for c in (far, near)
+    ]
+    assert felt == [False, True]
+
+
+def test_the_validation_log_may_ask_for_a_search(axis):
+    """A fit may absorb on its own log what shows on another one."""
+    session, search = axis
+    assert search.worth.at_floor(search.theta)
+    off = with_values(search, "constant_force", 1.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search.worth, "others", [search.samples])
+        assert search.worth.at_floor(search.theta)
+        shown = cand.Samples(session.fit.data)
+        moved = session.fit.data.force + 1.0
+        shown.arrays = [ForceData.of(dataclasses.replace(session.fit.data, force=moved))]
+        patch.setattr(search.worth, "others", [shown])
+        assert not search.worth.at_floor(search.theta)
+    assert not search.worth.at_floor(off)

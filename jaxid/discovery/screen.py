@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from jaxid.discovery.search import Search
 
 _SURROGATES = 200
+# An effect in the drive that, changed by its own size, moves the residual by less than this part of
+# the noise (in sum of squares) is not felt.
+_HIDDEN = 0.01
 # Points whose products are taken at once: few enough for memory, enough for matrix products to pay.
 _TOGETHER = 64
 
@@ -111,6 +114,7 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
             points.extend(search.many(c))
     counts = search.samples.moving
     scale = np.array([c.innovation for c in search.colour])
+    points = [p for p in points if _felt(p, counts, scale)]
     extra = _all_columns(e, base, points, counts, scale)
     whitener, noise = fit_whitener(e, base, extra, counts, search.colour)
     out = Screen.of(whitener, e, base)
@@ -121,6 +125,21 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
     if ahead:
         out.pairs = score_pairs(columns, white, _few_points(out, points, columns), out.blocks)
     return out
+
+
+def _felt(p: cand.Point, counts: np.ndarray, scale: np.ndarray) -> bool:
+    """Whether an effect in the drive does anything at its start that noise would not hide.
+
+    Residuals are in units of the declared force, so that whatever changes the drive also scales them
+    a little. Where it does nothing else, as a limit that no sample reaches, its column is the residual
+    itself: brought to length one it would explain everything.
+    """
+    c = p.candidate
+    if c.amplitude.any():
+        return True
+    start = c.starts[p.start]
+    change = stacked(p.columns * np.where(start != 0, np.abs(start), 1.0), counts, scale)
+    return float(np.sum(change**2)) > _HIDDEN * len(change)
 
 
 def _few_points(out: Screen, points: list[cand.Point], base: np.ndarray) -> list[tuple]:

@@ -64,13 +64,17 @@ class Worth:
         return total if np.isfinite(total) else np.inf
 
     def at_floor(self, theta: np.ndarray) -> bool:
-        """Whether the residual is what the sensors' noise leaves, within the scatter of its RMS."""
+        """Whether all residuals are what the sensors' noise leaves, within the scatter of their RMS.
+
+        Those of the validation logs too: what a fit absorbs on its own log may show on another.
+        """
         part = self.data.recipe.independent
-        e, moving = self.residual(theta), self.samples.moving
-        for x, counts, floor in zip(e.T, moving.T, self.floor, strict=True):
-            scatter = np.sqrt(0.5 / max(part * counts.sum(), 1))
-            if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
-                return False
+        for samples in (self.samples, *self.others):
+            e, moving = cand.evaluate(self.union, samples, theta)[0], samples.moving
+            for x, counts, floor in zip(e.T, moving.T, self.floor, strict=True):
+                scatter = np.sqrt(0.5 / max(part * counts.sum(), 1))
+                if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
+                    return False
         return True
 
     def above_numerics(self, theta: np.ndarray) -> bool:
