@@ -306,21 +306,24 @@ def set_valued_step(
     speed, before = (_port_speed(plant, at, slides) for at in (free, x))
     mobility = h * _mobility(plant, mass, x.q, slides)
 
-    def answered(levels: Balance) -> tuple[Array, Array]:
-        dry, stick = _picked(levels.dry, slides), _picked(levels.stick, slides)
-        # Break-away acts until a port slides, and again where it would pass through rest.
+    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, Array]:
+        dry = _picked(levels.dry, slides)
+        held = _picked(at_rest.dry, slides) + _picked(at_rest.stick, slides)
+        # The level at rest acts until a port slides, and again where it would pass through rest.
         own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
         slid = speed - jnp.sign(before) * own * dry
         rests = (before == 0.0) | (before * slid < 0.0)
-        reaction, stuck = _box_reaction(mobility, speed, dry, dry + jnp.where(rests, stick, 0.0))
+        reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
         return _spread(reaction, slides, ports), stuck
 
-    reaction, stuck = answered(levels)
     zero = jnp.zeros_like(x.q)
-    if depends(lambda v: residual(zero, v)[1].dry, (midway,)):
+    moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in ("dry", "stick")], (midway,))
+    at_rest = residual(zero, zero)[1] if moves else levels
+    reaction, stuck = answered(levels, at_rest)
+    if moves:
         # Without friction motion begins too fast, and friction that falls with speed is too small.
         slowed = free.qd + h * _solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
-        reaction, stuck = answered(residual(zero, 0.5 * (x.qd + slowed))[1])
+        reaction, stuck = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
     return _rest_exactly(flow(x, reaction), stuck, slides)
 
 

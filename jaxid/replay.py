@@ -264,9 +264,14 @@ def needed_steps(machine: Machine, log: Log) -> int:
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
     steps = float(_fastest(machine.plant, q, u)) * period / _FINE
-    if not steps <= _MOST_STEPS:
+    if not np.isfinite(steps):
         raise TooStiffError(
-            f"the plant would need {steps:.2g} integration steps a sample", where=log.source,
+            "the plant's forces have no finite slope where the log begins to move", where=log.source,
+            mend="check the guesses, and effects of your own at velocity zero",
+        )
+    if steps > _MOST_STEPS:
+        raise TooStiffError(
+            f"the plant would need {steps:.2g} integration steps every {period:.3g} s", where=log.source,
             mend="an inertia that is far too small, or a stiffness or damping far too large, does "
             "that: check the guesses, or declare less",
         )

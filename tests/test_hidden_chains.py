@@ -20,7 +20,7 @@ from hidden_run import logged, text_of
 from search_setup import write_case
 
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.discover import start_search, where_of
+from jaxid.discovery.discover import discover, start_search, where_of
 from jaxid.discovery.search import Step
 from jaxid.discovery.where import variables
 from jaxid.plants.chain import Chain
@@ -203,3 +203,13 @@ def test_where_points_at_the_spring(tmp_path):
     assert where.joint in (1, 2)
     assert where.region[1] > where.region[0]
     assert "force" not in variables(session.fit.data, 0, Chain(*np.ones((2, 3)), np.ones(4), actuated=(1,)))
+
+
+@pytest.mark.slow
+def test_break_away_friction_is_told_from_its_neighbours(tmp_path):
+    """At one mass of three: that one is named with its level, and no other."""
+    case = ChainCase("null", "chain3", 0.3, 3028)
+    case.effects["static_friction", 2] = {"level": 6.0}
+    found = discover(write_case(tmp_path, text_of(case)), logged(case), refit=False)
+    assert [e.label for e in found.effects] == ["static_friction[2]"]
+    assert found.after.value("static_friction[2].level") == pytest.approx(6.0, rel=0.15)

@@ -28,7 +28,7 @@ def light(tmp_path_factory):
 
 
 def test_it_is_refused(light):
-    with pytest.raises(TooStiffError, match=r"integration steps a sample.*inertia") as caught:
+    with pytest.raises(TooStiffError, match=r"integration steps every 0.001 s.*inertia") as caught:
         needed_steps(light.machine, light.fit.log)
     assert "stepper.csv" in str(caught.value)
 
@@ -51,6 +51,6 @@ def test_identify_says_so_and_writes_nothing(capsys, tmp_path):
     log = write_csv(tmp_path / "log.csv", recorded())
     ran = run(capsys, "identify", case, log, folder=tmp_path / "out")
     assert ran.status == 2
-    assert "integration steps a sample" in ran.err
+    assert "integration steps every" in ran.err
     assert ran.err.count("\n") == 1
     assert not ran.folder.exists()

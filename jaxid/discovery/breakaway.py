@@ -96,22 +96,22 @@ def break_away(
     try:
         steps = needed_steps(machine, log)
     except TooStiffError:
-        unknown = ["the model found is too stiff to be simulated"] * len(joints)
+        return ["the model found is too stiff to be simulated"] * len(joints)
     known = [j for j, why in zip(joints, unknown, strict=True) if not why]
     alike = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
     noise = position_noise(machine, log)
-    cuts = starts_from_rest(machine, alike, noise, known) if known else []
+    cuts, lengths = starts_from_rest(machine, alike, noise, known) if known else ([], [])
     enough = [[s for s in of_joint if s.count >= _FEWEST] for of_joint in cuts]
-    most = max((s.count for of_joint in enough for s in of_joint), default=0)
-    padded = 2 ** int(np.ceil(np.log2(max(most, 1))))
-    found: dict[int, BreakAway | str] = {}
+    most = max((s.count for of_joint in enough for s in of_joint), default=1)
+    trial = _Trial(estimate, log, known, steps, 2 ** int(np.ceil(np.log2(most))))
     few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
+    found: dict[int, BreakAway | str] = {}
     for k, joint in enumerate(known):
+        found[joint] = few
         for finer in (1, _FINER):
             judged = []
             for starts in enough[k]:
-                own = float(noise[joint])
-                fits = _fits(estimate, log, starts, padded, own, known, k, finer * steps)
+                fits = trial.fits(k, starts, float(noise[joint]), lengths[k], finer, found[joint])
                 leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
                 judged.append(_judge(*fits, leaves[np.asarray(starts.log) == 0]))
             found[joint] = max(judged, key=lambda b: b.evidence, default=few)
@@ -120,40 +120,64 @@ def break_away(
     return [why or found[j] for j, why in zip(joints, unknown, strict=True)]
 
 
-def _fits(
-    estimate: Estimate, log: Log, starts: Starts, padded: int, noise: float, known: list[int],
-    which: int, steps: int,
-) -> tuple[np.ndarray, list[_Fit]]:
-    """Fits at levels from none to the most that the log allows, denser about the best.
+@dataclass(frozen=True)
+class _Trial:
+    """What all joints share: one compiled plant with break-away friction at each of them.
 
     Args:
-        known: Joints that are looked at: one compiled plant serves them all.
-        which: Whose starts these are, among them.
+        estimate: The model.
+        log: Of the sampling time and hold of all.
+        joints: That are looked at.
+        steps: Integration steps a sample.
+        padded: Starts in a compiled call.
     """
-    machine, count = estimate.machine, starts.count
-    filled = starts.padded(padded)
-    drive = Drive(jnp.asarray(machine.gain), log.period, log.hold, steps, True)
-    plant = machine.plant
-    for joint in known:
-        plant = plant.with_effect(StaticFriction(level=0.0, port=joint))
-    prior = _prior(estimate)
-    places = machine.parameters.places
-    theta = jnp.asarray(estimate.theta)
 
-    def at(levels: np.ndarray) -> list[_Fit]:
-        own = jnp.asarray(levels)[:, None] * jnp.asarray(np.eye(len(known))[which])
-        both = _runs(plant, places, drive, filled, jnp.asarray(known[which]), own, theta)
-        e, jacobian = (np.asarray(a)[:, :count] for a in both)
-        return [_Fit(x, j, prior, noise) for x, j in zip(e, jacobian, strict=True)]
+    estimate: Estimate
+    log: Log
+    joints: list[int]
+    steps: int
+    padded: int
 
-    top = float(np.abs(machine.gain * np.asarray(starts.command)).max())
-    coarse = np.linspace(0.0, top, _LEVELS)
-    fits = at(coarse)
-    spread = min(f.spread for f in fits)
-    best = int(np.argmin([f.cost(spread) for f in fits]))
-    # An even number between the neighbours, so that the best is not tried twice.
-    fine = np.linspace(coarse[max(best - 1, 0)], coarse[min(best + 1, _LEVELS - 1)], _LEVELS + 2)[1:-1]
-    return np.concatenate([coarse, fine]), [*fits, *at(fine)]
+    def fits(
+        self, which: int, starts: Starts, noise: float, length: int, finer: int, before: BreakAway | str
+    ) -> tuple[np.ndarray, list[_Fit]]:
+        """Fits at levels from none to the most that the log allows, denser about the best.
+
+        Args:
+            which: Index of the joint that starts.
+            starts: When it does.
+            noise: Of its readings.
+            length: Samples of a start that count.
+            finer: Factor on the integration steps.
+            before: What was found with fewer: levels from none to twice that are enough.
+        """
+        machine, count = self.estimate.machine, starts.count
+        filled = starts.padded(self.padded)
+        drive = Drive(jnp.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
+        plant = machine.plant
+        for joint in self.joints:
+            plant = plant.with_effect(StaticFriction(level=0.0, port=joint))
+        prior = _prior(self.estimate)
+        places, theta = machine.parameters.places, jnp.asarray(self.estimate.theta)
+
+        def at(levels: np.ndarray) -> list[_Fit]:
+            own = jnp.asarray(levels)[:, None] * jnp.asarray(np.eye(len(self.joints))[which])
+            both = _runs(plant, places, drive, filled, jnp.asarray(self.joints[which]), own, theta)
+            e, jacobian = (np.asarray(a)[:, :count, :length] for a in both)
+            return [_Fit(x, j, prior, noise) for x, j in zip(e, jacobian, strict=True)]
+
+        if isinstance(before, BreakAway):
+            levels = np.linspace(0.0, 2 * before.level, _LEVELS)
+            return levels, at(levels)
+        top = float(np.abs(machine.gain * np.asarray(starts.command)).max())
+        coarse = np.linspace(0.0, top, _LEVELS)
+        fits = at(coarse)
+        spread = min(f.spread for f in fits)
+        best = int(np.argmin([f.cost(spread) for f in fits]))
+        # An even number between the neighbours, so that the best is not tried twice.
+        ends = coarse[max(best - 1, 0)], coarse[min(best + 1, _LEVELS - 1)]
+        fine = np.linspace(*ends, _LEVELS + 2)[1:-1]
+        return np.concatenate([coarse, fine]), [*fits, *at(fine)]
 
 
 def _unknown(machine: Machine, log: Log) -> str:

@@ -91,17 +91,20 @@ def explore(
     separating = proposals(session, search, effects, progress)
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
     missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]
-    if missing:
+    while missing:
         progress("looking at the starts from rest")
-    leaving = break_away(after, session.runs, [c.port for c in missing])
-    for c, b in zip(missing, leaving, strict=True):
-        if isinstance(b, str):
-            unseen = b
-        elif b.holds and len(effects) < max_effects:
-            where = where if effects else _at_starts(where, c, b)
-            after, found, step = _with_break_away(after, search, c, b)
-            steps.append(step)
-            effects, verdict = (*effects, found), "found"
+        leaving = break_away(after, session.runs, [c.port for c in missing])
+        unseen = next((b for b in leaving if isinstance(b, str)), "")
+        held = [b for b in leaving if isinstance(b, BreakAway) and b.holds]
+        if not held or len(effects) >= max_effects:
+            break
+        # The clearest first: what sticks at one joint makes its neighbours start late.
+        b = max(held, key=lambda b: b.evidence)
+        c = missing.pop(leaving.index(b))
+        where = where if effects else _at_starts(where, c, b)
+        after, found, step = _with_break_away(after, search, c, b)
+        steps.append(step)
+        effects, verdict = (*effects, found), "found"
     progress("simulating")
     old = gaps(before.machine, session.runs)
     new = gaps(after.machine, session.runs) if effects else old

@@ -6,7 +6,7 @@ other's balance is read along that motion, and what its own unknowns can absorb 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -85,6 +85,11 @@ class Pair:
             x[::-1] for x in (self.kinds, self.ports, self.thetas, self.active)
         )
         return Pair(kinds, ports, thetas, active, self.plant, self.index, self.places)
+
+    def rounder(self, factor: float) -> Pair:
+        """The same with a sign so many times as wide."""
+        plant = eqx.tree_at(lambda p: p.sharpness, self.plant, factor * self.plant.sharpness)
+        return replace(self, plant=plant)
 
     def model(self, which: int) -> Plant:
         """The plant of one of them."""

@@ -80,7 +80,7 @@ class Starts(eqx.Module):
 
 def starts_from_rest(
     machine: Machine, runs: Sequence[Run], noise: Float[np.ndarray, " n"], joints: Sequence[int]
-) -> list[list[Starts]]:
+) -> tuple[list[list[Starts]], list[int]]:
     """Find where joints leave a rest, by a lax and by a strict notion of one.
 
     Args:
@@ -90,14 +90,15 @@ def starts_from_rest(
         joints: 0-based.
 
     Returns:
-        By joint one or two cuts, the starts of all logs in each; all of one length.
+        By joint one or two cuts, the starts of all logs in each, all of one length so that compiled
+        code serves them; and how many samples of that each joint asks for.
     """
     first = runs[0]
     stills = [sorted(set(_stills(float(noise[j]), first.log, first.data, j))) for j in joints]
-    longest = max(of_joint[-1] for of_joint in stills)
-    length = longest + max(_AFTER, 2 * longest)
+    lengths = [of_joint[-1] + max(_AFTER, 2 * of_joint[-1]) for of_joint in stills]
+    length = max(lengths)
     delays = machine.plant.command_delays(runs[0].log.force.shape[1])
-    most = _MOST // (len(joints) * len(runs))
+    most = max(1, _MOST // (len(joints) * len(runs)))
     lead = int(np.ceil(float(delays.max()) / runs[0].log.period)) + 1
     ready = [
         (
@@ -107,13 +108,14 @@ def starts_from_rest(
         )
         for r in runs
     ]
-    return [
+    cuts = [
         [
             _joined([_cut(*each, float(noise[j]), still, length, lead, j, most) for each in ready])
             for still in of_joint
         ]
         for j, of_joint in zip(joints, stills, strict=True)
     ]
+    return cuts, lengths
 
 
 def _joined(cuts: list[Starts]) -> Starts:

@@ -31,6 +31,7 @@ _FAR_MORE = 2.0
 # Intervals say where a residual lies if they hold most of its sum of squares.
 _MOSTLY = 0.5
 _SAYS_MORE = 2.0
+_NEARLY_ALL = 0.95
 # A spectral line must carry this part of the variance, and stand above the median of its
 # neighbours by a factor that white noise exceeds once in 10^8.
 _LINE_PART = 0.05
@@ -177,8 +178,9 @@ def _locate(
     explained = _explained(gains[clean], counts)
     line = line if part > explained else None
     clear = gains[clean] > limit
-    # A curve that is there says more than the times at which it is far from zero.
-    said = _SAYS_MORE * explained if clear else explained
+    # A curve over the motion says more than the times at which it is far from zero.
+    over_motion = clear and not clean.startswith("time")
+    said = min(_SAYS_MORE * explained, _NEARLY_ALL) if over_motion else explained
     if line is not None or _share(e, counts, data, intervals) > max(said, _MOSTLY):
         best = "time"
     else:

@@ -16,12 +16,6 @@ if TYPE_CHECKING:
 def sentence(proposal: Proposal, units: Units) -> str:
     """What to do, and what is to be expected of it, in one line."""
     p = proposal
-    if p.too_fast:
-        part = f"a {p.steps}th of the {1e3 * p.time[1]:.3g} ms between two samples"
-        return (
-            f"no experiment sampled like this log separates {p.named} from {p.rival}: they differ "
-            f"within {part}, and a faster log may tell them"
-        )
     if not p.separates:
         unstated = [n for n in ("stroke", "speed", "force") if n not in p.limits.stated]
         wider = f"; a wider [limits] {', '.join(unstated)} may" if unstated else ""
