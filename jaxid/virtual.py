@@ -98,8 +98,12 @@ class Scene:
     every: int = 1
 
     @classmethod
-    def of(cls, case: Case) -> Scene:
+    def of(cls, case: Case, *, longer_delays: float = 1.0) -> Scene:
         """The scene of a case.
+
+        Args:
+            case: The case.
+            longer_delays: How many times the case's delays may be, where parameters are drawn.
 
         Raises:
             InputError: If the case does not say what to simulate.
@@ -122,14 +126,14 @@ class Scene:
                     mend="add an [input], or a [reference] and a [controller]",
                 )
             command = make_reference(case.input, rate, duration, case.folder, where="input")
-            drive = _drive(case, machine, 1 / rate)
+            drive = _drive(case, machine, 1 / rate, longer_delays)
             return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
         if not case.reference:
             raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
         period = machine.controller.period
         reference = _by_drive(make_reference(case.reference, 1 / period, duration, case.folder), machine)
         machine = _scaled(machine, reference, period)
-        drive = _drive(case, machine, period)
+        drive = _drive(case, machine, period, longer_delays)
         _refuse_coarse(case, machine, drive, reference)
         every = max(1, round(1 / (rate * period)))
         return cls(case, machine, drive, reference, position, velocity, every)
@@ -176,11 +180,11 @@ def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:
     return np.broadcast_to(signal, (len(signal), machine.gain.size))
 
 
-def _drive(case: Case, machine: Machine, period: float) -> Drive:
+def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
     """Exact sticking, unless the case states a sharpness: then friction is smoothed."""
     delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
     delays = machine.plant.command_delays(machine.gain.size)
-    longest = int(np.ceil(float(delays.max()) / period)) + 1 if delayed else 0
+    longest = int(np.ceil(longer * float(delays.max()) / period)) + 1 if delayed else 0
     hold = "linear" if machine.hold == "band_limited" else machine.hold
     return Drive(
         jnp.asarray(machine.gain), period, hold, int(case.simulation.get("substeps", 4)),

@@ -173,10 +173,51 @@ def test_a_worker_that_dies_loses_nothing(whole, tmp_path):
     assert (out / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
 
 
-def test_a_scheduler_that_does_not_answer(whole, monkeypatch):
+def test_a_scheduler_that_does_not_answer(whole, monkeypatch, tmp_path):
     monkeypatch.setattr("jaxid.studies.remote._PATIENCE", 1)
     with pytest.raises(InputError, match="no scheduler answers at tcp://127.0.0.1:9"):
-        jaxid.study(whole[0], runs=2, scheduler="tcp://127.0.0.1:9")
+        jaxid.study(whole[0], runs=2, scheduler="tcp://127.0.0.1:9", folder=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_chain_in_its_loop(tmp_path):
+    """Several joints, lists of parameters, the loop's command at every tick of a slower log."""
+    study = jaxid.study(write_case(tmp_path, CHAIN))
+    assert study.failures == []
+    assert all(r["rmse"] < 0.05 * abs(r["true"]) for r in study.summary)
+    # The command is known exactly to the bound only.
+    assert all(0 < r["bound"] < r["rmse"] for r in study.summary)
+
+
+CHAIN = """
+[plant]
+kind = "chain"
+actuated = [1]
+[plant.parameters]
+mass = [{ guess = 1.5, true = 2.0 }, { guess = 2.0, true = 1.5 }]
+damping = [8.0, 8.0]
+stiffness = [{ guess = 1200.0, true = 1500.0 }, 1500.0, 1500.0]
+[controller]
+kind = "pd"
+kp = 2000.0
+kd = 60.0
+period = 0.001
+[sensor]
+position_noise = 1e-6
+[reference]
+kind = "trapezoid"
+start = 0.0
+targets = [0.03, -0.02, 0.01]
+speed = 0.2
+acceleration = 4.0
+[simulation]
+duration = 3.0
+sample_rate = 500.0
+[study]
+estimators = ["output_error", "inverse_dynamics"]
+runs = 3
+"""
 
 
 REFUSED = {
@@ -200,6 +241,7 @@ def test_what_does_not_belong_together_is_refused(whole, fault, tmp_path):
 def test_nothing_to_resume(whole, tmp_path):
     with pytest.raises(InputError, match="holds no study"):
         jaxid.study(whole[0], folder=tmp_path / "empty", resume=True)
+    assert not (tmp_path / "empty").exists()
     with pytest.raises(InputError, match="nothing to resume"):
         jaxid.study(whole[0], resume=True)
 
@@ -207,8 +249,15 @@ def test_nothing_to_resume(whole, tmp_path):
 def test_a_broken_chunk_is_named(whole, tmp_path):
     out = tmp_path / "out"
     jaxid.study(whole[0], folder=out, runs=2, seed=3)
-    (out / "chunks" / "000001.npz").write_bytes(b"half")
-    with pytest.raises(InputError, match=r"000001\.npz.*remove this file"):
+    path = out / "chunks" / "000001.npz"
+    good = path.read_bytes()
+    other = (whole[2] / "chunks" / "000001.npz").read_bytes()
+    for bad, why in ((b"half", ""), (b"", ""), (good[:-200], ""), (other, "belongs to another study")):
+        path.write_bytes(bad)
+        with pytest.raises(InputError, match=rf"000001\.npz.*{why}.*remove this file"):
+            jaxid.study(whole[0], folder=out, runs=2, seed=3, resume=True)
+    (out / "study.json").write_text("{")
+    with pytest.raises(InputError, match=r"study\.json.*cannot be read"):
         jaxid.study(whole[0], folder=out, runs=2, seed=3, resume=True)
 
 
@@ -246,6 +295,7 @@ def made_up(errors, std, converged=None) -> xr.Dataset:
         {
             "estimate": (each, 5.0 + np.reshape(errors, shape)), "std": (each, np.full(shape, std)),
             "converged": (each[:3], np.reshape(converged, shape[:3])),
+            "identifiable": (each, np.ones(shape, int)),
             "message": (each[:3], np.full(shape[:3], "converged", object)),
             "named": (each[:3], np.full(shape[:3], "", object)),
             "truth": (each[2:], np.full((len(errors), 1), 5.0)),

@@ -80,15 +80,24 @@ def ready_folder(folder: Path, files: Sequence[str], *, force: bool = False) -> 
         InputError: As `check_folder`, or if it cannot be made.
     """
     check_folder(folder, files, force=force)
+    if not folder.exists():
+        mark_folder(folder)
+    return folder
+
+
+def mark_folder(folder: Path) -> None:
+    """Make a folder jaxid's own, so that it may write there again.
+
+    Raises:
+        InputError: If it cannot be made.
+    """
     try:
-        if not folder.exists():
-            folder.mkdir(parents=True)
-            (folder / _MARK).write_text("made by jaxid\n", encoding="utf-8")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _MARK).write_text("made by jaxid\n", encoding="utf-8")
     except OSError as error:
         raise InputError(
             f"cannot be made: {error.strerror}", where=str(folder), mend="choose another -o"
         ) from error
-    return folder
 
 
 def ready_file(path: Path, *, force: bool = False) -> Path:

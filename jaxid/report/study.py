@@ -70,5 +70,5 @@ def _answer(result: Study) -> str:
     fits = result.table["converged"].size
     return (
         f"95 % intervals held the truth, over all parameters and noises, in: {'; '.join(parts)}. "
-        f"{failed} of {fits} fits failed."
+        f"{failed} of {fits} fits gave no value for some parameter."
     )

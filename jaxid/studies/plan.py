@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -19,9 +20,11 @@ from jaxid.virtual import Scene
 
 DISCOVER = "discover"
 _RUNS = 100
-# Memory that the runs of one chunk may take [bytes], and most runs in one: more gain nothing.
-_MEMORY = 512 * 2**20
+# Part of the memory that the chunks in work may take together, and most runs in one: more gain nothing.
+_MEMORY = 0.25
 _LARGEST = 64
+# Deviations of a drawn delay that a simulation's memory of past commands allows for.
+_FARTHEST = 5.0
 
 
 @dataclass(frozen=True)
@@ -55,20 +58,26 @@ class Plan:
     seed: int
 
     @classmethod
-    def of(cls, case: Case, *, runs: int | None = None, seed: int = 0) -> Plan:
+    def of(
+        cls, case: Case, *, runs: int | None = None, seed: int = 0, workers: int | None = None
+    ) -> Plan:
         """The study of a case.
 
         Args:
             case: The case; its [study] may be left out.
             runs: In place of the case's.
-            seed: Of everything drawn.
+            seed: Of everything drawn, from 0 to 2^31 - 1.
+            workers: Chunks that are run at once; absent: one a core.
 
         Raises:
             InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has
                 nothing to act on, or an estimator is not there.
         """
-        scene, setting = Scene.of(case), case.study
-        where = str(case.path)
+        setting, where = case.study, str(case.path)
+        if not 0 <= seed < 2**31:
+            raise InputError(f"the seed is {seed}", mend="give one from 0 to 2147483647")
+        draw = float(setting.get("draw", 0.0))
+        scene = Scene.of(case, longer_delays=float(np.exp(_FARTHEST * draw)))
         model = _without(case, setting.get("hidden", ()))
         machine = build_machine(model, period=1 / float(case.simulation["sample_rate"]))
         if not machine.parameters.free:
@@ -92,10 +101,10 @@ class Plan:
         runs = int(setting.get("runs", _RUNS) if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, mend="give one or more")
-        chunk = int(setting.get("chunk", _fitting(scene, machine, runs)))
+        chunk = int(setting.get("chunk", _fitting(scene, machine, runs, workers or cores())))
+        start_spread = float(setting.get("start_spread", 0.0))
         return cls(
-            case, model, scene, machine, estimators, noise, float(setting.get("draw", 0.0)),
-            float(setting.get("start_spread", 0.0)), runs, chunk, seed,
+            case, model, scene, machine, estimators, noise, draw, start_spread, runs, chunk, seed
         )
 
     @property
@@ -108,7 +117,7 @@ class Plan:
         """Where the model's parameters stand among those of what is simulated."""
         return [self.scene.machine.parameters.names.index(name) for name in self.names]
 
-    @property
+    @functools.cached_property
     def chunks(self) -> list[tuple[int, range]]:
         """Level of noise and runs of each chunk, in order."""
         starts = range(0, self.runs, self.chunk)
@@ -125,6 +134,8 @@ class Plan:
         rng = np.random.default_rng([self.seed, run])
         truth = np.asarray(self.scene.machine.parameters.guess)
         truth = truth * np.exp(self.draw * rng.standard_normal(len(truth)))
+        # A fit must be able to reach it.
+        truth = np.clip(truth, *(np.asarray(b) for b in self.scene.machine.parameters.bounds))
         start = rng.standard_normal(len(self.names))
         guess = np.asarray(self.machine.parameters.guess)
         lower, upper = (np.asarray(b) for b in self.machine.parameters.bounds)
@@ -138,7 +149,7 @@ class Plan:
 
         packages = ("jaxid", "jax", "jaxlib", "numpy", "scipy")
         return {
-            "case": self.case.path.name, "fingerprint": _fingerprint(self.case),
+            "case": self.case.path.name, "fingerprint": fingerprint(self.case),
             "estimators": list(self.estimators), "hidden": list(self.case.study.get("hidden", ())),
             "noise": list(self.noise), "draw": self.draw,
             "start_spread": self.start_spread, "runs": self.runs, "chunk": self.chunk,
@@ -158,13 +169,15 @@ def _without(case: Case, hidden: tuple[str, ...]) -> Case:
     return replace(case, effects=tuple(e for e in case.effects if e.cls.kind not in hidden))
 
 
-def _fitting(scene: Scene, machine: Machine, runs: int) -> int:
-    """Runs that are solved together: as many as memory holds on every core, not more than there are."""
+def _fitting(scene: Scene, machine: Machine, runs: int, workers: int) -> int:
+    """Runs that are solved together: as many as memory holds for all workers, not more than there are."""
     samples, joints = len(scene.signal), scene.case.plant.joints
+    refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
     # Residual, Jacobian and trajectory, kept twice over by the solver.
-    each = 8 * samples * joints * 2 * (len(machine.parameters.free) + 10)
-    shared = -(-runs // cores())
-    return int(np.clip(_MEMORY // each, 1, min(_LARGEST, shared)))
+    each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**32
+    shared = -(-runs // workers)
+    return int(np.clip(_MEMORY * whole / workers / each, 1, min(_LARGEST, shared)))
 
 
 def cores() -> int:
@@ -172,10 +185,9 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _fingerprint(case: Case) -> str:
-    """Of the case file and of every file that it names and that is there."""
-    text = case.path.read_bytes()
-    digest = hashlib.sha256(text)
+def fingerprint(case: Case) -> str:
+    """Of a case as it is in memory, and of every file that it names and that is there."""
+    digest = hashlib.sha256(repr(replace(case, path=Path(case.path.name))).encode())
     for path in named_files(case):
         digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -197,8 +209,13 @@ def named_files(case: Case) -> list[Path]:
             if value and path.is_file():
                 found.add(path)
 
-    look(tomllib.loads(case.path.read_text(encoding="utf-8")))
+    look(tomllib.loads(case.path.read_text(encoding="utf-8-sig")))
     return sorted(found)
+
+
+def digest_of(manifest: dict) -> str:
+    """What every chunk of a study carries, so that no other's is taken for one of it."""
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def same(one: dict, other: dict) -> str:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
-from jaxid.studies.plan import Plan, named_files
+from jaxid.studies.plan import Plan, digest_of, fingerprint, named_files
 from jaxid.studies.runs import Arrays, Runner
 
-# A chunk is tried so often: a worker may die under it.
-_TRIES = 5
-# Seconds to wait for a scheduler.
+# Seconds to wait for a scheduler, and for a first worker.
 _PATIENCE = 20
 
 
@@ -26,7 +25,7 @@ class Bundle:
         case: Name of the case file.
         files: Contents by path, relative to the case's folder.
         runs, chunk, seed: Of the plan.
-        fingerprint: Of the files.
+        manifest: What the plan says of itself.
     """
 
     case: str
@@ -34,16 +33,22 @@ class Bundle:
     runs: int
     chunk: int
     seed: int
-    fingerprint: str
+    manifest: dict
 
     @classmethod
     def of(cls, plan: Plan) -> Bundle:
         """Of a plan.
 
         Raises:
-            InputError: If the case names a file outside its folder, which a worker would not find.
+            InputError: If the case is not what its file says, or names a file outside its folder, which a
+                worker would not find.
         """
         case, files = plan.case, {}
+        if fingerprint(load_case(case.path)) != fingerprint(case):
+            raise InputError(
+                "is not the case that was given", where=str(case.path),
+                mend="write what was changed in Python to the file: workers read it",
+            )
         for path in (case.path, *named_files(case)):
             try:
                 name = path.resolve().relative_to(case.folder.resolve())
@@ -53,60 +58,97 @@ class Bundle:
                     mend="put it beside the case, and name it without its folder",
                 ) from None
             files[name.as_posix()] = path.read_bytes()
-        own = plan.manifest
-        return cls(case.path.name, files, plan.runs, plan.chunk, plan.seed, own["fingerprint"])
+        return cls(case.path.name, files, plan.runs, plan.chunk, plan.seed, plan.manifest)
 
     def plan(self) -> Plan:
-        """The plan again, where it has arrived."""
-        folder = Path(tempfile.mkdtemp(prefix="jaxid-study-"))
-        for name, content in self.files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(content)
-        plan = Plan.of(load_case(folder / self.case), runs=self.runs, seed=self.seed)
-        return replace(plan, chunk=self.chunk)
+        """The plan again, where it has arrived.
+
+        Raises:
+            InputError: If this machine has other versions of what the bits depend on.
+        """
+        with tempfile.TemporaryDirectory(prefix="jaxid-study-") as name:
+            folder = Path(name)
+            for file, content in self.files.items():
+                (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                (folder / file).write_bytes(content)
+            plan = Plan.of(load_case(folder / self.case), runs=self.runs, seed=self.seed)
+            plan = replace(plan, chunk=self.chunk)
+            own, wanted = plan.manifest["versions"], self.manifest["versions"]
+        if own != wanted:
+            raise InputError(
+                f"a worker has {own} where {wanted} belong", mend="install the same on every machine"
+            )
+        return plan
 
 
 # Of this process, by what was asked: a worker loads a case and compiles once.
-_RUNNERS: dict[tuple, Runner] = {}
+_RUNNERS: dict[str, Runner] = {}
+_LOCK = threading.Lock()
 
 
 def run_chunk(bundle: Bundle, number: int) -> Arrays:
     """One chunk of a bundle, on the worker that this runs on."""
-    key = (bundle.fingerprint, bundle.runs, bundle.chunk, bundle.seed)
-    if key not in _RUNNERS:
-        _RUNNERS[key] = Runner(bundle.plan())
+    key = digest_of(bundle.manifest)
+    with _LOCK:
+        if key not in _RUNNERS:
+            _RUNNERS[key] = Runner(bundle.plan())
     return _RUNNERS[key].chunk(number)
 
 
-def solved_by(plan: Plan, numbers: list[int], address: str) -> Iterator[tuple[int, Arrays]]:
-    """Chunks as they come back from a scheduler's workers.
+class Remote:
+    """The workers of a Dask scheduler, while a study lasts.
 
     Args:
-        plan: The study.
-        numbers: Chunks that are still to be run.
         address: Of the scheduler, such as `tcp://host:8786`.
-
-    Raises:
-        InputError: If Dask is not installed, or no scheduler answers there.
     """
-    try:
-        from distributed import Client, as_completed
-    except ImportError:
-        raise InputError(
-            "--scheduler needs Dask's distributed", mend="install jaxid with its extra: jaxid[scheduler]"
-        ) from None
-    bundle = Bundle.of(plan)
-    try:
-        client = Client(address, timeout=_PATIENCE, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise InputError(
-            f"no scheduler answers at {address}: {error}", mend="give its address, as it prints it"
-        ) from error
-    with client:
-        left = {
-            client.submit(run_chunk, bundle, number, pure=False, retries=_TRIES): number
-            for number in numbers
-        }
-        for future in as_completed(list(left), loop=client.loop):
-            yield left[future], future.result()
-            future.release()
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+
+    def __enter__(self) -> Remote:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise InputError(
+                "--scheduler needs Dask's distributed", mend="install jaxid with its extra: jaxid[scheduler]"
+            ) from None
+        self.client = None
+        try:
+            self.client = Client(self.address, timeout=_PATIENCE, set_as_default=False)
+            self.client.wait_for_workers(1, timeout=_PATIENCE)
+        except (OSError, ValueError, TimeoutError) as error:
+            what = "no scheduler answers" if self.client is None else "there is no worker"
+            self.__exit__()
+            raise InputError(
+                f"{what} at {self.address}: {error}", mend="give its address, as it prints it"
+            ) from error
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.client is not None:
+            self.client.close()
+
+    @property
+    def threads(self) -> int:
+        """Chunks that run at once."""
+        return max(1, sum(self.client.nthreads().values()))
+
+    def run(self, bundle: Bundle, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
+        """Chunks as they come back; what a worker took with it, Dask gives to another.
+
+        Raises:
+            InputError: If a chunk ended several workers, or the scheduler is lost.
+        """
+        from distributed import CancelledError, KilledWorker, as_completed
+        from distributed.comm import CommClosedError
+
+        left = {self.client.submit(run_chunk, bundle, k, pure=False): k for k in numbers}
+        try:
+            for future in as_completed(list(left), loop=self.client.loop):
+                yield left[future], future.result()
+                future.release()
+        except (KilledWorker, CancelledError, CommClosedError) as error:
+            raise InputError(
+                f"the workers at {self.address} are lost: {error}",
+                mend="what is done is kept: see what ended them, then --resume",
+            ) from error

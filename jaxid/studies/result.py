@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,25 +47,39 @@ class Study:
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """`why` runs failed, and how many by that, for every estimator and noise."""
-        return self._counted("message", "why", converged=False)
+        """`why` runs gave no value for all parameters, and how many by that, for every estimator and noise.
+
+        Reasons that differ in numbers only count as one, told as the first run has it.
+        """
+        out = []
+        for estimator, noise, own in self._cells():
+            firsts: dict[str, str] = {}
+            counts: Counter[str] = Counter()
+            for k in range(own.sizes["run"]):
+                why = _why(own.isel(run=k))
+                if why:
+                    kind = re.sub(r"\d[\d.e+-]*", "#", why)
+                    firsts.setdefault(kind, why)
+                    counts[kind] += 1
+            out += [
+                {"estimator": estimator, "noise": noise, "why": firsts[kind], "runs": runs}
+                for kind, runs in counts.most_common()
+            ]
+        return out
 
     @property
     def named(self) -> list[dict[str, Any]]:
-        """`what` discover named, or its verdict, and in how many runs, for every noise."""
-        return [r for r in self._counted("named", "what", converged=True) if r["what"]]
+        """`what` discover named, or its verdict, and in how many `runs`, for every noise."""
+        return [
+            {"estimator": estimator, "noise": noise, "what": str(what), "runs": runs}
+            for estimator, noise, own in self._cells()
+            for what, runs in Counter(own["named"].values.tolist()).most_common() if what
+        ]
 
-    def _counted(self, variable: str, key: str, *, converged: bool) -> list[dict[str, Any]]:
-        out = []
-        for k, name in enumerate(self.table.estimator.values):
+    def _cells(self) -> Iterator[tuple[str, float, xr.Dataset]]:
+        for k, estimator in enumerate(self.table.estimator.values):
             for level, noise in enumerate(self.table.noise.values):
-                own = self.table.isel(estimator=k, noise=level)
-                words = own[variable].values[own["converged"].values.astype(bool) == converged]
-                out += [
-                    {"estimator": str(name), "noise": float(noise), key: str(word), "runs": count}
-                    for word, count in Counter(words.tolist()).most_common()
-                ]
-        return out
+                yield str(estimator), float(noise), self.table.isel(estimator=k, noise=level)
 
     def __str__(self) -> str:
         from jaxid.io.tables import study_table
@@ -121,6 +137,14 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
     )
     seconds = float(sum(c["seconds"] for c in chunks))
     return Study(table, seconds, plan.case.path.stem)
+
+
+def _why(run: xr.Dataset) -> str:
+    """Why a run has no value for all parameters; empty where it has."""
+    if not run["converged"].item():
+        return str(run["message"].item())
+    untold = run.parameter.values[run["identifiable"].values == 0]
+    return f"the log cannot tell {', '.join(map(str, untold))}" if len(untold) else ""
 
 
 def summarised(table: xr.Dataset) -> list[dict[str, Any]]:

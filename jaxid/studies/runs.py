@@ -11,11 +11,12 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
+from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Steps, alone, together
 from jaxid.machine import Machine
-from jaxid.preprocess import Recipe, choose_recipe
+from jaxid.preprocess import Recipe
 from jaxid.replay import Numerics
 from jaxid.session import Session, session_around
 from jaxid.studies.plan import DISCOVER, Plan
@@ -47,13 +48,20 @@ class Runner:
         """How runs at a level of noise are filtered and integrated, as the first of them asks."""
         with self._lock:
             if level not in self._ways:
-                plan = self.plan
-                machine = noisier(plan.scene.machine, plan.noise[level])
-                log = alone(plan.scene.virtual(machine, plan.drawn(0)[2])).log
-                recipe = choose_recipe(log, plan.case.preprocess)
-                fits = "output_error" in plan.estimators
-                self._ways[level] = Ways(recipe, choose_numerics(machine, log) if fits else None)
+                self._ways[level] = self._chosen(level)
         return self._ways[level]
+
+    def _chosen(self, level: int) -> Ways:
+        """As `identify` would choose on the log of the nominal machine."""
+        plan, factor = self.plan, self.plan.noise[level]
+        true = noisier(plan.scene.machine, factor)
+        log = alone(plan.scene.virtual(true, plan.drawn(0)[2])).log
+        session = session_around(plan.model, noisier(plan.machine, factor), log)
+        if "output_error" not in plan.estimators:
+            return Ways(session.recipe, None)
+        first = inverse_dynamics(session.machine, session.fit.data)
+        machine = first.machine if first.told else session.machine
+        return Ways(session.recipe, choose_numerics(machine, log))
 
     def chunk(self, number: int) -> Arrays:
         """All runs of a chunk, as arrays by estimator and run.
@@ -67,9 +75,8 @@ class Runner:
         level, runs = self.plan.chunks[number]
         ways = self.ways(level)
         found = together([self._run(level, k, ways) for k in runs], self.plan.chunk)
-        for outcome in found:
-            if isinstance(outcome, Exception):
-                raise outcome
+        # Whatever ends a run, in a library too, ends that run only.
+        found = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
         out = {name: np.stack([row[name] for row in found], axis=1) for name in _BY_METHOD}
         drawn = [self.plan.drawn(k) for k in runs]
         out["truth"] = np.stack([truth[self.plan.own] for truth, _, _ in drawn])
@@ -84,12 +91,8 @@ class Runner:
         true = noisier(plan.scene.machine.with_estimate(truth), factor)
         machine = noisier(plan.machine.with_estimate(start), factor)
         rows = []
-        try:
-            virtual = yield from plan.scene.virtual(true, rng)
-            session = session_around(plan.model, machine, virtual.log, ways.recipe)
-        except InputError as error:
-            rows = [_failed(plan, str(error)) for _ in plan.estimators]
-            return _stacked(rows)
+        virtual = yield from plan.scene.virtual(true, rng)
+        session = session_around(plan.model, machine, virtual.log, ways.recipe)
         for method in plan.estimators:
             options = {"numerics": ways.numerics} if method == "output_error" else {}
             try:
@@ -99,9 +102,12 @@ class Runner:
                     rows.append(_found(plan, whole))
                     continue
                 rows.append(_row((yield from METHODS[method](session, **options))))
-            except (InputError, np.linalg.LinAlgError) as error:
-                rows.append(_failed(plan, str(error)))
+            except Exception as error:
+                rows.append(_failed(plan, _words(error)))
         return _stacked(rows)
+
+    def _all_failed(self, error: Exception) -> Arrays:
+        return _stacked([_failed(self.plan, _words(error)) for _ in self.plan.estimators])
 
 
 _BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message", "named")
@@ -136,6 +142,10 @@ def _found(plan: Plan, session: Session) -> Arrays:
     row = {name: x[at] if np.ndim(x) else x for name, x in _row(found.after).items()}
     named = " + ".join(sorted(e.label for e in found.effects)) or found.verdict
     return row | {"named": np.asarray(named)}
+
+
+def _words(error: Exception) -> str:
+    return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
 
 
 def _failed(plan: Plan, why: str) -> Arrays:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
@@ -15,10 +17,12 @@ from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
 from jaxid.estimators.steps import alone
 from jaxid.io.case import Case, load_case
-from jaxid.io.output import ready_folder, write_json, write_whole
+from jaxid.io.log import Log
+from jaxid.io.output import check_folder, mark_folder, write_json, write_whole
 from jaxid.machine import position_noise
-from jaxid.studies.plan import Plan, cores, same
-from jaxid.studies.remote import solved_by
+from jaxid.replay import TooStiffError
+from jaxid.studies.plan import Plan, cores, digest_of, same
+from jaxid.studies.remote import Bundle, Remote
 from jaxid.studies.result import FILES, Study, gathered
 from jaxid.studies.runs import Arrays, Runner, noisier
 
@@ -59,34 +63,54 @@ def study(
         InputError: If the case does not say what to simulate, or the folder holds another study.
     """
     case = case if isinstance(case, Case) else load_case(case)
-    plan = Plan.of(case, runs=runs, seed=seed)
-    kept: dict[int, Arrays] = {}
-    where = None
-    if folder is not None:
-        where = ready_folder(Path(folder), FILES, force=force)
-        plan, kept = _opened(where, plan, resume)
-    elif resume:
+    where = None if folder is None else Path(folder)
+    if resume and where is None:
         raise InputError("there is nothing to resume from", mend="give the folder of the study: -o DIR")
-    total = plan.runs * len(plan.noise)
-    done = sum(len(plan.chunks[number][1]) for number in kept)
-    progress(done, total)
-    missing = [k for k in range(len(plan.chunks)) if k not in kept]
-    solved = _solved(plan, missing) if scheduler is None else solved_by(plan, missing, scheduler)
-    for number, arrays in solved:
-        kept[number] = arrays
-        if where is not None:
-            write_whole(_path(where, number), _packed(arrays))
-        done += len(plan.chunks[number][1])
+    if where is not None and not resume:
+        check_folder(where, FILES, force=force)
+        if (where / _MANIFEST).exists():
+            raise InputError(
+                "holds a study already", where=str(where),
+                mend="go on with it with --resume, or choose another -o",
+            )
+    begun = _begun(where) if resume else {}
+    with contextlib.ExitStack() as stack:
+        remote = None if scheduler is None else stack.enter_context(Remote(scheduler))
+        plan = Plan.of(case, runs=runs, seed=seed, workers=remote and remote.threads)
+        # How many runs are solved together changes the last bits: what was begun with stays.
+        plan = replace(plan, chunk=int(begun.get("chunk", plan.chunk)))
+        differs = same(plan.manifest, begun) if resume else ""
+        if differs:
+            raise InputError(
+                f"the study there is another one: {differs} differ", where=str(where),
+                mend="give what it was begun with, or choose another -o",
+            )
+        # All that can be refused is refused before anything is written.
+        runner = Runner(plan)
+        for level in range(len(plan.noise)):
+            runner.ways(level)
+        bundle = None if remote is None else Bundle.of(plan)
+        bound, identity = _bound(plan), digest_of(plan.manifest)
+        kept = _kept(where, plan, identity) if resume else {}
+        if where is not None and not resume:
+            _begin(where, plan)
+        missing = [k for k in range(len(plan.chunks)) if k not in kept]
+        total, done = plan.runs * len(plan.noise), sum(len(plan.chunks[k][1]) for k in kept)
         progress(done, total)
-    result = gathered(plan, [kept[k] for k in range(len(plan.chunks))], _bound(plan))
+        for number, arrays in remote.run(bundle, missing) if remote else _solved(runner, missing):
+            kept[number] = arrays
+            if where is not None:
+                write_whole(_path(where, number), _packed(arrays, identity))
+            done += len(plan.chunks[number][1])
+            progress(done, total)
+    result = gathered(plan, [kept[k] for k in range(len(plan.chunks))], bound)
     if where is not None:
         result.save(where, force=force)
     return result
 
 
-def _solved(plan: Plan, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
-    """Chunks as they end, two threads at least busy: compiled code leaves Python's lock alone."""
-    runner = Runner(plan)
+def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
+    """Chunks as they end, one a core at once: compiled code leaves Python's lock alone."""
     with ThreadPoolExecutor(cores()) as pool:
         left: dict[Future, int] = {pool.submit(runner.chunk, number): number for number in numbers}
         try:
@@ -98,53 +122,62 @@ def _solved(plan: Plan, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
             pool.shutdown(cancel_futures=True)
 
 
-def _opened(folder: Path, plan: Plan, resume: bool) -> tuple[Plan, dict[int, Arrays]]:
-    """The plan as it was begun in a folder, and the chunks that are there."""
+def _begin(folder: Path, plan: Plan) -> None:
+    """A folder that is a study's: what it is comes last, so that it is there whole."""
+    mark_folder(folder)
+    (folder / _CHUNKS).mkdir(exist_ok=True)
+    for old in (folder / _CHUNKS).iterdir():
+        old.unlink()
+    write_json(folder / _MANIFEST, plan.manifest)
+
+
+def _begun(folder: Path) -> dict:
+    """What a folder's study was begun with."""
     path = folder / _MANIFEST
-    if not resume:
-        if path.exists():
-            raise InputError(
-                "holds a study already", where=str(folder),
-                mend="go on with it with --resume, or choose another -o",
-            )
-        (folder / _CHUNKS).mkdir(exist_ok=True)
-        write_json(path, plan.manifest)
-        return plan, {}
     if not path.exists():
         raise InputError(
             "holds no study", where=str(folder), mend="leave out --resume, or give the study's folder"
         )
-    begun = json.loads(path.read_text(encoding="utf-8"))
-    # How many runs are solved together changes the last bits: what was begun with stays.
-    plan = replace(plan, chunk=int(begun.get("chunk", plan.chunk)))
-    differs = same(plan.manifest, begun)
-    if differs:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise InputError(
-            f"the study there is another one: {differs} differ", where=str(folder),
-            mend="give what it was begun with, or choose another -o",
-        )
+            f"cannot be read: {error}", where=str(path), mend="begin anew in another folder"
+        ) from error
+
+
+def _kept(folder: Path, plan: Plan, identity: str) -> dict[int, Arrays]:
+    """The chunks that are there; what an interruption left of another is removed."""
+    for part in (folder / _CHUNKS).glob(".*.npz.*"):
+        part.unlink()
     there = {k: _path(folder, k) for k in range(len(plan.chunks))}
-    return plan, {k: _unpacked(p) for k, p in there.items() if p.exists()}
+    return {k: _unpacked(p, identity) for k, p in there.items() if p.exists()}
 
 
 def _path(folder: Path, number: int) -> Path:
     return folder / _CHUNKS / f"{number:06d}.npz"
 
 
-def _packed(arrays: Arrays) -> bytes:
+def _packed(arrays: Arrays, identity: str) -> bytes:
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, study=np.asarray(identity), **arrays)
     return buffer.getvalue()
 
 
-def _unpacked(path: Path) -> Arrays:
+def _unpacked(path: Path, identity: str) -> Arrays:
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (ValueError, OSError) as error:
+            found = {name: arrays[name] for name in arrays.files}
+        own = str(found.pop("study"))
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(
             f"cannot be read: {error}", where=str(path), mend="remove this file, and resume again"
         ) from error
+    if own != identity:
+        raise InputError(
+            "belongs to another study", where=str(path), mend="remove this file, and resume again"
+        )
+    return found
 
 
 def _bound(plan: Plan) -> np.ndarray:
@@ -153,17 +186,24 @@ def _bound(plan: Plan) -> np.ndarray:
     Of an unbiased estimate from the readings of one log, their noise white, the start and the command
     known exactly: in a loop too the readings so far give the command, so that what counts is the
     derivative of the position under a given command. NaN where the case states no noise of the
-    readings, or where the log cannot tell.
+    readings, or where the log cannot tell. Where true values are drawn it is that of their middle.
     """
     out = np.full((len(plan.noise), len(plan.names)), np.nan)
     machine = plan.scene.machine
     if machine.sensor.position_std is None:
         return out
     silent = replace(machine, sensor=replace(machine.sensor, position_noise=None, force_noise=None))
-    log = alone(plan.scene.virtual(silent, np.random.default_rng(0))).log
-    alone_driven = replace(machine, controller=None)
-    numerics = choose_numerics(alone_driven, log, segments=False)
-    jacobian = position_jacobian(alone_driven, log, numerics)
+    virtual = alone(plan.scene.virtual(silent, np.random.default_rng(0)))
+    # The command of every tick, of which the log may have but some.
+    run, every = virtual.trajectory, plan.scene.every
+    ticks = plan.scene.drive.period * np.arange(len(run.command))
+    log = Log(ticks, np.asarray(run.reading), np.asarray(run.command), hold=virtual.log.hold)
+    driven = replace(machine, controller=None)
+    try:
+        numerics = choose_numerics(driven, log, segments=False)
+        jacobian = position_jacobian(driven, log, numerics)[::every]
+    except TooStiffError:
+        return out
     for level, factor in enumerate(plan.noise):
         noise = position_noise(noisier(machine, factor), log)
         rows = (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, jacobian.shape[-1])
