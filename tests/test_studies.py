@@ -186,8 +186,8 @@ def test_a_chain_in_its_loop(tmp_path):
     study = jaxid.study(write_case(tmp_path, CHAIN))
     assert study.failures == []
     assert all(r["rmse"] < 0.05 * abs(r["true"]) for r in study.summary)
-    # The command is known exactly to the bound only.
-    assert all(0 < r["bound"] < r["rmse"] for r in study.summary)
+    # Three runs tell a deviation within a factor of two.
+    assert all(0 < r["bound"] < 2 * r["rmse"] for r in study.summary)
 
 
 CHAIN = """

@@ -166,7 +166,7 @@ def _packed(arrays: Arrays, identity: str) -> bytes:
 
 def _unpacked(path: Path, identity: str) -> Arrays:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in arrays.files}
         own = str(found.pop("study"))
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
