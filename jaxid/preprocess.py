@@ -13,6 +13,7 @@ import scipy.signal
 from jaxtyping import Bool, Float
 
 from jaxid import signals
+from jaxid.errors import InputError
 from jaxid.io.log import Log
 
 # The surroundings of reversals that are left out are less of the motion than this.
@@ -151,9 +152,17 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     Args:
         log: The log.
         stated: The case's `[preprocess]`; its entries win.
+
+    Raises:
+        InputError: If it states a cut-off that the log's sampling rate cannot have.
     """
     stated = dict(stated or {})
     rate = log.rate_hz
+    if stated.get("cutoff_hz", 0.0) >= 0.5 * rate:
+        raise InputError(
+            f"[preprocess] cutoff_hz = {stated['cutoff_hz']:g} is not below half the sampling rate of "
+            f"{rate:.6g} Hz", where=log.source, mend="lower it, or leave it out: it is then chosen",
+        )
     literal = "cutoff_hz" in stated
     edge = None if literal else _noise_cutoff(log)
     cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)

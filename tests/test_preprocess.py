@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from jaxid.errors import InputError
 from jaxid.io.log import Log
 from jaxid.preprocess import choose_recipe, differentiate, prepare
 
@@ -142,3 +143,9 @@ def test_hold_counts_where_it_should(hold, stated, hold_period, expected):
     log = log_of(multisine(), hold=hold)
     data = prepare(log, np.ones(1), choose_recipe(log, stated), hold_period)
     assert data.hold == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_cutoff_beyond_half_the_rate_is_refused():
+    log = log_of(tour())
+    with pytest.raises(InputError, match="cutoff_hz = .* is not below half the sampling rate"):
+        choose_recipe(log, {"cutoff_hz": 0.5 * log.rate_hz})
