@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 from jaxtyping import Array, Float
 
 from jaxid.discovery.starts import Starts, starts_from_rest
@@ -40,7 +39,8 @@ _FINER = 8
 # A start tells its moment and its vigour, and what the model does wrong there is the same in all
 # samples that follow: so many of them count as independent.
 _TELLS = 3
-# For the better of two definitions of a rest.
+# For the better of two definitions of a rest. A likelihood ratio on held-out starts exceeds one over this
+# with at most this probability, whatever its distribution (Markov).
 _FALSE_POSITIVE = 0.5e-3
 # The velocity of a Stribeck curve must exceed the slowest that counts as motion so many times.
 _RESOLVED = 2.0
@@ -321,7 +321,7 @@ def _judge(levels: np.ndarray, fits: list[_Fit], times: np.ndarray) -> BreakAway
     variance = float((levels[order] - level) ** 2 @ weight) + step**2 / 12
     return BreakAway(
         level, float(np.sqrt(variance)), 0.5 * float(np.sum(old - new)),
-        float(scipy.stats.chi2.ppf(1 - _FALSE_POSITIVE, 1) / 2), _closed(old, new), times, count,
+        float(-np.log(_FALSE_POSITIVE)), _closed(old, new), times, count,
     )
 
 

@@ -23,6 +23,7 @@ _KNOTS = 12
 # noise of one level that happens less than once in 10^9 windows.
 _WINDOW = 20
 _LOUD = 8.0
+_QUIET = 0.02
 # Measured acceleration and force carry the noise that the residual is made of, and a loop echoes
 # in them whatever disturbs it: the residual depends on them even where they are not its cause. They
 # describe, where they explain so much more than all else does, but decide nothing.
@@ -275,7 +276,9 @@ def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[floa
     share = np.convolve(counts.astype(float), kernel, mode="same")
     local = np.convolve(energy, kernel, mode="same") / np.maximum(share, 1)
     usual = np.median(local[share > _WINDOW / 2])
-    loud = (local > _LOUD * usual) & (share > _WINDOW / 2)
+    counted = share > _WINDOW / 2
+    # What bends the fit leaves something everywhere: next to the loudest that is quiet.
+    loud = counted & (local > np.maximum(_LOUD * usual, _QUIET * local[counted].max()))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], loud, [False]]).astype(int)))
     time = data.times
     spans = [(float(time[a]), float(time[b - 1])) for a, b in edges.reshape(-1, 2)]
