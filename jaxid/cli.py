@@ -259,8 +259,6 @@ def _run_discover(args: argparse.Namespace) -> int:
 
 
 def _run_study(args: argparse.Namespace) -> int:
-    if args.seed < 0:
-        raise InputError(f"--seed is {args.seed}", mend="give zero or more")
     from tqdm import tqdm
 
     from jaxid.studies.study import study

@@ -190,3 +190,19 @@ def test_running_it_separates(make, more, tmp_path, capsys):
     assert after.kinds == [true]
     left = {s.candidate.kind for s in after.effects[0].alternatives}
     assert not left & rivals
+
+
+def test_no_more_evaluations_than_may_be_spent():
+    """A line search may take twenty by itself; what is best so far counts."""
+    asked = []
+
+    def bowl(p):
+        asked.append(p.copy())
+        return float(np.sum((p - 3.0) ** 4)), 4 * (p - 3.0) ** 3
+
+    start = np.zeros(3)
+    value, where = separate._improved(bowl, start, bowl(start), 4)
+    assert len(asked) == 1 + 4
+    assert value == min(np.sum((p - 3.0) ** 4) for p in asked)
+    assert value < np.sum((start - 3.0) ** 4)
+    assert any(np.array_equal(where, p) for p in asked)
