@@ -17,6 +17,7 @@ from search_setup import case_text, log_of, write_case
 
 import jaxid
 from jaxid.gap import force_gap
+from jaxid.identification import Gap
 from jaxid.io.log import Log
 
 Record = dict
@@ -63,6 +64,10 @@ def _searched(case: Case, folder: Path) -> Record:
             "after": [float(g.force.rms[0]) for g in d.gaps_after],
             "floor": float(d.noise_floor[0]),
             "truth": truth_gap(case, folder, logs) if case.hidden else None,
+        },
+        "simulated": {
+            "before": [_simulated(g) for g in d.gaps_before],
+            "after": [_simulated(g) for g in d.gaps_after],
         },
         "where": None if d.where is None else {
             "text": d.where.text, "variable": d.where.variable,
@@ -142,3 +147,12 @@ def _outside(case: Case) -> dict | None:
         return None
     machine = case.setup().machine
     return {"bursts": [list(b) for b in machine.bursts], "clock": list(machine.clock_force)}
+
+
+def _simulated(gap: Gap) -> list[list[float]] | None:
+    """Relative gap in simulation of position and, in a loop, of command; null where it diverged."""
+    s = gap.simulation
+    if s is None:
+        return None
+    parts = [s.relative] if s.command_relative is None else [s.relative, s.command_relative]
+    return [[float(x) for x in p] for p in parts]

@@ -147,13 +147,30 @@ def test_what_takes_the_sensors_own_noise_away_is_turned_down(axis):
     _, search = axis
     index = next(c for c in search.union.candidates if c.kind == "constant_force").index
     off = with_values(search, "constant_force", 5.0)
-    assert search.worth.objection(index, off, search.theta, None, None) == ""
+    assert search.worth.objection(index, off, search.theta, None, None, 3) == ""
     with pytest.MonkeyPatch.context() as patch:
         # As if the sensors had to leave a hundred times what is there.
         patch.setattr(search.worth, "_noise", 100 * search.worth._noise)
         patch.setattr(search.worth, "_numerics", 0.0)
-        why = search.worth.objection(index, off, search.theta, None, None)
+        why = search.worth.objection(index, off, search.theta, None, None, 3)
     assert why == "it takes away what the sensors' noise alone must leave"
+
+
+def test_few_independent_samples_may_leave_little(axis):
+    _, search = axis
+    worth = search.worth
+    many, few = worth._least(5), []
+    assert many == 0.25
+    moving = worth.samples.moving
+    with pytest.MonkeyPatch.context() as patch:
+        for count in (60, 30):
+            patch.setattr(worth.samples, "moving", moving & (np.cumsum(moving) <= count)[:, None])
+            n = int(count * worth.data.recipe.independent)
+            few.append(worth._least(5))
+            # What noise alone leaves after a fit of five unknowns, drawn.
+            left = np.random.default_rng(0).chisquare(max(n - 5, 1), 20_000) / n
+            assert np.mean(left < few[-1]) < 2e-3
+    assert many >= few[0] > few[1] > 0
 
 
 def test_many_starts_are_evaluated_once(axis, monkeypatch):

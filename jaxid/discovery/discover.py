@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.breakaway import BreakAway, break_away
+from jaxid.discovery.in_loop import WHY, hindering
 from jaxid.discovery.noise import sensor_colour
 from jaxid.discovery.result import Discovery, Found, Round
 from jaxid.discovery.screen import Score
@@ -36,6 +37,8 @@ from jaxid.session import Session, open_session
 _WORSE = 1.5
 # A residual counts as a disagreement only where it stands this far above the noise floor.
 _ABOVE_FLOOR = 1.3
+# So many effects that hinder the simulation are replaced; further ones are only taken out.
+_BARRED = 3
 
 
 def discover(
@@ -81,6 +84,12 @@ def explore(
     alternatives = search.alternatives(steps)
     where = where_of(search, steps[0], session.fit.log)
     final, effects = _final_machine(baseline.machine, search, alternatives, steps)
+    progress("simulating what was found")
+    while (c := hindering(search, session, final)) is not None:
+        # After some, nothing takes the place of what goes: a search must end.
+        steps += search.bar(c, WHY, max_effects if len(search.barred) < _BARRED else 0)
+        alternatives = search.alternatives(steps)
+        final, effects = _final_machine(baseline.machine, search, alternatives, steps)
     verdict = _verdict(effects, where, steps, search)
     before = baseline
     after = inverse_dynamics(final, data) if effects else before

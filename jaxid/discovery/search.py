@@ -39,6 +39,7 @@ class Step:
         threshold: Evidence that noise alone exceeds once in a thousand searches.
         theta: All unknowns of the union after the step.
         active: Indices of those that are fitted.
+        why: Reason for what was dropped, where it is not that it became superfluous.
     """
 
     added: Score | None
@@ -47,6 +48,7 @@ class Step:
     threshold: float
     theta: np.ndarray
     active: np.ndarray
+    why: str = ""
 
 
 @dataclass
@@ -61,6 +63,7 @@ class Search:
         validation: Logs that must confirm each effect.
         progress: Called with a line at every stage.
         added: Effects added, in order.
+        barred: Effects taken out for good.
     """
 
     union: cand.Union
@@ -70,6 +73,7 @@ class Search:
     validation: tuple[Prepared, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     added: list[cand.Candidate] = field(default_factory=list)
+    barred: list[cand.Candidate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.worth = Worth(self.union, self.data, self.validation, self.floor, self.colour)
@@ -87,7 +91,8 @@ class Search:
 
     def rest(self) -> list[cand.Candidate]:
         """Candidates not added yet."""
-        return [c for c in self.union.candidates if all(c is not a for a in self.added)]
+        gone = [*self.added, *self.barred]
+        return [c for c in self.union.candidates if all(c is not g for g in gone)]
 
     def many(self, candidate: cand.Candidate) -> list[cand.Point]:
         """A candidate at its many starts, computed once."""
@@ -100,8 +105,23 @@ class Search:
         """Add effects until none is worth it; drop what becomes superfluous on the way."""
         self.progress("fitting the baseline")
         self.theta = self._fit(self.theta, self.active)
-        steps = [Step(None, None, (), 0.0, self.theta, self.active)]
-        tried: set[frozenset[int]] = {frozenset()}
+        return [Step(None, None, (), 0.0, self.theta, self.active), *self._grow(most)]
+
+    def bar(self, c: cand.Candidate, why: str, most: int) -> list[Step]:
+        """Take an effect out for good, and go on without it."""
+        theta = self.without(c)
+        self.barred, self.added = [*self.barred, c], [a for a in self.added if a is not c]
+        self.theta = theta
+        return [Step(None, c, (), 0.0, theta, self.active, why), *self._grow(most)]
+
+    def without(self, c: cand.Candidate) -> np.ndarray:
+        """All unknowns, those of one effect neutral and the others fitted again."""
+        left = [a for a in self.added if a is not c]
+        return self._fit(self._neutral(self.theta, c), self._active(left))
+
+    def _grow(self, most: int) -> list[Step]:
+        steps: list[Step] = []
+        tried = {frozenset(id(c) for c in self.added)}
         while True:
             best, scores, limit = self.best(ahead=len(self.added) + 2 <= most)
             if not best or len(self.added) >= most:
@@ -193,8 +213,8 @@ class Search:
             own = self.added[k]
             self.progress(f"looking for what could replace {own.kind}")
             kept, theta = list(self.added), self.theta
+            self.theta = self.without(own)
             self.added = [c for c in kept if c is not own]
-            self.theta = self._fit(self._without(theta, own), self.active)
             _, scores, limit = self.best(MODEST, own)
             good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
             self.added, self.theta = kept, theta
@@ -234,7 +254,7 @@ class Search:
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         return cand.refine(self.union, self.samples, theta, active)[0]
 
-    def _without(self, theta: np.ndarray, c: cand.Candidate) -> np.ndarray:
+    def _neutral(self, theta: np.ndarray, c: cand.Candidate) -> np.ndarray:
         theta = theta.copy()
         theta[c.index] = c.neutral
         return theta
@@ -257,17 +277,17 @@ class Search:
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
         validation, confirmed = self.worth.confirmed(self.theta, theta, drive=drive)
         index = np.concatenate([s.candidate.index for s in new])
-        reason = self.worth.objection(index, self.theta, theta, validation, confirmed)
+        reason = self.worth.objection(index, self.theta, theta, validation, confirmed, len(active))
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
 
     def _drop_superfluous(self, limit: float) -> list[Step]:
         """Drop effects whose loss costs less than noise, or less than is relevant."""
         steps = []
         for c in self.added[:-1]:
-            without = [a for a in self.added if a is not c]
-            theta = self._fit(self._without(self.theta, c), self._active(without))
-            if not self._costs(theta, self._active(without), limit):
-                self.added, self.theta = without, theta
+            left = [a for a in self.added if a is not c]
+            theta = self.without(c)
+            if not self._costs(theta, self._active(left), limit):
+                self.added, self.theta = left, theta
                 steps.append(Step(None, c, (), limit, theta, self.active))
         return steps
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 from jaxtyping import Float
 
 from jaxid.discovery import candidates as cand
@@ -19,8 +20,10 @@ from jaxid.preprocess import Prepared
 RELEVANT = 0.15
 # A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
 _SCATTER = 3.0
-# ... and one that leaves less than this part of the noise's sum of squares explains noise.
+# ... and one that leaves less than this part of the noise's sum of squares explains noise; of few
+# independent samples, what a true model leaves less than only once in a thousand logs.
 _LEAST = 0.25
+_RARELY = 1e-3
 # The gain on the validation log must be at least this part of what the log itself promises.
 _CONFIRMED = 0.1
 
@@ -148,7 +151,7 @@ class Worth:
 
     def objection(
         self, index: np.ndarray, old: np.ndarray, new: np.ndarray, validation: float | None,
-        confirmed: float | None,
+        confirmed: float | None, fitted: int,
     ) -> str:
         """Why what a model adds to another may not be named; empty where it may.
 
@@ -156,6 +159,7 @@ class Worth:
             index: Its unknowns.
             old, new: All unknowns, without and with it.
             validation, confirmed: What `confirmed` says of it.
+            fitted: How many unknowns were.
         """
         free = self.union.machine.parameters.free
         for i in index:
@@ -166,7 +170,7 @@ class Worth:
             if np.isfinite(free[i].upper) and new[i] >= (1 - 1e-3) * free[i].upper:
                 return f"{free[i].name} runs to its limit, where it only imitates"
         e = self.residual(new)
-        if self._sum(e) < _LEAST * self._noise:
+        if self._sum(e) < self._least(fitted) * self._noise:
             return "it takes away what the sensors' noise alone must leave"
         closed = self.closed(self.residual(old), e)
         if closed < RELEVANT:
@@ -175,6 +179,11 @@ class Worth:
         if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
             return "it does not help on the validation log"
         return ""
+
+    def _least(self, fitted: int) -> float:
+        """Part of the noise's sum of squares that a fit of so many unknowns must leave."""
+        count = self.data.recipe.independent * self.samples.moving.sum()
+        return min(_LEAST, float(scipy.stats.chi2.ppf(_RARELY, max(count - fitted, 1)) / count))
 
     def _sum(self, e: np.ndarray) -> float:
         return float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))

@@ -225,19 +225,20 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
 
 
 def turned_down(result: Discovery, most: int = 3) -> list[str]:
-    """Why the best of what the last round did not add was not added."""
+    """Why effects were taken out again, and why the best of what the last round left were not added."""
     if not result.rounds:
         return []
     present = {e.kind for e in result.session.machine.plant.effects}
-    lines = []
+    steps = [r.step for r in result.rounds]
+    lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.why]
     if "static_friction" not in present and result.unseen:
         lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
-    last = [r.step for r in result.rounds if r.step.added is None and r.step.dropped is None][-1]
-    for score in last.scores:
-        if score.reason and score.evidence > last.threshold:
-            name, nats = score.candidate.label, score.evidence
-            lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
-    return lines[: most + 1]
+    last = [s for s in steps if s.added is None and s.dropped is None][-1]
+    left = [s for s in last.scores if s.reason and s.evidence > last.threshold]
+    for score in left[:most]:
+        name, nats = score.candidate.label, score.evidence
+        lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
+    return lines
 
 
 def step_json(r: Any, plant: Plant) -> dict[str, Any]:
