@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
+from jaxid import _cache
 from jaxid.errors import InputError, suggest
 
 METHODS = ("output_error", "inverse_dynamics", "algebraic")
@@ -44,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def entry() -> None:
     """Entry point of the installed command."""
+    _cache.configure()
     sys.exit(main())
 
 
