@@ -17,6 +17,7 @@ from jaxid.estimators.inverse_dynamics import (
     ForceData,
     force_precision,
     force_residual,
+    force_size,
     sharpened,
 )
 from jaxid.gap import noise_floor
@@ -119,7 +120,8 @@ def check(
     jacobian = _jacobian(sharpened(machine.plant, data), machine.parameters.places, arrays, theta)
     noise = np.random.default_rng(0).standard_normal(data.fitted.shape) * floor
     precision = force_precision(
-        machine, arrays, np.asarray(theta), noise, np.asarray(jacobian), data.fitted
+        machine, force_size(machine.plant, arrays), np.asarray(theta), noise,
+        np.asarray(jacobian), data.fitted,
     )
     return Check(session, precision, floor)
 

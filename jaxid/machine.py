@@ -61,7 +61,7 @@ class Machine:
         """The same machine with its unknowns set, which are also the new guesses."""
         theta = np.asarray(theta, dtype=np.float64)
         parameters = self.parameters.with_guess(theta)
-        plant = self.parameters.insert(self.plant, parameters.guess)
+        plant = self.parameters.insert(self.plant, theta)
         return replace(self, plant=plant, parameters=parameters)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -60,16 +60,16 @@ class Parameters:
         return [f.name for f in self.free]
 
     @property
-    def guess(self) -> Float[Array, " p"]:
+    def guess(self) -> Float[np.ndarray, " p"]:
         """Where a fit starts."""
-        return jnp.asarray([f.guess for f in self.free], dtype=jnp.float64)
+        return np.asarray([f.guess for f in self.free], dtype=np.float64)
 
     @property
-    def bounds(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    def bounds(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
         """Lower and upper bounds: the user's, and what the signs demand."""
         lower = [max(f.lower, _sign_floor(f)) for f in self.free]
         upper = [f.upper for f in self.free]
-        return jnp.asarray(lower, dtype=jnp.float64), jnp.asarray(upper, dtype=jnp.float64)
+        return np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
 
     def insert(self, plant: Plant, theta: Float[Array, " p"]) -> Plant:
         """The plant with the unknowns set."""
@@ -106,13 +106,14 @@ def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
 
 def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
     """The plant with theta[k] at places[k], each a path and, where the leaf is a list, an index."""
-    leaves: dict[tuple, Array] = {}
+    leaves, structure = jax.tree.flatten(plant)
+    numbers = jax.tree.unflatten(structure, range(len(leaves)))
+    # Entry by entry, an array of JAX outside compiled code takes longer to read than a plant to build.
+    values = [jnp.asarray(x) for x in theta] if isinstance(theta, np.ndarray) else theta
     for k, (path, index) in enumerate(places):
-        old = leaves[path] if path in leaves else leaf(plant, path)
-        leaves[path] = theta[k] if index is None else old.at[index].set(theta[k])
-    if not leaves:
-        return plant
-    return eqx.tree_at(lambda p: [leaf(p, path) for path in leaves], plant, [*leaves.values()])
+        at = leaf(numbers, path)
+        leaves[at] = values[k] if index is None else leaves[at].at[index].set(values[k])
+    return jax.tree.unflatten(structure, leaves)
 
 
 def _sign_floor(f: Free) -> float:

@@ -111,7 +111,7 @@ class Union:
     @property
     def neutral(self) -> np.ndarray:
         """The vector at which only the baseline acts."""
-        return np.asarray(self.machine.parameters.guess)
+        return self.machine.parameters.guess
 
 
 class Samples:

@@ -173,8 +173,8 @@ def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimat
             where=log.source, mend="take a log with longer motion, or use inverse_dynamics",
         )
     fit = yield Solve(_solve, (
-        plant, parameters.places, arrays, jnp.asarray(log.position), length,
-        jnp.asarray(rows, dtype=float), parameters.guess, Transform.of(parameters),
+        plant, parameters.places, arrays, log.position, length,
+        np.asarray(rows, dtype=float), parameters.guess, Transform.of(parameters),
         parameters.bounds,
     ))
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)

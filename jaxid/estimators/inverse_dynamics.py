@@ -115,15 +115,25 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
 def _solve(
     plant: Plant, places: tuple, data: ForceData, theta: Array, transform: Transform,
     bounds: tuple[Array, Array],
-) -> Minimum:
+) -> tuple[Minimum, Array]:
+    """The fit, and the size of the force that it explains."""
+
     def residual(theta: Array) -> Array:
         return data.weight * force_residual(scatter(places, plant, theta), data)
 
-    return levenberg_marquardt(residual, theta, transform, *bounds)
+    return levenberg_marquardt(residual, theta, transform, *bounds), _size(plant, data)
+
+
+def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
+    """2-norm of the measured force at the samples that count."""
+    return jnp.linalg.norm(jnp.where(data.weight > 0, measured_force(plant, data), 0.0))
+
+
+force_size = eqx.filter_jit(_size)
 
 
 def inverse_dynamics(
-    machine: Machine, data: Prepared, *, reweighted: bool = False, start: Array | None = None
+    machine: Machine, data: Prepared, *, reweighted: bool = False, start: np.ndarray | None = None
 ) -> Estimate:
     """Fit the unknowns to a prepared log by least squares on the balance of forces.
 
@@ -144,18 +154,19 @@ def inverse_dynamics(
 
 
 def inverse_dynamics_steps(
-    machine: Machine, data: Prepared, *, reweighted: bool = False, start: Array | None = None
+    machine: Machine, data: Prepared, *, reweighted: bool = False, start: np.ndarray | None = None
 ) -> Steps[Estimate]:
     """`inverse_dynamics`, one solve at a time."""
     plant = sharpened(machine.plant, data)
     rows = data.fitted
     arrays = ForceData.of(data, rows)
     parameters = machine.parameters
-    theta = parameters.guess if start is None else jnp.asarray(start)
+    theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
     places, transform = parameters.places, Transform.of(parameters)
     fits = []
     for at in _starts(machine, theta):
-        fits.append((yield Solve(_solve, (plant, places, arrays, at, transform, parameters.bounds))))
+        fit, size = yield Solve(_solve, (plant, places, arrays, at, transform, parameters.bounds))
+        fits.append(fit)
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
     # Of those that reach the lowest cost, to rounding, one that converged.
     lowest = [f for f, c in zip(fits, costs, strict=True) if c <= min(costs) * (1 + 1e-6)]
@@ -164,10 +175,10 @@ def inverse_dynamics_steps(
         e = np.asarray(fit.residual).reshape(data.moving.shape)
         weight = jnp.asarray(np.sqrt(_bisquare(e, rows)) * rows)
         arrays = eqx.tree_at(lambda a: a.weight, arrays, weight)
-        fit = yield Solve(_solve, (plant, places, arrays, fit.theta, transform, parameters.bounds))
+        fit, _ = yield Solve(_solve, (plant, places, arrays, fit.theta, transform, parameters.bounds))
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
-    precision = force_precision(machine, arrays, np.asarray(fit.theta), e, jacobian, rows)
+    precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)
     converged = bool(fit.converged) and bool(np.all(np.isfinite(fit.theta)))
     return Estimate(
         method="inverse_dynamics",
@@ -182,7 +193,7 @@ def inverse_dynamics_steps(
     )
 
 
-def _starts(machine: Machine, theta: Array) -> list[Array]:
+def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
     """The guesses, and the same with each shape (a width, a lag, a period) smaller and larger.
 
     What enters in proportion is solved in one step from anywhere; a shape that starts far off lets
@@ -194,19 +205,17 @@ def _starts(machine: Machine, theta: Array) -> list[Array]:
             continue
         info = parameters_of(type(machine.plant.effects[f.path[1]]))[f.path[2]]
         if not carries_force(info) and info.dimension != "1" and theta[k] > 0:
-            out += [theta.at[k].multiply(factor) for factor in _SHAPES]
+            out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _SHAPES]
     return out
 
 
 def force_precision(
-    machine: Machine, arrays: ForceData, theta: np.ndarray, e: np.ndarray, jacobian: np.ndarray,
+    machine: Machine, size: Array, theta: np.ndarray, e: np.ndarray, jacobian: np.ndarray,
     rows: np.ndarray,
 ) -> Precision:
-    """Precision of a fit in the force domain."""
-    measured = np.asarray(measured_force(machine.plant, arrays))
-    signal = float(np.linalg.norm(np.where(rows, measured, 0.0)))
+    """Precision of a fit in the force domain; `size` is what `force_size` says."""
     scale = np.where(theta != 0, theta, 1.0)
-    return assess(machine.parameters.names, jacobian, e, rows, signal, scale)
+    return assess(machine.parameters.names, jacobian, e, rows, float(size), scale)
 
 
 def _bisquare(e: np.ndarray, counts: np.ndarray) -> np.ndarray:

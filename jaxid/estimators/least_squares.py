@@ -7,6 +7,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxid.parameters import Parameters
@@ -32,7 +33,7 @@ class Transform(eqx.Module):
     @classmethod
     def of(cls, parameters: Parameters) -> Transform:
         """The transform of a set of unknowns."""
-        return cls(jnp.asarray([f.sign == "positive" for f in parameters.free], dtype=bool))
+        return cls(np.asarray([f.sign == "positive" for f in parameters.free], dtype=bool))
 
     def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
         """Physical to solver."""

@@ -179,14 +179,12 @@ def _with_start(
 def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple:
     parameters = machine.parameters
     lower, upper = parameters.bounds
-    free = jnp.full(nuisance, jnp.inf)
-    transform = Transform(
-        jnp.concatenate([Transform.of(parameters).log, jnp.zeros(nuisance, bool)])
-    )
+    free = np.full(nuisance, np.inf)
+    transform = Transform(np.concatenate([Transform.of(parameters).log, np.zeros(nuisance, bool)]))
     return (
-        replay, parameters.places, machine.plant, jnp.asarray(log.position),
-        jnp.ones(log.position.shape), jnp.concatenate([parameters.guess, jnp.zeros(nuisance)]),
-        transform, (jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])),
+        replay, parameters.places, machine.plant, log.position, np.ones(log.position.shape),
+        np.concatenate([parameters.guess, np.zeros(nuisance)]), transform,
+        (np.concatenate([lower, -free]), np.concatenate([upper, free])),
     )
 
 

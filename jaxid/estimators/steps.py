@@ -6,13 +6,13 @@ those that ask for the same solver at the same shapes are stacked and solved in 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 T = TypeVar("T")
 
@@ -59,13 +59,13 @@ def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     while waiting := {k: asked for k, asked in waiting.items() if asked is not None}:
         groups: dict[Any, list[int]] = {}
         parts = {k: _parted(asked) for k, asked in waiting.items()}
-        for k, (key, _, _) in parts.items():
+        for k, (key, _) in parts.items():
             groups.setdefault(key, []).append(k)
         answers: dict[int, Any] = {}
-        for members in groups.values():
+        for key, members in groups.items():
             for first in range(0, len(members), lanes):
                 some = members[first : first + lanes]
-                found = _solved(waiting[some[0]].function, [parts[k] for k in some], lanes)
+                found = _solved(key, [parts[k][1] for k in some], lanes)
                 answers.update(zip(some, found, strict=True))
         waiting = {k: _advanced(many[k], answers[k], k, ended) for k in waiting}
     return [ended[k] for k in range(len(many))]
@@ -81,23 +81,36 @@ def _advanced(steps: Steps[T], answer: Any, k: int, ended: dict[int, T | Excepti
     return None
 
 
-def _parted(asked: Solve) -> tuple[Any, Any, Any]:
-    """What two runs must share to be solved together; arrays; the rest."""
-    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, asked.args)
-    arrays, static = eqx.partition(args, eqx.is_array)
-    leaves, structure = jax.tree.flatten(static)
-    shapes = tuple((x.shape, x.dtype) for x in jax.tree.leaves(arrays))
-    return (asked.function, structure, tuple(leaves), shapes), arrays, static
+def _parted(asked: Solve) -> tuple[Any, list[np.ndarray]]:
+    """What two runs must share to be solved together, and the arrays of one."""
+    leaves, structure = jax.tree.flatten(asked.args)
+    arrays = [np.asarray(x) for x in leaves if isinstance(x, _ARRAYS)]
+    static = tuple(_Hole if isinstance(x, _ARRAYS) else x for x in leaves)
+    shapes = tuple((x.shape, x.dtype) for x in arrays)
+    return (asked.function, structure, static, shapes), arrays
 
 
-def _solved(function: Callable, runs: list[tuple[Any, Any, Any]], lanes: int) -> list[Any]:
-    filled = [arrays for _, arrays, _ in runs]
-    filled += [filled[-1]] * (lanes - len(filled))
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *filled)
-    found = jax.tree.map(np.asarray, _batched(function, runs[0][2], stacked))
-    return [jax.tree.map(lambda x, k=k: x[k], found) for k in range(len(runs))]
+class _Hole:
+    """Stands where an array belongs."""
 
 
-@eqx.filter_jit
-def _batched(function: Callable, static: Any, stacked: Any) -> Any:
-    return jax.vmap(lambda own: function(*eqx.combine(own, static)))(stacked)
+_ARRAYS = (np.ndarray, jax.Array)
+
+
+def _solved(key: Any, runs: list[list[np.ndarray]], lanes: int) -> list[Any]:
+    filled = [*runs, *[runs[-1]] * (lanes - len(runs))]
+    # Stacked by numpy: one transfer each, where JAX would dispatch an operation a run.
+    stacked = [np.stack(x) for x in zip(*filled, strict=True)]
+    found = jax.tree.map(np.asarray, _batched(*key[:3], stacked))
+    leaves, structure = jax.tree.flatten(found)
+    return [jax.tree.unflatten(structure, [x[k] for x in leaves]) for k in range(len(runs))]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _batched(function: Callable, structure: Any, static: tuple, stacked: list[Array]) -> Any:
+    def one(own: list[Array]) -> Any:
+        rest = iter(own)
+        leaves = [next(rest) if x is _Hole else x for x in static]
+        return function(*jax.tree.unflatten(structure, leaves))
+
+    return jax.vmap(one)(stacked)

@@ -132,13 +132,13 @@ class Plan:
         They depend on the seed and the run's number alone: every level of noise sees the same draws.
         """
         rng = np.random.default_rng([self.seed, run])
-        truth = np.asarray(self.scene.machine.parameters.guess)
+        truth = self.scene.machine.parameters.guess
         truth = truth * np.exp(self.draw * rng.standard_normal(len(truth)))
         # A fit must be able to reach it.
-        truth = np.clip(truth, *(np.asarray(b) for b in self.scene.machine.parameters.bounds))
+        truth = np.clip(truth, *self.scene.machine.parameters.bounds)
         start = rng.standard_normal(len(self.names))
-        guess = np.asarray(self.machine.parameters.guess)
-        lower, upper = (np.asarray(b) for b in self.machine.parameters.bounds)
+        guess = self.machine.parameters.guess
+        lower, upper = self.machine.parameters.bounds
         started = np.clip(guess * np.exp(self.start_spread * start), lower, upper)
         return truth, started, rng
 
