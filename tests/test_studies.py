@@ -96,6 +96,39 @@ def test_noise_scales_the_errors(whole):
     np.testing.assert_allclose(ratio, 2.0, rtol=0.2)
 
 
+VARIED = STUDY.replace("[0.5, 1.0]", "[1.0]").replace(
+    "[study]\n", "[study]\nsample_rate = [200.0, 400.0]\nposition_resolution = [1e-6, 1e-3]\n"
+)
+
+
+def test_sampling_and_resolution_are_varied_with_each_other(tmp_path):
+    study = jaxid.study(write_case(tmp_path, AXIS + VARIED), runs=4)
+    table = study.table
+    assert table["estimate"].dims[:4] == ("estimator", "sample_rate", "position_resolution", "noise")
+    spread = (table["estimate"] - table["truth"]).std("run").sel(parameter="inertia", noise=1.0)
+    one = spread.sel(estimator="inverse_dynamics")
+    # A thousandth is 30 deviations of the readings' noise.
+    assert np.all(one.sel(position_resolution=1e-3) > 2 * one.sel(position_resolution=1e-6))
+    settings = [(r["sample_rate"], r["position_resolution"]) for r in study.summary[::2]]
+    assert settings[:4] == [(200.0, 1e-6), (200.0, 1e-3), (400.0, 1e-6), (400.0, 1e-3)]
+    # More samples hold more, at the same noise of each.
+    bound = table["bound"].sel(parameter="inertia", position_resolution=1e-6, noise=1.0)
+    assert float(bound[0] / bound[1]) == pytest.approx(np.sqrt(2), rel=0.02)
+    page = (study.save(tmp_path / "out") / "report.html").read_text()
+    assert "400 Hz, resolution 0.001, noise 1" in page
+    with xr.open_dataset(tmp_path / "out" / "study.nc", engine="scipy") as saved:
+        np.testing.assert_array_equal(saved["estimate"], table["estimate"])
+
+
+def test_a_run_is_the_same_whatever_else_is_varied(whole, tmp_path):
+    alone = jaxid.study(whole[0], runs=3, seed=3)
+    both = jaxid.study(write_case(tmp_path, AXIS + STUDY.replace(
+        "[study]\n", "[study]\nsample_rate = [200.0, 400.0]\n"
+    )), runs=3, seed=3)  # fmt: skip
+    own = both.table["estimate"].sel(sample_rate=200.0)
+    np.testing.assert_array_equal(own, alone.table["estimate"])
+
+
 def test_resumed_to_the_same_bits(whole, tmp_path):
     case, _, folder = whole
     out = tmp_path / "out"

@@ -77,6 +77,8 @@ STUDY: Keys = {
     "estimators": Key(several(choice((*METHODS, "discover")))),
     "hidden": Key(several(text)),
     "noise": Key(several(number("nonnegative"))),
+    "sample_rate": Key(several(number("positive"))),
+    "position_resolution": Key(several(number("positive"))),
     "draw": Key(number("nonnegative")),
     "start_spread": Key(number("nonnegative")),
     "runs": Key(whole(1)),

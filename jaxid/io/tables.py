@@ -133,21 +133,24 @@ def check_table(result: Any) -> str:
 
 def study_table(result: Study) -> str:
     """What `study` prints."""
+    from jaxid.studies.settings import SETTINGS, words_of
+
     part = lambda x: "-" if not np.isfinite(x) else f"{100 * x:.1f} %"
     keys = ("bias", "spread", "std", "bound")
-    rows = [["estimator", "noise", "parameter", "bias", "spread", "reported", "bound", "unit",
+    own = [name for name in SETTINGS if name in result.table.dims]
+    rows = [["estimator", *own, "parameter", "bias", "spread", "reported", "bound", "unit",
              "68 %", "95 %", "failed"]]  # fmt: skip
     for r in result.summary:
         numbers = [*[_number(r[k]) for k in keys], r["unit"]]
         parts = [part(r[k]) for k in ("coverage_68", "coverage_95", "failed")]
-        rows.append([r["estimator"], f"{r['noise']:g}", r["parameter"], *numbers, *parts])
-    runs, levels = result.table.sizes["run"], result.table.sizes["noise"]
-    lines = [f"{result.title}: {runs} runs at {levels} level(s) of noise, {result.seconds:.3g} s of work"]
+        rows.append([r["estimator"], *[f"{r[k]:g}" for k in own], r["parameter"], *numbers, *parts])
+    runs, settings = result.table.sizes["run"], int(np.prod([result.table.sizes[k] for k in own]))
+    lines = [f"{result.title}: {runs} runs under {settings} setting(s), {result.seconds:.3g} s of work"]
     lines += ["", aligned(rows)]
     for k, n in enumerate(result.named):
         lines += ["", "named:"] if k == 0 else []
-        lines += [f"  noise {n['noise']:g}: {n['runs']} of {runs}: {n['what']}"]
+        lines += [f"  {words_of(n)}: {n['runs']} of {runs}: {n['what']}"]
     for k, f in enumerate(result.failures):
         lines += ["", "failed:"] if k == 0 else []
-        lines += [f"  {f['estimator']} at noise {f['noise']:g}: {f['runs']} of {runs}: {f['why']}"]
+        lines += [f"  {f['estimator']} at {words_of(f)}: {f['runs']} of {runs}: {f['why']}"]
     return "\n".join(lines)

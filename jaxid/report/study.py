@@ -9,6 +9,8 @@ import numpy as np
 from jaxid.report.numbers import pretty_unit, short
 from jaxid.report.page import filled, image
 from jaxid.report.study_plots import plot_coverage, plot_errors, plot_scatter
+from jaxid.studies.result import conditions
+from jaxid.studies.settings import SETTINGS, setting_of, words_of
 
 if TYPE_CHECKING:
     from jaxid.studies.result import Study
@@ -35,15 +37,20 @@ def study_report(result: Study) -> str:
             image(plot_coverage(rows), "Coverage of 95 % intervals, by parameter"),
         ),
     ]
-    for level, noise in enumerate(table.noise.values):
-        title = f"Errors in units of their reported σ, noise {noise:g}"
+    for setting, own in conditions(table):
+        title = f"Errors in units of their reported σ: {words_of(setting)}"
         words = "Beyond 4.5 σ everything is counted in the outermost bar."
-        figures.append((title, words, image(plot_scatter(table, level), title)))
+        figures.append((title, words, image(plot_scatter(own), title)))
+    settings = [name for name in SETTINGS if name in table.dims]
+    tried = "; ".join(
+        f"{name.replace('_', ' ')} {', '.join(f'{x:g}' for x in table[name].values)}" for name in settings
+    )
     return filled(
-        "study.html", title=result.title, rows=[_line(r) for r in rows],
-        failures=result.failures, named=result.named,
+        "study.html", title=result.title, rows=[_line(r) for r in rows], settings=settings,
+        failures=[f | {"where": words_of(f)} for f in result.failures],
+        named=[n | {"where": words_of(n)} for n in result.named],
         runs=table.sizes["run"], seconds=short(result.seconds, 3), figures=figures,
-        noises=", ".join(f"{n:g}" for n in table.noise.values), answer=_answer(result),
+        tried=tried, answer=_answer(result),
     )
 
 
@@ -51,7 +58,8 @@ def _line(row: dict) -> dict:
     percent = lambda x: f"{100 * x:.1f}" if np.isfinite(x) else "–"
     number = lambda x: short(x, 3) if np.isfinite(x) else "–"
     return {
-        **row, "unit": pretty_unit(row["unit"]), "noise": f"{row['noise']:g}", "true": number(row["true"]),
+        **row, "unit": pretty_unit(row["unit"]), "true": number(row["true"]),
+        "settings": [f"{x:g}" for x in setting_of(row).values()],
         **{k: number(row[k]) for k in ("bias", "spread", "rmse", "std", "bound")},
         **{k: percent(row[k]) for k in ("coverage_68", "coverage_95", "failed")},
     }
@@ -69,6 +77,6 @@ def _answer(result: Study) -> str:
     failed = sum(f["runs"] for f in result.failures)
     fits = result.table["converged"].size
     return (
-        f"95 % intervals held the truth, over all parameters and noises, in: {'; '.join(parts)}. "
+        f"95 % intervals held the truth, over all parameters and settings, in: {'; '.join(parts)}. "
         f"{failed} of {fits} fits gave no value for some parameter."
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.ticker
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 
 from jaxid.report.axes import FONT, TEXT, dress
 from jaxid.report.numbers import pretty_unit
+from jaxid.studies.settings import words_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 _MARKS = ("o", "s", "^", "D", "v", "P")
@@ -22,26 +24,34 @@ _COLUMNS = 3
 def plot_errors(rows: Sequence[dict]) -> Figure:
     """RMS error of every estimator against noise, a panel for each parameter, with the bound.
 
+    What else is varied is told by the dashes.
+
     Args:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
+    others = _others(rows)
     for name, ax in zip(names, panels, strict=True):
         own = [r for r in rows if r["parameter"] == name]
         noises = np.array(sorted({r["noise"] for r in own}))
-        for k, estimator in enumerate(_estimators(rows)):
-            line = {r["noise"]: r for r in own if r["estimator"] == estimator}
-            values = np.array([line[n]["rmse"] for n in noises])
-            style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5}
-            ax.plot(noises, values, lw=1.3, label=estimator, **style)
-            stated = np.array([line[n]["std"] for n in noises])
-            ax.plot(noises, stated, lw=0.9, ls=":", color=COLOURS[k % 6])
-        bound = np.array([next(r["bound"] for r in own if r["noise"] == n) for n in noises])
-        if np.any(np.isfinite(bound)):
-            ax.plot(noises, bound, color=TEXT, lw=1.0, ls="--", label="Cramér–Rao bound")
+        for other, dash in others.items():
+            here = [r for r in own if words_of(r, noise=False) == other]
+            for k, estimator in enumerate(_estimators(rows)):
+                line = {r["noise"]: r for r in here if r["estimator"] == estimator}
+                style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5, "ls": dash}
+                values = np.array([line[n]["rmse"] for n in noises])
+                ax.plot(noises, values, lw=1.3, label=estimator if dash == "-" else None, **style)
+                if len(others) == 1:
+                    stated = np.array([line[n]["std"] for n in noises])
+                    ax.plot(noises, stated, lw=0.9, ls=":", color=COLOURS[k % 6])
+            bound = np.array([next(r["bound"] for r in here if r["noise"] == n) for n in noises])
+            if np.any(np.isfinite(bound)):
+                label = "Cramér–Rao bound" if dash == "-" else None
+                ax.plot(noises, bound, color=TEXT, lw=1.0, ls="--" if len(others) == 1 else dash, label=label)
         dress(ax, "noise, times the sensor's", f"{name}\nRMS error [{pretty_unit(own[0]['unit'])}]")
         _logarithmic(ax, noises)
-    _legend(figure, panels[0], [("reported σ", ":")])
+    several = [(other, dash) for other, dash in others.items()] if len(others) > 1 else []
+    _legend(figure, panels[0], several or [("reported σ", ":")])
     return figure
 
 
@@ -52,39 +62,45 @@ def plot_coverage(rows: Sequence[dict]) -> Figure:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
-    estimators = _estimators(rows)
+    estimators, others = _estimators(rows), list(_others(rows))
+    sides = [(estimator, other) for estimator in range(len(estimators)) for other in range(len(others))]
     for name, ax in zip(names, panels, strict=True):
         own = [r for r in rows if r["parameter"] == name]
         noises = sorted({r["noise"] for r in own})
-        for k, estimator in enumerate(estimators):
-            line = {r["noise"]: r for r in own if r["estimator"] == estimator and r["used"]}
-            at = np.array([noises.index(n) for n in line]) + 0.12 * (k - 0.5 * (len(estimators) - 1))
+        for side, (k, o) in enumerate(sides):
+            line = {
+                r["noise"]: r for r in own
+                if r["estimator"] == estimators[k] and words_of(r, noise=False) == others[o] and r["used"]
+            }
+            step = min(0.12, 0.8 / len(sides))
+            at = np.array([noises.index(n) for n in line]) + step * (side - 0.5 * (len(sides) - 1))
             held = np.array([r["coverage_95"] for r in line.values()])
             ends = np.array([_proportion(r["coverage_95"], r["used"]) for r in line.values()]).reshape(-1, 2)
             style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5}
             ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=COLOURS[k % 6], lw=1.2)
-            ax.plot(at, 100 * held, ls="", label=estimator, **style)
+            ax.plot(at, 100 * held, ls="", label=None if o else estimators[k], **style)
         ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
         dress(ax, "noise, times the sensor's", f"{name}\nin the 95 % interval [%]")
         ax.set_ylim(0, 103)
         ax.set_xlim(-0.5, len(noises) - 0.5)
         ax.set_xticks(range(len(noises)), [f"{n:g}" for n in noises])
+    if len(others) > 1:
+        figure.supxlabel(f"of each estimator from left to right: {'; '.join(others)}", fontsize=FONT)
     _legend(figure, panels[0])
     return figure
 
 
-def plot_scatter(table: xr.Dataset, level: int) -> Figure:
-    """Errors of all runs at one level of noise, against the estimators' own deviation.
+def plot_scatter(table: xr.Dataset) -> Figure:
+    """Errors of all runs under one setting, against the estimators' own deviation.
 
     Args:
-        table: `Study.table`.
-        level: Index of the noise.
+        table: `Study.table` under that setting.
     """
     names = [str(n) for n in table.parameter.values]
     figure, panels = _grid(len(names))
     reach = np.linspace(-4.5, 4.5, 200)
     for k, (name, ax) in enumerate(zip(names, panels, strict=True)):
-        own = table.isel(noise=level, parameter=k)
+        own = table.isel(parameter=k)
         for i, estimator in enumerate(table.estimator.values):
             one = own.isel(estimator=i)
             used = one["converged"].values.astype(bool) & np.isfinite(one["std"].values)
@@ -97,6 +113,13 @@ def plot_scatter(table: xr.Dataset, level: int) -> Figure:
         dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
     _legend(figure, panels[0])
     return figure
+
+
+def _others(rows: Sequence[dict]) -> dict[str, Any]:
+    """What is varied beside the noise, in words, each with a dash."""
+    found = dict.fromkeys(words_of(r, noise=False) for r in rows)
+    dashes = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
+    return {other: dashes[k % len(dashes)] for k, other in enumerate(found)}
 
 
 def _panels(rows: Sequence[dict]) -> tuple[list[str], list[Axes], Figure]:

@@ -15,7 +15,8 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
 from jaxid.io.case import Case
-from jaxid.machine import Machine, build_machine
+from jaxid.machine import Machine
+from jaxid.studies.levels import Level, levels_of
 from jaxid.virtual import Scene
 
 DISCOVER = "discover"
@@ -33,24 +34,18 @@ class Plan:
 
     Args:
         case: The case.
-        model: The case without the effects that are hidden from the estimators.
-        scene: What is simulated.
-        machine: Of the model, where fits start, before the starts are spread.
+        levels: Under what it runs.
         estimators: Names of methods, or "discover".
-        noise: Factors on the noise of the case's [sensor].
         draw: Relative spread of the true values: each is multiplied by exp(draw * N(0, 1)).
         start_spread: Likewise of the values that a fit starts from.
-        runs: At each level of noise.
+        runs: At each level.
         chunk: Runs that are simulated and solved together.
         seed: Of everything drawn.
     """
 
     case: Case
-    model: Case
-    scene: Scene
-    machine: Machine
+    levels: tuple[Level, ...]
     estimators: tuple[str, ...]
-    noise: tuple[float, ...]
     draw: float
     start_spread: float
     runs: int
@@ -77,10 +72,9 @@ class Plan:
         if not 0 <= seed < 2**31:
             raise InputError(f"the seed is {seed}", mend="give one from 0 to 2147483647")
         draw = float(setting.get("draw", 0.0))
-        scene = Scene.of(case, longer_delays=float(np.exp(_FARTHEST * draw)))
         model = _without(case, setting.get("hidden", ()))
-        machine = build_machine(model, period=1 / float(case.simulation["sample_rate"]))
-        if not machine.parameters.free:
+        levels = levels_of(case, model, float(np.exp(_FARTHEST * draw)))
+        if not levels[0].machine.parameters.free:
             raise InputError(
                 "nothing is unknown", where=where, mend="give at least one parameter as { guess = ... }"
             )
@@ -91,21 +85,30 @@ class Plan:
                     f"estimator {name!r} is not available in this version", where=f"{where}, [study]",
                     mend=f"choose from {', '.join((*METHODS, DISCOVER))}",
                 )
-        noise = tuple(float(x) for x in setting.get("noise", (1.0,)))
-        sensor = scene.machine.sensor
-        if sensor.position_noise is None and sensor.force_noise is None and set(noise) != {1.0}:
-            raise InputError(
-                "there is no noise to multiply", where=f"{where}, [study] noise",
-                mend="give position_noise or force_noise in [sensor]",
-            )
         runs = int(setting.get("runs", _RUNS) if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, mend="give one or more")
-        chunk = int(setting.get("chunk", _fitting(scene, machine, runs, workers or cores())))
+        chunk = int(setting.get("chunk", _fitting(levels, runs, workers or cores())))
         start_spread = float(setting.get("start_spread", 0.0))
-        return cls(
-            case, model, scene, machine, estimators, noise, draw, start_spread, runs, chunk, seed
-        )
+        return cls(case, levels, estimators, draw, start_spread, runs, chunk, seed)
+
+    @property
+    def scene(self) -> Scene:
+        """What is simulated, but for the settings."""
+        return self.levels[0].scene
+
+    @property
+    def machine(self) -> Machine:
+        """Of the model, but for the settings."""
+        return self.levels[0].machine
+
+    @property
+    def settings(self) -> dict[str, list[float]]:
+        """Values of each setting, in the order of the levels."""
+        return {
+            name: list(dict.fromkeys(level.setting[name] for level in self.levels))
+            for name in self.levels[0].setting
+        }
 
     @property
     def names(self) -> list[str]:
@@ -119,17 +122,17 @@ class Plan:
 
     @functools.cached_property
     def chunks(self) -> list[tuple[int, range]]:
-        """Level of noise and runs of each chunk, in order."""
+        """Level and runs of each chunk, in order."""
         starts = range(0, self.runs, self.chunk)
         return [
             (level, range(first, min(first + self.chunk, self.runs)))
-            for level in range(len(self.noise)) for first in starts
+            for level in range(len(self.levels)) for first in starts
         ]  # fmt: skip
 
     def drawn(self, run: int) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
         """True values of all that is simulated in a run, where its fit starts, and what draws its noise.
 
-        They depend on the seed and the run's number alone: every level of noise sees the same draws.
+        They depend on the seed and the run's number alone: every level sees the same draws.
         """
         rng = np.random.default_rng([self.seed, run])
         truth = self.scene.machine.parameters.guess
@@ -151,7 +154,7 @@ class Plan:
         return {
             "case": self.case.path.name, "fingerprint": fingerprint(self.case),
             "estimators": list(self.estimators), "hidden": list(self.case.study.get("hidden", ())),
-            "noise": list(self.noise), "draw": self.draw,
+            **self.settings, "draw": self.draw,
             "start_spread": self.start_spread, "runs": self.runs, "chunk": self.chunk,
             "seed": self.seed, "parameters": self.names,
             "versions": {p: version(p) for p in packages},
@@ -169,9 +172,10 @@ def _without(case: Case, hidden: tuple[str, ...]) -> Case:
     return replace(case, effects=tuple(e for e in case.effects if e.cls.kind not in hidden))
 
 
-def _fitting(scene: Scene, machine: Machine, runs: int, workers: int) -> int:
+def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
     """Runs that are solved together: as many as memory holds for all workers, not more than there are."""
-    samples, joints = len(scene.signal), scene.case.plant.joints
+    machine, joints = levels[0].machine, levels[0].model.plant.joints
+    samples = max(len(level.scene.signal) for level in levels)
     refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
     # Residual, Jacobian and trajectory, kept twice over by the solver.
     each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)

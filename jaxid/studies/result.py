@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ import scipy.stats
 import xarray as xr
 
 from jaxid.io.output import ready_folder, write_json, write_whole
+from jaxid.studies.settings import SETTINGS
 
 if TYPE_CHECKING:
     from jaxid.studies.plan import Plan
@@ -31,7 +33,8 @@ class Study:
     Args:
         table: Every run: `estimate`, `std`, `identifiable` (estimator, noise, run, parameter),
             `converged`, `steps`, `message`, `named` (estimator, noise, run), `truth` and `start` (run,
-            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter). SI.
+            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter). SI. Before
+            noise come `sample_rate` [Hz] and `position_resolution`, where the study varies them.
         seconds: That all chunks took, added up over the threads; of those resumed, then.
         title: Name of the case.
     """
@@ -42,17 +45,17 @@ class Study:
 
     @property
     def summary(self) -> list[dict[str, Any]]:
-        """A row for every estimator, noise and parameter; see `summarised`."""
+        """A row for every estimator, setting and parameter; see `summarised`."""
         return summarised(self.table)
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """`why` runs gave no value for all parameters, and how many by that, for every estimator and noise.
+        """`why` runs gave no value for all parameters, and how many by that, by estimator and setting.
 
         Reasons that differ in numbers only count as one, told as the first run has it.
         """
         out = []
-        for estimator, noise, own in self._cells():
+        for estimator, setting, own in cells(self.table):
             firsts: dict[str, str] = {}
             counts: Counter[str] = Counter()
             for k in range(own.sizes["run"]):
@@ -62,24 +65,19 @@ class Study:
                     firsts.setdefault(kind, why)
                     counts[kind] += 1
             out += [
-                {"estimator": estimator, "noise": noise, "why": firsts[kind], "runs": runs}
+                {"estimator": estimator, **setting, "why": firsts[kind], "runs": runs}
                 for kind, runs in counts.most_common()
             ]
         return out
 
     @property
     def named(self) -> list[dict[str, Any]]:
-        """`what` discover named, or its verdict, and in how many `runs`, for every noise."""
+        """`what` discover named, or its verdict, and in how many `runs`, by setting."""
         return [
-            {"estimator": estimator, "noise": noise, "what": str(what), "runs": runs}
-            for estimator, noise, own in self._cells()
+            {"estimator": estimator, **setting, "what": str(what), "runs": runs}
+            for estimator, setting, own in cells(self.table)
             for what, runs in Counter(own["named"].values.tolist()).most_common() if what
         ]
-
-    def _cells(self) -> Iterator[tuple[str, float, xr.Dataset]]:
-        for k, estimator in enumerate(self.table.estimator.values):
-            for level, noise in enumerate(self.table.noise.values):
-                yield str(estimator), float(noise), self.table.isel(estimator=k, noise=level)
 
     def __str__(self) -> str:
         from jaxid.io.tables import study_table
@@ -103,16 +101,34 @@ class Study:
         return folder
 
 
+def cells(table: xr.Dataset) -> Iterator[tuple[str, dict[str, float], xr.Dataset]]:
+    """Estimator, setting and runs of every combination of them."""
+    for k, estimator in enumerate(table.estimator.values):
+        for setting, own in conditions(table):
+            yield str(estimator), setting, own.isel(estimator=k)
+
+
+def conditions(table: xr.Dataset) -> Iterator[tuple[dict[str, float], xr.Dataset]]:
+    """Every setting, and what was found under it."""
+    dims = [name for name in SETTINGS if name in table.dims]
+    for index in itertools.product(*[range(table.sizes[name]) for name in dims]):
+        own = table.isel(dict(zip(dims, index, strict=True)))
+        yield {name: float(own[name]) for name in dims}, own
+
+
 def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
     """One table of all chunks, in their order."""
     levels = [[c for c, (level, _) in zip(chunks, plan.chunks, strict=True) if level == k]
-              for k in range(len(plan.noise))]  # fmt: skip
+              for k in range(len(plan.levels))]  # fmt: skip
+    settings = plan.settings
+    sizes = tuple(len(values) for values in settings.values())
 
     def by_run(name: str) -> np.ndarray:
-        whole = [np.concatenate([c[name] for c in own], axis=1) for own in levels]
-        return np.stack(whole, axis=1)
+        whole = np.stack([np.concatenate([c[name] for c in own], axis=1) for own in levels], axis=1)
+        return whole.reshape(len(whole), *sizes, *whole.shape[2:])
 
-    each, run = ("estimator", "noise", "run", "parameter"), ("estimator", "noise", "run")
+    run = ("estimator", *settings, "run")
+    each = (*run, "parameter")
     once = {n: np.concatenate([c[n] for c in levels[0]]) for n in ("truth", "start")}
     free = plan.machine.parameters.free
     table = xr.Dataset(
@@ -126,11 +142,11 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
             "named": (run, by_run("named").astype(object)),
             "truth": (("run", "parameter"), once["truth"]),
             "start": (("run", "parameter"), once["start"]),
-            "bound": (("noise", "parameter"), bound),
+            "bound": ((*settings, "parameter"), bound.reshape(*sizes, -1)),
             "unit": (("parameter",), np.array([f.unit for f in free], dtype=object)),
         },
         coords={
-            "estimator": np.array(plan.estimators, dtype=object), "noise": list(plan.noise),
+            "estimator": np.array(plan.estimators, dtype=object), **settings,
             "run": np.arange(plan.runs, dtype=np.int32), "parameter": np.array(plan.names, dtype=object),
         },
         attrs={"case": plan.case.path.name, "seed": plan.seed},
@@ -148,7 +164,7 @@ def _why(run: xr.Dataset) -> str:
 
 
 def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
-    """Bias, spread and coverage of every estimator, noise and parameter.
+    """Bias, spread and coverage of every estimator, setting and parameter.
 
     Returns:
         Rows with `runs` and `used` (converged, and the parameter told); `failed`, the part that is
@@ -158,19 +174,18 @@ def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
         that hold the truth. NaN where there is nothing to say it of.
     """
     rows = []
-    for i, estimator in enumerate(table.estimator.values):
-        for level, noise in enumerate(table.noise.values):
-            for k, name in enumerate(table.parameter.values):
-                own = table.isel(estimator=i, noise=level, parameter=k)
-                truth, std = own["truth"].values, own["std"].values
-                error = own["estimate"].values - truth
-                used = own["converged"].values.astype(bool) & np.isfinite(error) & np.isfinite(std)
-                rows.append({
-                    "estimator": str(estimator), "noise": float(noise), "parameter": str(name),
-                    "unit": str(own["unit"].values), "true": float(np.mean(truth)),
-                    "runs": len(used), "used": int(used.sum()), "failed": float(1 - used.mean()),
-                    **_moments(error[used], std[used]), "bound": float(own["bound"].values),
-                })  # fmt: skip
+    for estimator, setting, whole in cells(table):
+        for k, name in enumerate(table.parameter.values):
+            own = whole.isel(parameter=k)
+            truth, std = own["truth"].values, own["std"].values
+            error = own["estimate"].values - truth
+            used = own["converged"].values.astype(bool) & np.isfinite(error) & np.isfinite(std)
+            rows.append({
+                "estimator": estimator, **setting, "parameter": str(name),
+                "unit": str(own["unit"].values), "true": float(np.mean(truth)),
+                "runs": len(used), "used": int(used.sum()), "failed": float(1 - used.mean()),
+                **_moments(error[used], std[used]), "bound": float(own["bound"].values),
+            })  # fmt: skip
     return rows
 
 

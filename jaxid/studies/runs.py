@@ -6,7 +6,6 @@ import threading
 import time
 from dataclasses import dataclass, field, replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxid.errors import InputError
@@ -15,7 +14,6 @@ from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Steps, alone, together
-from jaxid.machine import Machine
 from jaxid.preprocess import Recipe
 from jaxid.replay import Numerics
 from jaxid.session import Session, session_around
@@ -26,7 +24,7 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Ways:
-    """How all runs at one level of noise are filtered and integrated: alike, so as to share code."""
+    """How all runs at one level are filtered and integrated: alike, so as to share code."""
 
     recipe: Recipe
     numerics: Numerics | None
@@ -45,7 +43,7 @@ class Runner:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def ways(self, level: int) -> Ways:
-        """How runs at a level of noise are filtered and integrated, as the first of them asks."""
+        """How runs at a level are filtered and integrated, as the first of them asks."""
         with self._lock:
             if level not in self._ways:
                 self._ways[level] = self._chosen(level)
@@ -53,11 +51,10 @@ class Runner:
 
     def _chosen(self, level: int) -> Ways:
         """As `identify` would choose on the log of the nominal machine."""
-        plan, factor = self.plan, self.plan.noise[level]
-        true = noisier(plan.scene.machine, factor)
-        log = alone(plan.scene.virtual(true, plan.drawn(0)[2])).log
-        session = session_around(plan.model, noisier(plan.machine, factor), log)
-        if "output_error" not in plan.estimators:
+        at = self.plan.levels[level]
+        log = alone(at.scene.virtual(at.scene.machine, self.plan.drawn(0)[2])).log
+        session = session_around(at.model, at.machine, log)
+        if "output_error" not in self.plan.estimators:
             return Ways(session.recipe, None)
         first = inverse_dynamics(session.machine, session.fit.data)
         machine = first.machine if first.told else session.machine
@@ -85,20 +82,18 @@ class Runner:
         return out
 
     def _run(self, level: int, number: int, ways: Ways) -> Steps[Arrays]:
-        plan = self.plan
+        plan, at = self.plan, self.plan.levels[level]
         truth, start, rng = plan.drawn(number)
-        factor = plan.noise[level]
-        true = noisier(plan.scene.machine.with_estimate(truth), factor)
-        machine = noisier(plan.machine.with_estimate(start), factor)
+        machine = at.machine.with_estimate(start)
         rows = []
-        virtual = yield from plan.scene.virtual(true, rng)
-        session = session_around(plan.model, machine, virtual.log, ways.recipe)
+        virtual = yield from at.scene.virtual(at.scene.machine.with_estimate(truth), rng)
+        session = session_around(at.model, machine, virtual.log, ways.recipe)
         for method in plan.estimators:
             options = {"numerics": ways.numerics} if method == "output_error" else {}
             try:
                 if method == DISCOVER:
                     aligned = replace(ways.recipe, align_hold=True)
-                    whole = session_around(plan.model, machine, virtual.log, aligned)
+                    whole = session_around(at.model, machine, virtual.log, aligned)
                     rows.append(_found(plan, whole))
                     continue
                 rows.append(_row((yield from METHODS[method](session, **options))))
@@ -111,16 +106,6 @@ class Runner:
 
 
 _BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message", "named")
-
-
-def noisier(machine: Machine, factor: float) -> Machine:
-    """A machine whose sensors have so many times the noise; their resolution stays."""
-    sensor = machine.sensor
-    scaled = {
-        n: None if getattr(sensor, n) is None else factor * jnp.asarray(getattr(sensor, n))
-        for n in ("position_noise", "force_noise")
-    }
-    return replace(machine, sensor=replace(sensor, **scaled))
 
 
 def _row(estimate: Estimate) -> Arrays:

@@ -21,10 +21,11 @@ from jaxid.io.log import Log
 from jaxid.io.output import check_folder, mark_folder, write_json, write_whole
 from jaxid.machine import position_noise
 from jaxid.replay import TooStiffError
+from jaxid.studies.levels import Level
 from jaxid.studies.plan import Plan, cores, digest_of, same
 from jaxid.studies.remote import Bundle, Remote
 from jaxid.studies.result import FILES, Study, gathered
-from jaxid.studies.runs import Arrays, Runner, noisier
+from jaxid.studies.runs import Arrays, Runner
 
 _MANIFEST = "study.json"
 _CHUNKS = "chunks"
@@ -49,7 +50,7 @@ def study(
     Args:
         case: The case, or its file; [simulation] and [study] say what to do, `true` where a true value
             differs from the guess.
-        runs: At each level of noise; in place of the case's.
+        runs: At each level; in place of the case's.
         seed: Of everything drawn.
         folder: Where each chunk is kept as soon as it ends, and the results at the end; absent: in
             memory only.
@@ -87,15 +88,16 @@ def study(
             )
         # All that can be refused is refused before anything is written.
         runner = Runner(plan)
-        for level in range(len(plan.noise)):
+        for level in range(len(plan.levels)):
             runner.ways(level)
         bundle = None if remote is None else Bundle.of(plan)
-        bound, identity = _bound(plan), digest_of(plan.manifest)
+        bound = np.stack([_bound(plan, level) for level in plan.levels])
+        identity = digest_of(plan.manifest)
         kept = _kept(where, plan, identity) if resume else {}
         if where is not None and not resume:
             _begin(where, plan)
         missing = [k for k in range(len(plan.chunks)) if k not in kept]
-        total, done = plan.runs * len(plan.noise), sum(len(plan.chunks[k][1]) for k in kept)
+        total, done = plan.runs * len(plan.levels), sum(len(plan.chunks[k][1]) for k in kept)
         progress(done, total)
         for number, arrays in remote.run(bundle, missing) if remote else _solved(runner, missing):
             kept[number] = arrays
@@ -180,37 +182,35 @@ def _unpacked(path: Path, identity: str) -> Arrays:
     return found
 
 
-def _bound(plan: Plan) -> np.ndarray:
-    """Cramer-Rao bound on the deviation of each parameter at each level of noise, (level, p).
+def _bound(plan: Plan, level: Level) -> np.ndarray:
+    """Cramer-Rao bound on the deviation of each parameter at a level.
 
     Of an unbiased estimate from the readings of one log, their noise white, the start and the command
     known exactly: in a loop too the readings so far give the command, so that what counts is the
     derivative of the position under a given command. NaN where the case states no noise of the
     readings, or where the log cannot tell. Where true values are drawn it is that of their middle.
     """
-    out = np.full((len(plan.noise), len(plan.names)), np.nan)
-    machine = plan.scene.machine
+    none, scene, machine = np.full(len(plan.names), np.nan), level.scene, level.scene.machine
     if machine.sensor.position_std is None:
-        return out
+        return none
     silent = replace(machine, sensor=replace(machine.sensor, position_noise=None, force_noise=None))
-    virtual = alone(plan.scene.virtual(silent, np.random.default_rng(0)))
+    virtual = alone(scene.virtual(silent, np.random.default_rng(0)))
     # The command of every tick, of which the log may have but some.
-    run, every = virtual.trajectory, plan.scene.every
-    ticks = plan.scene.drive.period * np.arange(len(run.command))
+    run = virtual.trajectory
+    ticks = scene.drive.period * np.arange(len(run.command))
     log = Log(ticks, np.asarray(run.reading), np.asarray(run.command), hold=virtual.log.hold)
     driven = replace(machine, controller=None)
     try:
         numerics = choose_numerics(driven, log, segments=False)
-        jacobian = position_jacobian(driven, log, numerics)[::every]
+        jacobian = position_jacobian(driven, log, numerics)[:: scene.every]
     except TooStiffError:
-        return out
-    for level, factor in enumerate(plan.noise):
-        noise = position_noise(noisier(machine, factor), log)
-        rows = (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, jacobian.shape[-1])
-        scale = np.linalg.norm(rows, axis=0)
-        if not np.all(np.isfinite(scale)) or np.any(scale == 0):
-            continue
-        values, vectors = np.linalg.eigh((rows / scale).T @ (rows / scale))
-        if values[0] > 1e-12 * values[-1]:
-            out[level] = (np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)[plan.own]
-    return out
+        return none
+    noise = position_noise(machine, log)
+    rows = (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, jacobian.shape[-1])
+    scale = np.linalg.norm(rows, axis=0)
+    if not np.all(np.isfinite(scale)) or np.any(scale == 0):
+        return none
+    values, vectors = np.linalg.eigh((rows / scale).T @ (rows / scale))
+    if values[0] <= 1e-12 * values[-1]:
+        return none
+    return (np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)[plan.own]
