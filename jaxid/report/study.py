@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxid.report.numbers import pretty_unit, short
 from jaxid.report.page import filled, image
-from jaxid.report.study_plots import plot_coverage, plot_errors, plot_scatter
+from jaxid.report.study_plots import others_of, plot_coverage, plot_errors, plot_scatter
 from jaxid.studies.result import conditions
 from jaxid.studies.settings import SETTINGS, setting_of, words_of
 
@@ -23,17 +23,20 @@ def study_report(result: Study) -> str:
         result: What it shows.
     """
     rows, table = result.summary, result.table
+    others = others_of(rows)
     figures = [
         (
             "Error against noise",
-            "The RMS error of all runs that were used, bias included. Dotted: the mean σ that the estimator "
-            "reports. Dashed: what no unbiased estimate from the readings can go below, the start and "
+            "The RMS error of all runs that were used, bias included. "
+            + ("" if len(others) > 1 else "Dotted: the mean σ that the estimator reports. ")
+            + "Black: what no unbiased estimate from the readings can go below, the start and "
             "the command known exactly.",
             image(plot_errors(rows), "RMS error of every estimator over noise, by parameter"),
         ),
         (
             "Do the intervals hold the truth?",
-            "Bars are what this number of runs leaves uncertain (95 %).",
+            "Bars are what this number of runs leaves uncertain (95 %)."
+            + (f" Of each estimator from left to right: {'; '.join(others)}." if len(others) > 1 else ""),
             image(plot_coverage(rows), "Coverage of 95 % intervals, by parameter"),
         ),
     ]

@@ -50,7 +50,7 @@ def plot_errors(rows: Sequence[dict]) -> Figure:
                 ax.plot(noises, bound, color=TEXT, lw=1.0, ls="--" if len(others) == 1 else dash, label=label)
         dress(ax, "noise, times the sensor's", f"{name}\nRMS error [{pretty_unit(own[0]['unit'])}]")
         _logarithmic(ax, noises)
-    several = [(other, dash) for other, dash in others.items()] if len(others) > 1 else []
+    several = [*others.items()] if len(others) > 1 else []
     _legend(figure, panels[0], several or [("reported σ", ":")])
     return figure
 
@@ -62,7 +62,7 @@ def plot_coverage(rows: Sequence[dict]) -> Figure:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
-    estimators, others = _estimators(rows), list(_others(rows))
+    estimators, others = _estimators(rows), others_of(rows)
     sides = [(estimator, other) for estimator in range(len(estimators)) for other in range(len(others))]
     for name, ax in zip(names, panels, strict=True):
         own = [r for r in rows if r["parameter"] == name]
@@ -84,8 +84,6 @@ def plot_coverage(rows: Sequence[dict]) -> Figure:
         ax.set_ylim(0, 103)
         ax.set_xlim(-0.5, len(noises) - 0.5)
         ax.set_xticks(range(len(noises)), [f"{n:g}" for n in noises])
-    if len(others) > 1:
-        figure.supxlabel(f"of each estimator from left to right: {'; '.join(others)}", fontsize=FONT)
     _legend(figure, panels[0])
     return figure
 
@@ -115,11 +113,15 @@ def plot_scatter(table: xr.Dataset) -> Figure:
     return figure
 
 
+def others_of(rows: Sequence[dict]) -> list[str]:
+    """What is varied beside the noise, in words; one that says nothing where nothing is."""
+    return list(dict.fromkeys(words_of(r, noise=False) for r in rows))
+
+
 def _others(rows: Sequence[dict]) -> dict[str, Any]:
-    """What is varied beside the noise, in words, each with a dash."""
-    found = dict.fromkeys(words_of(r, noise=False) for r in rows)
+    """The same, each with a dash."""
     dashes = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
-    return {other: dashes[k % len(dashes)] for k, other in enumerate(found)}
+    return {other: dashes[k % len(dashes)] for k, other in enumerate(others_of(rows))}
 
 
 def _panels(rows: Sequence[dict]) -> tuple[list[str], list[Axes], Figure]:
@@ -155,7 +157,10 @@ def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, str]] = ()) -> N
     for label, dash in more:
         handles.append(ax.plot([], [], color=TEXT, lw=0.9, ls=dash)[0])
         labels.append(label)
-    figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=FONT)
+    # As many columns as the longest label lets stand side by side.
+    fits = int(figure.get_figwidth() / (0.6 + 0.075 * max(map(len, labels))))
+    columns = max(1, min(4, fits))
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns, frameon=False, fontsize=FONT)
 
 
 def _proportion(part: float, of: int) -> tuple[float, float]:
