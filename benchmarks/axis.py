@@ -28,6 +28,7 @@ from jaxid.sensors import Sensor
 from jaxid.simulation import Drive
 
 PERIOD, GAIN = 1e-3, 35.15065
+NOISE = 1e-6  # of a reading [m]
 TRUTH = np.array([95.1, 203.5, 20.39, -3.16])
 START = 0.7 * TRUTH
 # Fitted: inertia, viscous coefficient, Coulomb level, constant force.

@@ -48,6 +48,8 @@ def main() -> int:
     if lines.exists() and not options.resume:
         print(f"{lines} exists; give --resume to go on, or another -o", file=sys.stderr)
         return 2
+    if options.oracle:
+        ask_again(lines, {c.id: c for c in chosen})
     done = {r["id"] for r in read(lines)}
     if options.workers > 1:
         os.environ |= ONE_THREAD
@@ -77,6 +79,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cold", action="store_true", help=f"time {COLD} fresh commands too")
     parser.add_argument("--resume", action="store_true", help="skip the cases that are done")
+    parser.add_argument("--oracle", action="store_true", help="let it speak anew of what is done")
     parser.add_argument("-o", metavar="DIR", default=str(ROOT / "results" / "discovery"))
     return parser.parse_args()
 
@@ -99,6 +102,19 @@ def read(lines: Path) -> list[dict]:
     """Records so far; a line that an interruption cut short is left out."""
     text = lines.read_text() if lines.exists() else ""
     return [json.loads(line) for line in text.split("\n")[:-1] if line.endswith("}")]
+
+
+def ask_again(lines: Path, cases: dict[str, Case]) -> None:
+    """Replace what the oracle said of cases that are done, where it has learned since."""
+    from hidden_run import oracle
+
+    records = read(lines)
+    for record in tqdm(records, unit="case", desc="oracle"):
+        if record["id"] in cases:
+            record["oracle"] = oracle(cases[record["id"]])
+    fresh = lines.with_suffix(".new")
+    fresh.write_text("".join(json.dumps(r) + "\n" for r in records))
+    fresh.replace(lines)
 
 
 def run(chosen: Sequence[Case], lines: Path, workers: int) -> None:

@@ -1,8 +1,8 @@
-"""Speed of jaxid on one axis, as ratios to hand-written loops, scipy, diffrax and optimistix.
+"""Speed of jaxid on one axis, as ratios to hand-written loops and to other tools; and what it grows with.
 
-    python benchmarks/speed.py [--quick] [--no-write] [--optimistix]
+    python benchmarks/speed.py [--quick] [--no-write] [--only ratios|optimistix|peers|scale]
 
-prints the table and writes results/speed.json and results/speed.md beside this file.
+prints the tables and writes results/speed.json and results/speed.md beside this file.
 """
 
 import argparse
@@ -26,6 +26,8 @@ import axis_loops as loops
 import axis_rivals as rivals
 import jax.numpy as jnp
 import numpy as np
+import speed_scale
+from speed_peers import against_peers, installed
 from speed_rows import HEAD, Row, compare, in_process, line, table
 
 from jaxid.replay import Numerics
@@ -250,11 +252,14 @@ def start_times(repeats: int) -> dict[str, float]:
 
 
 def versions() -> dict[str, str]:
-    names = ("jax", "jaxlib", "diffrax", "optimistix", "equinox", "numba", "numpy", "scipy")
+    names = ["jax", "jaxlib", "diffrax", "optimistix", "equinox", "numba", "numpy", "scipy"]
+    names += [n for n in ("mujoco", "jax_sysid", "figaroh") if installed(n)]
     return {"python": platform.python_version(), **{n: version(n) for n in names}}
 
 
-def report(rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float]) -> str:
+def report(
+    rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float], scale: dict
+) -> str:
     shown = ", ".join(f"{k} {v}" for k, v in versions().items())
     flag = all(c["loop_flag"] for c in compiled.values())
     lines = [
@@ -271,6 +276,7 @@ def report(rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float]
             for name, c in compiled.items()
         ],
         "",
+        *speed_scale.tables(scale),
     ]
     return "\n".join(lines) + "\n" + (HERE / "speed_notes.md").read_text()
 
@@ -279,18 +285,27 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few repeats, to see that it runs")
     parser.add_argument("--no-write", action="store_true", help="only print")
-    parser.add_argument("--optimistix", action="store_true", help="only print fits by optimistix")
+    parts = ("ratios", "optimistix", "peers", "scale")
+    parser.add_argument("--only", choices=parts, help="only print this part")
     options = parser.parse_args()
     n, few, cold = (5, 2, 1) if options.quick else (41, 5, 3)
+    if options.only == "scale":
+        print("\n".join(speed_scale.tables(speed_scale.measured(quick=options.quick))))
+        return 0
     sides = Sides()
     print(HEAD)
-    if options.optimistix:
-        against_optimistix(sides, n, cold)
+    own = {
+        "ratios": lambda: comparisons(sides, n, few),
+        "optimistix": lambda: against_optimistix(sides, n, cold),
+        "peers": lambda: against_peers(sides, few),
+    }
+    rows = [row for part in own if options.only in (None, part) for row in own[part]()]
+    if options.only:
         return 0
-    rows = comparisons(sides, n, few) + against_optimistix(sides, n, cold)
     compiled = compile_times(sides)
     fits, starts = cold_fits(cold), start_times(3 * cold)
-    text = report(rows, compiled, fits, starts)
+    scale = speed_scale.measured(quick=options.quick)
+    text = report(rows, compiled, fits, starts, scale)
     print("\n" + text)
     if not options.no_write:
         folder = HERE / "results"
@@ -299,6 +314,7 @@ def main() -> int:
         data = {
             "cpu_count": os.cpu_count(), "versions": versions(),
             "rows": [asdict(r) for r in rows], "compile": compiled, "first_fits": fits, "starts": starts,
+            "scale": scale,
         }
         (folder / "speed.json").write_text(json.dumps(data, indent=1) + "\n")
     return 0

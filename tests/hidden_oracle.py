@@ -28,7 +28,8 @@ class Sight:
     """What shows of a hidden effect.
 
     Attributes:
-        evidence: Log-likelihood beyond the best baseline [nats], by log.
+        evidence: Log-likelihood beyond the best baseline [nats], by log; of the balance at the
+            samples and of that between them, the lesser.
         share: RMS of the unexplained force over that of the force, by log.
         ties: Effects of one parameter that explain it as well.
     """
@@ -57,7 +58,10 @@ def sights(case: HiddenCase) -> dict[str, Sight]:
 
 def _sight(case: HiddenCase, kind: str, setups: Sequence[Setup], logs: Sequence[Log]) -> Sight:
     views = [View.of(case, kind, s, log) for s, log in zip(setups, logs, strict=True)]
-    evidence = tuple(v.evidence for v in views)
+    evidence = tuple(
+        min(v.evidence, v.evidence if kind == "static_friction" else between(case, kind, s, log))
+        for v, s, log in zip(views, setups, logs, strict=True)
+    )
     rivals = {k for k in views[0].rivals if k != kind and k not in case.declared}
     ties = sorted(k for k in rivals if _left(views, k) < TIED_NATS)
     return Sight(evidence, tuple(v.share for v in views), tuple(ties))
@@ -114,6 +118,32 @@ class View:
         )
 
 
+def between(case: HiddenCase, kind: str, setup: Setup, log: Log) -> float:
+    """Evidence of the balance between samples, where a log of positions has it [nats].
+
+    A log holds no acceleration but the second difference of its positions, which is the acceleration
+    averaged over two periods. A ripple that is faster than half the sampling rate stands in the
+    acceleration at the samples as a slow one, in that average hardly at all.
+    """
+    q, u = log["true_position"], setup.machine.actuator_gain * log["true_command"]
+    acceleration = np.gradient(log["true_velocity"]) * setup.rate
+    acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) * setup.rate**2
+    held = np.concatenate([u[:1], 0.5 * (u[1:] + u[:-1])])
+    averaged = dict(log) | {"true_acceleration": acceleration}
+    others = [effect_force(k, setup, log) for k in case.hidden if k != kind]
+    rest = [*baseline_columns(case, setup, averaged), *others]
+    columns = [c if c is acceleration else _averaged(c) for c in rest]
+    force = held - setup.machine.inertia * acceleration if case.inertia_known else held
+    fade = faded(moving(log["true_velocity"]))
+    whiten = Whitener(setup, fade, averaged_noise)
+    return evidence_beyond(whiten(np.column_stack(columns)), whiten(force))
+
+
+def _averaged(x: np.ndarray) -> np.ndarray:
+    """Mean of a smooth signal over two periods with the weights of a second difference."""
+    return np.concatenate([x[:1], (x[:-2] + 4.0 * x[1:-1] + x[2:]) / 6.0, x[-1:]])
+
+
 class Whitener:
     """From a signal to its spectrum in units of the noise, gaps faded out.
 
@@ -142,12 +172,21 @@ class Whitener:
 
 def noise_density(setup: Setup, f: np.ndarray) -> np.ndarray:
     """One-sided density of the noise that a log leaves in the balance of forces [N^2/Hz]."""
+    return _density(setup, 2.0 * np.pi * f, np.ones_like(f))
+
+
+def averaged_noise(setup: Setup, f: np.ndarray) -> np.ndarray:
+    """The same of the balance between samples: differences for derivatives, commands in pairs."""
+    half = np.pi * f / setup.rate
+    return _density(setup, 2.0 * np.sin(half) * setup.rate, np.cos(half))
+
+
+def _density(setup: Setup, w: np.ndarray, of_command: np.ndarray) -> np.ndarray:
     sensor, machine = setup.sensor, setup.machine
-    w = 2.0 * np.pi * f
     drag = machine.effects.get("viscous_friction", {}).get("coefficient", 0.0)
     impedance = np.abs(-machine.inertia * w**2 + 1j * drag * w) ** 2
     position = sensor.position_noise**2 + sensor.position_resolution**2 / 12.0
-    command = (machine.actuator_gain * sensor.force_noise) ** 2
+    command = (of_command * machine.actuator_gain * sensor.force_noise) ** 2
     return 2.0 / setup.rate * (impedance * position + command)
 
 

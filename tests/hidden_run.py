@@ -26,17 +26,11 @@ Case = HiddenCase | ChainCase
 
 def run_case(case: Case, folder: Path) -> Record:
     """The oracle's say, then jaxid's, as what JSON can hold."""
-    seen = (chain_oracle if isinstance(case, ChainCase) else hidden_oracle).sights(case)
     record = {
         "id": case.id, "group": case.group, "what": case.what, "scale": case.scale,
         "noise": case.noise, "seed": case.seed, "rate": case.rate, "hidden": list(case.names),
         "declared": list(case.declared), "true": case.values,
-        "oracle": {
-            kind: {
-                "visible": s.visible, "evidence": s.evidence, "share": s.share, "ties": s.ties,
-            }
-            for kind, s in seen.items()
-        },
+        "oracle": oracle(case),
     }  # fmt: skip
     try:
         return record | _searched(case, folder)
@@ -44,6 +38,15 @@ def run_case(case: Case, folder: Path) -> Record:
         return record | {"verdict": "refused", "named": [], "error": str(error)}
     except Exception as error:  # the bench must survive it; it counts as wrong
         return record | {"verdict": "crashed", "named": [], "error": repr(error)}
+
+
+def oracle(case: Case) -> Record:
+    """What it says of each hidden effect."""
+    seen = (chain_oracle if isinstance(case, ChainCase) else hidden_oracle).sights(case)
+    return {
+        kind: {"visible": s.visible, "evidence": s.evidence, "share": s.share, "ties": s.ties}
+        for kind, s in seen.items()
+    }
 
 
 def _searched(case: Case, folder: Path) -> Record:

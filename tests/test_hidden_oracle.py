@@ -7,7 +7,7 @@ import hidden_judge as judge
 import numpy as np
 import pytest
 from hidden_cases import FIRST_SEED, KINDS, HiddenCase, cases, declared_beside
-from hidden_oracle import View, Whitener, effect_force, faded, moving, sights
+from hidden_oracle import View, Whitener, between, effect_force, faded, moving, sights
 from search_cases import SEARCH_CASES
 
 EVERY = [*cases("seen")]
@@ -104,6 +104,25 @@ def test_gaps_are_left_out():
     fade = faded(counts)
     assert not np.any(fade[~counts])
     assert fade[45] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("split", "seed", "seen"), [("seen_too", 6392, True), ("test", 8392, False)])
+def test_a_ripple_beyond_half_the_sampling_rate_is_not_in_the_positions(split, seed, seen):
+    """At the samples the acceleration holds it all the same, as a slow one."""
+    case = next(c for c in cases(split) if c.seed == seed)
+    setup = case.setup()
+    log = setup.run()
+    assert View.of(case, "cogging", setup, log).evidence > 100.0
+    assert (between(case, "cogging", setup, log) > 30.0) == seen
+
+
+@pytest.mark.parametrize("kind", ["constant_force", "cubic_stiffness", "quadratic_drag", "actuator_gain"])
+def test_between_samples_smooth_effects_show_as_at_them(kind):
+    case = hiding(kind)
+    setup = case.setup()
+    log = setup.run()
+    at = View.of(case, kind, setup, log).evidence
+    assert between(case, kind, setup, log) == pytest.approx(at, rel=0.25)
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k != "static_friction"])

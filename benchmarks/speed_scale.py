@@ -1,0 +1,258 @@
+"""What fits cost against cores, length of the log and masses, and what commands cost from cold.
+
+Each number is of a fresh process: peak memory is a process's, and so are its cores.
+"""
+
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+FITS = HERE / "cases" / "fits.toml"
+LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
+MASSES = (1, 2, 4, 6, 10)
+# Milliseconds a fit of a study and of one log that is warm; bytes of a log of a million samples;
+# seconds of `jaxid --help`.
+AIMS = {"study": 10.0, "fit": 30.0, "memory": 2 * 2**30, "help": 0.5}
+
+
+def child(what: str, *words: object, cores: int | None = None) -> dict:
+    """What a fresh process prints of itself, on so many cores."""
+    prefix = [] if cores is None else ["taskset", "-c", f"0-{cores - 1}"]
+    line = [*prefix, sys.executable, __file__, what, *map(str, words)]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def study(runs: int) -> dict:
+    """Milliseconds a run of the study, what is compiled once left out."""
+    import jaxid
+
+    stamps: list[tuple[float, int]] = []
+    result = jaxid.study(FITS, runs=runs, progress=lambda n, _: stamps.append((time.perf_counter(), n)))
+    # The first round of chunks compiles.
+    first = next(k for k, (_, n) in enumerate(stamps) if n >= runs // 4)
+    (begin, before), (end, after) = stamps[first], stamps[-1]
+    return {
+        "ms": 1e3 * (end - begin) / (after - before), "failed": len(result.failures),
+        "whole_s": stamps[-1][0] - stamps[0][0], "memory": _memory(),
+    }
+
+
+def fit(samples: int, repeats: int) -> dict:
+    """One log of so many samples: seconds of simulating, preparing and fitting, cold and warm."""
+    import jaxid
+    from jaxid.estimators import METHODS
+    from jaxid.estimators.steps import alone
+
+    with tempfile.TemporaryDirectory() as folder:
+        case = Path(folder) / "case.toml"
+        case.write_text(lasting(samples))
+        made = _timed(lambda: jaxid.simulate(case), 1)[0]
+        log = jaxid.simulate(case).log
+        session = jaxid.open_session(case, log)
+        prepared = _timed(lambda: jaxid.open_session(case, log), repeats)
+        out = {"samples": log.samples, "simulate_s": made, "prepare_s": float(np.median(prepared))}
+        for method in ("inverse_dynamics", "output_error"):
+            seconds = _timed(lambda m=method: alone(METHODS[m](session)), repeats + 1)
+            out[method] = {"cold_s": seconds[0], "warm_s": float(np.median(seconds[1:]))}
+    return out | {"memory": _memory()}
+
+
+def lasting(samples: int) -> str:
+    """The study's case with its reference repeated, or cut, to so many samples."""
+    text, seconds = FITS.read_text(), samples / 1000
+    found = re.search(r"targets = \[(.*)\]", text)
+    times = max(1, int(np.ceil(seconds / 25.0)))
+    targets = ", ".join([found[1]] * times)
+    text = text.replace(found[0], f"targets = [{targets}]")
+    # A second is too short for a stroke of the study's.
+    if samples < 5_000:
+        text = text.replace("speed = 0.12", "speed = 0.5").replace("acceleration = 0.8", "acceleration = 8.0")
+    return text.replace("duration = 25.0", f"duration = {seconds}")
+
+
+def chain(masses: int, samples: int, repeats: int) -> dict:
+    """A chain of so many masses in its loop, two unknowns each: a run, a Gauss-Newton step, compiling."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxid
+    from jaxid.estimators.output_error import choose_numerics, position_residual
+    from jaxid.replay import make_replay
+    from jaxid.session import open_session
+
+    with tempfile.TemporaryDirectory() as folder:
+        case = Path(folder) / "case.toml"
+        case.write_text(chain_case(masses, samples / 1000))
+        log = jaxid.simulate(case).log
+        machine = open_session(case, log).machine
+    replay = make_replay(machine, log, choose_numerics(machine, log))
+    places, plant, theta = machine.parameters.places, machine.plant, jnp.asarray(machine.parameters.guess)
+    residual = position_residual(replay, places, plant, jnp.asarray(log.position), 1.0)
+
+    def normal(theta: jax.Array) -> tuple:
+        jacobian, e = jax.jacfwd(lambda x: (residual(x).ravel(),) * 2, has_aux=True)(theta)
+        return jacobian.T @ jacobian, jacobian.T @ e
+
+    out = {"masses": masses, "unknowns": theta.size, "samples": log.samples}
+    for name, function in (("run", residual), ("step", normal)):
+        compiled = jax.jit(function)
+        seconds = _timed(lambda f=compiled: jax.block_until_ready(f(theta)), repeats + 1)
+        out |= {f"{name}_ms": 1e3 * float(np.median(seconds[1:])), f"{name}_compile_s": seconds[0]}
+    return out
+
+
+def chain_case(masses: int, seconds: float) -> str:
+    """A chain, every mass driven, its masses and friction unknown."""
+    each = lambda value: f"[{', '.join([value] * masses)}]"
+    return f"""
+[plant]
+kind = "chain"
+[plant.parameters]
+mass = {each('{ guess = 1.6, true = 2.0 }')}
+damping = {each('8.0')}
+stiffness = [{', '.join(['1500.0'] * (masses + 1))}]
+[[effects]]
+kind = "coulomb_friction"
+level = {each('{ guess = 2.0, true = 3.0 }')}
+port = [{', '.join(str(k + 1) for k in range(masses))}]
+[controller]
+kind = "pd"
+kp = 3000.0
+kd = 80.0
+period = 0.001
+[sensor]
+position_noise = 1e-6
+[reference]
+kind = "trapezoid"
+start = 0.0
+targets = [0.03, -0.02, 0.01, 0.04, 0.0]
+speed = 0.2
+acceleration = 4.0
+[simulation]
+duration = {seconds}
+sample_rate = 1000.0
+"""
+
+
+def commands() -> list[dict]:
+    """Seconds of every command on the demo's log: nothing compiled before, and run once more."""
+    demo = HERE.parent / "jaxid" / "demo"
+    case, log, other = (str(demo / name) for name in ("case.toml", "log.csv", "validation.csv"))
+    words = {
+        "--help": ["--help"], "effects": ["effects"], "check": ["check", case, log],
+        "identify": ["identify", case, log],
+        "identify --method inverse_dynamics": ["identify", case, log, "--method", "inverse_dynamics"],
+        "discover --validate": ["discover", case, log, "--validate", other],
+        "simulate": ["simulate", str(FITS), "-o", "{out}/log.csv"],
+        "study --runs 64": ["study", str(FITS), "--runs", "64"],
+    }
+    rows = []
+    for name, own in words.items():
+        with tempfile.TemporaryDirectory() as folder:
+            environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX")}
+            environment |= {"XDG_CACHE_HOME": folder, "PYTHONPATH": str(HERE.parent)}
+            seconds = []
+            for _ in range(2):
+                begin = time.perf_counter()
+                code = "from jaxid.cli import entry; entry()"
+                line = [sys.executable, "-c", code, *[w.replace("{out}", folder) for w in own]]
+                subprocess.run(line, env=environment, capture_output=True, check=True)
+                seconds.append(time.perf_counter() - begin)
+        rows.append({"command": name, "cold_s": seconds[0], "again_s": seconds[1]})
+    return rows
+
+
+def measured(*, quick: bool) -> dict:
+    """All of it."""
+    n = os.cpu_count() or 1
+    runs, repeats = (128, 2) if quick else (1024, 5)
+    out = {"study": [], "lengths": [], "masses": []}
+    for cores in sorted({1, n}):
+        out["study"].append({"cores": cores} | child("study", runs, cores=cores))
+        print(f"study on {cores} core(s): {out['study'][-1]['ms']:.1f} ms a fit", flush=True)
+    for samples in (25_000, *(LENGTHS[:-1] if quick else LENGTHS)):
+        out["lengths"].append(child("fit", samples, repeats if samples < 1e6 else 1))
+        print(f"{samples} samples: {out['lengths'][-1]}", flush=True)
+    for masses in MASSES[:3] if quick else MASSES:
+        out["masses"].append(child("chain", masses, 10_000, repeats))
+        print(f"{masses} mass(es): {out['masses'][-1]}", flush=True)
+    out["commands"] = commands()
+    return out
+
+
+def tables(found: dict) -> list[str]:
+    """In Markdown."""
+    met = lambda value, aim: "yes" if value <= aim else "**no**"
+    megabytes = lambda x: f"{x / 2**20:.0f}"
+    lines = ["## Fits by the study", "", "| cores | ms a fit | aim | met | of one core | peak MB |",
+             "|---|---|---|---|---|---|"]  # fmt: skip
+    one = found["study"][0]["ms"]
+    for s in found["study"]:
+        aim = f"{AIMS['study']:g} | {met(s['ms'], AIMS['study'])}" if s is found["study"][-1] else "|"
+        part, memory = s["ms"] / one, megabytes(s["memory"])
+        lines.append(f"| {s['cores']} | {s['ms']:.1f} | {aim} | {part:.2f} | {memory} |")
+    lines += ["", "## Against the length of the log", "",
+              "| samples | prepare s | inverse dynamics, warm s | output error, cold s | warm s | peak MB |",
+              "|---|---|---|---|---|---|"]  # fmt: skip
+    for r in sorted(found["lengths"], key=lambda r: r["samples"]):
+        own = r["inverse_dynamics"]["warm_s"], r["output_error"]["cold_s"], r["output_error"]["warm_s"]
+        shown = " | ".join(f"{x:.3g}" for x in (r["prepare_s"], *own))
+        lines.append(f"| {r['samples']} | {shown} | {megabytes(r['memory'])} |")
+    single = next(r for r in found["lengths"] if 20_000 < r["samples"] < 30_000)
+    warm = 1e3 * single["output_error"]["warm_s"]
+    lines += ["", "One warm fit of 25 000 samples: "
+              f"{warm:.0f} ms (aim {AIMS['fit']:g}: {met(warm, AIMS['fit'])})."]  # fmt: skip
+    longest = max(found["lengths"], key=lambda r: r["samples"])
+    if longest["samples"] >= 1_000_000:
+        lines += [f"A million samples: {megabytes(longest['memory'])} MB "
+                  f"(aim 2048: {met(longest['memory'], AIMS['memory'])})."]  # fmt: skip
+    lines += ["", "## Against the number of masses", "",
+              "A chain in its loop, every mass driven, 10 000 samples.",
+              "", "| masses | unknowns | run, ms | Gauss-Newton step, ms | compiling both, s |",
+              "|---|---|---|---|---|"]  # fmt: skip
+    for r in found["masses"]:
+        compiling = r["run_compile_s"] + r["step_compile_s"]
+        shown = " | ".join(f"{x:.1f}" for x in (r["run_ms"], r["step_ms"], compiling))
+        lines.append(f"| {r['masses']} | {r['unknowns']} | {shown} |")
+    lines += ["", "## Commands", "", "Seconds of a fresh process on the demo's log, nothing compiled before; "
+              "and once more.", "", "| jaxid | first | again |", "|---|---|---|"]  # fmt: skip
+    for r in found["commands"]:
+        lines.append(f"| {r['command']} | {r['cold_s']:.2f} | {r['again_s']:.2f} |")
+    slow = next(r for r in found["commands"] if r["command"] == "--help")["again_s"]
+    lines += ["", f"`jaxid --help` is to take {AIMS['help']:g} s at most: {met(slow, AIMS['help'])}.", ""]
+    return lines
+
+
+def _timed(function: object, repeats: int) -> list[float]:
+    seconds = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        function()
+        seconds.append(time.perf_counter() - begin)
+    return seconds
+
+
+def _memory() -> int:
+    """Most memory that this process has held [bytes]."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def main(what: str, *words: str) -> None:
+    numbers = [int(w) for w in words]
+    print(json.dumps({"study": study, "fit": fit, "chain": chain}[what](*numbers)))
+
+
+if __name__ == "__main__":
+    arguments: Sequence[str] = sys.argv[1:]
+    main(*arguments)
