@@ -285,8 +285,9 @@ def _turning(v: np.ndarray) -> np.ndarray:
 
 def _smeared(flags: np.ndarray, reach: int) -> np.ndarray:
     """Flags and their neighbours: the parallel filter smears a stop, which goes with them."""
-    window = np.ones(2 * reach + 1)
-    return np.stack([scipy.signal.convolve(f, window, "same") > 0.5 for f in flags.T], axis=1)
+    width = 2 * reach + 1
+    count = np.cumsum(np.pad(flags, ((reach + 1, reach), (0, 0))), axis=0)
+    return count[width:] > count[:-width]
 
 
 def _dwelling(flags: np.ndarray, length: int) -> np.ndarray:

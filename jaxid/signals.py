@@ -70,9 +70,11 @@ def spectral_derivatives(
     odd = np.concatenate([rest, -rest[-2:0:-1]])
     f = scipy.fft.rfftfreq(len(odd), period)[:, None]
     spectrum = scipy.fft.rfft(odd, axis=0) * roll_off(f, cutoff_hz)
-    omega = 2j * np.pi * f
-    out = [scipy.fft.irfft(spectrum * omega**k, len(odd), axis=0)[:n] for k in range(3)]
-    return out[0] + trend, out[1] + d_trend, out[2] + dd_trend
+    out = []
+    for of_ends in (trend, d_trend, dd_trend):
+        out.append(scipy.fft.irfft(spectrum, len(odd), axis=0)[:n] + of_ends)
+        spectrum = spectrum * (2j * np.pi * f)
+    return out[0], out[1], out[2]
 
 
 def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:

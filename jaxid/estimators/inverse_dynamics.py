@@ -17,12 +17,14 @@ from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquar
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.machine import Machine
-from jaxid.model import Plant, carries_force, parameters_of
-from jaxid.parameters import scatter
+from jaxid.model import ParameterInfo, Plant, carries_force, parameters_of
+from jaxid.parameters import Free, scatter
 from jaxid.precision import Precision, assess
 from jaxid.preprocess import Prepared
 from jaxid.readings import residual_along
 
+# Most balances are linear in their unknowns: the first step is then the last.
+DAMPING = 1e-10
 # Factors on the guess of a shape, from which a fit starts too.
 _SHAPES = (0.3, 3.0)
 
@@ -121,7 +123,8 @@ def _solve(
     def residual(theta: Array) -> Array:
         return data.weight * force_residual(scatter(places, plant, theta), data)
 
-    return levenberg_marquardt(residual, theta, transform, *bounds), _size(plant, data)
+    fit = levenberg_marquardt(residual, theta, transform, *bounds, damping=DAMPING)
+    return fit, _size(plant, data)
 
 
 def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
@@ -162,7 +165,7 @@ def inverse_dynamics_steps(
     arrays = ForceData.of(data, rows)
     parameters = machine.parameters
     theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
-    places, transform = parameters.places, Transform.of(parameters)
+    places, transform = parameters.places, linear_transform(machine)
     fits = []
     for at in _starts(machine, theta):
         fit, size = yield Solve(_solve, (plant, places, arrays, at, transform, parameters.bounds))
@@ -193,6 +196,22 @@ def inverse_dynamics_steps(
     )
 
 
+def linear_transform(machine: Machine) -> Transform:
+    """A solver's scale on which what enters the balance in proportion is fitted as it is.
+
+    As its logarithm, a mass that starts at two thirds of its value takes five evaluations for two.
+    Bounds keep it positive.
+    """
+    linear = [carries_force(_info(machine.plant, f)) for f in machine.parameters.free]
+    return Transform(Transform.of(machine.parameters).log & ~np.asarray(linear, dtype=bool))
+
+
+def _info(plant: Plant, free: Free) -> ParameterInfo:
+    """What its owner says of an unknown."""
+    owner = plant.effects[free.path[1]] if free.path[0] == "effects" else plant
+    return parameters_of(type(owner))[free.path[-1]]
+
+
 def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
     """The guesses, and the same with each shape (a width, a lag, a period) smaller and larger.
 
@@ -203,7 +222,7 @@ def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
     for k, f in enumerate(machine.parameters.free):
         if f.path[0] != "effects":
             continue
-        info = parameters_of(type(machine.plant.effects[f.path[1]]))[f.path[2]]
+        info = _info(machine.plant, f)
         if not carries_force(info) and info.dimension != "1" and theta[k] > 0:
             out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _SHAPES]
     return out

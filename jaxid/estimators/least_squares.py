@@ -91,6 +91,7 @@ def levenberg_marquardt(
     active: Bool[Array, " p"] | None = None,
     max_steps: int = 60,
     keep: bool = True,
+    damping: float = 1e-4,
 ) -> Minimum:
     """Minimise half the sum of squares of `residual` within bounds.
 
@@ -107,6 +108,7 @@ def levenberg_marquardt(
         active: Which unknowns may move; absent: all.
         max_steps: Most evaluations.
         keep: Return residual and Jacobian; without, batches need less memory.
+        damping: At the start, relative to the diagonal. What is linear asks for none.
 
     Returns:
         The minimum; `converged` is false where the steps ran out or the residual is not finite.
@@ -132,7 +134,7 @@ def levenberg_marquardt(
     p, size = theta.size, jax.eval_shape(residual, theta).size if keep else 0
     start = _Progress(
         x0, jnp.asarray(0.0), x0, jnp.asarray(jnp.inf), jnp.zeros(p), jnp.zeros((p, p)),
-        (jnp.zeros(size), jnp.zeros((size, p))), jnp.asarray(1e-4), jnp.asarray(2.0),
+        (jnp.zeros(size), jnp.zeros((size, p))), jnp.asarray(damping), jnp.asarray(2.0),
         jnp.asarray(0), jnp.asarray(False),
     )
     end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, start)
