@@ -181,6 +181,18 @@ def test_many_starts_are_evaluated_once(axis, monkeypatch):
     assert search.many(cogging) is first
 
 
+def test_a_joint_that_moves_between_the_pieces_only_is_looked_at(axis, monkeypatch):
+    data = axis[0].fit.data
+    monkeypatch.setattr(cand, "_MOST", 80)
+    parts = cand.Samples(data).parts
+    assert len(parts) == 4
+    inside = np.isin(data.times.round(9), np.concatenate([p.times for p in parts]).round(9))
+    elsewhere = dataclasses.replace(data, moving=data.moving & ~inside[:, None])
+    samples = cand.Samples(elsewhere)
+    assert len(samples.parts) == 1
+    assert samples.moving.any()
+
+
 @pytest.mark.parametrize("true", [40.0, 40.3, 39.6])
 def test_a_line_is_placed_between_the_bins(true):
     n = 512
