@@ -34,8 +34,7 @@ def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
         "named right, all visible": share(map(judge.right, single)),
         "named right, worst effect": min(
             (
-                share(judge.right(r) for r in [*effects, *chains] if r["what"] == k)
-                for k in _whats([*effects, *chains])
+                share(judge.right(r) for r in single if r["what"] == k) for k in _whats(single)
             ), default=None,
         ),
         "false positives": share(map(judge.false_positive, nulls)),

@@ -115,7 +115,7 @@ class Decimator:
     def __call__(self, x: Float[Array, "time k"]) -> Float[Array, "kept k"]:
         """Filter along the first axis, decimate and trim."""
         if self.filters:
-            x = self._low_pass(x)[:: self.factor]
+            x = self._low_pass(x)
         return x[self.trim : x.shape[0] - self.trim]
 
     def kept(self, samples: int) -> np.ndarray:
@@ -162,25 +162,40 @@ class Decimator:
         def gain(f: np.ndarray) -> np.ndarray:
             return self.response(f, 1.0)[:, None]
 
-        return _through(x, int(32 / self.pass_band), lambda f: jnp.asarray(gain(f)))
+        return _through(x, int(32 / self.pass_band), lambda f: jnp.asarray(gain(f)), self.factor)
 
 
-def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array]) -> Array:
+def _through(
+    x: Array, pad: int, response: Callable[[np.ndarray], Array], every: int = 1
+) -> Array:
     """Pass the columns of x through a response over frequency (cycles a sample), without ends.
 
     Odd extension at both ends keeps value and slope; a half cosine joins them over the rest of
     the period.
+
+    Args:
+        x: Columns.
+        pad: Samples of the extension.
+        response: Over frequency.
+        every: One sample in so many is wanted, from the first on.
     """
     n = x.shape[0]
-    pad = min(n - 1, pad)
-    head, tail = 2 * x[0] - x[pad:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
-    size = scipy.fft.next_fast_len(n + 3 * pad, real=True)
-    gap = size - n - 2 * pad
+    lead, pad = min(n - 1, pad + every - 1) // every * every, min(n - 1, pad)
+    head, tail = 2 * x[0] - x[lead:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
+    few = scipy.fft.next_fast_len(-(-(n + lead + 2 * pad) // every), real=True)
+    gap = every * few - n - lead - pad
     s = 0.5 * (1 - jnp.cos(jnp.pi * (jnp.arange(gap) + 1) / (gap + 1)))[:, None]
-    bridge = tail[-1] + s * (head[0] - tail[-1])
+    ahead = head[0] if lead else x[0]
+    bridge = tail[-1] + s * (ahead - tail[-1])
     whole = jnp.concatenate([head, x, tail, bridge])
-    spectrum = jnp.fft.rfft(whole, axis=0) * response(np.fft.rfftfreq(size))
-    return jnp.fft.irfft(spectrum, size, axis=0)[pad : pad + n]
+    spectrum = jnp.fft.rfft(whole, axis=0) * response(np.fft.rfftfreq(every * few))
+    if every > 1:
+        # Samples left out fold the spectrum: what is wanted takes a transform of its own length only.
+        mirrored = jnp.conj(spectrum[1 : every * few - spectrum.shape[0] + 1][::-1])
+        both = jnp.concatenate([spectrum, mirrored]).reshape(every, few, -1)
+        spectrum = jnp.sum(both, axis=0)[: few // 2 + 1] / every
+    first = lead // every
+    return jnp.fft.irfft(spectrum, few, axis=0)[first : first - (-n // every)]
 
 
 def delayed(

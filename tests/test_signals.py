@@ -58,6 +58,15 @@ def test_decimator_keeps_the_samples_that_it_says(factor, edge):
     np.testing.assert_allclose(kept[inside], index[expected, 0][inside], atol=0.5)
 
 
+@pytest.mark.parametrize("factor", [2, 3, 11, 25])
+@pytest.mark.parametrize("samples", [977, 1000])
+def test_decimating_is_leaving_samples_out(factor, samples):
+    x = jnp.asarray(np.cumsum(np.random.default_rng(1).standard_normal((samples, 2)), axis=0))
+    all_of_them = signals.Decimator(1, 0, 0.06)(x)
+    few = signals.Decimator(factor, 0, 0.06)(x)
+    np.testing.assert_allclose(few, all_of_them[::factor], rtol=0, atol=1e-12 * float(jnp.abs(x).max()))
+
+
 def test_decimator_without_a_filter_passes_everything():
     decimator = signals.Decimator(1, 3)
     np.testing.assert_array_equal(np.asarray(decimator(jnp.asarray(SIGNAL))), SIGNAL[3:-3])
