@@ -34,18 +34,18 @@ def child(what: str, *words: object, cores: int | None = None) -> dict:
 
 
 def study(runs: int) -> dict:
-    """Milliseconds a run of the study, what is compiled once left out."""
+    """Milliseconds a run of the study: of a second one in the same process, whole; the first compiles."""
     import jaxid
+    from jaxid.studies.plan import Plan, cores
 
-    stamps: list[tuple[float, int]] = []
-    result = jaxid.study(FITS, runs=runs, progress=lambda n, _: stamps.append((time.perf_counter(), n)))
-    # The first round of chunks compiles.
-    first = next(k for k, (_, n) in enumerate(stamps) if n >= runs // 4)
-    (begin, before), (end, after) = stamps[first], stamps[-1]
-    return {
-        "ms": 1e3 * (end - begin) / (after - before), "failed": len(result.failures),
-        "whole_s": stamps[-1][0] - stamps[0][0], "memory": _memory(),
-    }
+    case = jaxid.load_case(FITS)
+    chunk = Plan.of(case, runs=runs).chunk
+    first = _timed(lambda: jaxid.study(case, runs=chunk * cores()), 1)[0]
+    begin = time.perf_counter()
+    result = jaxid.study(case, runs=runs, seed=1)
+    ms = 1e3 * (time.perf_counter() - begin) / runs
+    failed = sum(f["runs"] for f in result.failures)
+    return {"ms": ms, "runs": runs, "failed": failed, "first_s": first, "memory": _memory()}
 
 
 def fit(samples: int, repeats: int) -> dict:

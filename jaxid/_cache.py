@@ -7,9 +7,12 @@ becomes of an entry that cannot be read: another run may be writing it, or was k
 from __future__ import annotations
 
 import atexit
+import contextlib
 import hashlib
 import os
 import platform
+import re
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,9 @@ from typing import Any
 _MOST_BYTES = 500_000_000
 # Faster than that, compiling costs little more than reading.
 _SECONDS = 0.02
-_UNREADABLE = "Error reading persistent compilation cache entry"
+_ENTRIES = "*-cache"
+_UNREADABLE = "Error reading persistent compilation cache entry for '([^']*)'"
+_UNWRITTEN = "Error writing persistent compilation cache entry"
 
 
 def configure() -> None:
@@ -27,12 +32,14 @@ def configure() -> None:
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or os.environ.get("JAXID_CACHE") == "off":
         return
-    folder = _home() / _host()
     try:
+        folder = _home() / _host()
         folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            return
         _shrink(folder)
-    except OSError:
-        return  # a home that cannot be written to: all works, only slower
+    except (OSError, RuntimeError):
+        return  # no home, or one that cannot be written to: all works, only slower
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_SECONDS))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
@@ -55,32 +62,37 @@ def _host() -> str:
 
 def _shrink(folder: Path) -> None:
     """Remove what was written first where it is too much."""
-    stats = [(entry.stat(), entry.path) for entry in os.scandir(folder)]
+    stats = [(path.stat(), path) for path in folder.glob(_ENTRIES)]
     total = 0
     for _, size, path in sorted(((s.st_mtime, s.st_size, path) for s, path in stats), reverse=True):
         total += size
         if total > _MOST_BYTES:
-            Path(path).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
 
 def _heal(folder: Path) -> None:
-    """Compile again what cannot be read, without a word, and empty the folder when the command ends.
+    """Compile again what cannot be read, without a word, and remove it when the command ends.
 
-    JAX compiles such an entry anew but leaves it as it is, to warn of it again in every run. Which
-    one it was it does not say, so that all go.
+    JAX compiles such an entry anew but leaves it as it is, to warn of it again in every run. It names
+    the function; of its entries those go that are older than this run. What another run is writing
+    just now is whole by then, and newer.
     """
-    found: list[str] = []
-    shown = warnings.showwarning
+    found: set[str] = set()
+    shown, begun = warnings.showwarning, time.time()
 
     def note(message: Any, *rest: Any, **more: Any) -> None:
-        if str(message).startswith(_UNREADABLE):
-            found.append(str(message))
-        else:
+        unreadable = re.match(_UNREADABLE, str(message))
+        if unreadable:
+            found.add(unreadable[1])
+        elif not str(message).startswith(_UNWRITTEN):
             shown(message, *rest, **more)
 
     def clear() -> None:
-        for path in folder.iterdir() if found else ():
-            path.unlink(missing_ok=True)
+        for path in folder.glob(_ENTRIES):
+            if any(path.name.startswith(name) for name in found):
+                with contextlib.suppress(OSError):
+                    if path.stat().st_mtime < begun:
+                        path.unlink()
 
     warnings.showwarning = note
     atexit.register(clear)

@@ -144,7 +144,7 @@ def _study(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("case", metavar="CASE.toml")
     parser.add_argument("-o", metavar="DIR", help="where chunks and results go; absent: only printed")
     parser.add_argument(
-        "--runs", metavar="N", type=int, help="at each level of noise; absent: the case's, or 100"
+        "--runs", metavar="N", type=int, help="under each setting; absent: the case's, or 100"
     )
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything drawn; default: 0")
     parser.add_argument("--resume", action="store_true", help="go on with what was interrupted")

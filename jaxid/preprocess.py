@@ -111,7 +111,7 @@ class Prepared:
         """The log itself, or, where it keeps more than `most` samples, pieces spread over it.
 
         All pieces have one length, so that compiled code serves them all, and begin on a kept
-        sample.
+        sample. A joint that moves between them only has a further piece where it does.
 
         Args:
             most: Samples to keep, all pieces together.
@@ -123,7 +123,14 @@ class Prepared:
         rows = most // pieces
         length = (rows + 2 * trim) * step
         last = (len(self.q) - length) // step
-        return [self._piece(int(k) * step, length) for k in np.linspace(0, last, pieces)]
+        starts = [int(k) for k in np.linspace(0, last, pieces)]
+        for moving in self.moving.T:
+            # The first sample of a piece does not continue another.
+            seen = any(moving[k + 1 : k + rows].any() for k in starts)
+            if moving.any() and not seen:
+                own = np.flatnonzero(moving)
+                starts.append(int(np.clip(own[len(own) // 2] - rows // 2, 0, last)))
+        return [self._piece(k * step, length) for k in starts]
 
     def _piece(self, first: int, length: int) -> Prepared:
         part = slice(first, first + length)

@@ -136,6 +136,11 @@ class Scene:
         drive = _drive(case, machine, period, longer_delays)
         _refuse_coarse(case, machine, drive, reference)
         every = max(1, round(1 / (rate * period)))
+        if abs(1 / (rate * period * every) - 1) > 1e-3:
+            raise InputError(
+                f"a loop of {1 / period:g} Hz cannot be logged at sample_rate = {rate:g}", where=where,
+                mend="take the loop's rate, or a whole part of it",
+            )
         return cls(case, machine, drive, reference, position, velocity, every)
 
     def virtual(self, machine: Machine, rng: np.random.Generator) -> Steps[Virtual]:

@@ -128,15 +128,21 @@ def between(case: HiddenCase, kind: str, setup: Setup, log: Log) -> float:
     q, u = log["true_position"], setup.machine.actuator_gain * log["true_command"]
     acceleration = np.gradient(log["true_velocity"]) * setup.rate
     acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) * setup.rate**2
-    held = np.concatenate([u[:1], 0.5 * (u[1:] + u[:-1])])
     averaged = dict(log) | {"true_acceleration": acceleration}
-    others = [effect_force(k, setup, log) for k in case.hidden if k != kind]
-    rest = [*baseline_columns(case, setup, averaged), *others]
-    columns = [c if c is acceleration else _averaged(c) for c in rest]
-    force = held - setup.machine.inertia * acceleration if case.inertia_known else held
+    columns = [c if c is acceleration else _averaged(c) for c in baseline_columns(case, setup, averaged)]
+    for other in case.hidden:
+        if other != kind:
+            mean = _of_held if other in DRIVES else _averaged
+            columns.append(mean(effect_force(other, setup, log)))
+    force = _of_held(u) - (setup.machine.inertia * acceleration if case.inertia_known else 0.0)
     fade = faded(moving(log["true_velocity"]))
     whiten = Whitener(setup, fade, averaged_noise)
     return evidence_beyond(whiten(np.column_stack(columns)), whiten(force))
+
+
+def _of_held(x: np.ndarray) -> np.ndarray:
+    """The same mean of a signal that is held from its sample on."""
+    return np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1])])
 
 
 def _averaged(x: np.ndarray) -> np.ndarray:

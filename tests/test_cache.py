@@ -19,10 +19,12 @@ print("compiled")
 """
 
 
+INHERITED = {k: v for k, v in os.environ.items() if not k.startswith("JAX")}
+
+
 def run(folder: Path, **environment: str) -> str:
     """Complaints of a fresh process."""
-    inherited = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
-    environment = inherited | {
+    environment = INHERITED | {
         "XDG_CACHE_HOME": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     } | environment  # fmt: skip
     ended = subprocess.run(
@@ -62,13 +64,26 @@ def test_a_broken_entry_is_compiled_again_and_goes(filled, left):
 
 
 def test_runs_at_once_do_not_disturb_each_other(tmp_path):
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    environment = INHERITED | {"XDG_CACHE_HOME": str(tmp_path)}
     several = [
         subprocess.Popen([sys.executable, "-c", CODE], env=environment, stderr=subprocess.PIPE, text=True)
         for _ in range(3)
     ]
     assert [p.communicate()[1] for p in several] == ["", "", ""]
     assert [p.returncode for p in several] == [0, 0, 0]
+
+
+def test_of_entries_only_those_that_cannot_be_read_go(filled):
+    run(filled)
+    whole = entries(filled)
+    broken = next(iter(whole))
+    broken.write_bytes(b"")
+    beside = broken.with_name("of-another-function-0123-cache")
+    beside.write_bytes(b"kept")
+    assert run(filled) == ""
+    assert beside.read_bytes() == b"kept"
+    assert not broken.exists()
+    beside.unlink()
 
 
 def test_the_users_own_cache_stays(tmp_path):

@@ -16,6 +16,7 @@ from search_setup import write_case
 import jaxid
 from jaxid.errors import InputError
 from jaxid.estimators.steps import Solve, alone, together
+from jaxid.studies.plan import Plan
 from jaxid.studies.result import summarised
 
 AXIS = """
@@ -118,6 +119,17 @@ def test_sampling_and_resolution_are_varied_with_each_other(tmp_path):
     assert "400 Hz, resolution 0.001, noise 1" in page
     with xr.open_dataset(tmp_path / "out" / "study.nc", engine="scipy") as saved:
         np.testing.assert_array_equal(saved["estimate"], table["estimate"])
+
+
+def test_the_loop_stays_where_its_log_is_sampled_otherwise(tmp_path):
+    """Gains without a period belong to the rate of [simulation]."""
+    text = CHAIN.replace("period = 0.001\n", "").replace("runs = 3", "sample_rate = [500.0, 250.0]")
+    plan = Plan.of(jaxid.load_case(write_case(tmp_path, text)))
+    assert [level.scene.machine.controller.period for level in plan.levels] == [0.002, 0.002]
+    assert [level.scene.every for level in plan.levels] == [1, 2]
+    wrong = text.replace("250.0]", "400.0]")
+    with pytest.raises(InputError, match="a loop of 500 Hz cannot be logged at sample_rate = 400"):
+        jaxid.study(write_case(tmp_path, wrong))
 
 
 def test_a_run_is_the_same_whatever_else_is_varied(whole, tmp_path):
@@ -375,6 +387,7 @@ def test_steps_alone_and_together():
 
 
 FAULTS = {
+    "a level twice": ("noise = [0.5, 1.0]", "noise = [1, 1.0]", "1 stands there twice"),
     "no sensor": ("[sensor]\nposition_noise = 3e-5", "", "no noise to multiply"),
     "nothing unknown": ("{ guess = 1.4, true = 2.0 }", "1.4", None),
     "no simulation": ("duration = 2.0\n", "", "no duration"),

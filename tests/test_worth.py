@@ -1,6 +1,7 @@
 """What an effect is worth: the colour of the sensors' noise, and what only seems to explain."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import _felt
 from jaxid.discovery.where import _between
+from jaxid.discovery.worth import Worth
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.gap import noise_density
 from jaxid.precision import NoiseModel
@@ -156,6 +158,19 @@ def test_what_takes_the_sensors_own_noise_away_is_turned_down(axis):
     assert why == "it takes away what the sensors' noise alone must leave"
 
 
+def test_a_joint_with_little_noise_counts_for_little():
+    """Weighted sums of squares: what a true model leaves seldom, of a loud joint and a quiet one."""
+    floors, counts = np.array([1.0, 0.1]), np.array([40, 4000])
+    worth = Worth.__new__(Worth)
+    worth.floor = floors
+    worth.data = SimpleNamespace(recipe=SimpleNamespace(independent=0.5))
+    worth.samples = SimpleNamespace(moving=np.arange(4000)[:, None] < counts)
+    rng = np.random.default_rng(0)
+    sums = sum(f**2 * rng.chisquare(0.5 * c, 20_000) for f, c in zip(floors, counts, strict=True))
+    left = sums / np.sum(0.5 * counts * floors**2)
+    assert np.mean(left < worth._least(0)) < 3e-3
+
+
 def test_few_independent_samples_may_leave_little(axis):
     _, search = axis
     worth = search.worth
@@ -189,7 +204,8 @@ def test_a_joint_that_moves_between_the_pieces_only_is_looked_at(axis, monkeypat
     inside = np.isin(data.times.round(9), np.concatenate([p.times for p in parts]).round(9))
     elsewhere = dataclasses.replace(data, moving=data.moving & ~inside[:, None])
     samples = cand.Samples(elsewhere)
-    assert len(samples.parts) == 1
+    assert len(samples.parts) == 5
+    assert len({len(p.q) for p in samples.parts}) == 1
     assert samples.moving.any()
 
 

@@ -126,9 +126,6 @@ class Samples:
         self, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None
     ) -> None:
         self.parts = data.parts(_MOST // data.q.shape[1], _PIECES)
-        seen = np.any([p.moving.any(axis=0) for p in self.parts], axis=0)
-        if not np.array_equal(seen, data.moving.any(axis=0)):
-            self.parts = [data]  # a joint moves between the pieces only
         self.arrays = [ForceData.of(p) for p in self.parts]
         self.noisier = [] if force_noise is None else [_noisier(a, force_noise) for a in self.arrays]
         moving = [p.moving.copy() for p in self.parts]

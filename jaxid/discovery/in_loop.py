@@ -41,10 +41,15 @@ def hindering(search: Search, session: Session, final: Machine) -> cand.Candidat
 
 
 def _distance(machine: Machine, runs: list[Run]) -> float:
-    """Mean logarithm of the gaps in the loop, all columns of all logs; large where it diverges."""
-    parts = []
+    """Mean logarithm of the relative gaps in the loop, over the columns of a log and then the logs.
+
+    A log from which the simulation runs away counts as far as one may be and still be a simulation.
+    """
+    means = []
     for r in runs:
         gap = simulated(r.machine(machine), r.log)
-        # As far as a simulation may be from its log and still count as one.
-        parts.append([np.log(1e3)] if gap is None else np.log([*gap.relative, *gap.command_relative]))
-    return float(np.mean(np.concatenate(parts)))
+        columns = np.array([1e3]) if gap is None else np.concatenate([gap.relative, gap.command_relative])
+        # A signal that is zero throughout has no relative gap.
+        told = columns[np.isfinite(columns) & (columns > 0)]
+        means.append(float(np.mean(np.log(told))) if len(told) else 0.0)
+    return float(np.mean(means))

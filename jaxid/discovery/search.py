@@ -80,6 +80,7 @@ class Search:
         self.samples = self.worth.samples
         self.theta = self.union.neutral
         self._many: dict[tuple[str, int], list[cand.Point]] = {}
+        self._limit = 0.0
 
     @property
     def active(self) -> np.ndarray:
@@ -112,7 +113,10 @@ class Search:
         theta = self.without(c)
         self.barred, self.added = [*self.barred, c], [a for a in self.added if a is not c]
         self.theta = theta
-        return [Step(None, c, (), 0.0, theta, self.active, why), *self._grow(most)]
+        steps = [Step(None, c, (), 0.0, theta, self.active, why)]
+        # What was worth its place beside it need not be so alone.
+        steps += self._drop_superfluous(self._limit, self.added)
+        return [*steps, *self._grow(most)]
 
     def without(self, c: cand.Candidate) -> np.ndarray:
         """All unknowns, those of one effect neutral and the others fitted again."""
@@ -124,6 +128,7 @@ class Search:
         tried = {frozenset(id(c) for c in self.added)}
         while True:
             best, scores, limit = self.best(ahead=len(self.added) + 2 <= most)
+            self._limit = max(self._limit, limit)
             if not best or len(self.added) >= most:
                 steps.append(Step(None, None, scores, limit, self.theta, self.active))
                 return steps
@@ -131,7 +136,7 @@ class Search:
                 self.added = [*self.added, score.candidate]
                 self.theta = score.theta
                 steps.append(Step(score, None, scores, limit, self.theta, self.active))
-            steps.extend(self._drop_superfluous(limit))
+            steps.extend(self._drop_superfluous(limit, self.added[:-1]))
             now = frozenset(id(c) for c in self.added)
             if now in tried:  # added and dropped in turn
                 return steps
@@ -280,10 +285,10 @@ class Search:
         reason = self.worth.objection(index, self.theta, theta, validation, confirmed, len(active))
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
 
-    def _drop_superfluous(self, limit: float) -> list[Step]:
+    def _drop_superfluous(self, limit: float, of: Sequence[cand.Candidate]) -> list[Step]:
         """Drop effects whose loss costs less than noise, or less than is relevant."""
         steps = []
-        for c in self.added[:-1]:
+        for c in of:
             left = [a for a in self.added if a is not c]
             theta = self.without(c)
             if not self._costs(theta, self._active(left), limit):

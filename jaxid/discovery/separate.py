@@ -260,7 +260,9 @@ def _optimised(
         good = np.isfinite(value) & np.all(np.isfinite(slope))
         return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))
 
-    steps = len(shapes.basis) * bench.drive.substeps * bench.start.size
+    # See `loss`: of several joints it goes forwards.
+    slower = 4 if bench.start.size > 1 else 1
+    steps = slower * len(shapes.basis) * bench.drive.substeps * bench.start.size
     affordable = max(_STEPS // steps, _FEWEST)
     # The last start is the log's own signal where it has one: the surest to keep to its limits.
     looked_at = [starts[-1], *starts[:-1]][: affordable // 2]

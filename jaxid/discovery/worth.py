@@ -181,9 +181,19 @@ class Worth:
         return ""
 
     def _least(self, fitted: int) -> float:
-        """Part of the noise's sum of squares that a fit of so many unknowns must leave."""
-        count = self.data.recipe.independent * self.samples.moving.sum()
-        return min(_LEAST, float(scipy.stats.chi2.ppf(_RARELY, max(count - fitted, 1)) / count))
+        """Part of the noise's sum of squares that a fit of so many unknowns must leave.
+
+        Source:
+            Satterthwaite (1946) for sums of squares that weigh differently, here by joint.
+        """
+        count = self.data.recipe.independent * self.samples.moving.sum(axis=0)
+        weight = np.square(self.floor)
+        fourth = float(np.sum(count * weight**2))
+        if fourth == 0:
+            return _LEAST
+        freedom = float(np.sum(count * weight)) ** 2 / fourth
+        rarely = scipy.stats.chi2.ppf(_RARELY, max(freedom - fitted, 1)) / freedom
+        return min(_LEAST, float(rarely))
 
     def _sum(self, e: np.ndarray) -> float:
         return float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))

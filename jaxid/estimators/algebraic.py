@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxid import signals
 from jaxid.errors import InputError
-from jaxid.estimators.inverse_dynamics import DAMPING, ForceData, linear_transform, sharpened
+from jaxid.estimators.inverse_dynamics import ForceData, linear_scale, sharpened
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
@@ -132,12 +132,12 @@ def weak_residual(
 @eqx.filter_jit
 def _solve(
     plant: Plant, places: tuple, data: ForceData, raw: Array, length: int, weight: Array,
-    theta: Array, transform: Transform, bounds: tuple[Array, Array],
+    theta: Array, transform: Transform, damping: float, bounds: tuple[Array, Array],
 ) -> Minimum:
     def residual(theta: Array) -> Array:
         return weight * weak_residual(scatter(places, plant, theta), data, raw, length)
 
-    return levenberg_marquardt(residual, theta, transform, *bounds, damping=DAMPING)
+    return levenberg_marquardt(residual, theta, transform, *bounds, damping=damping)
 
 
 def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
@@ -174,7 +174,7 @@ def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimat
         )
     fit = yield Solve(_solve, (
         plant, parameters.places, arrays, log.position, length,
-        np.asarray(rows, dtype=float), parameters.guess, linear_transform(machine),
+        np.asarray(rows, dtype=float), parameters.guess, *linear_scale(machine),
         parameters.bounds,
     ))
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)

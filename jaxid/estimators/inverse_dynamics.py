@@ -13,18 +13,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid import signals
-from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.least_squares import DAMPING, Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.machine import Machine
-from jaxid.model import ParameterInfo, Plant, carries_force, parameters_of
+from jaxid.model import Effect, ParameterInfo, Plant, carries_force, parameters_of
 from jaxid.parameters import Free, scatter
 from jaxid.precision import Precision, assess
 from jaxid.preprocess import Prepared
 from jaxid.readings import residual_along
 
-# Most balances are linear in their unknowns: the first step is then the last.
-DAMPING = 1e-10
+# Of the solver where the balance is linear in all unknowns: the first step is then the last.
+_UNDAMPED = 1e-10
 # Factors on the guess of a shape, from which a fit starts too.
 _SHAPES = (0.3, 3.0)
 
@@ -116,14 +116,14 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
 @eqx.filter_jit
 def _solve(
     plant: Plant, places: tuple, data: ForceData, theta: Array, transform: Transform,
-    bounds: tuple[Array, Array],
+    bounds: tuple[Array, Array], damping: float,
 ) -> tuple[Minimum, Array]:
     """The fit, and the size of the force that it explains."""
 
     def residual(theta: Array) -> Array:
         return data.weight * force_residual(scatter(places, plant, theta), data)
 
-    fit = levenberg_marquardt(residual, theta, transform, *bounds, damping=DAMPING)
+    fit = levenberg_marquardt(residual, theta, transform, *bounds, damping=damping)
     return fit, _size(plant, data)
 
 
@@ -165,10 +165,11 @@ def inverse_dynamics_steps(
     arrays = ForceData.of(data, rows)
     parameters = machine.parameters
     theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
-    places, transform = parameters.places, linear_transform(machine)
+    places, (transform, damping) = parameters.places, linear_scale(machine)
+    options = (transform, parameters.bounds, damping)
     fits = []
     for at in _starts(machine, theta):
-        fit, size = yield Solve(_solve, (plant, places, arrays, at, transform, parameters.bounds))
+        fit, size = yield Solve(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
     # Of those that reach the lowest cost, to rounding, one that converged.
@@ -178,7 +179,7 @@ def inverse_dynamics_steps(
         e = np.asarray(fit.residual).reshape(data.moving.shape)
         weight = jnp.asarray(np.sqrt(_bisquare(e, rows)) * rows)
         arrays = eqx.tree_at(lambda a: a.weight, arrays, weight)
-        fit, _ = yield Solve(_solve, (plant, places, arrays, fit.theta, transform, parameters.bounds))
+        fit, _ = yield Solve(_solve, (plant, places, arrays, fit.theta, *options))
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)
@@ -196,20 +197,32 @@ def inverse_dynamics_steps(
     )
 
 
-def linear_transform(machine: Machine) -> Transform:
-    """A solver's scale on which what enters the balance in proportion is fitted as it is.
+def linear_scale(machine: Machine) -> tuple[Transform, float]:
+    """A solver's scale on which what enters the balance in proportion is fitted as it is, and its damping.
 
     As its logarithm, a mass that starts at two thirds of its value takes five evaluations for two.
-    Bounds keep it positive.
+    Bounds keep it positive. Where all unknowns are so, no damping is needed.
     """
-    linear = [carries_force(_info(machine.plant, f)) for f in machine.parameters.free]
-    return Transform(Transform.of(machine.parameters).log & ~np.asarray(linear, dtype=bool))
+    linear = np.array([_linear(machine.plant, f) for f in machine.parameters.free], dtype=bool)
+    transform = Transform(Transform.of(machine.parameters).log & ~linear)
+    return transform, _UNDAMPED if np.all(linear) else DAMPING
 
 
-def _info(plant: Plant, free: Free) -> ParameterInfo:
+def _linear(plant: Plant, free: Free) -> bool:
+    """Whether the residual is in proportion to an unknown, as far as its owner says."""
+    info = _info(plant, free)
+    if info is None or not carries_force(info):
+        return False
+    if free.path[0] != "effects":
+        return True
+    effect = type(plant.effects[free.path[1]])
+    return effect.adds_force and effect.initial_state is Effect.initial_state
+
+
+def _info(plant: Plant, free: Free) -> ParameterInfo | None:
     """What its owner says of an unknown."""
     owner = plant.effects[free.path[1]] if free.path[0] == "effects" else plant
-    return parameters_of(type(owner))[free.path[-1]]
+    return parameters_of(type(owner)).get(free.path[-1])
 
 
 def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
@@ -223,7 +236,7 @@ def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
         if f.path[0] != "effects":
             continue
         info = _info(machine.plant, f)
-        if not carries_force(info) and info.dimension != "1" and theta[k] > 0:
+        if info is not None and not carries_force(info) and info.dimension != "1" and theta[k] > 0:
             out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _SHAPES]
     return out
 

@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxid.parameters import Parameters
 
+# At the start, relative to the diagonal of the normal matrix.
+DAMPING = 1e-4
 # A fit has converged where the cost can fall by no more than this part of itself: with 10^4
 # samples that is 10^-4 of a standard deviation.
 _TOLERANCE = 1e-12
@@ -24,7 +26,8 @@ _STUCK = 1e3
 class Transform(eqx.Module):
     """Physical values to the scale of the solver and back: one object, one inverse.
 
-    What must be positive is fitted as its logarithm; the rest as it is. Scaling to order one is
+    What must be positive is fitted as its logarithm (in the force domain only what the balance is not in
+    proportion to); the rest as it is. Scaling to order one is
     the solver's own (it scales by the columns of the Jacobian).
     """
 
@@ -91,7 +94,7 @@ def levenberg_marquardt(
     active: Bool[Array, " p"] | None = None,
     max_steps: int = 60,
     keep: bool = True,
-    damping: float = 1e-4,
+    damping: float = DAMPING,
 ) -> Minimum:
     """Minimise half the sum of squares of `residual` within bounds.
 

@@ -26,12 +26,12 @@ def study_report(result: Study) -> str:
     others = others_of(rows)
     figures = [
         (
-            "Error against noise",
+            "Errors",
             "The RMS error of all runs that were used, bias included. "
             + ("" if len(others) > 1 else "Dotted: the mean σ that the estimator reports. ")
             + "Black: what no unbiased estimate from the readings can go below, the start and "
             "the command known exactly.",
-            image(plot_errors(rows), "RMS error of every estimator over noise, by parameter"),
+            image(plot_errors(rows), "RMS error of every estimator, by parameter"),
         ),
         (
             "Do the intervals hold the truth?",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib.ticker
 import numpy as np
@@ -14,15 +13,20 @@ from matplotlib.figure import Figure
 
 from jaxid.report.axes import FONT, TEXT, dress
 from jaxid.report.numbers import pretty_unit
-from jaxid.studies.settings import words_of
+from jaxid.studies.settings import widest, words_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 _MARKS = ("o", "s", "^", "D", "v", "P")
 _COLUMNS = 3
+_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
+_AXES = {
+    "noise": "noise, times the sensor's", "sample_rate": "sampling rate [Hz]",
+    "position_resolution": "resolution of the position [m or rad]",
+}
 
 
 def plot_errors(rows: Sequence[dict]) -> Figure:
-    """RMS error of every estimator against noise, a panel for each parameter, with the bound.
+    """RMS error of every estimator against what is varied most, a panel a parameter, with the bound.
 
     What else is varied is told by the dashes.
 
@@ -30,28 +34,31 @@ def plot_errors(rows: Sequence[dict]) -> Figure:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
-    others = _others(rows)
+    against, others = widest(rows), others_of(rows)
     for name, ax in zip(names, panels, strict=True):
         own = [r for r in rows if r["parameter"] == name]
-        noises = np.array(sorted({r["noise"] for r in own}))
-        for other, dash in others.items():
-            here = [r for r in own if words_of(r, noise=False) == other]
+        at = np.array(sorted({r[against] for r in own}))
+        for o, other in enumerate(others):
+            # Of more than there are dashes, the later lines are thinner.
+            dash, width = _DASHES[o % len(_DASHES)], 1.3 / (1 + o // len(_DASHES))
+            here = [r for r in own if words_of(r, without=against) == other]
             for k, estimator in enumerate(_estimators(rows)):
-                line = {r["noise"]: r for r in here if r["estimator"] == estimator}
-                style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5, "ls": dash}
-                values = np.array([line[n]["rmse"] for n in noises])
-                ax.plot(noises, values, lw=1.3, label=estimator if dash == "-" else None, **style)
+                line = {r[against]: r for r in here if r["estimator"] == estimator}
+                style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5, "ls": dash, "lw": width}
+                values = np.array([line[x]["rmse"] for x in at])
+                ax.plot(at, values, label=None if o else estimator, **style)
                 if len(others) == 1:
-                    stated = np.array([line[n]["std"] for n in noises])
-                    ax.plot(noises, stated, lw=0.9, ls=":", color=COLOURS[k % 6])
-            bound = np.array([next(r["bound"] for r in here if r["noise"] == n) for n in noises])
+                    stated = np.array([line[x]["std"] for x in at])
+                    ax.plot(at, stated, lw=0.9, ls=":", color=COLOURS[k % 6])
+            bound = np.array([next(r["bound"] for r in here if r[against] == x) for x in at])
             if np.any(np.isfinite(bound)):
-                label = "Cramér–Rao bound" if dash == "-" else None
-                ax.plot(noises, bound, color=TEXT, lw=1.0, ls="--" if len(others) == 1 else dash, label=label)
-        dress(ax, "noise, times the sensor's", f"{name}\nRMS error [{pretty_unit(own[0]['unit'])}]")
-        _logarithmic(ax, noises)
-    several = [*others.items()] if len(others) > 1 else []
-    _legend(figure, panels[0], several or [("reported σ", ":")])
+                dash = "--" if len(others) == 1 else dash
+                label = None if o else "Cramér–Rao bound"
+                ax.plot(at, bound, color=TEXT, lw=0.8 * width, ls=dash, label=label)
+        dress(ax, _AXES[against], f"{name}\nRMS error [{pretty_unit(own[0]['unit'])}]")
+        _logarithmic(ax, at)
+    several = [(other, _DASHES[o % len(_DASHES)]) for o, other in enumerate(others)]
+    _legend(figure, panels[0], several if len(others) > 1 else [("reported σ", ":")])
     return figure
 
 
@@ -62,28 +69,28 @@ def plot_coverage(rows: Sequence[dict]) -> Figure:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
-    estimators, others = _estimators(rows), others_of(rows)
+    against, estimators, others = widest(rows), _estimators(rows), others_of(rows)
     sides = [(estimator, other) for estimator in range(len(estimators)) for other in range(len(others))]
     for name, ax in zip(names, panels, strict=True):
         own = [r for r in rows if r["parameter"] == name]
-        noises = sorted({r["noise"] for r in own})
+        places = sorted({r[against] for r in own})
         for side, (k, o) in enumerate(sides):
             line = {
-                r["noise"]: r for r in own
-                if r["estimator"] == estimators[k] and words_of(r, noise=False) == others[o] and r["used"]
+                r[against]: r for r in own
+                if r["estimator"] == estimators[k] and words_of(r, without=against) == others[o] and r["used"]
             }
             step = min(0.12, 0.8 / len(sides))
-            at = np.array([noises.index(n) for n in line]) + step * (side - 0.5 * (len(sides) - 1))
+            at = np.array([places.index(x) for x in line]) + step * (side - 0.5 * (len(sides) - 1))
             held = np.array([r["coverage_95"] for r in line.values()])
             ends = np.array([_proportion(r["coverage_95"], r["used"]) for r in line.values()]).reshape(-1, 2)
             style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5}
             ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=COLOURS[k % 6], lw=1.2)
             ax.plot(at, 100 * held, ls="", label=None if o else estimators[k], **style)
         ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
-        dress(ax, "noise, times the sensor's", f"{name}\nin the 95 % interval [%]")
+        dress(ax, _AXES[against], f"{name}\nin the 95 % interval [%]")
         ax.set_ylim(0, 103)
-        ax.set_xlim(-0.5, len(noises) - 0.5)
-        ax.set_xticks(range(len(noises)), [f"{n:g}" for n in noises])
+        ax.set_xlim(-0.5, len(places) - 0.5)
+        ax.set_xticks(range(len(places)), [f"{x:g}" for x in places])
     _legend(figure, panels[0])
     return figure
 
@@ -114,14 +121,8 @@ def plot_scatter(table: xr.Dataset) -> Figure:
 
 
 def others_of(rows: Sequence[dict]) -> list[str]:
-    """What is varied beside the noise, in words; one that says nothing where nothing is."""
-    return list(dict.fromkeys(words_of(r, noise=False) for r in rows))
-
-
-def _others(rows: Sequence[dict]) -> dict[str, Any]:
-    """The same, each with a dash."""
-    dashes = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
-    return {other: dashes[k % len(dashes)] for k, other in enumerate(others_of(rows))}
+    """What is varied beside that, in words; one that says nothing where nothing is."""
+    return list(dict.fromkeys(words_of(r, without=widest(rows)) for r in rows))
 
 
 def _panels(rows: Sequence[dict]) -> tuple[list[str], list[Axes], Figure]:
@@ -144,12 +145,12 @@ def _estimators(rows: Sequence[dict]) -> list[str]:
     return list(dict.fromkeys(r["estimator"] for r in rows))
 
 
-def _logarithmic(ax: Axes, noises: np.ndarray) -> None:
+def _logarithmic(ax: Axes, at: np.ndarray) -> None:
     ax.set_yscale("log")
-    if len(noises) > 1 and noises.min() > 0:
+    if len(at) > 1 and at.min() > 0:
         ax.set_xscale("log")
         ax.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
-    ax.set_xticks(noises, [f"{n:g}" for n in noises])
+    ax.set_xticks(at, [f"{n:g}" for n in at])
 
 
 def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, str]] = ()) -> None:

@@ -50,6 +50,18 @@ def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...
             mend="give position_noise or force_noise in [sensor]",
         )
     others = [name for name in SETTINGS[:-1] if name in setting]
+    for name in (*others, "noise"):
+        values = [float(x) for x in setting.get(name, ())]
+        twice = next((x for x in values if values.count(x) > 1), None)
+        if twice is not None:
+            raise InputError(
+                f"{twice:g} stands there twice", where=f"{case.path}, [study] {name}", mend="once is enough"
+            )
+    if "sample_rate" in others and _follows_rate(case):
+        raise InputError(
+            "the file's samples have no time of their own, and would be played faster or slower",
+            where=f"{case.path}, [study] sample_rate", mend="give its time or sample_rate beside its kind",
+        )
     levels = []
     for values in itertools.product(*[[float(x) for x in setting[name]] for name in others]):
         own = dict(zip(others, values, strict=True))
@@ -63,13 +75,22 @@ def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...
 
 
 def _under(case: Case, setting: dict[str, float]) -> Case:
-    """A case with its sampling rate and resolution replaced."""
-    simulation, sensor = dict(case.simulation), dict(case.sensor)
+    """A case whose log is sampled and resolved otherwise; its loop stays."""
+    simulation, sensor, controller = dict(case.simulation), dict(case.sensor), case.controller
     if "sample_rate" in setting:
+        if controller is not None and "sample_rate" in simulation:
+            rate = case.log.get("sample_rate") or simulation["sample_rate"]
+            controller = {**controller, "period": controller.get("period") or 1.0 / rate}
         simulation["sample_rate"] = setting["sample_rate"]
     if "position_resolution" in setting:
         sensor["position_resolution"] = setting["position_resolution"]
-    return replace(case, simulation=simulation, sensor=sensor)
+    return replace(case, simulation=simulation, sensor=sensor, controller=controller)
+
+
+def _follows_rate(case: Case) -> bool:
+    """Whether what drives the case is a file without a time of its own."""
+    tables = [t for t in (case.input, case.reference) if t and t.get("kind") == "csv"]
+    return any("time" not in t and "sample_rate" not in t for t in tables)
 
 
 def _noisier(machine: Machine, factor: float) -> Machine:
