@@ -137,9 +137,10 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     else:
         columns = [np.interp(ticks, log.time, r) for r in log.reference.T]
         reference, times = np.stack(columns, axis=1), ticks
+    disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"), machine.controller,
-        machine.sensor, jnp.asarray(reference), jnp.asarray(disturbance_at(machine.disturbance, times, log)),
+        machine.sensor.mean, jnp.asarray(reference), jnp.asarray(disturbance),
         None, jnp.asarray(log.position[0]), jnp.asarray(velocity), None, every,
     )
 
@@ -205,7 +206,7 @@ def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) 
     drive = _drive(machine, log, numerics, period, hold)
     restart = _segments(log, numerics.segment, every) if numerics.segment else None
     return Replay(
-        drive, None, machine.sensor, None, None, jnp.asarray(command),
+        drive, None, machine.sensor.mean, None, None, jnp.asarray(command),
         jnp.asarray(log.position[0]), jnp.asarray(velocity), restart, every,
     )
 

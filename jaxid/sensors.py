@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
+
+# Noise of so many counts leaves of the rounding's error nothing that goes with the signal
+# (Schuchman 1964; Gaussian noise, to 1 %).
+_DITHERS = 0.5
 
 
 class Sensor(eqx.Module):
@@ -33,6 +40,18 @@ class Sensor(eqx.Module):
             return q
         counts = jnp.round(q / self.position_resolution) * self.position_resolution
         return q + jax.lax.stop_gradient(counts - q)
+
+    @property
+    def mean(self) -> Sensor:
+        """What it reads on average: without rounding, where noise of half a count or more dithers it.
+
+        Rounding is then one more white noise, and whether a simulated reading falls on this side of a
+        count or that says nothing of a log in which noise decided it; of a cost it makes a rough one.
+        """
+        noise, count = self.position_noise, self.position_resolution
+        if noise is None or count is None or not np.all(np.asarray(noise) >= _DITHERS * np.asarray(count)):
+            return self
+        return replace(self, position_resolution=None)
 
     @property
     def position_std(self) -> Array | None:

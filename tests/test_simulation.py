@@ -209,3 +209,18 @@ def test_restarts_put_the_run_back_on_the_given_motion():
     out = open_loop(plant, drive, jnp.zeros((SAMPLES, 1)), *START, None, reset)
     expected = 0.3 - PERIOD * (np.arange(SAMPLES) % 20)
     np.testing.assert_allclose(np.asarray(out.position)[:, 0], expected, atol=1e-14)
+
+
+def test_rounding_that_noise_dithers_is_read_as_its_mean():
+    counts, q = jnp.asarray(1e-3), jnp.linspace(0.0, 0.01, 7)[:, None]
+    loud = Sensor(position_resolution=counts, position_noise=0.5 * counts)
+    quiet = Sensor(position_resolution=counts, position_noise=0.2 * counts)
+    np.testing.assert_array_equal(loud.mean.read(q), q)
+    np.testing.assert_array_equal(quiet.mean.read(q), quiet.read(q))
+    assert Sensor(position_resolution=counts).mean.position_resolution is not None
+    # What it leaves out is noise like any other: what half a count of noise and rounding leave on average.
+    noise = np.random.default_rng(0).standard_normal((200_000, 1))
+    for at in (0.0, 0.3e-3, 0.5e-3):
+        readings = loud.read(jnp.full((200_000, 1), at), jnp.asarray(noise))
+        assert float(jnp.mean(readings)) == pytest.approx(at, abs=1e-2 * 1e-3)
+        assert float(jnp.std(readings)) == pytest.approx(float(loud.position_std), rel=0.03)

@@ -21,9 +21,10 @@ from jaxid.virtual import Scene
 
 DISCOVER = "discover"
 _RUNS = 100
-# Part of the memory that the chunks in work may take together, and most runs in one: more gain nothing.
+# Part of the memory that the chunks in work may take together, and most runs in one: of more, the arrays
+# of long logs no longer fit a processor's cache.
 _MEMORY = 0.25
-_LARGEST = 64
+_LARGEST = 16
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
 
