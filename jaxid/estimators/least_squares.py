@@ -15,11 +15,12 @@ from jaxid.parameters import Parameters
 # At the start, relative to the diagonal of the normal matrix.
 DAMPING = 1e-4
 # A fit has converged where the cost can fall by no more than this part of itself: with 10^4
-# samples that is 10^-3 of a standard deviation.
-_TOLERANCE = 1e-10
+# samples that is 10^-4 of a standard deviation.
+_TOLERANCE = 1e-12
 # It has also converged where a step that should lower the cost by no more than this, with 10^4 samples
 # a hundredth of a standard deviation, does not: sticking and rounding make the last digits of a cost rough.
 _FLAT = 1e-8
+_WHOLE = 1e-2
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
 _ROUGH = 1e-6
 _STUCK = 1e3
@@ -175,8 +176,9 @@ def _advanced(
     predicted = -change @ gradient - 0.5 * change @ normal @ change
     # A step cut short by a bound says little of what is left: its unknown rests from now on.
     small = (predicted <= _TOLERANCE * cost) & jnp.all(trial == aim)
-    within = (p.predicted <= _FLAT * p.cost) | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost))
-    rough = ~better & within
+    # Of a step that was hardly damped, and that no bound bent: another promises little anywhere.
+    flat = (p.damping < _WHOLE) & (p.predicted > 0) & (p.predicted <= _FLAT * p.cost)
+    rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))
     stuck = rough | (~better & (damping > 1e12))
     growth = jnp.where(better, 2.0, 2 * p.growth)
     return _Progress(
