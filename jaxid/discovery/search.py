@@ -227,6 +227,8 @@ class Search:
             if not good or mine is None:
                 found[k] = ()
                 continue
+            if mine.theta is None:  # others promised more, and it was not refitted: it stands where it stood
+                mine = replace(mine, theta=theta)
             best, ties = simplest(good, self._undecided)
             if best.candidate is not own and self._takes_over(best, mine, own):
                 self.added = [best.candidate if c is own else c for c in kept]
