@@ -19,6 +19,7 @@ DAMPING = 1e-4
 _TOLERANCE = 1e-12
 # It has also converged where a step that should lower the cost by no more than this, with 10^4 samples
 # a hundredth of a standard deviation, does not: sticking and rounding make the last digits of a cost rough.
+# Only a step that is damped by less than this says so: a short one promises little anywhere.
 _FLAT = 1e-8
 _WHOLE = 1e-2
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
@@ -176,7 +177,7 @@ def _advanced(
     predicted = -change @ gradient - 0.5 * change @ normal @ change
     # A step cut short by a bound says little of what is left: its unknown rests from now on.
     small = (predicted <= _TOLERANCE * cost) & jnp.all(trial == aim)
-    # Of a step that was hardly damped, and that no bound bent: another promises little anywhere.
+    # A step that a bound bent may promise less than nothing.
     flat = (p.damping < _WHOLE) & (p.predicted > 0) & (p.predicted <= _FLAT * p.cost)
     rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))
     stuck = rough | (~better & (damping > 1e12))
