@@ -108,12 +108,20 @@ def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
     """The plant with theta[k] at places[k], each a path and, where the leaf is a list, an index."""
     leaves, structure = jax.tree.flatten(plant)
     numbers = jax.tree.unflatten(structure, range(len(leaves)))
-    # Entry by entry, an array of JAX outside compiled code takes longer to read than a plant to build.
-    values = [jnp.asarray(x) for x in theta] if isinstance(theta, np.ndarray) else theta
     for k, (path, index) in enumerate(places):
-        at = leaf(numbers, path)
-        leaves[at] = values[k] if index is None else leaves[at].at[index].set(values[k])
+        at, value = leaf(numbers, path), theta[k]
+        if isinstance(theta, np.ndarray):
+            # Each array that JAX makes outside compiled code takes longer than all else here.
+            leaves[at] = np.asarray(value) if index is None else _with_entry(leaves[at], index, value)
+        else:
+            leaves[at] = value if index is None else leaves[at].at[index].set(value)
     return jax.tree.unflatten(structure, leaves)
+
+
+def _with_entry(values: Array, index: int, value: float) -> np.ndarray:
+    out = np.array(values)
+    out[index] = value
+    return out
 
 
 def _sign_floor(f: Free) -> float:

@@ -20,6 +20,8 @@ _UNTOLD = 0.5
 _ROUNDING = 1e-12
 # Entries of a combination below this are left out when it is named.
 _NEGLIGIBLE = 0.1
+# Samples over which a residual may hang together: beyond, its covariance may wrap round.
+_REMEMBERED = 4096
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,9 @@ class NoiseModel:
         e = np.where(counts, e, 0.0)
         samples = max(int(counts.sum()), 1)
         largest = int(min(largest, samples // 10))
-        products = _lagged(e, largest)
-        pairs = np.maximum(_lagged(counts.astype(float), largest), 1.0)
-        r = products / pairs
+        whole = len(e) - np.arange(largest + 1.0)
+        pairs = whole if counts.all() else np.maximum(_lagged(counts.astype(float), largest), 1.0)
+        r = _lagged(e, largest) / pairs
         if r[0] <= 0:
             return cls(np.zeros(0), 0.0)
         # Taper: long lags are few pairs, and an untapered estimate need not be a covariance.
@@ -119,11 +121,12 @@ def sandwich(
     jacobian: Float[np.ndarray, "time p"], noise: NoiseModel
 ) -> Float[np.ndarray, "p p"]:
     """J' R J with R the covariance of the residual: its colour seen through the regressor."""
-    size = scipy.fft.next_fast_len(2 * len(jacobian), real=True)
-    spectrum = np.fft.rfft(jacobian, size, axis=0)
-    weight = noise.density(size)[:, None] * np.ones((size // 2 + 1, 1))
+    size = scipy.fft.next_fast_len(len(jacobian) + min(len(jacobian), _REMEMBERED), real=True)
+    weight = noise.density(size)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    return np.real(spectrum.conj().T @ (weight * spectrum)) / size
+    spectrum, root = scipy.fft.rfft(jacobian, size, axis=0), np.sqrt(weight)[:, None]
+    real, imaginary = spectrum.real * root, spectrum.imag * root
+    return (real.T @ real + imaginary.T @ imaginary) / size
 
 
 @dataclass(frozen=True)
@@ -187,7 +190,7 @@ def assess(
     Returns:
         The precision. The residual's colour is an autoregressive model, by column of the residual.
     """
-    rows = np.where(counts[..., None], jacobian, 0.0)
+    rows = jacobian if counts.all() else np.where(counts[..., None], jacobian, 0.0)
     flat = rows.reshape(-1, len(names))
     norm = np.linalg.norm(flat, axis=0)
     dead = norm * np.abs(scale) < 1e-9 * signal

@@ -140,8 +140,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"), machine.controller,
-        machine.sensor.mean, jnp.asarray(reference), jnp.asarray(disturbance),
-        None, jnp.asarray(log.position[0]), jnp.asarray(velocity), None, every,
+        machine.sensor.mean, reference, disturbance, None, log.position[0], velocity, None, every,
     )
 
 
@@ -151,7 +150,7 @@ def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: 
         sizes = float(np.std(log.position, axis=0).max()), float(machine.plant.velocity_scale)
         solver = Adaptive.sized(numerics.solver, *sizes)
     return Drive(
-        jnp.asarray(machine.gain), period, hold, numerics.substeps,
+        machine.gain, period, hold, numerics.substeps,
         numerics.sticks, numerics.longest_delay, solver,
     )
 
@@ -206,8 +205,7 @@ def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) 
     drive = _drive(machine, log, numerics, period, hold)
     restart = _segments(log, numerics.segment, every) if numerics.segment else None
     return Replay(
-        drive, None, machine.sensor.mean, None, None, jnp.asarray(command),
-        jnp.asarray(log.position[0]), jnp.asarray(velocity), restart, every,
+        drive, None, machine.sensor.mean, None, None, command, log.position[0], velocity, restart, every,
     )
 
 
@@ -230,7 +228,7 @@ def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
     for k in range(0, log.samples, length):
         flags[k * every] = True
         q[k * every], v[k * every] = local_line(log, k)
-    return jnp.asarray(flags), jnp.asarray(q), jnp.asarray(v)
+    return flags, q, v
 
 
 def local_line(log: Log, k: int, reach: int = 10) -> tuple[np.ndarray, np.ndarray]:

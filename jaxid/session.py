@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxid.errors import InputError
@@ -191,5 +190,5 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
 def _scaled(machine: Machine, data: Prepared) -> Machine:
     """The machine with the velocity scale of its log, which the smoothed sign multiplies."""
     speed = float(np.sqrt(np.mean(data.qd**2)))
-    plant = replace(machine.plant, velocity_scale=jnp.asarray(speed))
+    plant = replace(machine.plant, velocity_scale=np.asarray(speed))
     return machine.with_plant(plant, machine.parameters)

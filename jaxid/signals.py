@@ -11,6 +11,10 @@ import scipy.fft
 import scipy.signal
 from jaxtyping import Array, Float
 
+# Periods of the cut-off over which a signal fades out beyond its ends: by then the roll-off's own
+# memory is 10^-4.
+_MEMORY = 30
+
 
 def butterworth_zero_phase(
     x: Float[np.ndarray, "time k"], cutoff_hz: float, order: int, rate_hz: float
@@ -52,29 +56,33 @@ def spectral_derivatives(
     Returns:
         The signal, its first and its second derivative.
     """
-    n = len(x)
-    s = np.linspace(0.0, 1.0, n)[:, None]
-    slopes = [_end_slope(x, period) * (n - 1) * period, -_end_slope(x[::-1], period) * (n - 1) * period]
-    h00, h10 = 2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s
-    h01, h11 = -2 * s**3 + 3 * s**2, s**3 - s**2
-    trend = h00 * x[0] + h10 * slopes[0] + h01 * x[-1] + h11 * slopes[1]
-    span = (n - 1) * period
-    d_trend = (
-        (6 * s**2 - 6 * s) * (x[0] - x[-1]) + (3 * s**2 - 4 * s + 1) * slopes[0]
-        + (3 * s**2 - 2 * s) * slopes[1]
-    ) / span
-    dd_trend = (
-        (12 * s - 6) * (x[0] - x[-1]) + (6 * s - 4) * slopes[0] + (6 * s - 2) * slopes[1]
-    ) / span**2
-    rest = x - trend
-    odd = np.concatenate([rest, -rest[-2:0:-1]])
-    f = scipy.fft.rfftfreq(len(odd), period)[:, None]
-    spectrum = scipy.fft.rfft(odd, axis=0) * roll_off(f, cutoff_hz)
+    n, span = len(x), (len(x) - 1) * period
+    powers = np.linspace(0.0, 1.0, n)[:, None] ** np.arange(4)
+    first, last = span * _end_slope(x, period), -span * _end_slope(x[::-1], period)
+    rise = x[-1] - x[0]
+    cubic = np.stack([x[0], first, 3 * rise - 2 * first - last, first + last - 2 * rise])
+    rest = _tapered(x - powers @ cubic, int(_MEMORY / (cutoff_hz * period)))
+    f = scipy.fft.rfftfreq(len(rest), period)[:, None]
+    f = f[f[:, 0] < cutoff_hz]
+    spectrum = scipy.fft.rfft(rest, axis=0)[: len(f)] * roll_off(f, cutoff_hz)
     out = []
-    for of_ends in (trend, d_trend, dd_trend):
-        out.append(scipy.fft.irfft(spectrum, len(odd), axis=0)[:n] + of_ends)
+    for _ in range(3):
+        out.append(scipy.fft.irfft(spectrum, len(rest), axis=0)[:n] + powers[:, : len(cubic)] @ cubic)
         spectrum = spectrum * (2j * np.pi * f)
+        cubic = cubic[1:] * np.arange(1, len(cubic))[:, None] / span
     return out[0], out[1], out[2]
+
+
+def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
+    """A signal that is zero at both ends, then its odd continuation that fades out, then zeros.
+
+    The length suits a transform: one with a large prime factor takes ten times as long.
+    """
+    pad = min(pad, len(x) - 2)
+    fade = 0.5 * (1 + np.cos(np.pi * np.arange(1, pad + 1) / (pad + 1)))[:, None]
+    gap = scipy.fft.next_fast_len(len(x) + 2 * pad, real=True) - len(x) - 2 * pad
+    after, before = -x[-2 : -pad - 2 : -1] * fade, -x[pad:0:-1] * fade[::-1]
+    return np.concatenate([x, after, np.zeros((gap, x.shape[1])), before])
 
 
 def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
@@ -85,8 +93,8 @@ def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
 def _end_slope(x: np.ndarray, period: float) -> np.ndarray:
     """Slope at the first sample from a line through the first few."""
     k = min(8, len(x))
-    t = period * np.arange(k)
-    return np.polynomial.polynomial.polyfit(t, x[:k], 1)[1]
+    t = period * (np.arange(k) - 0.5 * (k - 1))
+    return t @ x[:k] / (t @ t)
 
 
 @dataclass(frozen=True)

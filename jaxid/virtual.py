@@ -152,15 +152,14 @@ class Scene:
         """
         noise = rng.standard_normal((len(self.signal), self.case.plant.joints))
         times = self.drive.period * np.arange(len(self.signal))
-        start = (jnp.asarray(self.position), jnp.asarray(self.velocity))
-        signal, sensor = jnp.asarray(self.signal), (machine.sensor, jnp.asarray(noise))
+        start, sensor = (self.position, self.velocity), (machine.sensor, noise)
         looped = machine.controller is not None
         if looped:
-            extra = jnp.asarray(disturbance_at(machine.disturbance, times))
-            args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
+            extra = disturbance_at(machine.disturbance, times)
+            args = (machine.plant, self.drive, machine.controller, self.signal, extra, *start, *sensor)
             run = yield Solve(_closed_run, args)
         else:
-            run = yield Solve(_open_run, (machine.plant, self.drive, signal, *start, *sensor))
+            run = yield Solve(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
         pick = slice(None, None, self.every)
         reference = self.signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
@@ -192,7 +191,7 @@ def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
     longest = int(np.ceil(longer * float(delays.max()) / period)) + 1 if delayed else 0
     hold = "linear" if machine.hold == "band_limited" else machine.hold
     return Drive(
-        jnp.asarray(machine.gain), period, hold, int(case.simulation.get("substeps", 4)),
+        machine.gain, period, hold, int(case.simulation.get("substeps", 4)),
         "sharpness" not in case.simulation, longest,
     )
 
@@ -217,7 +216,7 @@ def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
     speed = float(np.abs(np.diff(reference, axis=0)).max() / period)
     if speed == 0.0:
         return machine
-    plant = replace(machine.plant, velocity_scale=jnp.asarray(speed))
+    plant = replace(machine.plant, velocity_scale=np.asarray(speed))
     return machine.with_plant(plant, machine.parameters)
 
 

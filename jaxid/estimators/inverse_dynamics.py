@@ -53,10 +53,8 @@ class ForceData(eqx.Module):
         """Arrays of a prepared log; weight one for `rows`, by default every moving sample."""
         rows = data.moving if rows is None else rows
         return cls(
-            jnp.asarray(data.q), jnp.asarray(data.qd), jnp.asarray(data.qdd),
-            jnp.asarray(data.force), jnp.asarray(rows, dtype=float),
-            jnp.asarray(data.start), data.period,
-            data.hold, data.recipe.decimator,
+            data.q, data.qd, data.qdd, data.force, rows.astype(np.float64),
+            np.asarray(data.start), data.period, data.hold, data.recipe.decimator,
         )
 
 
@@ -109,7 +107,7 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
     return eqx.tree_at(
         lambda p: (p.sharpness, p.velocity_scale),
         plant,
-        (jnp.asarray(1 / 3), jnp.asarray(min(data.recipe.rest_velocity), dtype=float)),
+        (np.asarray(1 / 3), np.asarray(min(data.recipe.rest_velocity))),
     )
 
 
@@ -177,7 +175,7 @@ def inverse_dynamics_steps(
     fit = next((f for f in lowest if bool(f.converged)), lowest[0])
     for _ in range(2 if reweighted else 0):
         e = np.asarray(fit.residual).reshape(data.moving.shape)
-        weight = jnp.asarray(np.sqrt(_bisquare(e, rows)) * rows)
+        weight = np.sqrt(_bisquare(e, rows)) * rows
         arrays = eqx.tree_at(lambda a: a.weight, arrays, weight)
         fit, _ = yield Solve(_solve, (plant, places, arrays, fit.theta, *options))
     e = np.asarray(fit.residual).reshape(rows.shape)

@@ -10,6 +10,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from jaxid.errors import InputError
@@ -21,10 +22,13 @@ from jaxid.virtual import Scene
 
 DISCOVER = "discover"
 _RUNS = 100
-# Part of the memory that the chunks in work may take together, and most runs in one: of more, the arrays
-# of long logs no longer fit a processor's cache.
+# Part of the memory that the chunks in work may take together, and most runs in one on a processor's
+# cores: of more, the arrays of long logs no longer fit its cache.
 _MEMORY = 0.25
-_LARGEST = 16
+_LARGEST = 8
+# Likewise on an accelerator; and memory of a device that does not state it [bytes].
+_RUNS_OF_DEVICE = 4096
+_UNSTATED = 2**32
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
 
@@ -180,9 +184,18 @@ def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
     refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
     # Residual, Jacobian and trajectory, kept twice over by the solver.
     each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**32
+    memory, most = _memory()
     shared = -(-runs // workers)
-    return int(np.clip(_MEMORY * whole / workers / each, 1, min(_LARGEST, shared)))
+    return int(np.clip(_MEMORY * memory / workers / each, 1, min(most, shared)))
+
+
+def _memory() -> tuple[float, int]:
+    """Bytes that arrays may take, and most runs in a chunk: an accelerator is filled."""
+    device = jax.local_devices()[0]
+    if device.platform != "cpu":
+        return (device.memory_stats() or {}).get("bytes_limit", _UNSTATED), _RUNS_OF_DEVICE
+    stated = hasattr(os, "sysconf")
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if stated else _UNSTATED, _LARGEST
 
 
 def cores() -> int:

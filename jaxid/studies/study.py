@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
@@ -112,8 +113,11 @@ def study(
 
 
 def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
-    """Chunks as they end, one a core at once: compiled code leaves Python's lock alone."""
-    with ThreadPoolExecutor(cores()) as pool:
+    """Chunks as they end, one a core at once: compiled code leaves Python's lock alone.
+
+    Linear algebra keeps to one thread meanwhile: its own would wait for each other in a loop.
+    """
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(cores()) as pool:
         left: dict[Future, int] = {pool.submit(runner.chunk, number): number for number in numbers}
         try:
             while left:
