@@ -125,7 +125,7 @@ stiffness = [{', '.join(['1500.0'] * (masses + 1))}]
 [[effects]]
 kind = "coulomb_friction"
 level = {each('{ guess = 2.0, true = 3.0 }')}
-port = [{', '.join(str(k + 1) for k in range(masses))}]
+joint = [{', '.join(str(k + 1) for k in range(masses))}]
 [controller]
 kind = "pd"
 kp = 3000.0
@@ -154,7 +154,7 @@ def commands() -> list[dict]:
         "identify": ["identify", case, log],
         "identify --method inverse_dynamics": ["identify", case, log, "--method", "inverse_dynamics"],
         "discover --validate": ["discover", case, log, "--validate", other],
-        "simulate": ["simulate", str(FITS), "-o", "{out}/log.csv"],
+        "simulate": ["simulate", str(FITS), "-o", "{out}/log.csv", "--force"],
         "study --runs 64": ["study", str(FITS), "--runs", "64"],
     }
     rows = []

@@ -86,7 +86,7 @@ def open_session(
         InputError: If anything in case or logs is unsound.
     """
     case = case if isinstance(case, Case) else load_case(case)
-    fit = _read(case, log, case.columns)
+    fit = _read(case, log)
     machine = build_machine(case, period=fit.period)
     findings = _check(case, fit, machine)
     recipe = choose_recipe(fit, case.preprocess)
@@ -98,12 +98,12 @@ def open_session(
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
-        read = _read(case, source, entry.columns)
+        read = _read(case, source, columns=entry.columns)
         findings += _check(case, read, machine)
         opened.append(Run(entry.name, read, _prepare(read, machine, recipe), entry.disturbance))
         names.add(entry.name)
     for extra in validate:
-        read = _read(case, extra, {k: v for k, v in case.columns.items() if k != "rows"})
+        read = _read(case, extra, whole=True)
         findings += _check(case, read, machine)
         name = Path(read.source).stem
         while name in names:
@@ -134,10 +134,15 @@ def session_around(
     return Session(case, _scaled(machine, data), run, (), recipe, ())
 
 
-def _read(case: Case, log: Log | str | Path, columns: dict) -> Log:
+def _read(
+    case: Case, log: Log | str | Path, *, columns: dict | None = None, whole: bool = False
+) -> Log:
+    """A log, or that of a file by the case's columns or others; `whole`: all its rows."""
     joints, drives = case.plant.joints, case.plant.drives
     if not isinstance(log, Log):
-        return read_log(log, columns, joints=joints, drives=drives)
+        columns = case.columns if columns is None else columns
+        kept = {k: v for k, v in columns.items() if not (whole and k == "rows")}
+        return read_log(log, kept, joints=joints, drives=drives)
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):
         values = getattr(log, name)
         if values is not None and values.shape[1] != width:

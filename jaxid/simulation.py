@@ -9,8 +9,8 @@ different model from a sampled one.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,9 @@ from jaxid.readings import (
 )
 from jaxid.sensors import Sensor
 from jaxid.solvers import RELATIVE, Adaptive
+
+if TYPE_CHECKING:
+    import diffrax
 
 # Largest product of step and fastest decay for which the fourth-order step keeps both trajectory
 # and gradient (2.78 is where it turns unstable; past 1 the gradient error grows beyond 1 %).
@@ -274,6 +277,8 @@ def with_diffrax(
     Returns:
         Positions and velocities, (time, n).
     """
+    import diffrax
+
     if controller is None:
         controller = (
             diffrax.ConstantStepSize()

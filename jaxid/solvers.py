@@ -7,7 +7,6 @@ error asks for, which near a reversal is many and elsewhere one.
 
 from __future__ import annotations
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,14 +16,15 @@ from jaxid.errors import InputError, suggest
 from jaxid.model import Plant
 from jaxid.readings import State, derivative, line
 
-# Those with an error estimate whose one right-hand side is all they ask for.
-SOLVERS: dict[str, type[diffrax.AbstractAdaptiveSolver]] = {
-    "tsit5": diffrax.Tsit5,
-    "dopri5": diffrax.Dopri5,
-    "dopri8": diffrax.Dopri8,
-    "bosh3": diffrax.Bosh3,
-    "kvaerno3": diffrax.Kvaerno3,
-    "kvaerno5": diffrax.Kvaerno5,
+# Those of diffrax with an error estimate whose one right-hand side is all they ask for, by the names
+# of their classes: diffrax takes a third of a second to import, and few runs need it.
+SOLVERS = {
+    "tsit5": "Tsit5",
+    "dopri5": "Dopri5",
+    "dopri8": "Dopri8",
+    "bosh3": "Bosh3",
+    "kvaerno3": "Kvaerno3",
+    "kvaerno5": "Kvaerno5",
 }
 # Error of a step, relative to the state; near zero, to a tenth of the motion's size.
 RELATIVE = 1e-8
@@ -69,8 +69,11 @@ class Adaptive(eqx.Module):
         Returns:
             The state; not a number where the solver failed, so that a fit turns back.
         """
+        import diffrax
+
+        solver = getattr(diffrax, SOLVERS[self.name])()
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(_rate), SOLVERS[self.name](), 0.0, h, h, x, (plant, ends, t, h),
+            diffrax.ODETerm(_rate), solver, 0.0, h, h, x, (plant, ends, t, h),
             saveat=diffrax.SaveAt(t1=True),
             stepsize_controller=diffrax.PIDController(rtol=RELATIVE, atol=self.absolute),
             adjoint=diffrax.ForwardMode(), max_steps=_MOST_STEPS, throw=False,

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.discovery.candidates import Candidate
-from jaxid.discovery.screen import Score
-from jaxid.estimators.result import Estimate
-from jaxid.identification import Gap, Identification
 from jaxid.io.output import ready_folder, write_json, write_whole
 from jaxid.io.proposals import proposal_csv, proposal_json
-from jaxid.model import Plant
 from jaxid.parameters import leaf, several_places
-from jaxid.session import Session
 
 if TYPE_CHECKING:
+    from jaxid.discovery.candidates import Candidate
     from jaxid.discovery.result import Discovery, Found
+    from jaxid.discovery.screen import Score
+    from jaxid.estimators.result import Estimate
+    from jaxid.identification import Gap, Identification
+    from jaxid.model import Plant
+    from jaxid.session import Session
 
 
 def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:

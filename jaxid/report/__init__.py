@@ -1,10 +1,19 @@
 """One HTML page that tells what was found, with its plots inside."""
 
+from typing import Any
+
 from jaxid.report.data import CandidateScore as CandidateScore
 from jaxid.report.data import LogView as LogView
 from jaxid.report.data import ParameterRow as ParameterRow
 from jaxid.report.data import ReportData as ReportData
 from jaxid.report.data import SearchStep as SearchStep
 from jaxid.report.data import WherePlot as WherePlot
-from jaxid.report.page import render as render
-from jaxid.report.page import write_report as write_report
+
+
+def __getattr__(name: str) -> Any:
+    """The page itself, which imports matplotlib, only where it is asked for."""
+    if name in ("render", "write_report"):
+        from jaxid.report import page
+
+        return getattr(page, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
