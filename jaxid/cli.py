@@ -13,7 +13,10 @@ from typing import NoReturn
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
 
-METHODS = ("output_error", "inverse_dynamics", "algebraic")
+METHODS = (
+    "output_error", "inverse_dynamics", "algebraic", "algebraic_single_time", "algebraic_ratio",
+    "algebraic_sign_changed", "algebraic_sign_unchanged",
+)
 SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
 
 

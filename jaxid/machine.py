@@ -85,22 +85,28 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
         mend = "leave transmission out and log the joints' own positions and forces"
         what = "transmission is not available in this version"
         raise InputError(what, where=f"{case.path}, [actuator]", mend=mend)
-    plant, free = _bare_plant(case, true)
-    for entry in case.effects:
-        for at in range(len(entry.ports)):
-            plant, more = _with_effect(plant, entry, at, case, true)
-            free += more
+    plant, free = _plant(case, true)
     gain = np.broadcast_to(np.asarray(case.gain, dtype=np.float64), (case.plant.drives,)).copy()
     return Machine(
         plant=plant,
         parameters=Parameters(tuple(free)),
         gain=gain,
         units=case.plant.units,
-        controller=_controller(case, period),
+        controller=_controller(case, period, gain),
         disturbance=(case.controller or {}).get("disturbance"),
         sensor=Sensor(**{name: as_array(value) for name, value in case.sensor.items()}),
         hold=case.log.get("hold", "zero_order"),
     )
+
+
+def _plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
+    """The plant with its effects, and the unknowns."""
+    plant, free = _bare_plant(case, true)
+    for entry in case.effects:
+        for at in range(len(entry.ports)):
+            plant, more = _with_effect(plant, entry, at, case, true)
+            free += more
+    return plant, free
 
 
 def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
@@ -160,7 +166,7 @@ def _free(
     return [Free(name, path, unit, info.sign, guess, *bounds, index=index, true=value.true)]
 
 
-def _controller(case: Case, period: float | None) -> Controller | None:
+def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controller | None:
     if case.controller is None:
         return None
     cls = CONTROLLERS[case.controller["kind"]]
@@ -174,6 +180,9 @@ def _controller(case: Case, period: float | None) -> Controller | None:
     values |= given
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
     arrays = {k: v if k in static else as_array(v) for k, v in values.items()}
+    if "model" in cls.of_machine:
+        # The law knows what the case guesses, whatever the machine truly is.
+        arrays |= {"model": _plant(case, False)[0], "gain": as_array(gain.tolist())}
     return cls(period=case.controller.get("period") or _log_period(case, period), **arrays)
 
 

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid import smooth
@@ -292,6 +293,10 @@ class Plant(eqx.Module):
     def at_drives(self, x: Array) -> Array:
         """Of a quantity by joint (its last axis), the joints that are driven, by drive."""
         return x
+
+    def driven(self, coordinates: int) -> tuple[int, ...]:
+        """Joints that are driven, in the order of the drives."""
+        return tuple(int(i) for i in self.at_drives(np.arange(coordinates)))
 
     def applied(self, u: Array, coordinates: int) -> Array:
         """Generalized forces of the drives: one for each of the first coordinates by default."""

@@ -212,9 +212,12 @@ def closed_loop(
         One row a tick.
     """
     sensor = Sensor() if sensor is None else sensor
-    memory = controller.start(plant.at_drives(position), plant.at_drives(velocity), reference[0])
+    driven = plant.driven(position.size)
+    path = controller.path(reference)
+    first = jax.tree.map(lambda x: x[0], path)
+    memory = controller.start(Tick(position, first, driven), velocity)
     times = drive.period * jnp.arange(reference.shape[0])
-    tick0 = Tick(plant.at_drives(sensor.read(position)), reference[0])
+    tick0 = Tick(sensor.read(position), first, driven)
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
     past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
     x0 = State(position, velocity, plant.initial_states(held))
@@ -222,15 +225,14 @@ def closed_loop(
 
     def tick(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         x, memory, past = carry
-        reference, disturbance, noise, t = now
+        path, disturbance, noise, t = now
         reading = sensor.read(x.q, noise)
-        seen = Tick(plant.at_drives(reading), reference)
-        u, memory = controller.command(seen, memory, disturbance)
+        u, memory = controller.command(Tick(reading, path, driven), memory, disturbance)
         force, past = _delayed_force(plant, drive, u, past)
         new = advance(x, (force,), t)
         return (new, memory, past), (x.q, x.qd, u, reading)
 
-    inputs = (reference, disturbance, noise, times)
+    inputs = (path, disturbance, noise, times)
     _, (q, v, u, reading) = jax.lax.scan(tick, (x0, memory, past), inputs)
     return Trajectory(q, v, u, reading)
 

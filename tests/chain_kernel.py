@@ -94,3 +94,11 @@ def run(
             truth[k, i, 2] = axis.acceleration(masses[i], bursts, q[i], v[i], 0.0, force, 0.0)
         for _ in range(steps):
             advance(masses, springs, q, v, drive, pull, h)
+
+
+@njit(cache=True)
+def hold(masses, springs, q, v, drive, pull, period, step):
+    """Let the chain move for one period under held forces, in place."""
+    steps = int(math.ceil(period / step - 1e-6))
+    for _ in range(steps):
+        advance(masses, springs, q, v, drive, pull, period / steps)

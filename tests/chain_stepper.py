@@ -9,7 +9,7 @@ Conventions, beside those of `stepper`:
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import chain_kernel
@@ -188,6 +188,45 @@ def simulate_chain(
         "true_acceleration": truth[:, :, 2],
         "true_force": truth[:, :, 3],
         "true_command": u,
+    }
+
+
+def simulate_under(
+    machine: ChainMachine,
+    law: Callable[[int, np.ndarray], np.ndarray],
+    sensor: Sensor,
+    *,
+    rate: float,
+    duration: float,
+    seed: int = 0,
+    step: float = 5e-6,
+) -> dict[str, np.ndarray]:
+    """Run the chain, from rest at zero, under any law: a callable of the tick and the readings.
+
+    Returns:
+        t (time,) [s], position (time, n) [m] and force (time, drives) [unit of command] as logged,
+        noise-free true_position and true_velocity (time, n).
+    """
+    masses, springs = physics(machine)
+    n, driven, count = machine.count, machine.driven, round(duration * rate)
+    random = np.random.default_rng(seed)
+    noise = sensor.position_noise * random.standard_normal((count, n))
+    q, v, pull = np.zeros(n), np.zeros(n), np.zeros(n)
+    reading, truth = np.zeros((count, n)), np.zeros((count, n, 2))
+    u, drive = np.zeros((count, len(driven))), np.zeros(n)
+    for k in range(count):
+        reading[k] = q + noise[k]
+        if sensor.position_resolution > 0.0:
+            count_of = np.round(reading[k] / sensor.position_resolution)
+            reading[k] = count_of * sensor.position_resolution
+        truth[k, :, 0], truth[k, :, 1] = q, v
+        u[k] = law(k, reading[k])
+        drive[driven] = machine.gains * u[k]
+        chain_kernel.hold(masses, springs, q, v, drive, pull, 1.0 / rate, float(step))
+    return {
+        "t": np.arange(count) / rate, "position": reading,
+        "force": u + sensor.force_noise * random.standard_normal(u.shape),
+        "true_position": truth[:, :, 0], "true_velocity": truth[:, :, 1],
     }
 
 

@@ -4,7 +4,11 @@ To add one: write its class and register it here.
 """
 
 from jaxid.controllers.base import Controller as Controller
+from jaxid.controllers.base import Path as Path
 from jaxid.controllers.base import Tick as Tick
+from jaxid.controllers.flatness import Flatness
 from jaxid.controllers.linear import PD, PID, CascadePD
 
-CONTROLLERS: dict[str, type[Controller]] = {"cascade_pd": CascadePD, "pd": PD, "pid": PID}
+CONTROLLERS: dict[str, type[Controller]] = {
+    "cascade_pd": CascadePD, "pd": PD, "pid": PID, "flatness": Flatness
+}

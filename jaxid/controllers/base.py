@@ -2,24 +2,55 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxid.smooth import sharp_clip
+
+
+class Path(eqx.Module):
+    """Where the driven joints should be: at one tick, or at all, one row each.
+
+    Args:
+        reference: Position [m or rad].
+        slope, curvature: Its derivatives; None for a controller that does not anticipate.
+    """
+
+    reference: Array
+    slope: Array | None = None
+    curvature: Array | None = None
 
 
 class Tick(eqx.Module):
     """All that a controller sees at one tick.
 
     Args:
-        position: Measured coordinates.
-        reference: Where they should be.
+        joints: Measured coordinates of all joints.
+        path: Where those that are driven should be.
+        driven: Which these are, 0-based, in the order of the drives.
     """
 
-    position: Float[Array, " n"]
-    reference: Float[Array, " n"]
+    joints: Float[Array, " n"]
+    path: Path
+    driven: tuple[int, ...] = eqx.field(static=True)
+
+    def at_drives(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """Of a quantity by joint, the entries of the driven ones."""
+        whole = self.driven == tuple(range(x.size))
+        return x if whole else jnp.stack([x[i] for i in self.driven])
+
+    @property
+    def position(self) -> Float[Array, " m"]:
+        """Measured coordinates of the driven joints."""
+        return self.at_drives(self.joints)
+
+    @property
+    def reference(self) -> Float[Array, " m"]:
+        """Where they should be."""
+        return self.path.reference
 
 
 class Controller(eqx.Module):
@@ -35,18 +66,32 @@ class Controller(eqx.Module):
     limit: Array | None = eqx.field(default=None, kw_only=True)
     velocity_average: int = eqx.field(static=True, default=1, kw_only=True)
 
-    def start(self, position: Array, velocity: Array, reference: Array) -> Any:
-        """Memory of a controller that has watched the motion pass at constant velocity."""
-        ticks = range(1, self.velocity_average + 1)
-        past = tuple(position - k * self.period * velocity for k in ticks)
-        return past, self.start_law(reference)
+    # Whether the law needs the reference's derivatives.
+    anticipates: ClassVar[bool] = False
+    # Fields that no case states: the machine's own model and gain.
+    of_machine: ClassVar[tuple[str, ...]] = ()
 
-    def start_law(self, reference: Array) -> Any:
+    def path(self, reference: Float[Array, "ticks m"]) -> Path:
+        """The reference as the law needs it, at every tick; differences are central."""
+        if not self.anticipates:
+            return Path(reference)
+        before = jnp.concatenate([2 * reference[:1] - reference[1:2], reference[:-1]])
+        after = jnp.concatenate([reference[1:], 2 * reference[-1:] - reference[-2:-1]])
+        curvature = (after - 2 * reference + before) / self.period**2
+        return Path(reference, (after - before) / (2 * self.period), curvature)
+
+    def start(self, tick: Tick, velocity: Float[Array, " n"]) -> Any:
+        """Memory of a controller that has watched the joints pass at constant velocity."""
+        ticks = range(1, self.velocity_average + 1)
+        past = tuple(tick.joints - k * self.period * velocity for k in ticks)
+        return past, self.start_law(tick, velocity)
+
+    def start_law(self, tick: Tick, velocity: Float[Array, " n"]) -> Any:
         """Memory of the law itself."""
         return None
 
-    def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
-        """Command before the limit, and the law's new memory."""
+    def law(self, tick: Tick, velocity: Float[Array, " n"], memory: Any, disturbance: Array) -> tuple:
+        """Command before the limit, and the law's new memory; velocity is of all joints."""
         raise NotImplementedError
 
     def command(self, tick: Tick, memory: Any, disturbance: Array) -> tuple[Array, Any]:
@@ -56,9 +101,9 @@ class Controller(eqx.Module):
         (p[k] - p[k-1]) / period, which telescopes to two positions.
         """
         past, inner = memory
-        velocity = (tick.position - past[-1]) / (self.velocity_average * self.period)
+        velocity = (tick.joints - past[-1]) / (self.velocity_average * self.period)
         u, inner = self.law(tick, velocity, inner, disturbance)
-        return self.clipped(u + disturbance), ((tick.position, *past[:-1]), inner)
+        return self.clipped(u + disturbance), ((tick.joints, *past[:-1]), inner)
 
     def clipped(self, u: Array) -> Array:
         """The command within its limit."""

@@ -18,7 +18,8 @@ class CascadePD(Controller):
     kv: Array
 
     def law(self, tick: Tick, velocity: Array, memory: None, disturbance: Array) -> tuple:
-        return self.kv * (self.kp * (tick.reference - tick.position) - velocity), None
+        error = tick.reference - tick.position
+        return self.kv * (self.kp * error - tick.at_drives(velocity)), None
 
 
 class PD(Controller):
@@ -27,13 +28,13 @@ class PD(Controller):
     kp: Array
     kd: Array
 
-    def start_law(self, reference: Array) -> Array:
-        return reference
+    def start_law(self, tick: Tick, velocity: Array) -> Array:
+        return tick.reference
 
     def law(self, tick: Tick, velocity: Array, memory: Array, disturbance: Array) -> tuple:
         slope = (tick.reference - memory) / self.period
         error = tick.reference - tick.position
-        return self.kp * error + self.kd * (slope - velocity), tick.reference
+        return self.kp * error + self.kd * (slope - tick.at_drives(velocity)), tick.reference
 
 
 class PID(Controller):
@@ -49,13 +50,14 @@ class PID(Controller):
     derivative_filter: Array = eqx.field(default=0.0, kw_only=True)
     anti_windup: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    def start_law(self, reference: Array) -> tuple:
-        return reference, jnp.zeros_like(reference), jnp.zeros_like(reference)
+    def start_law(self, tick: Tick, velocity: Array) -> tuple:
+        none = jnp.zeros_like(tick.reference)
+        return tick.reference, none, none
 
     def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
         last, integral, slope = memory
         error = tick.reference - tick.position
-        raw = (tick.reference - last) / self.period - velocity
+        raw = (tick.reference - last) / self.period - tick.at_drives(velocity)
         # Backward Euler, so that a filter faster than the sampling only passes the difference.
         slope = slope + (raw - slope) * self.period / (self.period + self.derivative_filter)
         grown = integral + error * self.period

@@ -194,7 +194,8 @@ def _acted(machine: Machine, log: Log) -> np.ndarray:
         return log.force
     extra = disturbance_at(machine.disturbance, log.time, log)
     arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
-    made = np.asarray(_commands(machine.controller, *(jnp.asarray(a) for a in arrays)))
+    driven = machine.plant.driven(log.position.shape[1])
+    made = np.asarray(_commands(machine.controller, driven, *(jnp.asarray(a) for a in arrays)))
     size = np.sqrt(np.mean(log.force**2, axis=0))
     stated = machine.sensor.force_noise
     noise = 0.0 if stated is None else np.asarray(stated)
@@ -203,10 +204,16 @@ def _acted(machine: Machine, log: Log) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _commands(controller: Controller, position: Array, reference: Array, disturbance: Array) -> Array:
+def _commands(
+    controller: Controller, driven: tuple[int, ...], position: Array, reference: Array,
+    disturbance: Array,
+) -> Array:
     def tick(memory: tuple, now: tuple) -> tuple[tuple, Array]:
-        u, memory = controller.command(Tick(*now[:2]), memory, now[2])
+        position, path, disturbance = now
+        u, memory = controller.command(Tick(position, path, driven), memory, disturbance)
         return memory, u
 
-    start = controller.start(position[0], jnp.zeros_like(position[0]), reference[0])
-    return jax.lax.scan(tick, start, (position, reference, disturbance))[1]
+    path = controller.path(reference)
+    first = Tick(position[0], jax.tree.map(lambda x: x[0], path), driven)
+    start = controller.start(first, jnp.zeros_like(position[0]))
+    return jax.lax.scan(tick, start, (position, path, disturbance))[1]

@@ -43,12 +43,38 @@ def _output_error(
 
 def _algebraic(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.algebraic import algebraic_steps
+    from jaxid.estimators.one_window import least_squares_steps
 
-    return algebraic_steps(session.machine, session.fit.log, session.fit.data)
+    run, window = session.fit, session.case.algebraic.get("window")
+    if window is None:
+        return algebraic_steps(session.machine, run.log, run.data)
+    return least_squares_steps(session.machine, run.log, run.data, window)
+
+
+def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
+    """One of the forms that solve a joint's equations by themselves."""
+
+    def steps(session: Session) -> Steps[Estimate]:
+        from jaxid.estimators import one_window
+
+        forms = {
+            "algebraic_single_time": one_window.joint_by_joint(one_window.single_time, name),
+            "algebraic_ratio": one_window.joint_by_joint(one_window.ratio, name),
+            "algebraic_sign_changed": one_window.two_intervals(True, name),
+            "algebraic_sign_unchanged": one_window.two_intervals(False, name),
+        }
+        run, window = session.fit, session.case.algebraic.get("window")
+        return forms[name](session.machine, run.log, run.data, window)
+
+    return steps
+
+
+_FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
     "inverse_dynamics": _inverse_dynamics,
     "algebraic": _algebraic,
+    **{f"algebraic_{name}": _form(f"algebraic_{name}") for name in _FORMS},
 }

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxid import signals
 from jaxid.estimators.least_squares import DAMPING, Minimum, Transform, levenberg_marquardt
@@ -201,9 +201,14 @@ def linear_scale(machine: Machine) -> tuple[Transform, float]:
     As its logarithm, a mass that starts at two thirds of its value takes five evaluations for two.
     Bounds keep it positive. Where all unknowns are so, no damping is needed.
     """
-    linear = np.array([_linear(machine.plant, f) for f in machine.parameters.free], dtype=bool)
+    linear = linear_unknowns(machine)
     transform = Transform(Transform.of(machine.parameters).log & ~linear)
     return transform, _UNDAMPED if np.all(linear) else DAMPING
+
+
+def linear_unknowns(machine: Machine) -> Bool[np.ndarray, " p"]:
+    """Which unknowns the balance is in proportion to."""
+    return np.array([_linear(machine.plant, f) for f in machine.parameters.free], dtype=bool)
 
 
 def _linear(plant: Plant, free: Free) -> bool:

@@ -24,6 +24,7 @@ from jaxid.io.case_entries import (
     read_plant,
 )
 from jaxid.io.case_tables import (
+    ALGEBRAIC,
     PLANNED_CONTROLLERS,
     STUDY,
     TOP,
@@ -71,6 +72,7 @@ class Case:
         transmission: R, rows of numbers; joint = R^-1 motor.
         log: [log], as `jaxid.io.log.read_log` takes it; empty where it is absent.
         preprocess: [preprocess], for `jaxid.preprocess.choose_recipe`.
+        algebraic: [algebraic], for the estimators of that name.
         controller: [controller].
         sensor: [sensor].
         limits: [limits], for `jaxid.discovery.limits`.
@@ -89,6 +91,7 @@ class Case:
     transmission: tuple[tuple[float, ...], ...] | None = None
     log: dict[str, Any] = field(default_factory=dict)
     preprocess: dict[str, Any] = field(default_factory=dict)
+    algebraic: dict[str, Any] = field(default_factory=dict)
     controller: dict[str, Any] | None = None
     sensor: dict[str, Any] = field(default_factory=dict)
     limits: dict[str, Any] = field(default_factory=dict)
@@ -153,6 +156,7 @@ def load_case(path: str | Path) -> Case:
         transmission=actuator.get("transmission"),
         log=_log(tables, plant, file),
         preprocess=read("preprocess", preprocess_keys(joints)),
+        algebraic=read("algebraic", ALGEBRAIC),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
         limits=read("limits", limits_keys(joints, drives)),

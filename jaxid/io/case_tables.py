@@ -18,6 +18,7 @@ from jaxid.io.schema import (
     number,
     rows,
     several,
+    span,
     stretch,
     text,
     whole,
@@ -26,11 +27,15 @@ from jaxid.io.schema import (
 # Names that the case file promises and this version does not have yet.
 PLANNED_PLANTS = ("flexible_axis", "micropositioning_stage", "serial_arm", "five_bar")
 PLANNED_EFFECTS = ("velocity_hysteresis", "backlash", "joint_flexibility")
-PLANNED_CONTROLLERS = ("flatness", "computed_torque", "adaptive")
+PLANNED_CONTROLLERS = ("computed_torque", "adaptive")
 METHODS = (
     "inverse_dynamics",
     "instrumental_variable",
     "algebraic",
+    "algebraic_single_time",
+    "algebraic_ratio",
+    "algebraic_sign_changed",
+    "algebraic_sign_unchanged",
     "recursive",
     "power",
     "output_error",
@@ -43,6 +48,7 @@ TOP = {
     "actuator": False,
     "log": False,
     "preprocess": False,
+    "algebraic": False,
     "controller": False,
     "sensor": False,
     "limits": False,
@@ -54,7 +60,9 @@ TOP = {
     "study": False,
 }
 # Fields of controllers that are bounded; all others may have any sign.
-_CONTROLLER_SIGNS = {"derivative_filter": "nonnegative"}
+_CONTROLLER_SIGNS = {"derivative_filter": "nonnegative", "epsilon": "positive"}
+# And fields that are no value by drive.
+_CONTROLLER_READS = {"poles": several(number("negative"), shortest=2, longest=3)}
 
 DISTURBANCE = either_text(
     inline(
@@ -73,6 +81,7 @@ PLANT: Keys = {
     "gravity": Key(number("nonnegative")),
     "units": Key(inline({"position": Key(text), "force": Key(text)})),
 }
+ALGEBRAIC: Keys = {"window": Key(span(), "from and to [s]; absent: many windows over the log")}
 STUDY: Keys = {
     "estimators": Key(several(choice((*METHODS, "discover")))),
     "hidden": Key(several(text)),
@@ -140,14 +149,16 @@ def controller_keys(kind: str, drives: int) -> Keys:
         "limit": Key(by_joint(number("positive"), drives, "drive"), "of the command"),
         "disturbance": Key(DISTURBANCE),
     }
-    shared = {field.name for field in fields(Controller)}
+    cls = CONTROLLERS[kind]
+    unstated = {field.name for field in fields(Controller)} | set(cls.of_machine)
     own = {}
-    for field in fields(CONTROLLERS[kind]):
-        if field.name not in shared:
+    for field in fields(cls):
+        if field.name not in unstated:
             required = field.default is MISSING and field.default_factory is MISSING
             sign = _CONTROLLER_SIGNS.get(field.name, "free")
             yes_or_no = field.type in (bool, "bool")
             read = flag if yes_or_no else by_joint(number(sign), drives, "drive")
+            read = _CONTROLLER_READS.get(field.name, read)
             own[field.name] = Key(read, f"it belongs to kind = '{kind}'", required)
     return {**own, **keys}
 

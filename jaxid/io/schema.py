@@ -133,12 +133,13 @@ _DEMANDS: dict[str, tuple[Callable[[float], bool], str]] = {
     "free": (lambda x: True, ""),
     "nonnegative": (lambda x: x >= 0, "is negative; it must be >= 0"),
     "positive": (lambda x: x > 0, "is not positive; it must be > 0"),
+    "negative": (lambda x: x < 0, "is not negative; it must be < 0"),
     "nonzero": (lambda x: x != 0, "is zero; it must not be 0"),
 }
 
 
 def number(sign: str = "free") -> Reader:
-    """A finite number; `sign` is "free", "nonnegative", "positive" or "nonzero"."""
+    """A finite number; `sign` is "free", "nonnegative", "positive", "negative" or "nonzero"."""
     holds, demand = _DEMANDS[sign]
 
     def read(value: Any, spot: Spot) -> float:
@@ -201,13 +202,17 @@ def choice(known: Iterable[str], planned: Iterable[str] = ()) -> Reader:
     return read
 
 
-def several(read: Reader, *, shortest: int = 1) -> Reader:
+def several(read: Reader, *, shortest: int = 1, longest: int | None = None) -> Reader:
     """A list of such values, as a tuple."""
 
     def read_list(value: Any, spot: Spot) -> tuple:
         if not isinstance(value, list) or len(value) < shortest:
             mend = f"give a list of at least {shortest} in [ ]"
-            raise spot.refuse(value, "is not a list" if value != [] else "is empty", mend)
+            short = isinstance(value, list)
+            what = f"has {count(len(value), 'entry', 'entries')}" if short else "is not a list"
+            raise spot.refuse(value, what if value != [] else "is empty", mend)
+        if longest is not None and len(value) > longest:
+            raise spot.refuse(value, f"has {len(value)} entries", f"give at most {longest}")
         return tuple(read(v, spot.entry(k)) for k, v in enumerate(value, start=1))
 
     return read_list
@@ -227,16 +232,23 @@ def by_joint(read: Reader, joints: int, what: str = "joint") -> Reader:
     return read_either
 
 
-def stretch(joints: int) -> Reader:
-    """Two numbers, the lower first, for all joints; or a list with two a joint."""
+def span() -> Reader:
+    """Two numbers, the lower first."""
     ends = several(number(), shortest=2)
 
-    def read_pair(value: Any, spot: Spot) -> tuple[float, float]:
+    def read(value: Any, spot: Spot) -> tuple[float, float]:
         pair = ends(value, spot)
         if len(pair) != 2 or not pair[0] < pair[1]:
             mend = f"give the lower end and the upper, e.g. {spot.key} = [0.0, 0.2]"
             raise spot.refuse(value, "is not a range", mend)
         return pair
+
+    return read
+
+
+def stretch(joints: int) -> Reader:
+    """Two numbers, the lower first, for all joints; or a list with two a joint."""
+    read_pair = span()
 
     def read_either(value: Any, spot: Spot) -> Any:
         if isinstance(value, list) and any(isinstance(v, list) for v in value):

@@ -15,11 +15,13 @@ from jaxid.references.family import Family, Grid, Key
 from jaxid.references.fourier import FOURIER
 from jaxid.references.moves import POINT_TO_POINT, TRAPEZOID
 from jaxid.references.multisine import MULTISINE
+from jaxid.references.quarter_sine import QUARTER_SINE
 
 __all__ = ["REFERENCES", "Family", "Key", "make_reference"]
 
 REFERENCES: dict[str, Family] = {
-    family.kind: family for family in (CSV, TRAPEZOID, BEZIER, FOURIER, MULTISINE, POINT_TO_POINT)
+    family.kind: family
+    for family in (CSV, TRAPEZOID, BEZIER, QUARTER_SINE, FOURIER, MULTISINE, POINT_TO_POINT)
 }
 
 

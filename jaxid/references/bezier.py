@@ -33,10 +33,15 @@ def bezier_curve(
     return levels[0]
 
 
+def rest_to_rest(start: float, end: float) -> Float[np.ndarray, " points"]:
+    """Control points of a move from rest to rest."""
+    return np.repeat([start, end], [_AT_START, _AT_END])
+
+
 def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
     points = values["points"]
     if len(points) == 2:
-        points = np.repeat(points, [_AT_START, _AT_END])
+        points = rest_to_rest(*points)
     rest = grid.duration - values["start_time"]
     if rest <= 0:
         mend = f"start before {grid.duration:g} s"

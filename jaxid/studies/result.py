@@ -168,10 +168,11 @@ def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
 
     Returns:
         Rows with `runs` and `used` (converged, and the parameter told); `failed`, the part that is
-        not; and of those used `bias` (mean error), `bias_std` (its own deviation), `spread`
+        not; of those used `bias` (mean error), `bias_std` (its own deviation), `spread`
         (standard deviation of the error), `rmse`, `std` (mean of those reported), `bound`
         (Cramer-Rao), and `coverage_68`, `coverage_95`: the part of intervals of that nominal coverage
-        that hold the truth. NaN where there is nothing to say it of.
+        that hold the truth. NaN where there is nothing to say it of, as of an estimator that
+        gives no standard deviation.
     """
     rows = []
     for estimator, setting, whole in cells(table):
@@ -179,7 +180,7 @@ def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
             own = whole.isel(parameter=k)
             truth, std = own["truth"].values, own["std"].values
             error = own["estimate"].values - truth
-            used = own["converged"].values.astype(bool) & np.isfinite(error) & np.isfinite(std)
+            used = own["converged"].values.astype(bool) & np.isfinite(error)
             rows.append({
                 "estimator": estimator, **setting, "parameter": str(name),
                 "unit": str(own["unit"].values), "true": float(np.mean(truth)),
@@ -195,10 +196,11 @@ def _moments(error: np.ndarray, std: np.ndarray) -> dict[str, float]:
         return dict.fromkeys(("bias", "bias_std", "spread", "rmse", "std", *coverages), np.nan)
     spread = float(np.std(error, ddof=1)) if len(error) > 1 else np.nan
     widths = {c: scipy.stats.norm.ppf(0.5 + 0.5 * c) for c in COVERAGES}
+    held = {c: np.where(np.isfinite(std), np.abs(error) <= w * std, np.nan) for c, w in widths.items()}
     return {
         "bias": float(np.mean(error)), "bias_std": spread / np.sqrt(len(error)), "spread": spread,
         "rmse": float(np.sqrt(np.mean(error**2))), "std": float(np.mean(std)),
-        **{f"coverage_{_percent(c)}": float(np.mean(np.abs(error) <= w * std)) for c, w in widths.items()},
+        **{f"coverage_{_percent(c)}": float(np.mean(x)) for c, x in held.items()},
     }
 
 

@@ -1,0 +1,325 @@
+"""Algebraic identification over one window of a log: least squares, and the paper's four other forms.
+
+All work on the rows of `jaxid.estimators.online`: of each joint and sample the balance, weighted by
+(t - t0)^2 and integrated twice, as columns of the unknowns and the value b where they are zero.
+
+Source:
+    Wi, Ri, Ri & Ri, (14)-(25), after Beltran-Carbajal & Silva-Navarro (2015). As printed, (18) lacks
+    its subscripts and (19) its bars: the integrals are of |Delta_j| and |Delta|, which hides signs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.integrate
+from jaxtyping import Bool, Float
+
+from jaxid.errors import InputError
+from jaxid.estimators.online import Online, window_rows
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Solve, Steps
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.parameters import Free
+from jaxid.precision import Precision, assess
+from jaxid.preprocess import Prepared
+
+# A matrix whose scaled condition is worse than this tells nothing at noise of rounding.
+_SINGULAR = 1e12
+# Shortest interval of one direction, in samples.
+_SHORTEST = 12
+
+Window = tuple[float, float]
+# Rows of one joint: samples by own unknowns, and b.
+Rows = tuple[Float[np.ndarray, "time k"], Float[np.ndarray, " time"]]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """The part of a log that a window covers.
+
+    Args:
+        position, command: Readings and command there.
+        online: The recursion that gives the rows.
+        moving: Which intervals before each sample are faster than rest, (time, n).
+        direction: Sign of the velocity of those, (time, n).
+    """
+
+    position: Float[np.ndarray, "time n"]
+    command: Float[np.ndarray, "time m"]
+    online: Online
+    moving: Bool[np.ndarray, "time n"]
+    direction: Float[np.ndarray, "time n"]
+
+    @classmethod
+    def of(cls, machine: Machine, log: Log, data: Prepared, window: Window | None) -> Stretch:
+        """Cut a window out of a log; with a stated cut-off its positions are the filtered ones.
+
+        Raises:
+            InputError: If the window holds too few samples, the command is not held, or the balance
+                is not linear in the unknowns.
+        """
+        if log.hold != "zero_order":
+            raise InputError(
+                f"the command is {log.hold}, not held between samples", where=log.source,
+                mend="leave out [algebraic] window, or use inverse_dynamics",
+            )
+        start, end = window or (log.time[0], log.time[-1])
+        inside = (log.time >= start - 1e-9) & (log.time <= end + 1e-9)
+        if inside.sum() < 4 * _SHORTEST:
+            raise InputError(
+                f"[algebraic] window = [{start:g}, {end:g}] s holds {int(inside.sum())} samples",
+                where=log.source, mend=f"let it hold at least {4 * _SHORTEST}",
+            )
+        recipe = data.recipe
+        position = (data.q if recipe.keeps_reversals else log.position)[inside]
+        velocity = np.diff(data.q[inside], axis=0, prepend=data.q[inside][:1]) / log.period
+        rest, fast = np.asarray(recipe.rest_velocity), np.abs(velocity).max(axis=0)
+        moving = np.abs(velocity) >= rest
+        if not moving.any():
+            raise InputError(
+                f"nothing moves between {start:g} and {end:g} s", where=log.source,
+                mend="choose another [algebraic] window",
+            )
+        online = Online.of(machine, log.period, rest, fast)
+        return cls(position, log.force[inside], online, moving, np.sign(velocity) * moving)
+
+    def rows(self, restart: Bool[np.ndarray, "time n"]) -> Solve:
+        """The rows, windows beginning where it says."""
+        return Solve(window_rows, (self.online, self.position, self.command, restart))
+
+    def ages(self, restart: Bool[np.ndarray, "time n"]) -> Float[np.ndarray, "time n"]:
+        """Time since the start of each joint's window [s]."""
+        index = np.arange(len(restart))[:, None]
+        last = np.maximum.accumulate(np.where(restart, index, 0), axis=0)
+        return self.online.period * (index - last)
+
+
+def least_squares_steps(
+    machine: Machine, log: Log, data: Prepared, window: Window | None
+) -> Steps[Estimate]:
+    """All rows of a window at once; dry friction is a column like any other."""
+    cut = Stretch.of(machine, log, data, window)
+    _, rows = yield cut.rows(~cut.moving)
+    rows = np.asarray(rows)
+    counts = np.any(rows != 0, axis=-1)
+    jacobian, b = rows[..., :-1], rows[..., -1]
+    flat, values = jacobian[counts], b[counts]
+    scale = np.linalg.norm(flat, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    theta = -np.linalg.lstsq(flat / scale, values, rcond=1e-13)[0] / scale
+    e = jacobian @ theta + b
+    names = machine.parameters.names
+    size = float(np.linalg.norm(values))
+    precision = assess(names, jacobian, e, counts, size, np.where(theta != 0, theta, 1.0))
+    resting = int(counts.size - counts.sum())
+    notes = (f"one window of {log.period * (len(rows) - 1):.3g} s; {resting} rows of rest left out",)
+    return _estimate("algebraic", machine, theta, precision, np.where(counts, e, np.nan), notes)
+
+
+def single_time(rows: Rows, period: float) -> np.ndarray:
+    """Solve the rows and their iterated integrals at the window's end, (15)-(17)."""
+    matrix, b = (x[-1] for x in _iterated(*rows, period))
+    return _solved(matrix, b)
+
+
+def ratio(rows: Rows, period: float) -> np.ndarray:
+    """Twice integrated |Delta_j| over twice integrated |Delta|, (18)-(19): signs are lost."""
+    matrix, b = _iterated(*rows, period)
+    whole = np.abs(np.linalg.det(matrix))
+    if not np.max(whole) > 0:
+        return np.full(matrix.shape[-1], np.nan)
+    parts = []
+    for j in range(matrix.shape[-1]):
+        other = matrix.copy()
+        other[..., j] = -b
+        parts.append(np.abs(np.linalg.det(other)))
+    twice = [_integral(_integral(x, period), period)[-1] for x in (*parts, whole)]
+    return np.array(twice[:-1]) / twice[-1]
+
+
+def without_friction(one: Rows, other: Rows, column: int, period: float) -> np.ndarray:
+    """Two intervals, the level of friction eliminated between them, (20)-(25).
+
+    The column of friction carries the direction of motion: what is a sum where directions differ and
+    a difference where they do not is one formula.
+
+    Args:
+        one, other: Rows of the two intervals.
+        column: Of friction among the unknowns.
+        period: Sampling time [s].
+    """
+    own = [k for k in range(one[0].shape[1]) if k != column]
+    ends = [tuple(x[-1] for x in _iterated(*rows, period)) for rows in (one, other)]
+    (a1, b1), (a2, b2) = ((a[: len(own)], b[: len(own)]) for a, b in ends)
+    d1, d2 = a1[:, column], a2[:, column]
+    matrix = d2[:, None] * a1[:, own] - d1[:, None] * a2[:, own]
+    theta = np.zeros(len(own) + 1)
+    theta[own] = _solved(matrix, d2 * b1 - d1 * b2)
+    levels = [-(a[0, own] @ theta[own] + b[0]) / a[0, column] for a, b in ((a1, b1), (a2, b2))]
+    theta[column] = np.mean(levels)
+    return theta
+
+
+def _iterated(columns: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows at every sample and their integrals, as many as there are unknowns, (16)."""
+    levels = [(columns, b)]
+    for _ in range(columns.shape[1] - 1):
+        levels.append(tuple(_integral(x, period) for x in levels[-1]))
+    return np.stack([a for a, _ in levels], axis=1), np.stack([b for _, b in levels], axis=1)
+
+
+def _integral(x: np.ndarray, period: float) -> np.ndarray:
+    return scipy.integrate.cumulative_simpson(x, dx=period, axis=0, initial=0.0)
+
+
+def _solved(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Solve matrix @ theta = -b, scaled by rows and columns; NaN where it is singular."""
+    across = np.abs(matrix).max(axis=1, keepdims=True)
+    if not np.all(across > 0):
+        return np.full(matrix.shape[1], np.nan)
+    scaled = matrix / across
+    down = np.abs(scaled).max(axis=0)
+    if not np.all(down > 0) or np.linalg.cond(scaled / down) > _SINGULAR:
+        return np.full(matrix.shape[1], np.nan)
+    return np.linalg.solve(scaled / down, -b / across[:, 0]) / down
+
+
+def joint_by_joint(form: Callable[[Rows, float], np.ndarray], name: str) -> Callable[..., Steps[Estimate]]:
+    """An estimator that solves each joint's rows by themselves, from its start to its first rest.
+
+    What two joints share (a spring) is the mean of both. No standard deviation is given.
+    """
+
+    def steps(machine: Machine, log: Log, data: Prepared, window: Window | None) -> Steps[Estimate]:
+        cut = Stretch.of(machine, log, data, window)
+        restart = ~cut.moving
+        _, rows = yield cut.rows(restart)
+        ages = cut.ages(restart)
+        found = []
+        for i in range(rows.shape[1]):
+            begin, end = _first_run(cut.moving[:, i])
+            part = slice(begin, end)
+            # Of what came before a row counted, nothing is known: it is zero.
+            own, values = _own(np.asarray(rows)[part, i], ages[part, i])
+            found.append((own, form(values, log.period) if end - begin >= _SHORTEST else None))
+        return _merged(name, machine, found, log)
+
+    return steps
+
+
+def two_intervals(changed: bool, name: str) -> Callable[..., Steps[Estimate]]:
+    """An estimator that eliminates friction between two intervals of one direction each.
+
+    Args:
+        changed: Take one interval before a reversal and one after it; else both halves of the first.
+        name: Of the method.
+    """
+
+    def steps(machine: Machine, log: Log, data: Prepared, window: Window | None) -> Steps[Estimate]:
+        cut = Stretch.of(machine, log, data, window)
+        pairs = [_intervals(d, changed) for d in cut.direction.T]
+        answers = []
+        for which in (0, 1):
+            restart = np.zeros(cut.moving.shape, bool)
+            restart[0] = True
+            for i, pair in enumerate(pairs):
+                restart[pair[which][0] if pair else 0, i] = True
+            answers.append((np.asarray((yield cut.rows(restart))[1]), cut.ages(restart)))
+        found = []
+        for i, pair in enumerate(pairs):
+            if pair is None:
+                found.append(((), None))
+                continue
+            both = [
+                _own(rows[a:b, i], ages[a:b, i]) for (rows, ages), (a, b) in zip(answers, pair, strict=True)
+            ]
+            own = both[0][0]
+            column = [k for k, j in enumerate(own) if _is_friction(machine, machine.parameters.free[j])]
+            if len(column) != 1 or both[1][0] != own:
+                found.append((own, None))
+                continue
+            theta = without_friction(both[0][1], both[1][1], column[0], log.period)
+            found.append((own, theta))
+        return _merged(name, machine, found, log)
+
+    return steps
+
+
+def _is_friction(machine: Machine, free: Free) -> bool:
+    return free.path[0] == "effects" and machine.plant.effects[free.path[1]].kind == "coulomb_friction"
+
+
+def _own(rows: np.ndarray, ages: np.ndarray) -> tuple[tuple[int, ...], Rows]:
+    """Unknowns that stand in a joint's rows, and these as the double integrals that they are."""
+    whole = rows * ages[:, None] ** 2
+    size = np.abs(whole).max(axis=0, initial=0.0)
+    own = tuple(int(k) for k in np.flatnonzero(size[:-1] > 0))
+    return own, (whole[:, list(own)], whole[:, -1])
+
+
+def _first_run(flags: np.ndarray) -> tuple[int, int]:
+    """From the sample before the first true entry to the last of that run."""
+    if not flags.any():
+        return 0, 0
+    begin = int(np.argmax(flags))
+    rest = np.flatnonzero(~flags[begin:])
+    return max(begin - 1, 0), begin + int(rest[0]) if rest.size else len(flags)
+
+
+def _intervals(direction: np.ndarray, changed: bool) -> tuple[tuple[int, int], ...] | None:
+    """Two stretches of samples in one direction each; None where there are none."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0.0], direction, [0.0]])))
+    runs = [(a, b, direction[a]) for a, b in zip(edges[:-1], edges[1:], strict=True) if direction[a] != 0]
+    if not changed:
+        long = [(a, b) for a, b, _ in runs if b - a >= 2 * _SHORTEST]
+        if not long:
+            return None
+        a, b = long[0]
+        middle = (a + b) // 2
+        return (max(a - 1, 0), middle), (middle, b)
+    long = [r for r in runs if r[1] - r[0] >= _SHORTEST]
+    for one, other in zip(long[:-1], long[1:], strict=True):
+        if one[2] != other[2]:
+            return (max(one[0] - 1, 0), one[1]), (other[0], other[1])
+    return None
+
+
+def _merged(name: str, machine: Machine, found: list[tuple], log: Log) -> Estimate:
+    """One estimate of what each joint says."""
+    p = len(machine.parameters.free)
+    total, times = np.zeros(p), np.zeros(p)
+    for own, theta in found:
+        if theta is not None and np.all(np.isfinite(theta)):
+            total[list(own)] += theta
+            times[list(own)] += 1
+    told = times > 0
+    if not told.any():
+        raise InputError(
+            "no joint has an interval that its equations could be solved on", where=log.source,
+            mend="take a longer window, or `algebraic`",
+        )
+    theta = np.where(told, total / np.maximum(times, 1), machine.parameters.guess)
+    unknown = np.full((p, p), np.nan)
+    blind = [{n: 1.0} for n, t in zip(machine.parameters.names, told, strict=True) if not t]
+    precision = Precision(unknown, told, blind, np.full(p, np.nan))
+    left = [k + 1 for k, (_, theta) in enumerate(found) if theta is None or not np.all(np.isfinite(theta))]
+    notes = ["this form gives no standard deviation"]
+    if left:
+        notes.append(f"no equations of joint {', '.join(map(str, left))} could be solved")
+    return _estimate(name, machine, theta, precision, np.full((1, len(found)), np.nan), tuple(notes))
+
+
+def _estimate(
+    name: str, machine: Machine, theta: np.ndarray, precision: Precision, e: np.ndarray,
+    notes: tuple[str, ...],
+) -> Estimate:
+    good = bool(np.all(np.isfinite(theta)))
+    return Estimate(
+        method=name, machine=machine.with_estimate(theta), theta=theta, precision=precision,
+        converged=good, message="solved" if good else "the equations are singular", residual=e,
+        samples=int(np.isfinite(e).sum()), steps=1, notes=notes,
+    )
