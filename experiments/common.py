@@ -11,13 +11,18 @@ from pathlib import Path
 from jaxid.io.tables import aligned
 
 
-def arguments(doc: str, default: str) -> argparse.Namespace:
+def parser_of(doc: str, default: str) -> argparse.ArgumentParser:
     """Command line of an experiment."""
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("-o", metavar="DIR", type=Path, default=Path(default), help=f"default: {default}")
-    return parser.parse_args()
+    return parser
+
+
+def arguments(doc: str, default: str) -> argparse.Namespace:
+    """What was asked on the command line of an experiment."""
+    return parser_of(doc, default).parse_args()
 
 
 def case_with_data(folder: Path, cases: tuple[str, ...], data: str, files: tuple[str, ...]) -> Path:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from jaxid.io.case import load_case as load_case
     from jaxid.io.log import Log as Log
     from jaxid.io.log import read_log as read_log
+    from jaxid.live import Live as Live
+    from jaxid.live import follow as follow
     from jaxid.plants import PLANTS as PLANTS
     from jaxid.session import open_session as open_session
     from jaxid.studies.study import study as study
@@ -30,6 +32,8 @@ _HOMES = {
     "load_case": ("jaxid.io.case", "load_case"),
     "read_log": ("jaxid.io.log", "read_log"),
     "Log": ("jaxid.io.log", "Log"),
+    "Live": ("jaxid.live", "Live"),
+    "follow": ("jaxid.live", "follow"),
     "open_session": ("jaxid.session", "open_session"),
     "InputError": ("jaxid.errors", "InputError"),
     "EFFECTS": ("jaxid.effects", "EFFECTS"),

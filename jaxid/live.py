@@ -1,0 +1,167 @@
+"""A case's controller one tick at a time, for a machine or a simulator that is not jaxid's.
+
+With `identify` it finds the unknowns in the first instants, algebraically, and goes on with what it found.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.controllers import Controller, Tick
+from jaxid.errors import InputError
+from jaxid.estimators.online import Memory, Online, Told
+from jaxid.io.case import Case, load_case
+from jaxid.io.log import Log
+from jaxid.machine import Machine, build_machine
+from jaxid.virtual import Scene
+
+# A joint is taken to rest below this part of its reference's largest speed, and below so many
+# standard deviations of a difference of two readings.
+_REST = 5e-3
+_NOISE = 5.0
+
+
+class Live:
+    """The loop of a case without its plant: readings in, commands out.
+
+    Args:
+        case: The case, or its file; it needs [controller], [reference] and [simulation].
+        identify: Identify the unknowns on-line and, once all may be trusted, put what was found into
+            the model of a controller that has one.
+        tolerance: Of that trust (see `jaxid.estimators.online.Told`).
+
+    Attributes:
+        told: What the rows so far say; None without `identify`, and before the second tick.
+        switched: Tick from which on the controller knows what was found; None: not yet.
+
+    Raises:
+        InputError: If the case has no controller or reference, or asks for what cannot be identified
+            on-line.
+    """
+
+    def __init__(self, case: Case | str | Path, *, identify: bool = False, tolerance: float = 0.05):
+        case = case if isinstance(case, Case) else load_case(case)
+        scene = Scene.of(case)
+        if scene.machine.controller is None:
+            raise InputError("there is no loop", where=str(case.path), mend="add a [controller]")
+        self.machine = build_machine(case, period=scene.drive.period)
+        self.reference: Float[np.ndarray, "ticks m"] = scene.signal
+        self.period: float = scene.drive.period
+        self.told: Told | None = None
+        self.switched: int | None = None
+        self._controller = scene.machine.controller
+        path = self._controller.path(jnp.asarray(self.reference))
+        self._path = jax.tree.map(np.asarray, path)
+        self._driven = self.machine.plant.driven(case.plant.joints)
+        self._tick = 0
+        self._memory: object = None
+        self._last: np.ndarray | None = None
+        self._online, self._rows = None, None
+        if identify:
+            if "model" not in self._controller.of_machine:
+                kind = (case.controller or {})["kind"]
+                raise InputError(
+                    f"a controller of kind {kind!r} has no model to put what is found into",
+                    where=str(case.path), mend="take kind = 'flatness'",
+                )
+            self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
+
+    def command(self, position: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        """The command to hold until the next tick.
+
+        Args:
+            position: Readings of all joints [m or rad].
+
+        Raises:
+            InputError: If the reference has ended.
+        """
+        if self._tick >= len(self.reference):
+            raise InputError(
+                f"the reference ends after {len(self.reference)} ticks",
+                mend="let [simulation] duration be longer",
+            )
+        position = np.asarray(position, dtype=np.float64)
+        tick = Tick(position, jax.tree.map(lambda x: x[self._tick], self._path), self._driven)
+        if self._tick == 0:
+            self._memory = self._controller.start(tick, np.zeros_like(position))
+        if self._online is not None and self.switched is None:
+            self._identify(position)
+        u, self._memory = _command(self._controller, tick, self._memory)
+        self._tick, self._last = self._tick + 1, np.asarray(u)
+        return self._last
+
+    def _identify(self, position: np.ndarray) -> None:
+        if self._rows is None:
+            self._rows = self._online.start(jnp.asarray(position))
+            return
+        self._rows, told = _learned(self._online, self._rows, position, self._last)
+        self.told = jax.tree.map(np.asarray, told)
+        if self.told.trusted.all():
+            model = self.machine.with_estimate(self.told.theta).plant
+            like = lambda new, old: jnp.asarray(new, dtype=jnp.asarray(old).dtype)
+            model = jax.tree.map(like, model, self._controller.model)
+            self._controller = eqx.tree_at(lambda c: c.model, self._controller, model)
+            self.switched = self._tick
+
+
+def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> Told:
+    """What the on-line estimator tells at every sample of a log but the first, (time, p) each.
+
+    Args:
+        case: The case, or its file.
+        log: The log; its command is held between samples.
+        tolerance: Of trust (see `jaxid.estimators.online.Told`).
+
+    Raises:
+        InputError: If the case asks for what cannot be identified on-line.
+    """
+    case = case if isinstance(case, Case) else load_case(case)
+    machine = build_machine(case, period=log.period)
+    fast = np.abs(np.diff(log.position, axis=0)).max(axis=0) / log.period
+    rest = np.maximum(_REST * fast, _noise(machine, log.position.shape[1]) / log.period)
+    online = Online.of(machine, log.period, rest, fast, tolerance)
+    return jax.tree.map(np.asarray, _followed(online, log.position, log.force))
+
+
+@eqx.filter_jit
+def _followed(online: Online, position: Array, command: Array) -> Told:
+    def step(memory: Memory, now: tuple) -> tuple[Memory, Told]:
+        memory, _ = online.update(memory, *now)
+        return memory, online.told(memory)
+
+    return jax.lax.scan(step, online.start(position[0]), (position[1:], command[:-1]))[1]
+
+
+@eqx.filter_jit
+def _command(controller: Controller, tick: Tick, memory: object) -> tuple:
+    return controller.command(tick, memory, jnp.zeros(1))
+
+
+@eqx.filter_jit
+def _learned(online: Online, memory: Memory, position: Array, command: Array) -> tuple[Memory, Told]:
+    memory, _ = online.update(memory, position, command)
+    return memory, online.told(memory)
+
+
+def _online(
+    machine: Machine, reference: np.ndarray, driven: tuple[int, ...], period: float, tolerance: float
+) -> Online:
+    speed = np.abs(np.diff(reference, axis=0)).max(axis=0) / period
+    joints = machine.plant.joints
+    fast = np.full(joints, speed.max())
+    fast[list(driven)] = np.where(speed > 0, speed, speed.max())
+    rest = np.maximum(_REST * fast, _noise(machine, joints) / period)
+    return Online.of(machine, period, rest, fast, tolerance)
+
+
+def _noise(machine: Machine, joints: int) -> np.ndarray:
+    """Difference of two readings that noise alone hardly exceeds."""
+    stated = machine.sensor.position_std
+    std = np.zeros(joints) if stated is None else np.broadcast_to(np.asarray(stated), joints)
+    return _NOISE * np.sqrt(2) * std
