@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxid.model import Effect, Plant, parameters_of
 from jaxid.units import Units
@@ -128,6 +128,29 @@ def _sign_floor(f: Free) -> float:
     if f.sign == "free":
         return -np.inf
     return 0.0 if f.sign == "nonnegative" else _POSITIVE_FLOOR * abs(f.guess)
+
+
+def colours(enters: Bool[np.ndarray, "n p"]) -> tuple[int, ...]:
+    """A number for each unknown, such that no two of one number stand in one balance.
+
+    Each takes the first that is free in all balances in which it stands.
+    """
+    taken: list[np.ndarray] = []
+    out = []
+    for rows in enters.T:
+        k = next((k for k, t in enumerate(taken) if not np.any(t & rows)), len(taken))
+        if k == len(taken):
+            taken.append(np.zeros_like(rows))
+        taken[k] = taken[k] | rows
+        out.append(k)
+    return tuple(out)
+
+
+def seeds(colours: tuple[int, ...]) -> Float[np.ndarray, "p c"]:
+    """Directions in which a derivative is taken, one a colour."""
+    out = np.zeros((len(colours), max(colours, default=-1) + 1))
+    out[np.arange(len(colours)), list(colours)] = 1.0
+    return out
 
 
 def free_effect(

@@ -201,7 +201,9 @@ def assess(
     meat = np.zeros_like(normal)
     for i in range(residual.shape[1]):
         noise = NoiseModel.fit(residual[:, i], counts[:, i])
-        meat += sandwich(rows[:, i] / norm, noise)
+        # Of a chain of many masses a balance holds few of the unknowns.
+        own = np.flatnonzero(np.any(rows[:, i] != 0, axis=0))
+        meat[np.ix_(own, own)] += sandwich(rows[:, i, own] / norm[own], noise)
     values, vectors = np.linalg.eigh(normal)
     spread = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", vectors, meat, vectors), 0.0))
     safe = np.maximum(values, 1e-300)

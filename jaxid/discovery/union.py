@@ -16,7 +16,7 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.inverse_dynamics import ForceData, sharpened
 from jaxid.machine import Machine
 from jaxid.model import Effect, Plant, Scales, carries_force, parameters_of, port_motion
-from jaxid.parameters import Free, Parameters, free_effect, label
+from jaxid.parameters import Free, Parameters, colours, free_effect, label
 from jaxid.preprocess import Prepared
 
 
@@ -83,7 +83,7 @@ def build_union(machine: Machine, data: Prepared, own: Sequence[type[Effect]] = 
             candidates.append(_candidate(cls, where, port, index, scales[port]))
     union = machine.with_plant(sharpened(plant, data), parameters)
     enters = _enters(plant, parameters, data.q.shape[1], data.force.shape[1])
-    return Union(union, base, tuple(candidates), enters, _colours(enters))
+    return Union(union, base, tuple(candidates), enters, colours(enters))
 
 
 def _enters(
@@ -102,19 +102,6 @@ def _enters(
         rows = [*plant.reached(effect.port, joints), *(undriven if effect.in_drive else [])]
         enters[:, k] = np.isin(np.arange(joints), rows)
     return enters
-
-
-def _colours(enters: Bool[np.ndarray, "n p"]) -> tuple[int, ...]:
-    """The first number that is free in all balances in which an unknown stands."""
-    taken: list[np.ndarray] = []
-    colours = []
-    for rows in enters.T:
-        k = next((k for k, t in enumerate(taken) if not np.any(t & rows)), len(taken))
-        if k == len(taken):
-            taken.append(np.zeros_like(rows))
-        taken[k] = taken[k] | rows
-        colours.append(k)
-    return tuple(colours)
 
 
 def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> bool:

@@ -18,7 +18,7 @@ from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.machine import Machine
 from jaxid.model import Effect, ParameterInfo, Plant, carries_force, parameters_of
-from jaxid.parameters import Free, scatter
+from jaxid.parameters import Free, scatter, seeds
 from jaxid.precision import Precision, assess
 from jaxid.preprocess import Prepared
 from jaxid.readings import residual_along
@@ -79,9 +79,7 @@ def force_and_columns(
         colours: Column of the result in which each unknown's is; those that share one must not enter
             the balance of the same joint. Absent: each has its own.
     """
-    own = range(theta.size) if colours is None else colours
-    shared = np.zeros((theta.size, max(own, default=-1) + 1))
-    shared[np.arange(theta.size), list(own)] = 1.0
+    shared = seeds(tuple(range(theta.size)) if colours is None else colours)
 
     def residual(step: Array) -> tuple[Array, Array]:
         moved = theta + (step if colours is None else shared @ step)

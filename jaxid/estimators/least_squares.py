@@ -198,4 +198,20 @@ def _step(
     # A trace of damping keeps directions that the data cannot tell where they are.
     matrix = normal + jnp.diag(jnp.where(free, damping + 1e-13, 1.0))
     gradient = jnp.where(free, gradient / scale, 0.0)
-    return -jnp.linalg.solve(matrix, gradient) / scale
+    return -_solved(matrix, gradient) / scale
+
+
+def _solved(matrix: Float[Array, "p p"], b: Float[Array, " p"]) -> Float[Array, " p"]:
+    """Solve with a positive definite matrix by Gauss and Jordan's elimination, without pivoting.
+
+    Not LAPACK's: a batch of its factorisations waits for threads of the pool on which it runs, and two
+    batches at once, as studies have them, then wait for each other for ever (jaxlib 0.10.2).
+    """
+
+    def eliminate(k: Array, rows: Array) -> Array:
+        pivot = rows[k] / rows[k, k]
+        rows = rows - rows[:, k, None] * pivot
+        return rows.at[k].set(pivot)
+
+    rows = jnp.concatenate([matrix, b[:, None]], axis=1)
+    return jax.lax.fori_loop(0, b.size, eliminate, rows)[:, -1]

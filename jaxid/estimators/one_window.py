@@ -31,6 +31,9 @@ from jaxid.preprocess import Prepared
 _SINGULAR = 1e12
 # Shortest interval of one direction, in samples.
 _SHORTEST = 12
+# Samples for which a joint must have moved on end, for its rows to count: in less, start-up errors
+# of the quadrature are as large as what damping and springs do.
+_LONG_ENOUGH = 40
 
 Window = tuple[float, float]
 # Rows of one joint: samples by own unknowns, and b.
@@ -77,14 +80,17 @@ class Stretch:
         recipe = data.recipe
         position = (data.q if recipe.keeps_reversals else log.position)[inside]
         velocity = np.diff(data.q[inside], axis=0, prepend=data.q[inside][:1]) / log.period
-        rest, fast = np.asarray(recipe.rest_velocity), np.abs(velocity).max(axis=0)
-        moving = np.abs(velocity) >= rest
-        if not moving.any():
+        fast = np.abs(velocity).max(axis=0)
+        if not fast.any():
             raise InputError(
                 f"nothing moves between {start:g} and {end:g} s", where=log.source,
                 mend="choose another [algebraic] window",
             )
-        online = Online.of(machine, log.period, rest, fast)
+        online = Online.of(machine, log.period, np.asarray(recipe.rest_velocity), fast)
+        rest = online.rest_velocity
+        # A filter rings into a rest; readings that do not differ do not move.
+        raw = np.pad(log.position[inside], ((2, 2), (0, 0)), mode="edge")
+        moving = (np.abs(velocity) > rest) & (np.abs(raw[4:] - raw[:-4]) / (4 * log.period) > 0.5 * rest)
         return cls(position, log.force[inside], online, moving, np.sign(velocity) * moving)
 
     def rows(self, restart: Bool[np.ndarray, "time n"]) -> Solve:
@@ -104,16 +110,25 @@ def least_squares_steps(
     """All rows of a window at once; dry friction is a column like any other."""
     cut = Stretch.of(machine, log, data, window)
     _, rows = yield cut.rows(~cut.moving)
-    rows = np.asarray(rows)
+    rows, owner, p = np.asarray(rows), cut.online.owner, len(machine.parameters.free)
+    rows = np.where(_lasting(cut.moving, min(_LONG_ENOUGH, len(rows) // 2))[..., None], rows, 0.0)
     counts = np.any(rows != 0, axis=-1)
-    jacobian, b = rows[..., :-1], rows[..., -1]
-    flat, values = jacobian[counts], b[counts]
+    jacobian, b = np.zeros((*counts.shape, p)), rows[..., -1]
+    triangles = []
+    for i in range(len(owner)):
+        own = owner[i] < p
+        jacobian[:, i, owner[i][own]] = rows[:, i, :-1][:, own]
+        # Of a joint's rows their triangle says all, in its own unknowns alone.
+        short = np.linalg.qr(np.concatenate([rows[:, i, :-1][:, own], b[:, i, None]], axis=1), mode="r")
+        triangles.append(np.zeros((len(short), p + 1)))
+        triangles[-1][:, [*owner[i][own], p]] = short
+    flat, values = np.split(np.concatenate(triangles), [p], axis=1)
     scale = np.linalg.norm(flat, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    theta = -np.linalg.lstsq(flat / scale, values, rcond=1e-13)[0] / scale
+    theta = -np.linalg.lstsq(flat / scale, values[:, 0], rcond=1e-13)[0] / scale
     e = jacobian @ theta + b
     names = machine.parameters.names
-    size = float(np.linalg.norm(values))
+    size = float(np.linalg.norm(b[counts]))
     precision = assess(names, jacobian, e, counts, size, np.where(theta != 0, theta, 1.0))
     resting = int(counts.size - counts.sum())
     notes = (f"one window of {log.period * (len(rows) - 1):.3g} s; {resting} rows of rest left out",)
@@ -204,7 +219,7 @@ def joint_by_joint(form: Callable[[Rows, float], np.ndarray], name: str) -> Call
             begin, end = _first_run(cut.moving[:, i])
             part = slice(begin, end)
             # Of what came before a row counted, nothing is known: it is zero.
-            own, values = _own(np.asarray(rows)[part, i], ages[part, i])
+            own, values = _own(cut.online, i, np.asarray(rows)[part, i], ages[part, i])
             found.append((own, form(values, log.period) if end - begin >= _SHORTEST else None))
         return _merged(name, machine, found, log)
 
@@ -235,11 +250,12 @@ def two_intervals(changed: bool, name: str) -> Callable[..., Steps[Estimate]]:
                 found.append(((), None))
                 continue
             both = [
-                _own(rows[a:b, i], ages[a:b, i]) for (rows, ages), (a, b) in zip(answers, pair, strict=True)
+                _own(cut.online, i, rows[a:b, i], ages[a:b, i])
+                for (rows, ages), (a, b) in zip(answers, pair, strict=True)
             ]
             own = both[0][0]
             column = [k for k, j in enumerate(own) if _is_friction(machine, machine.parameters.free[j])]
-            if len(column) != 1 or both[1][0] != own:
+            if len(column) != 1:
                 found.append((own, None))
                 continue
             theta = without_friction(both[0][1], both[1][1], column[0], log.period)
@@ -253,12 +269,24 @@ def _is_friction(machine: Machine, free: Free) -> bool:
     return free.path[0] == "effects" and machine.plant.effects[free.path[1]].kind == "coulomb_friction"
 
 
-def _own(rows: np.ndarray, ages: np.ndarray) -> tuple[tuple[int, ...], Rows]:
+def _own(
+    online: Online, joint: int, rows: np.ndarray, ages: np.ndarray
+) -> tuple[tuple[int, ...], Rows]:
     """Unknowns that stand in a joint's rows, and these as the double integrals that they are."""
     whole = rows * ages[:, None] ** 2
-    size = np.abs(whole).max(axis=0, initial=0.0)
-    own = tuple(int(k) for k in np.flatnonzero(size[:-1] > 0))
-    return own, (whole[:, list(own)], whole[:, -1])
+    columns = [c for c, k in enumerate(online.owner[joint]) if k < online.guess.size]
+    own = tuple(int(online.owner[joint, c]) for c in columns)
+    return own, (whole[:, columns], whole[:, -1])
+
+
+def _lasting(flags: np.ndarray, length: int) -> np.ndarray:
+    """Only those runs of flags that last so many samples."""
+    out = np.zeros_like(flags)
+    for i, column in enumerate(flags.T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]]).astype(int)))
+        for start, end in edges.reshape(-1, 2):
+            out[start:end, i] = end - start >= length
+    return out
 
 
 def _first_run(flags: np.ndarray) -> tuple[int, int]:

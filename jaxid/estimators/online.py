@@ -16,17 +16,19 @@ the columns of the unknowns, are derivatives of the plant's own balance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import linear_unknowns
 from jaxid.machine import Machine
 from jaxid.model import Plant
-from jaxid.parameters import scatter
+from jaxid.parameters import Parameters, colours, scatter, seeds
 
 # Adams-Moulton weights on the newest sample and up to three before it, by how many there are.
 _WEIGHTS = np.array(
@@ -35,6 +37,8 @@ _WEIGHTS = np.array(
 )  # fmt: skip
 # Samples after the start of a window before its rows count: so many hold next to nothing.
 _FEWEST = 5
+# Part of a joint's largest velocity below which it rests, at least.
+_LEAST = 1e-6
 # Relative to the largest, below this an eigenvalue of the scaled normal matrix is rounding.
 _ROUNDING = 1e-14
 
@@ -73,10 +77,10 @@ class Memory(eqx.Module):
         since: Samples since the start of each joint's window, (n,).
         position: The last reading, (n,).
         single: Integrals of q, t q, t^2 q (n, n each: the clock's joint, then the coordinate), of t^2
-            times the smooth part of the balance (n, p + 1), and of p and t p.
+            times the smooth part of the balance (n, c + 1), and of p and t p.
         double: Integrals of the first, second, fourth and fifth of these.
         held: Single integral of what is held between samples, and the double one, p; exact.
-        normal: Sum of the rows' outer products, (p + 1, p + 1).
+        normal: Sum of the outer products of each joint's rows, (n, c + 1, c + 1).
         rows: How many.
     """
 
@@ -115,6 +119,8 @@ class Online(eqx.Module):
         period: Sampling time [s].
         rest_velocity: Below it a joint counts as at rest, (n,).
         fast: Velocity at which the slope of the forces is taken for the linear part, (n,).
+        owner: Which unknown each of the c columns of a joint's row is of, (n, c); p where of none.
+        seeds: Of the columns: unknowns that share one stand in different joints' balances, (p, c).
         tolerance: Of `Told.relative`, where an estimate may be trusted.
     """
 
@@ -125,6 +131,8 @@ class Online(eqx.Module):
     period: float = eqx.field(static=True)
     rest_velocity: Float[Array, " n"]
     fast: Float[Array, " n"]
+    owner: Int[np.ndarray, "n c"]
+    seeds: Float[np.ndarray, "p c"]
     tolerance: float = eqx.field(static=True, default=0.05)
 
     @classmethod
@@ -139,29 +147,37 @@ class Online(eqx.Module):
                 memory of its own or delays the command: that asks for `inverse_dynamics`.
         """
         check_linear(machine)
+        # A joint that never moves has no velocity of its own.
+        fast = np.where(fast > 0, fast, np.max(fast))
+        rest_velocity = np.maximum(rest_velocity, _LEAST * fast)
         sharp = (np.asarray(1 / 3), np.asarray(np.min(rest_velocity)))
         plant = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), machine.plant, sharp)
+        enters = _enters(plant, machine.parameters, len(fast), machine.gain.size)
+        numbers = colours(enters)
+        owner = np.full((len(fast), max(numbers, default=-1) + 1), len(numbers))
+        for k, number in enumerate(numbers):
+            owner[enters[:, k], number] = k
         return cls(
             plant, machine.parameters.places, np.asarray(machine.parameters.guess), machine.gain,
-            period, np.asarray(rest_velocity, dtype=float), np.asarray(fast, dtype=float), tolerance,
+            period, rest_velocity, fast, owner, seeds(numbers), tolerance,
         )
 
     def start(self, position: Float[Array, " n"]) -> Memory:
         """Memory at the first reading."""
-        n, p = position.size, self.guess.size
-        square, wide = jnp.zeros((n, n)), jnp.zeros((n, p + 1))
+        n, c = self.owner.shape
+        square, wide = jnp.zeros((n, n)), jnp.zeros((n, c + 1))
         first = self._smooth(position)
         zero = jnp.zeros(n, int)
         functions = self._functions(position, jnp.zeros(n), first, wide)
         single = tuple(Integral.zero(f).next(f, zero, self.period) for f in functions)
         double = tuple(Integral.zero(x).next(x, zero, self.period) for x in (square, square, wide, wide))
-        normal = jnp.zeros((p + 1, p + 1))
+        normal = jnp.zeros((n, c + 1, c + 1))
         return Memory(zero, position, single, double, (wide, wide), normal, jnp.asarray(0))
 
     def update(
         self, memory: Memory, position: Float[Array, " n"], command: Float[Array, " m"],
         restart: Bool[Array, " n"] | None = None,
-    ) -> tuple[Memory, Float[Array, "n p1"]]:
+    ) -> tuple[Memory, Float[Array, "n c1"]]:
         """Take one reading more.
 
         Args:
@@ -172,8 +188,8 @@ class Online(eqx.Module):
 
         Returns:
             The new memory and the joints' rows: the balance, times (t - t0)^2, integrated twice and
-            over (t - t0)^2, as its derivatives in the unknowns and its value where all are zero.
-            Rows that do not count are zero.
+            over (t - t0)^2, as its derivatives in the unknowns of `owner` and, last, its value where
+            all are zero. Rows that do not count are zero.
         """
         h = self.period
         velocity = (position - memory.position) / h
@@ -204,13 +220,18 @@ class Online(eqx.Module):
             tuple(mix(a, b) for a, b in zip(once, fresh.single, strict=True)),
             tuple(mix(a, b) for a, b in zip(twice, fresh.double, strict=True)),
             tuple(joints(a, b) for a, b in zip((slope, twofold), fresh.held, strict=True)),
-            memory.normal + rows.T @ rows, memory.rows + jnp.sum(counts),
+            memory.normal + rows[:, :, None] * rows[:, None, :], memory.rows + jnp.sum(counts),
         )
         return grown, rows
 
     def told(self, memory: Memory) -> Told:
         """What the rows so far say; compiles, but is no part of a fast loop."""
-        normal, p = memory.normal, self.guess.size
+        p = self.guess.size
+        # Of all unknowns and, last but one, the value; what is of no unknown goes into the last.
+        at = jnp.where(self.owner == p, p + 1, self.owner)
+        at = jnp.concatenate([at, jnp.full((len(at), 1), p)], axis=1)
+        whole = jnp.zeros((p + 2, p + 2)).at[at[:, :, None], at[:, None, :]].add(memory.normal)
+        normal = whole[: p + 1, : p + 1]
         scale = jnp.sqrt(jnp.diagonal(normal)[:p])
         seen = scale > 1e-9 * jnp.max(scale * jnp.abs(jnp.where(self.guess == 0, 1.0, self.guess)))
         scale = jnp.where(seen, scale, 1.0)
@@ -231,16 +252,17 @@ class Online(eqx.Module):
         every = jnp.broadcast_to(q, (q.size, q.size))
         return every, t * every, t**2 * every, t**2 * smooth, twofold, t * twofold
 
-    def _columns(self, f: object) -> Float[Array, "n p1"]:
+    def _columns(self, f: Callable[[Plant], Array]) -> Float[Array, "n c1"]:
         """A balance that is linear in the unknowns as its derivatives and its value at zero."""
+        guess = jnp.asarray(self.guess)
 
-        def residual(theta: Array) -> tuple[Array, Array]:
-            e = f(scatter(self.places, self.plant, theta))
+        def residual(step: Array) -> tuple[Array, Array]:
+            e = f(scatter(self.places, self.plant, guess + self.seeds @ step))
             return e, e
 
-        guess = jnp.asarray(self.guess)
-        jacobian, e = jax.jacfwd(residual, has_aux=True)(guess)
-        return jnp.concatenate([jacobian, (e - jacobian @ guess)[:, None]], axis=1)
+        jacobian, e = jax.jacfwd(residual, has_aux=True)(jnp.zeros(self.seeds.shape[1]))
+        here = jnp.concatenate([guess, jnp.zeros(1)])[self.owner]
+        return jnp.concatenate([jacobian, (e - jnp.sum(jacobian * here, axis=1))[:, None]], axis=1)
 
     def _residual(self, plant: Plant, q: Array, v: Array, a: Array, u: Array) -> Array:
         return plant.balance(q, v, a, u, jnp.zeros(()), plant.initial_states(u)).residual
@@ -277,6 +299,23 @@ class Online(eqx.Module):
         return self._columns(linear)
 
 
+def _enters(plant: Plant, parameters: Parameters, joints: int, drives: int) -> Bool[np.ndarray, "n p"]:
+    """Which unknowns stand in the balance of which joints, by its derivatives along random motion."""
+    random = np.random.default_rng(0)
+    motion, u = random.uniform(0.5, 1.5, (3, joints)), random.uniform(0.5, 1.5, drives)
+    guess = np.where(parameters.guess == 0, 1.0, parameters.guess)
+    return np.asarray(_slopes(plant, parameters.places, guess, motion, u)) != 0
+
+
+@eqx.filter_jit
+def _slopes(plant: Plant, places: tuple, theta: Array, motion: Array, u: Array) -> Float[Array, "n p"]:
+    def residual(theta: Array) -> Array:
+        moved = scatter(places, plant, theta)
+        return moved.balance(*motion, u, jnp.zeros(()), moved.initial_states(u)).residual
+
+    return jax.jacfwd(residual)(jnp.asarray(theta))
+
+
 def check_linear(machine: Machine) -> None:
     """Refuse what the recursion cannot hold.
 
@@ -302,7 +341,7 @@ def check_linear(machine: Machine) -> None:
 def window_rows(
     online: Online, position: Float[Array, "time n"], command: Float[Array, "time m"],
     restart: Bool[Array, "time n"],
-) -> tuple[Memory, Float[Array, "time n p1"]]:
+) -> tuple[Memory, Float[Array, "time n c1"]]:
     """All rows of a log whose windows begin where `restart` says, and the memory at its end."""
 
     def step(memory: Memory, now: tuple) -> tuple[Memory, Array]:
