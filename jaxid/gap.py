@@ -54,8 +54,10 @@ def force_gap(machine: Machine, data: Prepared) -> ForceGap:
     residual = np.where(data.moving, np.asarray(residual), np.nan)
     counted = np.where(data.moving, np.asarray(measured), np.nan)
     norm, size = (np.sqrt(np.nansum(x**2, axis=0)) for x in (residual, counted))
+    # Of a joint that never moves nothing is said.
+    samples = np.sum(np.isfinite(residual), axis=0)
     return ForceGap(
-        residual, np.asarray(measured), np.sqrt(np.nanmean(residual**2, axis=0)),
+        residual, np.asarray(measured), norm / np.sqrt(np.where(samples > 0, samples, np.nan)),
         norm / np.where(size > 0, size, np.nan),
     )
 

@@ -114,7 +114,7 @@ def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
             # Each array that JAX makes outside compiled code takes longer than all else here.
             leaves[at] = np.asarray(value) if index is None else _with_entry(leaves[at], index, value)
         else:
-            leaves[at] = value if index is None else leaves[at].at[index].set(value)
+            leaves[at] = value if index is None else jnp.asarray(leaves[at]).at[index].set(value)
     return jax.tree.unflatten(structure, leaves)
 
 

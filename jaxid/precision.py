@@ -151,11 +151,11 @@ class Precision:
         """Standard deviations; NaN where not identifiable."""
         return np.sqrt(np.diag(self.covariance))
 
-    def first(self, p: int) -> Precision:
-        """Of the first p parameters: the rest were nuisances."""
-        return Precision(
-            self.covariance[:p, :p], self.identifiable[:p], self.unidentifiable, self.information
-        )
+    def first(self, names: list[str]) -> Precision:
+        """Of the parameters of these names, which come first: the rest were nuisances."""
+        p = len(names)
+        told = [c for c in self.unidentifiable if any(n in names for n in c)]
+        return Precision(self.covariance[:p, :p], self.identifiable[:p], told, self.information)
 
     def beside(self, std: float) -> Precision:
         """With one parameter more, known from elsewhere to a standard deviation."""
@@ -193,7 +193,7 @@ def assess(
     rows = jacobian if counts.all() else np.where(counts[..., None], jacobian, 0.0)
     flat = rows.reshape(-1, len(names))
     norm = np.linalg.norm(flat, axis=0)
-    dead = norm * np.abs(scale) < 1e-9 * signal
+    dead = norm * np.abs(scale) <= 1e-9 * signal
     norm = np.where(dead, 1.0, norm)
     normal = (flat.T @ flat if hessian is None else hessian) / np.outer(norm, norm)
     normal[dead] = 0.0

@@ -190,7 +190,8 @@ chunk = 4
 @pytest.mark.parametrize("kind", CONTROLLERS)
 def test_every_controller_states_its_own_keys(tmp_path, kind):
     told = message(tmp_path, swapped(CASCADE, f'kind = "{kind}"\n'))
-    assert f"[controller]: 'kp' is missing; add kp: it belongs to kind = '{kind}'" in told
+    first = "poles" if kind == "flatness" else "kp"
+    assert f"[controller]: '{first}' is missing; add {first}: it belongs to kind = '{kind}'" in told
 
 
 def test_other_file_does_not_inherit_rows(tmp_path):

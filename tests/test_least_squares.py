@@ -1,5 +1,8 @@
 """Levenberg-Marquardt: far starts, bounds, logarithms, failures that are told, batches."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,3 +140,30 @@ def test_signs_give_bounds_and_guesses_survive_the_round_trip():
     np.testing.assert_array_equal(np.asarray(lower)[2:], [-np.inf, 0.0])
     assert np.all(np.asarray(lower)[:2] > 0)
     assert np.all(np.asarray(upper) == np.inf)
+
+
+TOGETHER = """
+import threading
+import jaxid, jax, jax.numpy as jnp, numpy as np
+from jaxid.estimators.least_squares import Transform, levenberg_marquardt
+p = 40
+columns = jnp.asarray(np.random.default_rng(0).standard_normal((200, p)))
+free = (jnp.full(p, -jnp.inf), jnp.full(p, jnp.inf))
+residual = lambda y: columns @ jnp.tanh(y) - 1.0
+fit = lambda x: levenberg_marquardt(residual, x, Transform(np.zeros(p, bool)), *free)
+batch = jax.jit(jax.vmap(fit))
+starts = jnp.asarray(0.1 * np.random.default_rng(1).standard_normal((8, p)))
+def run():
+    for _ in range(20):
+        np.asarray(batch(starts).theta)
+threads = [threading.Thread(target=run) for _ in range(3)]
+[t.start() for t in threads]
+[t.join() for t in threads]
+print("done")
+"""
+
+
+def test_batches_of_many_unknowns_run_side_by_side():
+    """LAPACK's batched factorisation, as jaxlib 0.10.2 has it, hangs here for ever."""
+    done = subprocess.run([sys.executable, "-c", TOGETHER], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "done\n", done.stderr

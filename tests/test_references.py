@@ -39,7 +39,8 @@ def refuse(table: dict, match: str, **kwargs) -> None:
 
 def test_names_are_those_of_the_interface():
     kinds = {"csv", "trapezoid", "bezier", "fourier", "multisine", "point_to_point"}
-    assert set(REFERENCES) == kinds
+    # Beside what was promised, the profile of the chain's paper.
+    assert set(REFERENCES) == kinds | {"quarter_sine"}
 
 
 @pytest.mark.parametrize("kind", sorted(REFERENCES))
@@ -221,6 +222,21 @@ def test_bezier_of_order_two_by_hand():
     np.testing.assert_array_equal(q[:501], 1.0)
     np.testing.assert_allclose(q[[750, 1000]], expected[1:3], rtol=1e-12)
     np.testing.assert_array_equal(q[1500:], -1.0)
+
+
+def test_quarter_sine_hold_and_return():
+    """The paper's reference of mass 2, its polynomial written out."""
+    times = {"rise_time": 0.1, "hold_until": 5.0, "return_until": 10.0}
+    table = {"kind": "quarter_sine", "level": 0.05, **times}
+    got = make_reference(table, 1000.0, 11.0)[:, 0]
+    t = np.arange(11000) / 1000.0
+    z = np.clip((t - 5.0) / 5.0, 0.0, 1.0)
+    terms = 252 - 1050 * z + 1800 * z**2 - 1575 * z**3 + 700 * z**4 - 126 * z**5
+    expected = 0.05 * np.sin(np.minimum(t / 0.1, 1.0) * np.pi / 2) - 0.05 * z**5 * terms
+    # Terms of up to 90 cancel to one.
+    np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-13)
+    with pytest.raises(InputError, match="do not follow"):
+        make_reference(table | {"hold_until": 0.05}, 1000.0, 11.0)
 
 
 def test_bezier_to_and_fro():

@@ -81,16 +81,19 @@ class Stretch:
         position = (data.q if recipe.keeps_reversals else log.position)[inside]
         velocity = np.diff(data.q[inside], axis=0, prepend=data.q[inside][:1]) / log.period
         fast = np.abs(velocity).max(axis=0)
+        still = InputError(
+            f"nothing moves between {start:g} and {end:g} s", where=log.source,
+            mend="choose another [algebraic] window",
+        )
         if not fast.any():
-            raise InputError(
-                f"nothing moves between {start:g} and {end:g} s", where=log.source,
-                mend="choose another [algebraic] window",
-            )
+            raise still
         online = Online.of(machine, log.period, np.asarray(recipe.rest_velocity), fast)
         rest = online.rest_velocity
         # A filter rings into a rest; readings that do not differ do not move.
         raw = np.pad(log.position[inside], ((2, 2), (0, 0)), mode="edge")
         moving = (np.abs(velocity) > rest) & (np.abs(raw[4:] - raw[:-4]) / (4 * log.period) > 0.5 * rest)
+        if not moving.any():
+            raise still
         return cls(position, log.force[inside], online, moving, np.sign(velocity) * moving)
 
     def rows(self, restart: Bool[np.ndarray, "time n"]) -> Solve:

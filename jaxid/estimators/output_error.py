@@ -157,7 +157,7 @@ def output_error_steps(
         float(np.linalg.norm(log.position - log.position.mean(axis=0))),
         np.where(theta != 0, theta, 1.0)[active],
         None if full is None else full[np.ix_(active, active)],
-    ).first(p)
+    ).first(machine.parameters.names)
     converged = bool(minimum.converged)
     return Estimate(
         method="output_error",

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jaxid.discovery.candidates import Candidate
     from jaxid.discovery.result import Discovery, Found
     from jaxid.discovery.screen import Score
+    from jaxid.estimators.derived import Derived
     from jaxid.estimators.result import Estimate
     from jaxid.identification import Gap, Identification
     from jaxid.model import Plant
@@ -111,15 +112,24 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     return out
 
 
+def derived(result: Identification) -> list[Derived]:
+    """Friction in its other form, where the case states the gravity that a coefficient refers to."""
+    from jaxid.estimators.derived import dry_friction
+
+    return [] if result.session.case.plant.gravity is None else dry_friction(result.estimate)
+
+
 def identification_json(result: Identification) -> dict[str, Any]:
     """Content of result.json."""
-    estimate = result.estimate
+    estimate, more = result.estimate, derived(result)
+    follows = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in more if np.isfinite(d.std)}
     return {
         "method": estimate.method,
         "converged": estimate.converged,
         "message": estimate.message,
         "samples": estimate.samples,
         "parameters": parameters_json(estimate),
+        **({"derived": follows} if follows else {}),
         "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
         "gap": gap_json(result.session, result.gaps, result.noise_floor),
         "preprocess": recipe_json(result.session),

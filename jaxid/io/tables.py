@@ -13,6 +13,7 @@ from jaxid.report.tables import place_words
 
 if TYPE_CHECKING:
     from jaxid.discovery.result import Discovery
+    from jaxid.estimators.derived import Derived
     from jaxid.estimators.result import Estimate
     from jaxid.identification import Identification
     from jaxid.studies.result import Study
@@ -25,8 +26,8 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def parameter_lines(estimate: Estimate) -> str:
-    """Value, standard deviation and unit of every parameter."""
+def parameter_lines(estimate: Estimate, derived: Sequence[Derived] = ()) -> str:
+    """Value, standard deviation and unit of every parameter, and of what follows from them."""
     rows = [["parameter", "value", "std", "unit"]]
     for f, value, std, told in zip(
         estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
@@ -34,6 +35,7 @@ def parameter_lines(estimate: Estimate) -> str:
     ):
         shown = with_std(value, std) if told else ("-", "this log cannot tell it")
         rows.append([f.name, *shown, f.unit])
+    rows += [[d.name, *with_std(d.value, d.std), d.unit] for d in derived if np.isfinite(d.std)]
     return aligned(rows)
 
 
@@ -57,8 +59,9 @@ def identification_table(result: Identification) -> str:
         ["simulated position", _number(simulation["fit"]), _number(simulation["validation"]),
          simulation["unit"]],
     ]
-    return "\n".join([head, "", parameter_lines(estimate), *_blind(estimate), "", aligned(rows),
-                      *_notes(results.notes(result.session, estimate))])
+    told = parameter_lines(estimate, results.derived(result))
+    notes = _notes(results.notes(result.session, estimate))
+    return "\n".join([head, "", told, *_blind(estimate), "", aligned(rows), *notes])
 
 
 def discovery_table(result: Discovery) -> str:

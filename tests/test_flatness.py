@@ -1,0 +1,108 @@
+"""Flatness: the error obeys the poles; the law on a machine that is not jaxid's; live, and switched."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from six_masses import CASE, KINDS, driven, errors, text, true_values
+
+from jaxid.controllers import Flatness
+from jaxid.errors import InputError
+from jaxid.io.case import load_case
+from jaxid.live import Live, follow
+from jaxid.plants import Axis
+from jaxid.simulation import Drive, closed_loop
+
+PERIOD, MASS, STIFF, DRAG, GAIN = 1e-4, 2.0, 300.0, 5.0, 4.0
+
+
+def pulled(poles: tuple[float, ...], offset: float, velocity: float = 0.0):
+    """A sprung axis that starts off its reference, under a law that knows it."""
+    from jaxid.effects import EFFECTS
+
+    effects = (EFFECTS["viscous_friction"](coefficient=DRAG), EFFECTS["linear_stiffness"](coefficient=STIFF))
+    plant = Axis(MASS, effects=effects)
+    law = Flatness(
+        poles=poles, epsilon=jnp.asarray(1e-6), model=plant, gain=jnp.asarray([GAIN]), period=PERIOD,
+    )
+    reference = 0.05 * np.sin(8.0 * PERIOD * np.arange(4000))[:, None]
+    slope = 0.05 * 8.0
+    run = closed_loop(
+        plant, Drive(jnp.asarray([GAIN]), PERIOD), law, jnp.asarray(reference), jnp.zeros((4000, 1)),
+        jnp.asarray([offset]), jnp.asarray([slope + velocity]),
+    )
+    return np.asarray(run.position)[:, 0] - reference[:, 0]
+
+
+@pytest.mark.parametrize("poles", [(-30.0, -50.0), (-40.0, -40.0)])
+def test_error_dies_out_by_its_poles(poles):
+    off = pulled(poles, 0.01)
+    companion = np.array([[0.0, 1.0], [-poles[0] * poles[1], poles[0] + poles[1]]])
+    t = PERIOD * np.arange(len(off))
+    expected = np.array([(scipy.linalg.expm(companion * x) @ [0.01, 0.0])[0] for x in t[::400]])
+    # The held command acts half a tick late, and the velocity is half a tick old: of 10 mm, 1e-4 s of 20 ms.
+    np.testing.assert_allclose(off[::400], expected, atol=2e-5)
+    # A law that asked for the acceleration alone would leave c v + k q, of 2 mm.
+    assert np.abs(off[3000:]).max() < 2e-5
+
+
+def test_reconstructed_velocity_and_integral():
+    """Three poles: the error's third-order polynomial, its integral driven to zero."""
+    off = pulled((-30.0, -40.0, -50.0), 0.01)
+    polynomial = np.poly([-30.0, -40.0, -50.0])
+    companion = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], -polynomial[:0:-1]])
+    # States: integral of e, e, e'.
+    t = PERIOD * np.arange(len(off))
+    expected = np.array([(scipy.linalg.expm(companion * x) @ [0.0, 0.01, 0.0])[1] for x in t[::400]])
+    np.testing.assert_allclose(off[::400], expected, atol=2e-5)
+    assert np.abs(off[3000:]).max() < 2e-5
+
+
+def test_live_identifies_switches_and_tracks(tmp_path):
+    """Wrong values, truth of the exact simulator: all found in 0.1 s, then tracked far better."""
+    case = tmp_path / "case.toml"
+    case.write_text(text(duration="1.0"))
+    late = {}
+    for identify in (False, True):
+        live = Live(case, identify=identify)
+        log, ran = driven(live, 1.0)
+        off = (ran["true_position"] - live.reference)[200:, 1]
+        late[identify] = float(np.sqrt(np.mean(off**2)))
+    assert 30 < live.switched <= 100
+    found = errors(list(true_values()), live.told.theta)
+    assert all(found[kind] <= aim for kind, aim in KINDS.items())
+    assert late[True] < 1e-4 < 2e-4 < late[False]
+    told = follow(case, log)
+    assert told.trusted[live.switched - 1].all()
+    assert not told.trusted[5].any()
+    # What is trusted is within what trust means.
+    worst = errors(list(true_values()), told.theta[live.switched - 1])
+    assert max(worst.values()) < 0.05
+
+
+def test_live_refuses(tmp_path):
+    live = Live(CASE)
+    live._tick = len(live.reference)
+    with pytest.raises(InputError, match="the reference ends after 10000 ticks"):
+        live.command(np.zeros(6))
+    case = tmp_path / "case.toml"
+    law = 'kind = "flatness"\npoles = [-60.0, -60.0]\nepsilon = 1e-3'
+    assert law in text()
+    case.write_text(text().replace(law, 'kind = "pd"\nkp = 1.0\nkd = 1.0'))
+    with pytest.raises(InputError, match="a controller of kind 'pd' has no model"):
+        Live(case, identify=True)
+    Live(case)
+
+
+@pytest.mark.parametrize(
+    ("poles", "words"),
+    [
+        ("[-60.0]", "has 1 entry"), ("[-60.0, 60.0]", "is not negative"), ("-60.0", "is not a list"),
+        ("[-9.0, -9.0, -9.0, -9.0]", "at most 3"),
+    ],
+)
+def test_poles_that_cannot_be(tmp_path, poles, words):
+    case = tmp_path / "case.toml"
+    case.write_text(text(poles=poles))
+    with pytest.raises(InputError, match=words):
+        load_case(case)
