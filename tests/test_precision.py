@@ -1,5 +1,7 @@
 """Covariance under coloured noise, its coverage, and what a log cannot tell."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -189,9 +191,12 @@ def test_first_leaves_nuisances_out():
     x = regressor()
     e = np.random.default_rng(10).standard_normal(len(x))
     whole = precision_of(x, e)
-    part = whole.first(2)
+    part = whole.first(["a", "b"])
     np.testing.assert_array_equal(part.std, whole.std[:2])
     assert part.identifiable.size == 2
+    # What cannot be told of nuisances alone is not named; what is of both is.
+    blind = replace(whole, unidentifiable=[{"c": 1.0}, {"b": 0.7, "c": 0.7}])
+    assert blind.first(["a", "b"]).unidentifiable == [{"b": 0.7, "c": 0.7}]
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
