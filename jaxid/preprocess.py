@@ -263,7 +263,7 @@ def prepare(
         # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
         at_rest = at_rest | (_turning(qd) & (reach > 0))
     moving = ~_smeared(at_rest, reach)[kept]
-    fitted = ~_smeared(_dwelling(at_rest, 2 * recipe.decimation), reach)[kept]
+    fitted = ~_smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept]
     held = recipe.align_hold and log.hold == "zero_order"
     hold = (hold_period or log.period) if held else 0.0
     return Prepared(
@@ -297,8 +297,8 @@ def _smeared(flags: np.ndarray, reach: int) -> np.ndarray:
     return count[width:] > count[:-width]
 
 
-def _dwelling(flags: np.ndarray, length: int) -> np.ndarray:
-    """Only those flags that stand for longer than `length` samples on end."""
+def lasting(flags: np.ndarray, length: int) -> np.ndarray:
+    """Only those flags, (time, n), that stand for longer than `length` samples on end."""
     out = np.zeros_like(flags)
     for i, f in enumerate(flags.T):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], f, [False]]).astype(int)))

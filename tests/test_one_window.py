@@ -5,7 +5,7 @@ import pytest
 from six_masses import KINDS, Live, driven, errors, first_instants, text
 
 from jaxid.errors import InputError
-from jaxid.estimators.one_window import ratio, single_time, without_friction
+from jaxid.estimators.one_window import _homogeneous, ratio, single_time, without_friction
 from jaxid.identification import identify
 from jaxid.io.log import Log
 from jaxid.io.results import identification_json
@@ -77,6 +77,18 @@ def test_what_sticks_is_named(tmp_path):
     kept = [k for k, n in enumerate(found.names) if n in told]
     worst = errors([found.names[k] for k in kept], found.theta[kept])
     assert all(worst[kind] <= aim for kind, aim in KINDS.items())
+
+
+def test_what_swings_by_itself_has_no_equations():
+    """Joints 1 and 2 share an unknown, joint 3 shares none; then a force acts on joint 2."""
+    random = np.random.default_rng(0)
+    owner = np.array([[0, 1], [1, 2], [3, 4]])
+    rows = random.standard_normal((50, 3, 3))
+    rows[:, :, 2] = 0.0
+    rows[:, 2, 2] = 1.0
+    np.testing.assert_array_equal(_homogeneous(rows, owner, np.ones(5)), [True, True, False])
+    rows[:, 1, 2] = 1e-3
+    np.testing.assert_array_equal(_homogeneous(rows, owner, np.ones(5)), [False, False, False])
 
 
 def test_friction_as_coefficient_with_its_deviation(tmp_path):

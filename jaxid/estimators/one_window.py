@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.integrate
+import scipy.sparse.csgraph
 from jaxtyping import Bool, Float
 
 from jaxid.errors import InputError
@@ -25,7 +26,7 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.parameters import Free
 from jaxid.precision import Precision, assess
-from jaxid.preprocess import Prepared
+from jaxid.preprocess import Prepared, lasting
 
 # A matrix whose scaled condition is worse than this tells nothing at noise of rounding.
 _SINGULAR = 1e12
@@ -114,7 +115,8 @@ def least_squares_steps(
     cut = Stretch.of(machine, log, data, window)
     _, rows = yield cut.rows(~cut.moving)
     rows, owner, p = np.asarray(rows), cut.online.owner, len(machine.parameters.free)
-    rows = np.where(_lasting(cut.moving, min(_LONG_ENOUGH, len(rows) // 2))[..., None], rows, 0.0)
+    rows = np.where(lasting(cut.moving, min(_LONG_ENOUGH, len(rows) // 2) - 1)[..., None], rows, 0.0)
+    rows[:, _homogeneous(rows, owner, machine.parameters.guess)] = 0.0
     counts = np.any(rows != 0, axis=-1)
     jacobian, b = np.zeros((*counts.shape, p)), rows[..., -1]
     triangles = []
@@ -136,6 +138,21 @@ def least_squares_steps(
     resting = int(counts.size - counts.sum())
     notes = (f"one window of {log.period * (len(rows) - 1):.3g} s; {resting} rows of rest left out",)
     return _estimate("algebraic", machine, theta, precision, np.where(counts, e, np.nan), notes)
+
+
+def _homogeneous(rows: np.ndarray, owner: np.ndarray, guess: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Joints whose equations hold for zeros: those tied to them neither are driven nor know a value.
+
+    A mass that swings by itself tells ratios; least squares would say that nothing is there.
+    """
+    p, n = len(guess), len(owner)
+    stands = np.zeros((n, p), bool)
+    for i in range(n):
+        stands[i, owner[i][(owner[i] < p) & np.any(rows[:, i, :-1] != 0, axis=0)]] = True
+    _, groups = scipy.sparse.csgraph.connected_components(stands @ stands.T, directed=False)
+    size = np.abs(rows[..., :-1] * np.append(np.abs(guess), 0.0)[owner]).max(axis=(0, 2))
+    given = np.abs(rows[..., -1]).max(axis=0) > 1e-9 * np.where(size > 0, size, np.inf)
+    return np.array([not given[groups == g].any() for g in groups])
 
 
 def single_time(rows: Rows, period: float) -> np.ndarray:
@@ -280,16 +297,6 @@ def _own(
     columns = [c for c, k in enumerate(online.owner[joint]) if k < online.guess.size]
     own = tuple(int(online.owner[joint, c]) for c in columns)
     return own, (whole[:, columns], whole[:, -1])
-
-
-def _lasting(flags: np.ndarray, length: int) -> np.ndarray:
-    """Only those runs of flags that last so many samples."""
-    out = np.zeros_like(flags)
-    for i, column in enumerate(flags.T):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]]).astype(int)))
-        for start, end in edges.reshape(-1, 2):
-            out[start:end, i] = end - start >= length
-    return out
 
 
 def _first_run(flags: np.ndarray) -> tuple[int, int]:
