@@ -278,6 +278,8 @@ def noise(folder: Path, runs: int = RUNS) -> bool:
         for colour, name in enumerate(estimators):
             spread = [_median(rows, name, level, kind, "spread") for level in at]
             bias = [_median(rows, name, level, kind, "bias") for level in at]
+            if not np.isfinite(spread).any():
+                continue
             ax.loglog(1e-9 * np.array(at), spread, f"C{colour}-o", ms=3, label=name)
             ax.loglog(1e-9 * np.array(at), bias, f"C{colour}--", lw=0.8)
         ax.set(title=kind.replace("_", " "), ylabel="relative error [%]", ylim=(1e-4, 1e4))
