@@ -32,7 +32,7 @@ from jaxid.estimators.steps import alone
 from jaxid.machine import build_machine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from chain_stepper import ChainMachine, simulate_under
+from chain_stepper import ChainMachine, name_of, simulate_under
 from stepper import Sensor
 
 SECONDS, TRACKED_FROM, FIRST, RUNS = 10.0, 0.2, 0.1, 1000
@@ -373,9 +373,46 @@ sample_rate = 1000.0
 """
 
 
+def hidden(folder: Path) -> bool:
+    """Friction that the case leaves out at one mass, and a cubic spring at one place: named with it."""
+    begin, good = time.perf_counter(), True
+    table = Table("hidden in the six masses, nothing declared", ["true", "verdict", "named", "evidence"])
+    for kind, place, values in (
+        ("coulomb_friction", 3, {"level": 4.7}), ("cubic_stiffness", 4, {"coefficient": 4e5}),
+    ):
+        case = folder / f"hidden_{kind}.toml"
+        text = re.sub(r"# mu m g.*?\n\n(?=\[controller\])", "", (folder / "chain6.toml").read_text(), flags=re.S)
+        text = re.sub(r"\[reference\].*?(?=\[simulation\])", SWEEP, text, flags=re.S)
+        case.write_text(text + "\n[sensor]\nposition_noise = 1e-6\n")
+        plain = chain(case)
+        live = jaxid.Live(case)
+        log = simulate_under(
+            plain.with_effect(kind, place, **values), lambda k, reading, live=live: live.command(reading),
+            Sensor(0.0, 1e-6), rate=1 / live.period, duration=SECONDS,
+        )
+        found = jaxid.discover(case, as_log(log | {"reference": live.reference}, "exact simulator"))
+        named = ", ".join(e.label for e in found.effects) or "-"
+        evidence = ", ".join(f"{e.score.evidence:.0f}" for e in found.effects)
+        table.row(name_of(kind, place), found.verdict, named, evidence)
+        good &= [e.label for e in found.effects] == [name_of(kind, place)]
+    table.show(time.perf_counter() - begin)
+    return good
+
+
+# Every mass to and fro on its own beat, so that springs and frictions are told apart.
+SWEEP = """[reference]
+kind = "trapezoid"
+start = 0.0
+targets = [0.02, -0.015, 0.03, 0.005, -0.025, 0.0]
+speed = [0.05, 0.08, 0.11, 0.06, 0.09, 0.07]
+acceleration = [1.0, 1.6, 2.2, 1.2, 1.8, 1.4]
+
+"""
+
+
 PARTS: dict[str, Callable[[Path], bool]] = {
     "first_instants": first_instants, "tracking": tracking, "partial": partial, "noise": noise,
-    "cost": cost,
+    "cost": cost, "hidden": hidden,
 }
 
 

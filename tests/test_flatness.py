@@ -6,12 +6,13 @@ import pytest
 import scipy.linalg
 from six_masses import CASE, KINDS, driven, errors, text, true_values
 
-from jaxid.controllers import Flatness
+from jaxid.controllers import Flatness, Path, flat_inputs
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
 from jaxid.live import Live, follow
 from jaxid.plants import Axis
-from jaxid.simulation import Drive, closed_loop
+from jaxid.plants.chain import Chain
+from jaxid.simulation import Drive, closed_loop, open_loop
 
 PERIOD, MASS, STIFF, DRAG, GAIN = 1e-4, 2.0, 300.0, 5.0, 4.0
 
@@ -56,6 +57,23 @@ def test_reconstructed_velocity_and_integral():
     expected = np.array([(scipy.linalg.expm(companion * x) @ [0.0, 0.01, 0.0])[1] for x in t[::400]])
     np.testing.assert_allclose(off[::400], expected, atol=2e-5)
     assert np.abs(off[3000:]).max() < 2e-5
+
+
+def test_flat_output_gives_all_inputs():
+    """Three masses driven open loop by what their trajectories ask for follow them."""
+    plant = Chain([2.0, 1.4, 2.6], [8.0, 7.0, 9.0], [1700.0, 1600.0, 1900.0, 1500.0])
+    t = 1e-4 * np.arange(5001)
+    size, rate = np.array([0.01, -0.02, 0.015]), np.array([5.0, 7.0, 9.0])
+    angle = t[:, None] * rate
+    motion = [size * np.sin(angle), size * rate * np.cos(angle), -size * rate**2 * np.sin(angle)]
+    path = Path(*(jnp.asarray(x) for x in motion))
+    force = flat_inputs(plant, path, 3)
+    run = open_loop(
+        plant, Drive(jnp.ones(3), 1e-4, "linear"), force, jnp.zeros(3), jnp.asarray(motion[1][0])
+    )
+    # Forces joined by lines over 0.1 ms: (rate h)^2 / 8 of the motion.
+    np.testing.assert_allclose(np.asarray(run.position), motion[0], atol=1e-8)
+    np.testing.assert_allclose(np.asarray(run.velocity), motion[1], atol=1e-6)
 
 
 def test_live_identifies_switches_and_tracks(tmp_path):

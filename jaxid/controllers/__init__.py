@@ -7,6 +7,7 @@ from jaxid.controllers.base import Controller as Controller
 from jaxid.controllers.base import Path as Path
 from jaxid.controllers.base import Tick as Tick
 from jaxid.controllers.flatness import Flatness
+from jaxid.controllers.flatness import flat_inputs as flat_inputs
 from jaxid.controllers.linear import PD, PID, CascadePD
 
 CONTROLLERS: dict[str, type[Controller]] = {

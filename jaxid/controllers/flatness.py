@@ -5,14 +5,39 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxid.controllers.base import Controller, Tick
+from jaxid.controllers.base import Controller, Path, Tick
 from jaxid.model import Plant, port_motion
 from jaxid.readings import State, acceleration
 from jaxid.smooth import sharp_clip
+
+
+def flat_inputs(plant: Plant, path: Path, drives: int) -> Float[Array, "time m"]:
+    """Forces of the drives along a trajectory of the flat output, which is every joint's position.
+
+    Positions, velocities and accelerations are the trajectory and its derivatives; the balance gives the
+    rest. Where not every joint is driven, a trajectory that the others would not follow by themselves
+    asks for forces that no drive gives: these are left out.
+
+    Args:
+        plant: The plant; its dry friction is smoothed.
+        path: Of all joints, one row an instant.
+        drives: How many there are.
+
+    Source:
+        Wi, Ri, Ri & Ri, (3).
+    """
+
+    def forces(q: Array, v: Array, a: Array) -> Array:
+        none = jnp.zeros(drives)
+        own = plant.initial_states(none)
+        return plant.at_drives(plant.balance(q, v, a, none, jnp.zeros(()), own).residual)
+
+    return jax.vmap(forces)(path.reference, path.slope, path.curvature)
 
 
 class Flatness(Controller):
