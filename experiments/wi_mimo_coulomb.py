@@ -51,10 +51,15 @@ def variant(
     text = re.sub(r"period = [\d.]+", f"period = {1 / rate}", text)
     text = re.sub(r"sample_rate = [\d.]+", f"sample_rate = {rate}", text)
     if not friction:
-        text = re.sub(r"# mu m g.*?\n\n(?=\[controller\])", "", text, flags=re.S)
+        text = without_effects(text)
     if poles is not None:
         text = text.replace("poles = [-60.0, -60.0]", f"poles = {poles}")
     return written(folder / f"{name}.toml", text, window)
+
+
+def without_effects(text: str) -> str:
+    """The case of a chain without friction."""
+    return re.sub(r"# mu m g.*?\n\n(?=\[controller\])", "", text, flags=re.S)
 
 
 def written(path: Path, text: str, window: float) -> Path:
@@ -381,7 +386,7 @@ def hidden(folder: Path) -> bool:
         ("coulomb_friction", 3, {"level": 4.7}), ("cubic_stiffness", 4, {"coefficient": 4e5}),
     ):
         case = folder / f"hidden_{kind}.toml"
-        text = re.sub(r"# mu m g.*?\n\n(?=\[controller\])", "", (folder / "chain6.toml").read_text(), flags=re.S)
+        text = without_effects((folder / "chain6.toml").read_text())
         text = re.sub(r"\[reference\].*?(?=\[simulation\])", SWEEP, text, flags=re.S)
         case.write_text(text + "\n[sensor]\nposition_noise = 1e-6\n")
         plain = chain(case)
