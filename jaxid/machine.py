@@ -17,7 +17,7 @@ from jaxid.io.case_entries import EffectEntry
 from jaxid.io.case_values import Value
 from jaxid.io.log import Log
 from jaxid.model import ParameterInfo, Plant, as_array, parameters_of
-from jaxid.parameters import Free, Parameters, effect_name
+from jaxid.parameters import Free, Parameters, effect_name, label
 from jaxid.sensors import Sensor
 from jaxid.tables import read_columns
 from jaxid.units import Units
@@ -106,7 +106,19 @@ def _plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
         for at in range(len(entry.ports)):
             plant, more = _with_effect(plant, entry, at, case, true)
             free += more
+    _check_weights(plant, case)
     return plant, free
+
+
+def _check_weights(plant: Plant, case: Case) -> None:
+    """A coefficient of friction needs a weight that it is of."""
+    for effect in plant.effects:
+        if getattr(effect, "friction_coefficient", None) is None:
+            continue
+        if not float(np.asarray(plant.port_normal(np.zeros(plant.joints)))[effect.port]) > 0:
+            what = f"{label(plant, effect.kind, effect.port)} has a friction_coefficient where nothing weighs"
+            mend = "let [plant] gravity be positive, or give the friction by its level"
+            raise InputError(what, where=str(case.path), mend=mend)
 
 
 def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:

@@ -272,6 +272,18 @@ gain = { guess = 1.0 }
     assert machine.gain.shape == (2,)
 
 
+@pytest.mark.parametrize("gravity", ["0.0", "9.81"])
+def test_a_coefficient_needs_a_weight(tmp_path, gravity):
+    effect = '[[effects]]\nkind = "coulomb_friction"\nfriction_coefficient = 0.1\n'
+    text = BARE.replace('"chain"', f'"chain"\ngravity = {gravity}') + effect
+    case = load_case(write(tmp_path, text))
+    if gravity == "0.0":
+        with pytest.raises(InputError, match=r"friction\[1\] has a friction_coefficient where nothing"):
+            build_machine(case)
+    else:
+        assert len(build_machine(case).plant.effects) == 3
+
+
 def test_tables_of_lists(tmp_path):
     text = BARE.replace(f"mass = {MASS.tolist()}", "mass = { guess = [1.0, 2.0, 3.0], min = 0.5 }")
     values = load_case(write(tmp_path, text)).plant.parameters["mass"]
