@@ -104,8 +104,6 @@ class Live:
         self.told = jax.tree.map(np.asarray, told)
         if self.told.trusted.all():
             model = self.machine.with_estimate(self.told.theta).plant
-            like = lambda new, old: jnp.asarray(new, dtype=jnp.asarray(old).dtype)
-            model = jax.tree.map(like, model, self._controller.model)
             self._controller = eqx.tree_at(lambda c: c.model, self._controller, model)
             self.switched = self._tick
 
@@ -132,8 +130,7 @@ def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> Tol
 @eqx.filter_jit
 def _followed(online: Online, position: Array, command: Array) -> Told:
     def step(memory: Memory, now: tuple) -> tuple[Memory, Told]:
-        memory, _ = online.update(memory, *now)
-        return memory, online.told(memory)
+        return _learn(online, memory, *now)
 
     return jax.lax.scan(step, online.start(position[0]), (position[1:], command[:-1]))[1]
 
@@ -143,10 +140,12 @@ def _command(controller: Controller, tick: Tick, memory: object) -> tuple:
     return controller.command(tick, memory, jnp.zeros(1))
 
 
-@eqx.filter_jit
-def _learned(online: Online, memory: Memory, position: Array, command: Array) -> tuple[Memory, Told]:
+def _learn(online: Online, memory: Memory, position: Array, command: Array) -> tuple[Memory, Told]:
     memory, _ = online.update(memory, position, command)
     return memory, online.told(memory)
+
+
+_learned = eqx.filter_jit(_learn)
 
 
 def _online(

@@ -7,20 +7,20 @@ import scipy.linalg
 from six_masses import CASE, KINDS, driven, errors, text, true_values
 
 from jaxid.controllers import Flatness, Path, flat_inputs
+from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
 from jaxid.live import Live, follow
 from jaxid.plants import Axis
 from jaxid.plants.chain import Chain
+from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, closed_loop, open_loop
 
 PERIOD, MASS, STIFF, DRAG, GAIN = 1e-4, 2.0, 300.0, 5.0, 4.0
 
 
-def pulled(poles: tuple[float, ...], offset: float, velocity: float = 0.0):
-    """A sprung axis that starts off its reference, under a law that knows it."""
-    from jaxid.effects import EFFECTS
-
+def in_loop(poles: tuple[float, ...], offset: float, sensor: Sensor | None = None):
+    """A sprung axis that starts off its reference, under a law that knows it: the run, the error."""
     effects = (EFFECTS["viscous_friction"](coefficient=DRAG), EFFECTS["linear_stiffness"](coefficient=STIFF))
     plant = Axis(MASS, effects=effects)
     law = Flatness(
@@ -30,14 +30,14 @@ def pulled(poles: tuple[float, ...], offset: float, velocity: float = 0.0):
     slope = 0.05 * 8.0
     run = closed_loop(
         plant, Drive(jnp.asarray([GAIN]), PERIOD), law, jnp.asarray(reference), jnp.zeros((4000, 1)),
-        jnp.asarray([offset]), jnp.asarray([slope + velocity]),
+        jnp.asarray([offset]), jnp.asarray([slope]), sensor,
     )
-    return np.asarray(run.position)[:, 0] - reference[:, 0]
+    return run, np.asarray(run.position)[:, 0] - reference[:, 0]
 
 
 @pytest.mark.parametrize("poles", [(-30.0, -50.0), (-40.0, -40.0)])
 def test_error_dies_out_by_its_poles(poles):
-    off = pulled(poles, 0.01)
+    off = in_loop(poles, 0.01)[1]
     companion = np.array([[0.0, 1.0], [-poles[0] * poles[1], poles[0] + poles[1]]])
     t = PERIOD * np.arange(len(off))
     expected = np.array([(scipy.linalg.expm(companion * x) @ [0.01, 0.0])[0] for x in t[::400]])
@@ -49,7 +49,7 @@ def test_error_dies_out_by_its_poles(poles):
 
 def test_reconstructed_velocity_and_integral():
     """Three poles: the error's third-order polynomial, its integral driven to zero."""
-    off = pulled((-30.0, -40.0, -50.0), 0.01)
+    off = in_loop((-30.0, -40.0, -50.0), 0.01)[1]
     polynomial = np.poly([-30.0, -40.0, -50.0])
     companion = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], -polynomial[:0:-1]])
     # States: integral of e, e, e'.
@@ -57,6 +57,17 @@ def test_reconstructed_velocity_and_integral():
     expected = np.array([(scipy.linalg.expm(companion * x) @ [0.0, 0.01, 0.0])[1] for x in t[::400]])
     np.testing.assert_allclose(off[::400], expected, atol=2e-5)
     assert np.abs(off[3000:]).max() < 2e-5
+
+
+def test_reconstructed_velocity_does_not_see_the_counts():
+    """A count of 1 um is 10 mm/s from tick to tick: the law that differences readings passes it on."""
+    counts = Sensor(position_resolution=jnp.asarray(1e-6))
+    jitter = {}
+    for poles in ((-40.0, -40.0), (-40.0, -40.0, -40.0)):
+        run, off = in_loop(poles, 0.0, counts)
+        jitter[len(poles)] = np.std(np.diff(np.asarray(run.command)[2000:, 0], 2))
+        assert np.abs(off[2000:]).max() < 2e-4  # It still follows, by 0.1 m.
+    assert jitter[3] < 0.1 * jitter[2]
 
 
 def test_flat_output_gives_all_inputs():

@@ -55,16 +55,10 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
     """One of the forms that solve a joint's equations by themselves."""
 
     def steps(session: Session) -> Steps[Estimate]:
-        from jaxid.estimators import one_window
+        from jaxid.estimators.one_window import FORMS
 
-        forms = {
-            "algebraic_single_time": one_window.joint_by_joint(one_window.single_time, name),
-            "algebraic_ratio": one_window.joint_by_joint(one_window.ratio, name),
-            "algebraic_sign_changed": one_window.two_intervals(True, name),
-            "algebraic_sign_unchanged": one_window.two_intervals(False, name),
-        }
         run, window = session.fit, session.case.algebraic.get("window")
-        return forms[name](session.machine, run.log, run.data, window)
+        return FORMS[name](session.machine, run.log, run.data, window)
 
     return steps
 

@@ -55,6 +55,16 @@ def iterated_integral(
     return x
 
 
+def second_by_parts(t: Array, x: Array, moment: Array, twofold: Array) -> Array:
+    """Double integral of t^2 x'' from x, the integral of t x and the double integral of x."""
+    return t**2 * x - 4 * moment + 2 * twofold
+
+
+def first_by_parts(moment: Array, twofold: Array) -> Array:
+    """Double integral of t^2 x' from the integral of t^2 x and the double integral of t x."""
+    return moment - 2 * twofold
+
+
 def weak_motion(
     q: Float[Array, "time n"], period: float
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -72,8 +82,8 @@ def weak_motion(
     def once(x: Array) -> Array:
         return iterated_integral(x, period, 1)
 
-    acceleration = t**2 * q - 4 * once(t * q) + 2 * once(once(q))
-    return acceleration[-1], (once(t**2 * q) - 2 * once(once(t * q)))[-1]
+    acceleration = second_by_parts(t, q, once(t * q), once(once(q)))
+    return acceleration[-1], first_by_parts(once(t**2 * q), once(once(t * q)))[-1]
 
 
 @eqx.filter_jit

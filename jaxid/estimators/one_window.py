@@ -361,3 +361,12 @@ def _estimate(
         converged=good, message="solved" if good else "the equations are singular", residual=e,
         samples=int(np.isfinite(e).sum()), steps=1, notes=notes,
     )
+
+
+# Names of the forms that solve a joint's equations by themselves.
+FORMS: dict[str, Callable[..., Steps[Estimate]]] = {
+    "algebraic_single_time": joint_by_joint(single_time, "algebraic_single_time"),
+    "algebraic_ratio": joint_by_joint(ratio, "algebraic_ratio"),
+    "algebraic_sign_changed": two_intervals(True, "algebraic_sign_changed"),
+    "algebraic_sign_unchanged": two_intervals(False, "algebraic_sign_unchanged"),
+}

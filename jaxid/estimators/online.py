@@ -2,8 +2,9 @@
 
 Over a window that starts at t0 the balance of each joint is multiplied by (t - t0)^2 and integrated
 twice up to every sample. By parts no derivative of the measurement is left where the balance is
-linear in it, and the initial conditions vanish. Each sample adds one row a joint to a least-squares
-problem in the unknowns; integrals are of fourth order, from samples that have been.
+linear in it, its coefficients constant, and the initial conditions vanish. Each sample adds one row
+a joint to a least-squares problem in the unknowns; integrals are of fourth order, from samples that
+have been.
 
 A joint's window begins anew when it leaves rest: the force that holds a stuck joint is not in the
 balance. A held force bends the motion at every sample, where a quadrature of the position loses its
@@ -25,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxid.errors import InputError
+from jaxid.estimators.algebraic import first_by_parts, second_by_parts
 from jaxid.estimators.inverse_dynamics import linear_unknowns
 from jaxid.machine import Machine
 from jaxid.model import Plant
@@ -81,7 +83,6 @@ class Memory(eqx.Module):
         double: Integrals of the first, second, fourth and fifth of these.
         held: Single integral of what is held between samples, and the double one, p; exact.
         normal: Sum of the outer products of each joint's rows, (n, c + 1, c + 1).
-        rows: How many.
     """
 
     since: Array
@@ -90,7 +91,6 @@ class Memory(eqx.Module):
     double: tuple[Integral, ...]
     held: tuple[Array, Array]
     normal: Array
-    rows: Array
 
 
 class Told(eqx.Module):
@@ -172,7 +172,7 @@ class Online(eqx.Module):
         single = tuple(Integral.zero(f).next(f, zero, self.period) for f in functions)
         double = tuple(Integral.zero(x).next(x, zero, self.period) for x in (square, square, wide, wide))
         normal = jnp.zeros((n, c + 1, c + 1))
-        return Memory(zero, position, single, double, (wide, wide), normal, jnp.asarray(0))
+        return Memory(zero, position, single, double, (wide, wide), normal)
 
     def update(
         self, memory: Memory, position: Float[Array, " n"], command: Float[Array, " m"],
@@ -203,10 +203,9 @@ class Online(eqx.Module):
         once = tuple(i.next(f, since, h) for i, f in zip(memory.single, functions, strict=True))
         picked = tuple(once[k].value for k in (0, 1, 3, 4))
         twice = tuple(i.next(x, since, h) for i, x in zip(memory.double, picked, strict=True))
-        square = t1[:, None] ** 2
-        second = square * position - 4 * once[1].value + 2 * twice[0].value
-        first = once[2].value - 2 * twice[1].value
-        forced = square * twofold - 4 * once[5].value + 2 * twice[3].value
+        second = second_by_parts(t1[:, None], position, once[1].value, twice[0].value)
+        first = first_by_parts(once[2].value, twice[1].value)
+        forced = second_by_parts(t1[:, None], twofold, once[5].value, twice[3].value)
         rows = self._motion(position, second, first) + twice[2].value + forced
         resting = jnp.abs(velocity) < self.rest_velocity if restart is None else restart
         counts = (since >= _FEWEST) & ~resting
@@ -220,7 +219,7 @@ class Online(eqx.Module):
             tuple(mix(a, b) for a, b in zip(once, fresh.single, strict=True)),
             tuple(mix(a, b) for a, b in zip(twice, fresh.double, strict=True)),
             tuple(joints(a, b) for a, b in zip((slope, twofold), fresh.held, strict=True)),
-            memory.normal + rows[:, :, None] * rows[:, None, :], memory.rows + jnp.sum(counts),
+            memory.normal + rows[:, :, None] * rows[:, None, :],
         )
         return grown, rows
 
@@ -328,11 +327,10 @@ def check_linear(machine: Machine) -> None:
             f"{odd[0]} does not enter the balance in proportion", where="algebraic, over one window",
             mend="declare it known, friction by its level, or use inverse_dynamics",
         )
-    drives = machine.gain.size
     for e in machine.plant.effects:
         if e.initial_state(jnp.zeros(())) is not None or not isinstance(e.command_delay(), float):
             raise InputError(
-                f"{e.kind} has a memory or a delay", where=f"algebraic, over one window, {drives} drive(s)",
+                f"{e.kind} has a memory or a delay", where="algebraic, over one window",
                 mend="leave it out, or use inverse_dynamics",
             )
 
