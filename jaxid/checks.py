@@ -56,6 +56,7 @@ class Check:
         session, log = self.session, self.session.fit.log
         free = session.machine.parameters.free
         told = self.precision.identifiable
+        seen = lambda x: np.where(log.measured, x, np.nan)
         return {
             "sound": True,
             "warnings": self.warnings,
@@ -63,10 +64,10 @@ class Check:
                 "samples": log.samples, "rate_hz": log.rate_hz,
                 "duration_s": log.period * log.samples,
                 "stroke": np.ptp(log.position, axis=0),
-                "peak_velocity": np.abs(session.fit.data.qd).max(axis=0),
+                "peak_velocity": np.abs(seen(session.fit.data.qd)).max(axis=0),
                 "peak_force": np.abs(session.fit.data.force).max(axis=0),
                 "moving": float(session.fit.data.moving.mean()),
-                "position_noise": signals.high_band_std(log.position, log.rate_hz),
+                "position_noise": seen(signals.high_band_std(log.filled, log.rate_hz)),
             },
             "preprocess": recipe_json(session),
             "noise_floor": self.noise_floor,

@@ -85,7 +85,7 @@ _run = eqx.filter_jit(lambda replay, plant: replay(plant))
 
 
 def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:
-    """Gap between measured and simulated position."""
+    """Gap between measured and simulated position; NaN of joints without an encoder."""
     run = _run(replay, machine.plant)
     position = np.asarray(run.position)
     gap = log.position - position
@@ -130,7 +130,7 @@ def noise_density(
     sigma = position_noise(machine, log)
     mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
     w = 2 * np.pi * f[:, None, None]
-    impedance = -mass * w**2 + 1j * w * damping + stiffness
+    impedance = _seen(-mass * w**2 + 1j * w * damping + stiffness, data.measured)
     through = np.abs(_position_filter(f, recipe, rate)) * recipe.decimator.response(f, rate)
     density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
     power = np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
@@ -141,6 +141,18 @@ def noise_density(
         white = np.asarray(machine.plant.applied(by_drive, len(mass)))
         power = power + white * recipe.decimator.response(f, rate)[:, None] ** 2
     return f, power
+
+
+def _seen(impedance: np.ndarray, measured: tuple[bool, ...]) -> np.ndarray:
+    """Of the joints that have an encoder, the others moving as they must; zero of those."""
+    if all(measured):
+        return impedance
+    seen, hidden = np.flatnonzero(measured), np.flatnonzero(~np.array(measured))
+    part = lambda i, j: impedance[:, i[:, None], j]
+    through = part(seen, hidden) @ np.linalg.solve(part(hidden, hidden), part(hidden, seen))
+    out = np.zeros_like(impedance)
+    out[:, seen[:, None], seen] = part(seen, seen) - through
+    return out
 
 
 def _position_filter(f: np.ndarray, recipe: object, rate: float) -> np.ndarray:

@@ -208,11 +208,14 @@ def _log_period(case: Case, period: float | None) -> float:
 
 
 def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
-    """Standard deviation of a reading of each joint, as stated, else off the log's high band."""
+    """Standard deviation of a reading of each joint, as stated, else off the log's high band.
+
+    Zero where a joint has no encoder.
+    """
     stated = machine.sensor.position_std
     if stated is None:
-        return signals.high_band_std(log.position, log.rate_hz)
-    return np.broadcast_to(np.asarray(stated), log.position.shape[1]).copy()
+        stated = signals.high_band_std(log.filled, log.rate_hz)
+    return np.broadcast_to(np.asarray(stated), log.position.shape[1]) * log.measured
 
 
 def disturbance_at(

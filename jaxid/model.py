@@ -88,6 +88,8 @@ class Signals(eqx.Module):
         dry_scale: Factor on every level of dry friction (drift).
         gravity: Acceleration of gravity along the port; zero on a horizontal axis [m/s^2].
         normal: Force that presses the sliding surfaces together [N].
+        stiffness: Of the plant's own spring, where the port is its elongation [N/m or N m/rad]; else zero.
+        damping: Likewise [N s/m or N m s/rad].
     """
 
     y: Array
@@ -99,6 +101,8 @@ class Signals(eqx.Module):
     dry_scale: Array
     gravity: Array
     normal: Array
+    stiffness: Array
+    damping: Array
 
 
 class Action(eqx.Module):
@@ -171,7 +175,10 @@ class Effect(eqx.Module):
         raise NotImplementedError
 
     def initial_state(self, u: Array) -> Array | None:
-        """Own state at the start, where the drive has long been at `u`; None without memory."""
+        """Own state at the start, where the drive has long been at `u`; None without memory.
+
+        A number, or a vector whose rate has constant coefficients (a linear oscillator).
+        """
         return None
 
     def command_delay(self) -> Array | float:
@@ -189,6 +196,8 @@ class Effect(eqx.Module):
     in_drive: ClassVar[bool] = False
     # Whether it is the law of a spring: of a plant with springs, its place is an elongation.
     of_spring: ClassVar[bool] = False
+    # Whether only a plant with springs of its own (True), or only one without (False), can have it.
+    with_springs: ClassVar[bool | None] = None
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
@@ -257,6 +266,10 @@ class Plant(eqx.Module):
     joints: ClassVar[int] = 1
     # Whether no joint's acceleration enters the balance of another: there is nothing to solve then.
     diagonal: ClassVar[bool] = False
+    # Joint behind an elastic coupling, which may go without an encoder; None where there is none.
+    load: ClassVar[int | None] = None
+    # Joints that are driven, 0-based, in the order of their drives; None: the first ones, all of them.
+    actuated = None
     effects: eqx.AbstractVar[tuple[Effect, ...]]
     sharpness: eqx.AbstractVar[Array]
     velocity_scale: eqx.AbstractVar[Array]
@@ -288,22 +301,32 @@ class Plant(eqx.Module):
 
     def drive_of(self, port: int, drives: int) -> int | None:
         """Index of the drive that acts on a port; None where there is none."""
-        return min(port, drives - 1)
+        if self.actuated is None:
+            return port if port < drives else None
+        return self.actuated.index(port) if port in self.actuated else None
 
     def at_drives(self, x: Array) -> Array:
         """Of a quantity by joint (its last axis), the joints that are driven, by drive."""
-        return x
+        return x if self.actuated is None else x[..., list(self.actuated)]
 
     def driven(self, coordinates: int) -> tuple[int, ...]:
         """Joints that are driven, in the order of the drives."""
         return tuple(int(i) for i in self.at_drives(np.arange(coordinates)))
 
     def applied(self, u: Array, coordinates: int) -> Array:
-        """Generalized forces of the drives: one for each of the first coordinates by default."""
-        return u if u.size == coordinates else jnp.zeros(coordinates, u.dtype).at[: u.size].add(u)
+        """Generalized forces of the drives, by coordinate."""
+        if self.actuated is None:
+            return u
+        drives = [self.drive_of(i, u.size) for i in range(coordinates)]
+        return jnp.stack([jnp.zeros((), u.dtype) if j is None else u[j] for j in drives])
 
     def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
         """Whether a search may name such an effect on a port."""
+        springs = self.springs(self.joints) > 0
+        if effect.with_springs not in (None, springs):
+            return False
+        if springs and effect.of_spring != (port >= self.joints):
+            return False
         return not effect.in_drive or self.drive_of(port, drives) is not None
 
     def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
@@ -317,6 +340,11 @@ class Plant(eqx.Module):
     def port_normal(self, q: Array) -> Array:
         """Force that presses the sliding surfaces of each port together [N]."""
         return jnp.zeros_like(self.ports(q))
+
+    def port_spring(self, q: Array) -> tuple[Array, Array]:
+        """Stiffness and damping of the plant's own spring at each port; zero on joints."""
+        zero = jnp.zeros_like(self.ports(q))
+        return zero, zero
 
     @property
     def width(self) -> Array:
@@ -372,6 +400,7 @@ class Plant(eqx.Module):
         """
         y, yd, ydd = port_motion(self, q, qd, qdd)
         gravity, normal, width = self.port_gravity(q), self.port_normal(q), self.width
+        stiffness, damping = self.port_spring(q)
         # Sums by port and drive in lists: arrays updated in place compile much more slowly.
         force, dry, stick, dry_scale = ([x] * y.size for x in (0.0, 0.0, 0.0, 1.0))
         for e in self.effects:
@@ -383,7 +412,7 @@ class Plant(eqx.Module):
             signals = [
                 Signals(
                     y[i], yd[i], ydd[i], jnp.zeros(()) if j is None else drive[j], t, width,
-                    jnp.asarray(dry_scale[i]), gravity[i], normal[i],
+                    jnp.asarray(dry_scale[i]), gravity[i], normal[i], stiffness[i], damping[i],
                 )
                 for i, j in ((ports[k], drives[k]) for k in run)
             ]

@@ -88,6 +88,8 @@ class Prepared:
             also those that only pass through zero, as the published recipes leave nothing out.
         kept: Their indices in these arrays.
         start: Time of the first sample, from the start of the log [s].
+        measured: Which joints have an encoder; the motion of the others is that of `Log.filled`.
+        steps: Integration steps a sample by which theirs is found (see `jaxid.unmeasured`).
     """
 
     q: Float[np.ndarray, "time n"]
@@ -101,6 +103,8 @@ class Prepared:
     fitted: Bool[np.ndarray, "kept n"]
     kept: np.ndarray
     start: float = 0.0
+    measured: tuple[bool, ...] = (True,)
+    steps: int = 1
 
     @property
     def times(self) -> Float[np.ndarray, " kept"]:
@@ -175,8 +179,8 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
     band = cutoff if literal else edge
     decimation = int(stated.get("decimation", _decimation(log, band)))
-    q, qd, _ = differentiate(log.position, log.period, cutoff, 4, "central" if literal else "spectral")
-    noise = signals.high_band_std(log.position, rate)
+    q, qd, _ = differentiate(log.filled, log.period, cutoff, 4, "central" if literal else "spectral")
+    noise = signals.high_band_std(log.filled, rate)
     # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
     velocity_noise = noise * 2 * np.pi * np.sqrt(2 * cutoff**3 / (3 * rate))
     rest = np.maximum(5 * velocity_noise, 5e-3 * np.sqrt(np.mean(qd**2, axis=0)))
@@ -217,14 +221,15 @@ def _noise_cutoff(log: Log) -> float:
     """Highest frequency at which every joint's position stands above its noise [Hz]."""
     rate = log.rate_hz
     # Two seconds a segment: friction's corners recur over seconds, noise everywhere.
-    length = int(min(len(log.position), max(256, 2 * rate)))
+    position = log.position[:, list(log.measured)]
+    length = int(min(len(position), max(256, 2 * rate)))
     f, p = scipy.signal.welch(
-        log.position, rate, window="hann", nperseg=length, detrend="linear", axis=0
+        position, rate, window="hann", nperseg=length, detrend="linear", axis=0
     )
-    floor = 2 * signals.high_band_std(log.position, rate) ** 2 / rate
+    floor = 2 * signals.high_band_std(position, rate) ** 2 / rate
     above = np.all(p > 4 * floor, axis=1) & (f < 0.3 * rate)
     first_lost = np.argmax(~above[1:]) + 1 if np.any(~above[1:]) else len(f) - 1
-    lowest = 8.0 / (len(log.position) * log.period)
+    lowest = 8.0 / (log.samples * log.period)
     # Two digits, rounded down: it is not known better, and alike logs share compiled code.
     digit = 10.0 ** (np.floor(np.log10(f[first_lost])) - 1)
     return float(np.clip(np.floor(f[first_lost] / digit) * digit, lowest, 0.3 * rate))
@@ -253,7 +258,7 @@ def prepare(
         hold_period: For how long a held command is held [s]; absent: the log's sampling time.
     """
     q, qd, qdd = differentiate(
-        log.position, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives
+        log.filled, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives
     )
     kept = recipe.decimator.kept(len(q))
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
@@ -262,14 +267,14 @@ def prepare(
         reach = _affordable(at_rest, _turning(qd), max(reach, recipe.decimation - 1))
         # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
         at_rest = at_rest | (_turning(qd) & (reach > 0))
-    moving = ~_smeared(at_rest, reach)[kept]
-    fitted = ~_smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept]
+    moving = ~_smeared(at_rest, reach)[kept] & log.measured
+    fitted = ~_smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
     held = recipe.align_hold and log.hold == "zero_order"
     hold = (hold_period or log.period) if held else 0.0
     return Prepared(
         q, qd, qdd, log.force * gain, log.period,
         hold, recipe, moving,
-        fitted if recipe.keeps_reversals else moving, kept,
+        fitted if recipe.keeps_reversals else moving, kept, measured=log.measured,
     )
 
 

@@ -109,12 +109,14 @@ def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
 
     The rate of an own state is affine in it, so that its slope is the decay; a lag far shorter
     than the step, or a presliding spring at speed, is then stepped exactly instead of blowing up.
+    Vectors (oscillators) are no single decays, and are left to the explicit part.
     """
 
     def rates(own: tuple) -> tuple:
         return plant.balance(x.q, x.qd, jnp.zeros_like(x.q), u, t, own).rates
 
     slopes = jax.jvp(rates, (x.own,), (jax.tree.map(jnp.ones_like, x.own),))[1]
+    slopes = jax.tree.map(lambda s: s if s.ndim == 0 else jnp.zeros_like(s), slopes)
     zero = jnp.zeros_like(x.q)
     return State(zero, zero, slopes)
 
@@ -272,10 +274,11 @@ def set_valued_step(
 ) -> State:
     """One step under set-valued friction: flow without it, then the reaction that stops or drags.
 
-    The reaction of each port is the force, constant over the step, that brings the port to rest
-    at the step's end, clipped to the level of dry friction halfway; at rest it holds up to the
-    break-away level above that. Ports that are coupled through the mass matrix share their reactions by
-    projected Gauss-Seidel sweeps; one port needs one.
+    A port slides under the level of dry friction halfway. Where it comes to rest within the step it
+    stays if the break-away level holds it, and else goes back for the rest of the step: the reaction
+    is then the mean of both parts, and the position that of two parabolas, of second order in the
+    step. Ports that are coupled through the mass matrix share their reactions by projected
+    Gauss-Seidel sweeps, each the force that brings its port to rest at the step's end, clipped.
 
     Args:
         plant: The plant.
@@ -306,25 +309,32 @@ def set_valued_step(
     speed, before = (_port_speed(plant, at, slides) for at in (free, x))
     mobility = h * _mobility(plant, mass, x.q, slides)
 
-    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, Array]:
+    own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
+    alone = mobility.ndim == 1 or own.size == 1
+
+    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, Array, Array]:
         dry = _picked(levels.dry, slides)
         held = _picked(at_rest.dry, slides) + _picked(at_rest.stick, slides)
-        # The level at rest acts until a port slides, and again where it would pass through rest.
-        own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
-        slid = speed - jnp.sign(before) * own * dry
-        rests = (before == 0.0) | (before * slid < 0.0)
-        reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
-        return _spread(reaction, slides, ports), stuck
+        if alone:
+            reaction, stuck, part = own_reaction(own, speed, before, dry, held)
+        else:
+            # The level at rest acts until a port slides, and again where it would pass through rest.
+            slid = speed - jnp.sign(before) * own * dry
+            rests = (before == 0.0) | (before * slid < 0.0)
+            reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
+            part = jnp.ones_like(speed)
+        return _spread(reaction, slides, ports), stuck, part
 
     zero = jnp.zeros_like(x.q)
     moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in ("dry", "stick")], (midway,))
     at_rest = residual(zero, zero)[1] if moves else levels
-    reaction, stuck = answered(levels, at_rest)
+    reaction, stuck, part = answered(levels, at_rest)
     if moves:
         # Without friction motion begins too fast, and friction that falls with speed is too small.
         slowed = free.qd + h * _solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
-        reaction, stuck = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
-    return _rest_exactly(flow(x, reaction), stuck, slides)
+        reaction, stuck, part = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
+    end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
+    return _turned(x, end_of_step, part, h, slides) if alone else end_of_step
 
 
 def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
@@ -353,6 +363,49 @@ def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> A
     return jnp.stack([jacobian @ c for c in columns], axis=1)
 
 
+def own_reaction(
+    own: Array, speed: Array, before: Array, dry: Array, hold: Array
+) -> tuple[Array, Array, Array]:
+    """Mean reaction over a step of ports that do not push each other.
+
+    Args:
+        own: Change of velocity over the step per unit reaction.
+        speed: At the step's end without reaction.
+        before: At its start.
+        dry, hold: Levels, sliding and at rest.
+
+    Returns:
+        The reaction, which ports rest at the step's end, and the part of the step before a port comes
+        to rest; one where it does not.
+    """
+    slid = speed - jnp.sign(before) * own * dry
+    turns = before * slid < 0.0
+    part = jnp.where(turns, before / jnp.where(turns, before - slid, 1.0), 1.0)
+    rests = (before == 0.0) | (part < 1.0)
+    stuck = rests & (jnp.abs(speed - before) <= own * hold)
+    way = jnp.where(before == 0.0, jnp.sign(speed), jnp.sign(before))
+    sliding = way * dry * jnp.where(part < 1.0, 1.0 - 2.0 * part, -1.0)
+    return jnp.where(stuck, -speed / own, sliding), stuck, part
+
+
+def _turned(x: State, end: State, part: Array, h: Array, slides: tuple[int, ...]) -> State:
+    """The end of a step with the positions of joints that came to rest within it."""
+    joints = [k for k, i in enumerate(slides) if i < x.qd.size]
+    if not joints:
+        return end
+    own = _spread(part - 1.0, slides, max(*slides, x.qd.size - 1) + 1)[: x.qd.size] + 1.0
+    return State(end.q - overshot(x.qd, end.qd, own, h), end.qd, end.own)
+
+
+def overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
+    """By how much one line of velocity over a step misses the stroke of a joint that came to rest in it.
+
+    Until then, and from then on, velocity runs in lines; one line over the whole step is off by half
+    a step times the velocity of either end in the other part.
+    """
+    return jnp.where(part < 1.0, 0.5 * h * ((1.0 - part) * before + part * after), 0.0)
+
+
 def _box_reaction(
     mobility: Array, speed: Array, dry: Array, hold: Array
 ) -> tuple[Array, Array]:
@@ -361,14 +414,11 @@ def _box_reaction(
     A port is held up to `hold`, the level at rest; one that breaks loose is dragged by `dry`.
     """
     n = speed.size
-    inverse = 1.0 / (mobility if mobility.ndim == 1 else jnp.diagonal(mobility))
+    inverse = 1.0 / jnp.diagonal(mobility)
 
     def answer(wanted: Array, dry: Array, hold: Array) -> Array:
         return jnp.where(jnp.abs(wanted) < hold, wanted, sharp_clip(wanted, dry))
 
-    if n == 1 or mobility.ndim == 1:
-        wanted = speed * -inverse
-        return answer(wanted, dry, hold), jnp.abs(wanted) < hold
     reaction = wanted = jnp.zeros(n)
     for _ in range(20):
         for i in range(n):
@@ -422,6 +472,13 @@ def drive_own_states(
             return jax.vmap(lambda *now: plant.balance(*now).rates[i])(*motion, at)
 
         push = rate(jnp.zeros_like(z))
+        if z.ndim:
+            here = jax.tree.map(lambda a: a[0], (*motion, own))
+            slope = jax.jacfwd(lambda v, i=i, at=here: plant.balance(
+                *at[:5], (*at[5][:i], v, *at[5][i + 1 :])
+            ).rates[i])(z)
+            own = (*own[:i], _vector_recurrence(z, slope, push, period), *own[i + 1 :])
+            continue
         decay = rate(jnp.ones_like(z)) - push
         own = (*own[:i], _recurrence(z, decay, push, period), *own[i + 1 :])
     return own
@@ -436,12 +493,7 @@ def _recurrence(start: Array, decay: Array, push: Array, h: Array) -> Array:
     Source:
         Cox and Matthews (2002), J. Comput. Phys. 176, for the exponential integrals.
     """
-    before = jnp.concatenate([2 * push[:1] - push[1:2], push[:-2]])
-    here, there = push[:-1], push[1:]
-    after = jnp.concatenate([push[2:], 2 * push[-1:] - push[-2:-1]])
-    line = there - before / 3 - here / 2 - after / 6
-    bend = (before + there) / 2 - here
-    turn = (after - before) / 6 + (here - there) / 2
+    here, line, bend, turn = _cubics(push)
     mean = 0.5 * (decay[:-1] + decay[1:])
     e, p1, p2, p3, p4 = _phi(h * mean)
     add = h * (here * p1 + line * p2 + 2 * bend * p3 + 6 * turn * p4)
@@ -456,6 +508,48 @@ def _recurrence(start: Array, decay: Array, push: Array, h: Array) -> Array:
 
     _, later = jax.lax.scan(advance, start, (scale * gain, scale * add))
     return jnp.concatenate([start[None], later])
+
+
+def _vector_recurrence(start: Array, slope: Array, push: Array, h: Array) -> Array:
+    """Solve dz/dt = slope z + push, slope constant (k, k), from samples of the push, (time, k)."""
+    e, p1, p2, p3, p4 = _matrix_phi(h * slope)
+    here, line, bend, turn = _cubics(push)
+    add = h * (here @ p1.T + line @ p2.T + 2 * bend @ p3.T + 6 * turn @ p4.T)
+
+    def advance(z: Array, add: Array) -> tuple[Array, Array]:
+        # No call to a matrix library inside the loop, which would defeat its flag.
+        z = jnp.sum(e * z, axis=1) + add
+        return z, z
+
+    _, later = jax.lax.scan(advance, start, add)
+    return jnp.concatenate([start[None], later])
+
+
+def _cubics(x: Array) -> tuple[Array, Array, Array, Array]:
+    """Coefficients, over the fraction of an interval, of the cubic through its ends and neighbours."""
+    before = jnp.concatenate([2 * x[:1] - x[1:2], x[:-2]])
+    here, there = x[:-1], x[1:]
+    after = jnp.concatenate([x[2:], 2 * x[-1:] - x[-2:-1]])
+    line = there - before / 3 - here / 2 - after / 6
+    bend = (before + there) / 2 - here
+    turn = (after - before) / 6 + (here - there) / 2
+    return here, line, bend, turn
+
+
+def _matrix_phi(x: Float[Array, "k k"]) -> list[Array]:
+    """`_phi` of a matrix: the first row of blocks of the exponential of a shifted block matrix.
+
+    By Taylor's series, halved and squared: LAPACK inside a batch of a study may wait for ever.
+    """
+    k, halvings = x.shape[0], 16
+    whole = jnp.eye(5 * k, k=k).at[:k, :k].set(x) / 2.0**halvings
+    term = total = jnp.eye(5 * k)
+    for n in range(1, 7):
+        term = jnp.matmul(term, whole) / n
+        total = total + term
+    for _ in range(halvings):
+        total = jnp.matmul(total, total)
+    return [total[:k, i * k : (i + 1) * k] for i in range(5)]
 
 
 def residual_along(

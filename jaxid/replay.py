@@ -12,12 +12,13 @@ import scipy.interpolate
 import scipy.signal
 from jaxtyping import Array, Float
 
+from jaxid import signals
 from jaxid.controllers import Controller
 from jaxid.errors import InputError
 from jaxid.io.log import Log
 from jaxid.machine import Machine, disturbance_at
 from jaxid.model import Plant
-from jaxid.readings import State, acceleration
+from jaxid.readings import State, acceleration, derivative
 from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
 from jaxid.solvers import Adaptive
@@ -143,14 +144,14 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"), machine.controller,
-        machine.sensor.mean, reference, disturbance, None, log.position[0], velocity, None, every,
+        machine.sensor.mean, reference, disturbance, None, log.filled[0], velocity, None, every,
     )
 
 
 def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: str) -> Drive:
     solver = None
     if numerics.solver is not None:
-        sizes = float(np.std(log.position, axis=0).max()), float(machine.plant.velocity_scale)
+        sizes = float(np.std(log.filled, axis=0).max()), float(machine.plant.velocity_scale)
         solver = Adaptive.sized(numerics.solver, *sizes)
     return Drive(
         machine.gain, period, hold, numerics.substeps,
@@ -176,7 +177,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     short = eqx.tree_at(
         lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1]
     )
-    nudge = _start(short, plant, jnp.asarray(log.position[:count]))
+    nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
     n = replay.position.size
     moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
     if not bool(jnp.all(jnp.isfinite(nudge))):
@@ -185,9 +186,9 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
 
 
 @eqx.filter_jit
-def _start(replay: Replay, plant: Plant, measured: Array) -> Array:
+def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, ...]) -> Array:
     def residual(nudge: Array) -> Array:
-        return (replay(plant, nudge).position - measured).ravel()
+        return ((replay(plant, nudge).position - position) * np.array(measured)).ravel()
 
     def improve(_: int, nudge: Array) -> Array:
         jacobian = jax.jacfwd(residual)(nudge)
@@ -208,7 +209,7 @@ def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) 
     drive = _drive(machine, log, numerics, period, hold)
     restart = _segments(log, numerics.segment, every) if numerics.segment else None
     return Replay(
-        drive, None, machine.sensor.mean, None, None, command, log.position[0], velocity, restart, every,
+        drive, None, machine.sensor.mean, None, None, command, log.filled[0], velocity, restart, every,
     )
 
 
@@ -227,20 +228,57 @@ def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
     """Restart every `length` samples from the measured position and its local slope."""
     n = (log.samples - 1) * every + 1
     flags = np.zeros(n, bool)
-    q, v = np.zeros((n, log.position.shape[1])), np.zeros((n, log.position.shape[1]))
+    q, v = np.zeros((n, log.filled.shape[1])), np.zeros((n, log.filled.shape[1]))
+    noise = signals.high_band_std(log.filled, log.rate_hz)
     for k in range(0, log.samples, length):
         flags[k * every] = True
-        q[k * every], v[k * every] = local_line(log, k)
+        q[k * every], v[k * every] = local_line(log, k, noise)
     return flags, q, v
 
 
-def local_line(log: Log, k: int, reach: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity at sample k from a parabola through its neighbours."""
+# Reaches of the parabola that gives a velocity [samples], and how far, in standard deviations, a wider
+# one may stray from what a narrower one says.
+_REACHES = (2, 3, 5, 7, 10)
+_STRAY = 2.0
+
+
+def local_line(
+    log: Log, k: int, noise: Float[np.ndarray, " n"] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at sample k, by joint, from parabolas through its neighbours.
+
+    As wide as noise asks and the motion allows: a machine that starts with a jerk is nowhere near a
+    parabola for twenty samples. The widest one counts that agrees with all narrower ones.
+
+    Args:
+        log: The log.
+        k: The sample.
+        noise: Standard deviation of a reading, by joint; absent: read off the log.
+    """
+    noise = signals.high_band_std(log.filled, log.rate_hz) if noise is None else noise
+    position = velocity = low = high = None
+    for reach in _REACHES:
+        q, v, size = _parabola(log, k, reach)
+        # Wide enough that rounding alone, in a log without noise, is no disagreement.
+        spread = _STRAY * size * noise + 1e-12 * np.abs(v)
+        if velocity is None:
+            position, velocity, low, high = q, v, v - spread, v + spread
+            going = np.ones(q.shape, bool)
+            continue
+        low, high = np.maximum(low, v - spread), np.minimum(high, v + spread)
+        going = going & (low <= high)
+        position, velocity = np.where(going, q, position), np.where(going, v, velocity)
+    return position, velocity
+
+
+def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Value and slope at sample k, and the standard deviation of the slope for readings of one."""
     lo = int(np.clip(k - reach, 0, max(log.samples - 2 * reach - 1, 0)))
-    window = slice(lo, lo + 2 * reach + 1)
-    t = log.period * (np.arange(lo, lo + len(log.position[window])) - k)
-    c = np.polynomial.polynomial.polyfit(t, log.position[window], 2)
-    return c[0], c[1]
+    x = log.filled[lo : lo + 2 * reach + 1]
+    t = log.period * (np.arange(lo, lo + len(x)) - k)
+    fit = np.linalg.pinv(np.vander(t / log.period, 3, increasing=True))
+    q, v = fit[0] @ x, fit[1] @ x / log.period
+    return q, v, float(np.linalg.norm(fit[1]) / log.period)
 
 
 def start_velocity(log: Log) -> np.ndarray:
@@ -264,7 +302,7 @@ def needed_steps(machine: Machine, log: Log) -> int:
     """
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
-    q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
     steps = float(_fastest(machine.plant, q, u)) * period / _FINE
     if not np.isfinite(steps):
         raise TooStiffError(
@@ -293,6 +331,24 @@ def _fastest(plant: Plant, q: Array, u: Array) -> Array:
             return acceleration(plant, State(q, v, own), u, jnp.zeros(()), none)
 
         stiffness, damping = jax.jacfwd(acc, argnums=(0, 1))(q, zero)
-        return jnp.maximum(jnp.sqrt(jnp.abs(stiffness).max()), jnp.abs(damping).max())
+        motion = jnp.maximum(jnp.sqrt(jnp.abs(stiffness).max()), jnp.abs(damping).max())
+        return jnp.maximum(motion, _swing(plant, State(q, zero, own), u, none))
 
     return jax.vmap(rate)(q, u).max()
+
+
+def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
+    """Fastest rate of the effects that are oscillators: what steps cannot take exactly."""
+    worst = jnp.zeros(())
+    for i, z in enumerate(x.own):
+        if z is None or z.ndim == 0:
+            continue
+
+        def rates(value: Array, i: int = i) -> Array:
+            own = (*x.own[:i], value, *x.own[i + 1 :])
+            return derivative(plant, State(x.q, x.qd, own), u, jnp.zeros(()), reaction).own[i]
+
+        slope = jax.jacfwd(rates)(z)
+        frequency = jnp.sqrt(jnp.abs(slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]))
+        worst = jnp.maximum(worst, jnp.maximum(frequency, jnp.abs(jnp.trace(slope))))
+    return worst

@@ -10,10 +10,11 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.io.case import Case, load_case
-from jaxid.io.log import Log, read_log
+from jaxid.io.log import Log, read_log, with_load
 from jaxid.io.soundness import Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine, build_machine
 from jaxid.preprocess import Prepared, Recipe, choose_recipe, prepare
+from jaxid.replay import needed_steps
 
 
 @dataclass(frozen=True)
@@ -138,11 +139,13 @@ def _read(
     case: Case, log: Log | str | Path, *, columns: dict | None = None, whole: bool = False
 ) -> Log:
     """A log, or that of a file by the case's columns or others; `whole`: all its rows."""
-    joints, drives = case.plant.joints, case.plant.drives
+    joints, drives, load = case.plant.joints, case.plant.drives, case.plant.cls.load
     if not isinstance(log, Log):
         columns = case.columns if columns is None else columns
         kept = {k: v for k, v in columns.items() if not (whole and k == "rows")}
-        return read_log(log, kept, joints=joints, drives=drives)
+        own = joints if load is None else None
+        return with_load(read_log(log, kept, joints=own, drives=drives), load, joints)
+    log = with_load(log, load, joints)
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):
         values = getattr(log, name)
         if values is not None and values.shape[1] != width:
@@ -183,6 +186,8 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
         )
     hold = None if machine.controller is None else machine.controller.period
     data = prepare(log, machine.gain, recipe, hold)
+    if not all(log.measured):
+        data = replace(data, steps=needed_steps(machine, log))
     if data.moving.sum() < 5 * max(len(machine.parameters.free), 4):
         raise InputError(
             f"only {int(data.moving.sum())} samples move faster than the rest velocity "

@@ -42,6 +42,13 @@ def clip(
     return x - dead_zone(x, limit, width)
 
 
+def within(
+    x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Slope of `clip`: one inside plus or minus limit, zero outside."""
+    return jax.nn.sigmoid((limit - x) / width) - jax.nn.sigmoid((-limit - x) / width)
+
+
 def sharp_clip(x: Float[Array, "..."], limit: Float[Array, "..."]) -> Float[Array, "..."]:
     """Clip of x to plus or minus limit, not smoothed.
 

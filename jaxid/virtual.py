@@ -39,7 +39,11 @@ class Virtual:
     def csv(self) -> str:
         """The log as a table with a header, every digit kept."""
         log = self.log
-        parts = {"time": log.time[:, None], "position": log.position, "force": log.force}
+        load = "load_position" in self.columns
+        known = log.position[:, list(log.measured)]
+        parts = {"time": log.time[:, None], "position": known[:, :-1] if load else known}
+        parts |= {"load_position": known[:, -1:]} if load else {}
+        parts["force"] = log.force
         if log.reference is not None:
             parts["reference"] = log.reference
         header = []
@@ -109,6 +113,11 @@ class Scene:
             InputError: If the case does not say what to simulate.
         """
         where, setting = str(case.path), case.simulation
+        if "load_acceleration" in case.log:
+            raise InputError(
+                "a simulated log has no load_acceleration", where=f"{where}, [log]",
+                mend="leave it out of the case that is simulated",
+            )
         for key in ("duration", "sample_rate"):
             if key not in setting:
                 raise InputError(
@@ -233,14 +242,19 @@ def _log(
             "the simulation diverged", where=str(case.path),
             mend="check gains and parameters, or raise substeps in [simulation]",
         )
+    reading = np.array(reading)
+    if case.plant.cls.load is not None and not case.load_column:
+        reading[:, case.plant.cls.load] = np.nan
     return Log(
-        time=times, position=np.asarray(reading), force=command, reference=reference,
+        time=times, position=reading, force=command, reference=reference,
         hold=machine.hold, source=f"simulation of {case.path.name}",
     )
 
 
 def _columns(case: Case, *, reference: bool) -> dict[str, str]:
     names = {"time": "t", "position": "q", "force": "u", "reference": "ref"}
+    if case.plant.cls.load is not None and (not case.log or "load_position" in case.log):
+        names["load_position"] = "q_load"
     names.update({k: v for k, v in case.log.items() if k in names})
     if not reference:
         names.pop("reference")

@@ -3,49 +3,60 @@
 What acts on one mass is the axis's own (`stepper_kernel`); here the springs couple them. One step
 is drift, kick, drift (second order where all is smooth). Positions, and with them the springs,
 stand still in the kick, so that each mass stops, sticks and breaks away by itself, in closed form.
+Where a spring has a damper, its force is that of the velocities halfway.
 """
 
 import math
 
+import numpy as np
 import stepper_kernel as axis
 from numba import njit
 
 
 @njit(cache=True)
-def pull_of_springs(springs, q, pull):
+def pull_of_springs(springs, q, v, pull):
     """Fill `pull` with the springs' force on each mass [N], walls at 0.
 
     Spring j joins mass j - 1 and mass j; its row of `springs` holds k, k2 and k3 of the force
-    k e + k2 e^2 + k3 e^3 at elongation e, which draws both ends together.
+    k e + k2 e^2 + k3 e^3 at elongation e, which draws both ends together, the d of a damper beside
+    it, and a clearance, inside which neither spring nor damper pulls.
     """
     pull[:] = 0.0
-    before = 0.0
+    before, speed = 0.0, 0.0
     for j in range(q.size + 1):
         here = q[j] if j < q.size else 0.0
-        e = here - before
-        force = e * (springs[j, 0] + e * (springs[j, 1] + e * springs[j, 2]))
+        now = v[j] if j < q.size else 0.0
+        e, half = here - before, 0.5 * springs[j, 4]
+        force = 0.0
+        if abs(e) >= half:
+            e -= math.copysign(half, e)
+            force = e * (springs[j, 0] + e * (springs[j, 1] + e * springs[j, 2]))
+            force += springs[j, 3] * (now - speed)
         if j < q.size:
             pull[j] -= force
         if j > 0:
             pull[j - 1] += force
-        before = here
+        before, speed = here, now
 
 
 @njit(cache=True)
 def advance(masses, springs, q, v, drive, pull, h):
     """One step of h [s], in place: positions q [m] and velocities v [m/s]."""
-    half = 0.5 * h
+    half, middle = 0.5 * h, np.empty(q.size)
     for i in range(q.size):
         q[i] += half * v[i]
-    pull_of_springs(springs, q, pull)
+    pull_of_springs(springs, q, v, pull)
     for i in range(q.size):
         p = masses[i]
-        force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0)
-        hold = p.coulomb + p.stribeck + p.static
-        slip = axis.slip_level(p, abs(v[i]), 1.0)
-        middle = axis.kick(v[i], half, force + axis.velocity_force(p, v[i]), slip, hold, p.mass)
-        slip = axis.slip_level(p, abs(middle), 1.0)
-        v[i] = axis.kick(v[i], h, force + axis.velocity_force(p, middle), slip, hold, p.mass)
+        force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0) + axis.velocity_force(p, v[i])
+        slip, hold = axis.slip_level(p, abs(v[i]), 1.0), p.coulomb + p.stribeck + p.static
+        middle[i] = axis.kick(v[i], half, force, slip, hold, p.mass)
+    pull_of_springs(springs, q, middle, pull)
+    for i in range(q.size):
+        p, mid = masses[i], middle[i]
+        force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0) + axis.velocity_force(p, mid)
+        slip, hold = axis.slip_level(p, abs(mid), 1.0), p.coulomb + p.stribeck + p.static
+        v[i] = axis.kick(v[i], h, force, slip, hold, p.mass)
         q[i] += half * v[i]
 
 
@@ -87,7 +98,7 @@ def run(
             if laws[d].kind != axis.OPEN:
                 u[k, d] = axis.command(laws[d], k, reference[:, i], reading[:, i], memory[d], period)
             drive[i] = masses[i].gain * u[k, d]
-        pull_of_springs(springs, q, pull)
+        pull_of_springs(springs, q, v, pull)
         for i in range(q.size):
             force = drive[i] + pull[i]
             truth[k, i, 0], truth[k, i, 1], truth[k, i, 3] = q[i], v[i], drive[i]

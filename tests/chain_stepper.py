@@ -1,7 +1,7 @@
 """Ground truth for tests: a chain of masses under set-valued friction, without jax and jaxid.
 
-m_i a_i + c_i v_i + k_i (x_i - x_(i-1)) - k_(i+1) (x_(i+1) - x_i) = u_i + effects, the masses
-between two walls at 0. Real sign, exact sticking, sampled loops through a quantised noisy encoder.
+m_i a_i + c_i v_i + s_i - s_(i+1) = u_i + effects, s_i = k_i (x_i - x_(i-1)) + d_i (v_i - v_(i-1)), the
+masses between two walls at 0. Real sign, exact sticking, sampled loops through a quantised noisy encoder.
 
 Conventions, beside those of `stepper`:
     Masses, springs and drives count from 1; spring i joins mass i - 1 and mass i.
@@ -17,8 +17,8 @@ import numpy as np
 from stepper import EFFECTS, Loop, Sensor, control_law, first_samples
 from stepper_kernel import Law, Physics
 
-# Effects on the elongation of a spring -> power of it in the force.
-SPRING_EFFECTS = {"quadratic_stiffness": 2, "cubic_stiffness": 3}
+# Effects on the elongation of a spring -> their column in the kernel.
+SPRING_EFFECTS = {"quadratic_stiffness": 1, "cubic_stiffness": 2, "backlash": 4}
 MASS_EFFECTS = (
     "viscous_friction", "coulomb_friction", "static_friction", "stribeck_friction",
     "asymmetric_viscous", "quadratic_drag", "cubic_friction", "quartic_friction",
@@ -39,6 +39,7 @@ class ChainMachine:
         damping: Of each mass to ground [N s/m].
         stiffness: Of each spring [N/m].
         effects: (kind, mass or spring) -> its parameters, as in the case file [SI].
+        coupling: d, of a damper beside each spring [N s/m]; None: none has one.
         actuated: Masses that are driven, in the order of the drives; None: every mass.
         actuator_gain: Known force per unit of command, by drive or one for all [N per unit].
     """
@@ -49,6 +50,7 @@ class ChainMachine:
     effects: Mapping[Place, Mapping[str, float]] = dataclasses.field(default_factory=dict)
     actuated: Sequence[int] | None = None
     actuator_gain: Sequence[float] | float = 1.0
+    coupling: Sequence[float] | None = None
 
     @property
     def count(self) -> int:
@@ -78,7 +80,7 @@ class ChainMachine:
 
 
 def physics(machine: ChainMachine) -> tuple[np.ndarray, np.ndarray]:
-    """Flatten a machine into records of the kernel, one a mass, and springs (n + 1, 3).
+    """Flatten a machine into records of the kernel, one a mass, and springs (n + 1, 5).
 
     Raises:
         ValueError: If lengths do not fit, or an effect, its place or a parameter is unknown.
@@ -88,8 +90,9 @@ def physics(machine: ChainMachine) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"{n} masses need {n} dampings and {n + 1} springs.")
     if len(set(driven)) < len(driven) or not set(driven) <= set(range(n)):
         raise ValueError(f"actuated names masses from 1 to {n}, each once: {machine.actuated}.")
-    springs = np.zeros((n + 1, 3))
+    springs = np.zeros((n + 1, 5))
     springs[:, 0] = machine.stiffness
+    springs[:, 3] = 0.0 if machine.coupling is None else machine.coupling
     own = zip(machine.mass, machine.damping, strict=True)
     fields = [{"mass": float(mass), "viscous": float(damping)} for mass, damping in own]
     for i, gain in zip(driven, machine.gains, strict=True):
@@ -102,11 +105,11 @@ def physics(machine: ChainMachine) -> tuple[np.ndarray, np.ndarray]:
             )
         if not 1 <= place <= n + (kind in SPRING_EFFECTS):
             raise ValueError(f"{kind} cannot act at {place}: there are {n} masses.")
-        names = EFFECTS[kind]
+        names = EFFECTS.get(kind, {"gap": "gap"})
         if set(values) != set(names):
             raise ValueError(f"{kind} takes {sorted(names)}, got {sorted(values)}.")
         if kind in SPRING_EFFECTS:
-            springs[place - 1, SPRING_EFFECTS[kind] - 1] += float(values["coefficient"])
+            springs[place - 1, SPRING_EFFECTS[kind]] += float(next(iter(values.values())))
             continue
         own = fields[place - 1]
         for name, value in values.items():

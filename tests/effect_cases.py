@@ -23,7 +23,7 @@ class Instant(NamedTuple):
     a: float
     u: float
     t: float
-    z: float = 0.0
+    z: float | tuple[float, ...] = 0.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Row:
     values: Mapping[str, float]
     load: Callable[[Instant], float]
     beside: tuple = ()
-    own: float | None = None
+    own: float | tuple[float, ...] | None = None
     dry: bool = False
     effects: tuple = field(init=False)
 
@@ -116,6 +116,13 @@ ROWS: dict[str, Row] = {
     "input_delay": Row("input_delay", {"delay": 2.4e-3}, lambda x: x.u),
     "saturation": Row("saturation", {"limit": 150.0}, lambda x: clip(x.u, 150.0)),
     "added_mass": Row("added_mass", {"mass": 20.0}, lambda x: x.u - 20.0 * x.a),
+    # own state: elongation times the spring's frequency of 200 rad/s, and its velocity
+    "joint_flexibility": Row(
+        "joint_flexibility",
+        {"stiffness": 1.2e6, "damping": 300.0, "load_inertia": 30.0},
+        lambda x: x.u + 30.0 * x.a + 1.2e6 * x.z[0] / 200.0 + 300.0 * x.z[1],
+        own=(0.004, 0.03),
+    ),
     "friction_drift": Row(
         "friction_drift",
         {"rate": 1.5},

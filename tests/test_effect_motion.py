@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chain_stepper import ChainMachine, simulate_chain
 from effect_cases import MASS, ROWS, Row
 from stepper import Loop, Machine, Sensor, simulate
 from test_effects import differences, places_of, plant_of
@@ -83,9 +84,21 @@ def test_gradient_through_the_loop_that_sticks(name):
 
 def truth(effects: tuple) -> np.ndarray:
     loop = Loop("cascade_pd", reference=REFERENCE, kp=KP, kv=KV, velocity_average=AVERAGE)
+    if "joint_flexibility" in dict(effects):
+        return behind_a_spring(loop, **dict(effects)["joint_flexibility"])
     machine = Machine(MASS, dict(effects), actuator_gain=GAIN)
     log = simulate(machine, loop, Sensor(), rate=1 / PERIOD, duration=TICKS * PERIOD)
     return log["true_position"]
+
+
+def behind_a_spring(loop: Loop, stiffness: float, damping: float, load_inertia: float) -> np.ndarray:
+    """Part of the mass as a second one of the independent chain."""
+    machine = ChainMachine(
+        (MASS - load_inertia, load_inertia), (0.0, 0.0), (0.0, stiffness, 0.0), actuated=(1,),
+        actuator_gain=GAIN, coupling=(0.0, damping, 0.0),
+    )
+    log = simulate_chain(machine, [loop], Sensor(), rate=1 / PERIOD, duration=TICKS * PERIOD)
+    return log["true_position"][:, 0]
 
 
 def distance(name: str, substeps: int) -> float:

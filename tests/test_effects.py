@@ -51,7 +51,8 @@ def balance(plant: Axis, x: Instant, own: tuple):
 
 
 def test_every_registered_effect_has_a_row():
-    assert {row.kind for row in ROWS.values()} == set(EFFECTS)
+    # An axis has no spring for clearance: see test_flexible_axis.
+    assert {row.kind for row in ROWS.values()} == set(EFFECTS) - {"backlash"}
 
 
 @each_row
@@ -114,8 +115,9 @@ def test_balance_is_affine_in_the_acceleration_and_rates_in_their_states(row):
         if row.own is None:
             continue
         scaled = [(*own[:-1], own[-1] * s) for s in (0.0, 1.0, 2.0)]
-        rates = [float(balance(plant, x, z).rates[-1]) for z in scaled]
-        assert rates[2] - 2 * rates[1] + rates[0] == pytest.approx(0.0, abs=1e-12 * abs(rates[1]))
+        rates = [np.asarray(balance(plant, x, z).rates[-1]) for z in scaled]
+        rounding = 1e-12 * np.abs(rates[1]).max()
+        np.testing.assert_allclose(rates[2] - 2 * rates[1] + rates[0], 0.0, atol=rounding)
 
 
 def short_motion() -> ForceData:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool
 from jaxid.discovery.candidates import Candidate, Union
 from jaxid.discovery.own import check_foreign, is_foreign
 from jaxid.effects import EFFECTS
-from jaxid.estimators.inverse_dynamics import ForceData, sharpened
+from jaxid.estimators.inverse_dynamics import ForceData, sharpened, whole_motion
 from jaxid.machine import Machine
 from jaxid.model import Effect, Plant, Scales, carries_force, parameters_of, port_motion
 from jaxid.parameters import Free, Parameters, colours, free_effect, label
@@ -50,7 +50,8 @@ def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
 
 @eqx.filter_jit
 def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
-    return jax.vmap(lambda *motion: port_motion(plant, *motion))(data.q, data.qd, data.qdd)
+    motion = whole_motion(plant, data, data.force)
+    return jax.vmap(lambda *now: port_motion(plant, *now))(*motion)
 
 
 def build_union(machine: Machine, data: Prepared, own: Sequence[type[Effect]] = ()) -> Union:

@@ -8,6 +8,7 @@ from jaxid.effects.registry import EFFECTS as EFFECTS
 from jaxid.effects.registry import register as register
 
 from jaxid.effects import actuator as actuator  # isort: skip
+from jaxid.effects import coupling as coupling  # isort: skip
 from jaxid.effects import friction as friction  # isort: skip
 from jaxid.effects import hysteresis as hysteresis  # isort: skip
 from jaxid.effects import inertia as inertia  # isort: skip

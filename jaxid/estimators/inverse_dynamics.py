@@ -22,11 +22,14 @@ from jaxid.parameters import Free, scatter, seeds
 from jaxid.precision import Precision, assess
 from jaxid.preprocess import Prepared
 from jaxid.readings import residual_along
+from jaxid.unmeasured import complete_motion
 
 # Of the solver where the balance is linear in all unknowns: the first step is then the last.
 _UNDAMPED = 1e-10
 # Factors on the guess of a shape, from which a fit starts too.
 _SHAPES = (0.3, 3.0)
+# Of the dry friction, what may act on joints without an encoder.
+_SHARES = (0.2, 0.5, 0.8)
 
 
 class ForceData(eqx.Module):
@@ -47,6 +50,8 @@ class ForceData(eqx.Module):
     period: float = eqx.field(static=True)
     hold: float = eqx.field(static=True)
     decimator: signals.Decimator = eqx.field(static=True)
+    measured: tuple[bool, ...] = eqx.field(static=True, default=(True,))
+    steps: int = eqx.field(static=True, default=1)
 
     @classmethod
     def of(cls, data: Prepared, rows: np.ndarray | None = None) -> ForceData:
@@ -54,7 +59,8 @@ class ForceData(eqx.Module):
         rows = data.moving if rows is None else rows
         return cls(
             data.q, data.qd, data.qdd, data.force, rows.astype(np.float64),
-            np.asarray(data.start), data.period, data.hold, data.recipe.decimator,
+            np.asarray(data.start), data.period, data.hold, data.recipe.decimator, data.measured,
+            data.steps,
         )
 
 
@@ -62,7 +68,16 @@ def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
-    return data.decimator(residual_along(plant, data.q, data.qd, data.qdd, u, data.period, data.start))
+    motion = whole_motion(plant, data, u)
+    return data.decimator(residual_along(plant, *motion, u, data.period, data.start))
+
+
+def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration of all joints, also of those without an encoder, (time, n)."""
+    times = data.start + data.period * jnp.arange(data.q.shape[0])
+    return complete_motion(
+        plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps
+    )
 
 
 @eqx.filter_jit
@@ -161,10 +176,15 @@ def inverse_dynamics_steps(
     arrays = ForceData.of(data, rows)
     parameters = machine.parameters
     theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
-    places, (transform, damping) = parameters.places, linear_scale(machine)
+    whole = all(data.measured)
+    places, (transform, damping) = parameters.places, linear_scale(machine, whole)
     options = (transform, parameters.bounds, damping)
     fits = []
     for at in _starts(machine, theta):
+        fit, size = yield Solve(_solve, (plant, places, arrays, at, *options))
+        fits.append(fit)
+    # What a joint without an encoder sticks at is told by jumps of the others: full of local minima.
+    for at in [] if whole else _splits(machine, np.asarray(fits[0].theta), data.measured):
         fit, size = yield Solve(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
@@ -193,13 +213,14 @@ def inverse_dynamics_steps(
     )
 
 
-def linear_scale(machine: Machine) -> tuple[Transform, float]:
+def linear_scale(machine: Machine, whole: bool = True) -> tuple[Transform, float]:
     """A solver's scale on which what enters the balance in proportion is fitted as it is, and its damping.
 
     As its logarithm, a mass that starts at two thirds of its value takes five evaluations for two.
-    Bounds keep it positive. Where all unknowns are so, no damping is needed.
+    Bounds keep it positive. Where all unknowns are so, no damping is needed. Nothing is so where some
+    of the motion has to be found, `whole` being false.
     """
-    linear = linear_unknowns(machine)
+    linear = linear_unknowns(machine) & whole
     transform = Transform(Transform.of(machine.parameters).log & ~linear)
     return transform, _UNDAMPED if np.all(linear) else DAMPING
 
@@ -239,6 +260,24 @@ def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
         info = _info(machine.plant, f)
         if info is not None and not carries_force(info) and info.dimension != "1" and theta[k] > 0:
             out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _SHAPES]
+    return out
+
+
+def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> list[np.ndarray]:
+    """The same with the dry friction of all joints shared otherwise between those with an encoder and not."""
+    effects = machine.plant.effects
+    levels = [
+        (k, effects[f.path[1]].port) for k, f in enumerate(machine.parameters.free)
+        if f.path[0] == "effects" and effects[f.path[1]].kind == "coulomb_friction" and f.path[2] == "level"
+    ]
+    seen = [k for k, port in levels if port < len(measured) and measured[port]]
+    hidden = [k for k, port in levels if port < len(measured) and not measured[port]]
+    out = []
+    for share in _SHARES if seen and hidden else ():
+        at = theta.copy()
+        total = at[seen].sum() + at[hidden].sum()
+        at[hidden], at[seen] = share * total / len(hidden), (1 - share) * total / len(seen)
+        out.append(at)
     return out
 
 

@@ -84,7 +84,7 @@ def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndar
     """
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     unknown = machine.parameters
-    measured = jnp.asarray(log.position)
+    measured = jnp.asarray(log.filled)
     return -np.asarray(_jacobian(replay, unknown.places, machine.plant, measured, unknown.guess))
 
 
@@ -147,14 +147,14 @@ def output_error_steps(
         problem, active = _with_start(machine, log, problem, minimum)
         minimum = yield Solve(_fit, (*problem, active))
     e = np.asarray(minimum.residual).reshape(log.position.shape)
+    counts = np.broadcast_to(log.measured, e.shape)
     jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
     theta = np.asarray(minimum.theta)
-    counts = np.ones(e.shape, bool)
     names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
     full = np.asarray((yield Solve(_hessian, (*problem[:5], minimum.theta)))) if hessian else None
     precision = assess(
         names, jacobian[..., active], e, counts,
-        float(np.linalg.norm(log.position - log.position.mean(axis=0))),
+        float(np.linalg.norm((log.filled - log.filled.mean(axis=0))[counts])),
         np.where(theta != 0, theta, 1.0)[active],
         None if full is None else full[np.ix_(active, active)],
     ).first(machine.parameters.names)
@@ -166,8 +166,8 @@ def output_error_steps(
         precision=precision,
         converged=converged,
         message="converged" if converged else _failure(minimum),
-        residual=e,
-        samples=int(e.size),
+        residual=np.where(counts, e, np.nan),
+        samples=int(counts.sum()),
         steps=int(minimum.steps),
         notes=_notes(machine, numerics, log),
     )
@@ -194,7 +194,8 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple
     free = np.full(nuisance, np.inf)
     transform = Transform(np.concatenate([Transform.of(parameters).log, np.zeros(nuisance, bool)]))
     return (
-        replay, parameters.places, machine.plant, log.position, np.ones(log.position.shape),
+        replay, parameters.places, machine.plant, log.filled,
+        np.broadcast_to(np.asarray(log.measured, dtype=float), log.position.shape),
         np.concatenate([parameters.guess, np.zeros(nuisance)]), transform,
         (np.concatenate([lower, -free]), np.concatenate([upper, free])),
     )
@@ -227,8 +228,8 @@ def choose_numerics(
         return numerics
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     run = eqx.filter_jit(lambda r, p: r(p).position)(replay, machine.plant)
-    off = np.sqrt(np.mean((np.asarray(run) - log.position) ** 2))
-    if np.isfinite(off) and off < _LOST * np.std(log.position):
+    off = np.sqrt(np.nanmean((np.asarray(run) - log.position) ** 2))
+    if np.isfinite(off) and off < _LOST * np.nanstd(log.position):
         return numerics
     length = max(20, log.samples // _SEGMENTS)
     return replace(numerics, segment=length)
@@ -238,7 +239,7 @@ def _sharp_steps(machine: Machine, log: Log) -> int:
     """Steps a sample that the smoothed sign asks for: a coarser one gives garbage for a gradient."""
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
-    q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
     drive = Drive(jnp.asarray(machine.gain), period)
     return needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
 

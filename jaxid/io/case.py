@@ -114,6 +114,13 @@ class Case:
         return tuple(dict.fromkeys(c for c in classes if EFFECTS.get(c.kind) is not c))
 
     @property
+    def load_column(self) -> bool:
+        """Whether the log has the position of a load behind an elastic coupling."""
+        named = self.log.get("position", ())
+        whole = not isinstance(named, str) and len(named) == self.plant.joints
+        return not self.log or whole or "load_position" in self.log
+
+    @property
     def columns(self) -> dict[str, Any]:
         """The [log] table of a case that must have one.
 

@@ -112,7 +112,8 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         raise spot.at("orientation").refuse("vertical", "does not go with a rotary plant", mend)
     units = Units(motion, **given.get("units", {}))
     return PlantEntry(
-        cls, given["parameters"], units, vertical, given.get("gravity"), joints, given.get("actuated")
+        cls, given["parameters"], units, vertical, given.get("gravity"), joints,
+        given.get("actuated", cls.actuated),
     )
 
 

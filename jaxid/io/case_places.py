@@ -23,6 +23,11 @@ def read_ports(
     if len(places) > 1:
         raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
     springs = plant.cls.springs(plant.joints)
+    if cls.with_springs not in (None, springs > 0):
+        has, mend = ("no springs", "chain or flexible_axis") if cls.with_springs else (
+            "springs of its own", "axis, or state the spring there",
+        )
+        raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {mend}")
     for name in ("spring", "passive"):
         if name in table and (name == "passive" or not springs):
             mend = f"leave {name} out: the effect then acts on the joint"

@@ -1,6 +1,6 @@
 """Measured logs: the columns that a case names, checked and in SI units."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ class Log:
 
     Attributes:
         time: Time [s], from where the file starts.
-        position: Positions [m or rad], a column a joint.
+        position: Positions [m or rad], a column a joint; NaN throughout where a joint has no encoder.
         force: The logged command, before the known gain of the actuator.
         velocity: Measured velocity [m/s or rad/s].
         acceleration: Measured acceleration [m/s^2 or rad/s^2].
@@ -91,6 +91,19 @@ class Log:
         return self.time.size
 
     @property
+    def measured(self) -> tuple[bool, ...]:
+        """Which joints have an encoder."""
+        return tuple(bool(m) for m in ~np.isnan(self.position[0]))
+
+    @property
+    def filled(self) -> Float[np.ndarray, "samples joints"]:
+        """Positions in which joints without an encoder stand where the others are, on average."""
+        if all(self.measured):
+            return self.position
+        others = np.nanmean(self.position, axis=1, keepdims=True)
+        return np.where(self.measured, self.position, others)
+
+    @property
     def period(self) -> float:
         """Sampling period [s].
 
@@ -103,6 +116,37 @@ class Log:
     def rate_hz(self) -> float:
         """Sampling rate [Hz]."""
         return 1.0 / self.period
+
+
+def with_load(log: Log, load: int | None, joints: int) -> Log:
+    """The log with a column of positions for each joint, that of the load where it belongs.
+
+    Args:
+        log: Of a plant's encoders: all joints in `position`, or all but the load, which stands in
+            `load_position` or has none.
+        load: Joint behind an elastic coupling, 0-based; None: every joint has its encoder.
+        joints: How many there are.
+
+    Raises:
+        InputError: If the load is given twice, or columns are missing.
+    """
+    if load is None:
+        return log
+    width = log.position.shape[1]
+    if width == joints:
+        if log.load_position is not None:
+            raise InputError(
+                "load_position is given beside the positions of all joints", where=log.source,
+                mend="leave it out, or let position name the motor's column alone",
+            )
+        return log
+    if width != joints - 1:
+        raise InputError(
+            f"position has {width} columns where {joints - 1} or {joints} belong", where=log.source,
+            mend="name the motor's column, and the load's as load_position where it has one",
+        )
+    column = np.full(log.samples, np.nan) if log.load_position is None else log.load_position[:, 0]
+    return replace(log, position=np.insert(log.position, load, column, axis=1), load_position=None)
 
 
 def _frozen(values: Any) -> np.ndarray:

@@ -76,12 +76,13 @@ def raise_on_error(findings: Iterable[Finding]) -> None:
 
 def _movement(log: Log, path: str) -> list[Finding]:
     """Joints that stand still, and positions that come in coarse steps."""
-    reasons = [_stillness(q) for q in log.position.T]
+    seen = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
+    reasons = [_stillness(q) for _, q in seen]
     if all(reasons):
         mend = "check that position names the right column and that the machine moved"
         return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, position", mend)]
     findings = []
-    for joint, (q, reason) in enumerate(zip(log.position.T, reasons, strict=True), start=1):
+    for (joint, q), reason in zip(seen, reasons, strict=True):
         where = f"{path}, position of joint {joint}"
         levels, step = _levels(q)
         if reason:

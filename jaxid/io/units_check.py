@@ -89,7 +89,7 @@ def ratio_findings(
     reference_of = dict(zip(followed, range(references), strict=False))
     for joint in range(log.position.shape[1]):
         q = log.position[:, joint]
-        if np.ptp(q) == 0:
+        if np.ptp(q) == 0 or not log.measured[joint]:
             continue
         if log.velocity is not None:
             where = f"{path}, velocity of joint {joint + 1}"
@@ -155,6 +155,8 @@ def magnitude_findings(log: Log, motion: str, path: str) -> list[Finding]:
         what = f"the sampling period is {log.period:.4g} s: time looks like milliseconds or rows"
         findings.append(Finding(severity, what, f"{path}, time", "give time in seconds"))
     for joint, q in enumerate(log.position.T, start=1):
+        if not log.measured[joint - 1]:
+            continue
         where = f"{path}, position of joint {joint}"
         span = float(np.ptp(q))
         if span >= 100 and np.all(q == np.round(q)):
@@ -217,7 +219,7 @@ def plausible_inertia(
     guesses = np.broadcast_to(np.asarray(guess, dtype=np.float64), joints)
     forces = log.force * np.asarray(gain, dtype=np.float64)
     for force, joint in zip(forces.T, driven, strict=True):
-        others = np.delete(log.position, joint, axis=1)
+        others = np.delete(log.position, [joint, *np.flatnonzero(~np.array(log.measured))], axis=1)
         rough = implied_inertia(force, log.position[:, joint], log.period, others)
         where = f"{log.source}, joint {joint + 1}"
         span = float(np.ptp(log.position[:, joint]))

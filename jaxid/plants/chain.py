@@ -75,26 +75,13 @@ class Chain(Plant):
     def port_normal(self, q: Array) -> Array:
         return jnp.concatenate([self.mass * self.gravity, jnp.zeros(q.size + 1)])
 
+    def port_spring(self, q: Array) -> tuple[Array, Array]:
+        stiffness = jnp.concatenate([jnp.zeros_like(q), self.stiffness])
+        return stiffness, jnp.zeros_like(stiffness)
+
     def reached(self, port: int, joints: int) -> tuple[int, ...]:
         spring = port - joints
         return (port,) if spring < 0 else tuple(i for i in (spring - 1, spring) if 0 <= i < joints)
-
-    def drive_of(self, port: int, drives: int) -> int | None:
-        if self.actuated is None:
-            return port if port < drives else None
-        return self.actuated.index(port) if port in self.actuated else None
-
-    def at_drives(self, x: Array) -> Array:
-        return x if self.actuated is None else x[..., list(self.actuated)]
-
-    def applied(self, u: Array, coordinates: int) -> Array:
-        if self.actuated is None:
-            return u
-        drives = [self.drive_of(i, u.size) for i in range(coordinates)]
-        return jnp.stack([jnp.zeros((), u.dtype) if j is None else u[j] for j in drives])
-
-    def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
-        return effect.of_spring == (port >= self.joints) and super().offers(effect, port, drives)
 
     def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         what, k = self.place(port)

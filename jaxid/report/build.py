@@ -118,7 +118,7 @@ def _views(
     session: Session, before: Sequence[Gap] | None, after: Sequence[Gap]
 ) -> tuple[LogView, ...]:
     earlier = before or [None] * len(after)
-    joints = range(session.fit.log.position.shape[1])
+    joints = np.flatnonzero(session.fit.log.measured).tolist()
     return tuple(
         _view(run, old, new, joint, len(joints))
         for run, old, new in zip(session.runs, earlier, after, strict=True)

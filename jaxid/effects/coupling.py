@@ -1,0 +1,85 @@
+"""What an elastic coupling does beside its stiffness."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxid import smooth
+from jaxid.effects.registry import register
+from jaxid.model import Action, Effect, Scales, Signals, parameter
+
+# Corner of the clearance, relative to it.
+_CORNER = 1e-2
+
+
+@register("backlash")
+class Backlash(Effect):
+    """No force passes a spring within its clearance: k times a dead zone of e, in place of k e.
+
+    Stated as the force that takes the spring's own back: k clip(e) + d e' inside. The gap lies about
+    the elongation at which the spring was relaxed.
+    """
+
+    of_spring = True
+    with_springs = True
+
+    gap: Array = parameter("position", "positive", "total clearance")
+
+    def act(self, x: Signals, state: None) -> Action:
+        half = 0.5 * self.gap
+        width = _CORNER * half
+        lost = smooth.clip(x.y, half, width)
+        return Action(force=x.stiffness * lost + x.damping * smooth.within(x.y, half, width) * x.yd)
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"gap": 1e-9 * scales.position}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"gap": scales.position * s} for s in (0.1, 0.3, 0.6, 1.0, 1.5)]
+
+    @classmethod
+    def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
+        return {"gap": (0.0, 2 * scales.position)}
+
+
+@register("joint_flexibility")
+class JointFlexibility(Effect):
+    """Part of the inertia, J, sits behind a spring: k e + d e' - (-J a) on the joint.
+
+    e is the elongation of the spring: J (a + e'') = -k e - d e'. What the plant's own inertia says of
+    the whole stays as it is; the effect takes its part of it away and gives the spring's pull instead.
+    The state is e times the spring's frequency, and e', of one size.
+    """
+
+    with_springs = False
+
+    stiffness: Array = parameter("force/position", "positive", "of the spring")
+    damping: Array = parameter("force*time/position", "positive", "beside the spring")
+    load_inertia: Array = parameter("inertia", "positive", "part of the inertia behind it")
+
+    def act(self, x: Signals, state: Array) -> Action:
+        w = jnp.sqrt(self.stiffness / self.load_inertia)
+        e, ed = state[0] / w, state[1]
+        pull = self.stiffness * e + self.damping * ed
+        rate = jnp.stack([w * ed, -x.ydd - pull / self.load_inertia])
+        return Action(force=self.load_inertia * x.ydd + pull, rate=rate)
+
+    def initial_state(self, u: Array) -> Array:
+        return jnp.zeros((2,), u.dtype)
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        # Half of the inertia behind a spring that swings once in 3 to 100 samples. A fifth of critical
+        # damping: resonances are then wide enough for a grid of a third of an octave.
+        inertia = 0.5 * scales.natural("inertia")
+        found = []
+        for samples in 3.0 * 2.0 ** (np.arange(16) / 3.0):
+            w = 2 * np.pi / (samples * scales.period)
+            found.append(
+                {"stiffness": inertia * w**2, "damping": 0.4 * inertia * w, "load_inertia": inertia}
+            )
+        return found
