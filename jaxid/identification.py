@@ -154,4 +154,5 @@ def simulated(machine: Machine, log: Log) -> SimulationGap | None:
     numerics = replace(numerics, segment=None, set_valued=True, substeps=steps)
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     gap = simulation_gap(machine, replay, log)
-    return gap if np.all(np.isfinite(gap.rms)) and np.all(gap.relative < 1e3) else None
+    seen = list(log.measured)
+    return gap if np.all(np.isfinite(gap.rms[seen])) and np.all(gap.relative[seen] < 1e3) else None

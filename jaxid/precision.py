@@ -190,6 +190,8 @@ def assess(
     Returns:
         The precision. The residual's colour is an autoregressive model, by column of the residual.
     """
+    if not names:
+        return Precision(np.zeros((0, 0)), np.zeros(0, bool), [], np.zeros(0))
     rows = jacobian if counts.all() else np.where(counts[..., None], jacobian, 0.0)
     flat = rows.reshape(-1, len(names))
     norm = np.linalg.norm(flat, axis=0)

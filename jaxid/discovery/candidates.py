@@ -176,6 +176,8 @@ def refine(
     Returns:
         All unknowns, and whether the solver converged.
     """
+    if not len(moving):
+        return theta.copy(), True
     few = free_of(union, moving)
     transform = Transform.of(few)
     lower, upper = (np.asarray(transform.inward(b)) for b in few.bounds)

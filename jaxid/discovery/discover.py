@@ -239,7 +239,7 @@ def _refit(session: Session, start: Estimate) -> Estimate:
 
 
 def _length(gap: Gap) -> float:
-    return float(np.linalg.norm(gap.simulation.rms))
+    return float(np.sqrt(np.nansum(gap.simulation.rms**2)))
 
 
 def _round(search: Search, step: Step) -> Round:

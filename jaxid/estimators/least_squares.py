@@ -123,6 +123,12 @@ def levenberg_marquardt(
     Source:
         Marquardt (1963); damping after Nielsen (1999), IMM-REP-1999-05.
     """
+    if theta.size == 0:  # nothing is unknown: only the residual is asked for
+        e = residual(theta).ravel()
+        cost, kept = 0.5 * e @ e, e if keep else e[:0]
+        return Minimum(
+            theta, cost, jnp.asarray(1), jnp.isfinite(cost), kept, jnp.zeros((kept.size, 0)),
+        )
     lower, upper = transform.inward(lower), transform.inward(upper)
     moves = jnp.ones(theta.size, bool) if active is None else active
 
