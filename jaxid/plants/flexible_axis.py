@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxid.model import Effect, Plant, as_array, parameter
 
 _INERTIAS = ("motor_inertia", "load_inertia")
+# Of motor, load and coupling.
+_OF_LOAD = np.array([0.0, 1.0, 0.0])
 
 
 class FlexibleAxis(Plant):
@@ -16,7 +19,7 @@ class FlexibleAxis(Plant):
 
     Joint 1 is the motor, joint 2 the load, both in the coordinate of the load; the drive acts on the
     motor. Ports are the two joints and then the coupling, by its elongation e. g acts along a
-    vertical axis only, and on both: the motor's inertia then has to weigh, as that of a lifted drive.
+    vertical axis only, and on the load: what turns does not weigh.
 
     Args:
         motor_inertia: J_1 [kg or kg m^2].
@@ -64,7 +67,7 @@ class FlexibleAxis(Plant):
 
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         coupling = self.stiffness * self._elongation(q) + self.damping * (qd[1] - qd[0])
-        weight = self.port_gravity(q)[:2]
+        weight = self.port_gravity(q)[: q.size]
         return self.own_inertia() * (qdd + weight) + jnp.stack([-coupling, coupling])
 
     def ports(self, q: Array) -> Array:
@@ -76,11 +79,10 @@ class FlexibleAxis(Plant):
 
     def port_gravity(self, q: Array) -> Array:
         along = self.gravity if self.vertical else 0.0 * self.gravity
-        return jnp.stack([along, along, jnp.zeros_like(along)])
+        return along * _OF_LOAD
 
     def port_normal(self, q: Array) -> Array:
-        pressed = self.own_inertia() * self.gravity
-        return jnp.concatenate([pressed, jnp.zeros(1)])
+        return self.load_inertia * self.gravity * _OF_LOAD
 
     def port_spring(self, q: Array) -> tuple[Array, Array]:
         none = jnp.zeros(2)
