@@ -17,8 +17,8 @@ import numpy as np
 from stepper import EFFECTS, Loop, Sensor, control_law, first_samples
 from stepper_kernel import Law, Physics
 
-# Effects on the elongation of a spring -> their column in the kernel.
-SPRING_EFFECTS = {"quadratic_stiffness": 1, "cubic_stiffness": 2, "backlash": 4}
+# Effects on the elongation of a spring -> power of it in the force.
+SPRING_EFFECTS = {"quadratic_stiffness": 2, "cubic_stiffness": 3}
 MASS_EFFECTS = (
     "viscous_friction", "coulomb_friction", "static_friction", "stribeck_friction",
     "asymmetric_viscous", "quadratic_drag", "cubic_friction", "quartic_friction",
@@ -98,18 +98,21 @@ def physics(machine: ChainMachine) -> tuple[np.ndarray, np.ndarray]:
     for i, gain in zip(driven, machine.gains, strict=True):
         fields[i]["gain"] = float(gain)
     for (kind, place), values in machine.effects.items():
+        if kind == "backlash":
+            springs[place - 1, 4] = float(values["gap"])
+            continue
         if kind not in (*MASS_EFFECTS, *SPRING_EFFECTS):
             raise ValueError(
                 f"The chain has no effect {kind!r}; it has {MASS_EFFECTS} by mass "
-                f"and {tuple(SPRING_EFFECTS)} by spring."
+                f"and {('backlash', *SPRING_EFFECTS)} by spring."
             )
         if not 1 <= place <= n + (kind in SPRING_EFFECTS):
             raise ValueError(f"{kind} cannot act at {place}: there are {n} masses.")
-        names = EFFECTS.get(kind, {"gap": "gap"})
+        names = EFFECTS[kind]
         if set(values) != set(names):
             raise ValueError(f"{kind} takes {sorted(names)}, got {sorted(values)}.")
         if kind in SPRING_EFFECTS:
-            springs[place - 1, SPRING_EFFECTS[kind]] += float(next(iter(values.values())))
+            springs[place - 1, SPRING_EFFECTS[kind] - 1] += float(values["coefficient"])
             continue
         own = fields[place - 1]
         for name, value in values.items():

@@ -108,14 +108,17 @@ def distance(name: str, substeps: int) -> float:
     return float(np.abs(ours - truth(row.effects)).max())
 
 
-# Of the stroke. Dry friction: when sliding starts is known to a step of 0.25 ms (first order). A
-# delay off the grid is averaged over a tick (second order in it). |v| is rounded over 1 mm/s.
-# All else is smooth: the stepper's second order at 5 us.
+# Of the stroke. Dry friction turns exactly within a step where its level is constant; one that moves with
+# speed is taken halfway (second order), one that drifts at the step's start (first). A delay off the
+# grid is averaged over a tick (second order in it). |v| is rounded over 1 mm/s. All else is smooth: the
+# stepper's second order at 5 us.
 CLOSE = {
     "input_delay": 1e-5,
     "asymmetric_viscous": 1e-6,
     "hysteresis": 1e-6,
     "quadratic_drag": 2e-9,
+    "stribeck_friction": 2e-8,
+    "friction_drift": 1e-6,
 }
 
 
@@ -125,11 +128,16 @@ def test_motion_is_the_independent_steppers(name):
     # break-away acts in the first milliseconds alone: it needs the finer step to stand out
     off = distance(name, 16 if name == "static_friction" else 4)
     removed = float(np.abs(truth(row.effects) - truth(row.effects[:-1])).max())
-    assert off < CLOSE.get(name, 4e-5 if row.dry else 1e-9) * STROKE
+    assert off < CLOSE.get(name, 1e-9) * STROKE
     assert removed > 20 * off
 
 
 @pytest.mark.parametrize("name", ["coulomb_friction", "static_friction"])
-def test_distance_to_the_truth_falls_with_the_step(name):
-    # first order: a fourth on average, at most a half where the coarse step happens to be lucky
-    assert distance(name, 16) < 0.5 * distance(name, 4)
+def test_one_step_a_tick_turns_where_friction_does(name):
+    assert distance(name, 1) < 1e-9 * STROKE
+
+
+@pytest.mark.parametrize(("name", "part"), [("stribeck_friction", 0.1), ("friction_drift", 0.4)])
+def test_distance_to_the_truth_falls_with_the_step(name, part):
+    # Second order, and first, as said above: a sixteenth and a fourth.
+    assert distance(name, 16) < part * distance(name, 4)
