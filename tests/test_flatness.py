@@ -93,19 +93,19 @@ def test_live_identifies_switches_and_tracks(tmp_path):
     case.write_text(text(duration="1.0"))
     late = {}
     for identify in (False, True):
-        live = Live(case, identify=identify)
-        log, ran = driven(live, 1.0)
-        off = (ran["true_position"] - live.reference)[200:, 1]
+        run = driven(case, 1.0, identify=identify)
+        off = (run.position - run.log.reference)[200:, 1]
         late[identify] = float(np.sqrt(np.mean(off**2)))
-    assert 30 < live.switched <= 100
-    found = errors(list(true_values()), live.told.theta)
+    switched = run.live.switched
+    assert 30 < switched <= 100
+    found = errors(list(true_values()), run.live.told.theta)
     assert all(found[kind] <= aim for kind, aim in KINDS.items())
     assert late[True] < 1e-4 < 2e-4 < late[False]
-    told = follow(case, log)
-    assert told.trusted[live.switched - 1].all()
+    told = follow(case, run.log)
+    assert told.trusted[switched - 1].all()
     assert not told.trusted[5].any()
     # What is trusted is within what trust means.
-    worst = errors(list(true_values()), told.theta[live.switched - 1])
+    worst = errors(list(true_values()), told.theta[switched - 1])
     assert max(worst.values()) < 0.05
 
 

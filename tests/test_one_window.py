@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from six_masses import KINDS, Live, driven, errors, first_instants, text
+from six_masses import KINDS, driven, errors, first_instants, machine, text
 
 from jaxid.errors import InputError
 from jaxid.estimators.one_window import _homogeneous, ratio, single_time, without_friction
@@ -45,7 +45,7 @@ def test_forms_of_one_interval(tmp_path, method, stiffness):
 def test_two_intervals_work_at_10_khz_and_fail_at_1(tmp_path):
     """As the notes on the paper have it: 0.4 % at 10 kHz, useless at 1 kHz."""
     fast = case(tmp_path, period="1e-4", sample_rate="10000.0")
-    log = driven(Live(fast), 0.1)[0]
+    log = driven(fast, 0.1).log
     found = identify(fast, log, method="algebraic_sign_unchanged").estimate
     assert max(errors(found.names, found.theta).values()) < 0.005
     found = identify(case(tmp_path), first_instants(), method="algebraic_sign_unchanged").estimate
@@ -56,20 +56,13 @@ def test_two_intervals_work_at_10_khz_and_fail_at_1(tmp_path):
 
 def test_what_sticks_is_named(tmp_path):
     """Only mass 2 driven: until 0.1 s masses 5 and 6 have not moved."""
-    from chain_stepper import simulate_under
-    from six_masses import Sensor, machine
-
     changes = {"level": "0.05", "rise_time": "0.1", "kind": '"chain"\nactuated = [2]'}
     whole = text(**{k: v for k, v in changes.items() if k != "level"})
     # Two lines begin with `level`: that of the reference is the second.
     whole = whole.replace("level = [0.03, 0.05, 0.04, 0.06, 0.035, 0.045]", "level = 0.05")
     path = tmp_path / "case.toml"
     path.write_text(whole + "\n[algebraic]\nwindow = [0.0, 0.1]\n")
-    live = Live(path)
-    one = machine()
-    one = type(one)(one.mass, one.damping, one.stiffness, one.effects, [2])
-    ran = simulate_under(one, lambda k, q: live.command(q), Sensor(0.0, 0.0), rate=1e3, duration=0.1)
-    log = Log(ran["t"], ran["position"], ran["force"], reference=live.reference[:100], source="one drive")
+    log = driven(path, 0.1, on=machine(path, [2])).log
     found = identify(path, log, method="algebraic").estimate
     told = {n for n, ok in zip(found.names, found.identifiable, strict=True) if ok}
     assert {"mass[1]", "mass[2]", "mass[3]", "stiffness[4]"} <= told
