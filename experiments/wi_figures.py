@@ -65,7 +65,7 @@ def tracking(path: Path, run: Driven) -> None:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     title = "mass; dotted: the controller switches to what was found"
     figure.legend(handles, labels, ncols=6, title=title, loc="outside upper center")
-    for ax, end in zip(axes[-1], (ONSET, run.log.time[-1]), strict=True):
+    for ax, end in zip(axes[-1], (ONSET, len(run.log.time) * run.log.period), strict=True):
         ax.set(xlim=(0.0, end), xlabel="time [s]")
     _save(figure, path)
 
@@ -75,7 +75,8 @@ def noise(path: Path, lines: dict[str, dict], at: list[float], exact: dict[str, 
 
     Args:
         path: Of the picture.
-        lines: By method, (kind, "spread" or "bias") to its values over noise [%].
+        lines: By method, (kind, "spread" or "bias") to its values over noise [%]; first a bound, of
+            spread only.
         at: Noise [m].
         exact: Spread of `algebraic` on logs of the exact simulator, by kind [%].
     """
@@ -85,8 +86,8 @@ def noise(path: Path, lines: dict[str, dict], at: list[float], exact: dict[str, 
             if (kind, "bias") not in values:
                 ax.loglog(at, values[kind, "spread"], "k:", label=name)
                 continue
-            ax.loglog(at, values[kind, "spread"], f"C{colour}-o", ms=3, label=name)
-            ax.loglog(at, values[kind, "bias"], f"C{colour}--", lw=0.8)
+            ax.loglog(at, values[kind, "spread"], f"C{colour - 1}-o", ms=3, label=name)
+            ax.loglog(at, values[kind, "bias"], f"C{colour - 1}--", lw=0.8)
         ax.loglog(at, exact[kind], "kx", ms=7, label="algebraic, exact simulator")
         ax.set(title=kind.replace("_", " "), ylim=(1e-4, 1e4))
         ax.grid(alpha=0.3)
