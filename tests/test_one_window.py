@@ -129,20 +129,32 @@ def test_forms_on_a_polynomial():
 
 
 FAULTS = {
-    "too short": ("[0.0, 0.02]", {}, "holds 21 samples"),
-    "backwards": ("[0.1, 0.0]", {}, "is not a range"),
-    "not linear": ("[0.0, 0.1]", {"level": "0.1"}, "does not enter the balance in proportion"),
+    "too short": ("[0.0, 0.02]", "", "holds 21 samples; let it hold at least 48"),
+    "backwards": ("[0.1, 0.0]", "", "is not a range"),
+    "not in the log": ("[5.0, 6.0]", "", "not within the log, which runs from 0 to 0.099 s; choose one"),
+    "beyond its end": ("[0.05, 0.2]", "", "not within the log"),
+    "before its start": ("[-0.1, 0.1]", "", "not within the log"),
+    "memory": ("[0.0, 0.1]", 'kind = "hysteresis"\nlevel = 1.0\nstiffness = 1e5', "has a memory"),
+    "unknown delay": ("[0.0, 0.1]", 'kind = "input_delay"\ndelay = { guess = 1e-3 }', "has a memory"),
+    "drift": ("[0.0, 0.1]", 'kind = "friction_drift"\nrate = 0.1', "changes with time; leave out"),
+    "unknown drift": ("[0.0, 0.1]", 'kind = "friction_drift"\nrate = { guess = 0.0 }', "changes with time"),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_windows_that_cannot_be(tmp_path, name):
-    window, changes, words = FAULTS[name]
+    window, effect, words = FAULTS[name]
     path = case(tmp_path, window)
-    if changes:
-        lines = path.read_text().replace("level = [\n  {", "friction_coefficient = [\n  {")
-        path.write_text(lines)
+    if effect:
+        path.write_text(path.read_text().replace("[controller]", f"[[effects]]\n{effect}\n\n[controller]"))
     with pytest.raises(InputError, match=words):
+        identify(path, first_instants(), method="algebraic")
+
+
+def test_friction_by_coefficient_is_not_in_proportion(tmp_path):
+    path = case(tmp_path)
+    path.write_text(path.read_text().replace("level = [\n  {", "friction_coefficient = [\n  {"))
+    with pytest.raises(InputError, match="not enter the balance in proportion; .* friction by its level"):
         identify(path, first_instants(), method="algebraic")
 
 
