@@ -1,12 +1,13 @@
 """Flatness: the error obeys the poles; the law on a machine that is not jaxid's; live, and switched."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 from six_masses import CASE, KINDS, driven, errors, text, true_values
 
-from jaxid.controllers import Flatness, Path, flat_inputs
+from jaxid.controllers import Flatness, Path, Tick, flat_inputs
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
@@ -68,6 +69,27 @@ def test_reconstructed_velocity_does_not_see_the_counts():
         jitter[len(poles)] = np.std(np.diff(np.asarray(run.command)[2000:, 0], 2))
         assert np.abs(off[2000:]).max() < 2e-4  # It still follows, by 0.1 m.
     assert jitter[3] < 0.1 * jitter[2]
+
+
+def test_reconstructed_velocity_rests_with_its_joint():
+    """Stuck by friction that the model lacks: the command ramps with the error's integral, no more."""
+    effects = (EFFECTS["viscous_friction"](coefficient=DRAG), EFFECTS["linear_stiffness"](coefficient=STIFF))
+    law = Flatness(
+        poles=(-30.0, -40.0, -50.0), epsilon=jnp.asarray(1e-6), model=Axis(MASS, effects=effects),
+        gain=jnp.asarray([GAIN]), period=PERIOD,
+    )
+    at, none = 0.01, jnp.zeros(1)
+    tick = Tick(jnp.full(1, at), Path(none, none, none), (0,))
+    memory, given, command = law.start(tick, none), [], eqx.filter_jit(law.command)
+    for _ in range(300):
+        u, memory = command(tick, memory, none)
+        given.append(float(u[0]))
+    b1, b0 = np.poly(law.poles)[2:]
+    integral = at * PERIOD * np.arange(1, 301)
+    # The first sample's error counts half a tick.
+    expected = (STIFF * at - MASS * (b1 * at + b0 * (integral - 0.5 * at * PERIOD))) / GAIN
+    # Without the reset the model's velocity would follow its force, away from the stuck joint's.
+    np.testing.assert_allclose(given, expected, rtol=1e-9)
 
 
 def test_flat_output_gives_all_inputs():
