@@ -343,15 +343,18 @@ def check_linear(machine: Machine) -> None:
 
 def _ages(machine: Machine) -> bool:
     """Whether time stands in the balance, by its value along random motion now and later."""
-    guess, random = machine.parameters.guess, np.random.default_rng(0)
-    plant = scatter(machine.parameters.places, machine.plant, np.where(guess == 0, 1.0, guess))
+    plant, parameters, random = machine.plant, machine.parameters, np.random.default_rng(0)
+    theta = np.where(parameters.guess == 0, 1.0, parameters.guess)
     motion, u = random.uniform(0.5, 1.5, (3, plant.joints)), random.uniform(0.5, 1.5, machine.gain.size)
-    early, late = (_value(plant, motion, u, np.asarray(t)) for t in (0.0, 1.0))
+    early, late = (_value(plant, parameters.places, theta, motion, u, np.asarray(t)) for t in (0.0, 1.0))
     return bool(np.any(np.asarray(early) != np.asarray(late)))
 
 
 @eqx.filter_jit
-def _value(plant: Plant, motion: Array, u: Array, t: Array) -> Float[Array, " n"]:
+def _value(
+    plant: Plant, places: tuple, theta: Array, motion: Array, u: Array, t: Array
+) -> Float[Array, " n"]:
+    plant = scatter(places, plant, jnp.asarray(theta))
     return plant.balance(*motion, u, t, plant.initial_states(u)).residual
 
 
