@@ -18,89 +18,30 @@ import re
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from common import Table, copied, parser_of
 
 import jaxid
 from jaxid.estimators import METHODS
-from jaxid.estimators.online import Online, window_rows
+from jaxid.estimators.online import Online, Told, window_rows
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
 from jaxid.machine import build_machine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from chain_stepper import ChainMachine, name_of, simulate_under
-from stepper import Sensor
+import wi_figures
+from chain_stepper import name_of
+from six_masses import KINDS, driven, machine, true_values
+from wi_cases import CASE, FIRST, long_chain, one_driven, undeclared, variant
+from wi_noise import FORMS, noise
 
-SECONDS, TRACKED_FROM, FIRST, RUNS = 10.0, 0.2, 0.1, 1000
+SECONDS, TRACKED_FROM = 10.0, 0.2
 # The law with measured velocity, and the one with a reconstructed one and the error's integral.
 LAWS = {"(4)-(5)": "[-60.0, -60.0]", "(9)-(12)": "[-60.0, -60.0, -60.0]"}
-AIMS = {"mass": 1.0, "stiffness": 1.0, "damping": 5.0, "coulomb_friction": 5.0}  # %
-FORMS = [name for name in METHODS if name.startswith("algebraic")]
-
-
-def variant(
-    folder: Path, name: str, *, rate: float = 1e3, friction: bool = True, window: float = FIRST,
-    poles: str | None = None,
-) -> Path:
-    """The case at another rate, without friction, or with other poles, as a file of its own."""
-    text = (folder / "chain6.toml").read_text()
-    text = re.sub(r"period = [\d.]+", f"period = {1 / rate}", text)
-    text = re.sub(r"sample_rate = [\d.]+", f"sample_rate = {rate}", text)
-    if not friction:
-        text = without_effects(text)
-    if poles is not None:
-        text = text.replace("poles = [-60.0, -60.0]", f"poles = {poles}")
-    return written(folder / f"{name}.toml", text, window)
-
-
-def without_effects(text: str) -> str:
-    """The case of a chain without friction."""
-    return re.sub(r"# mu m g.*?\n\n(?=\[controller\])", "", text, flags=re.S)
-
-
-def written(path: Path, text: str, window: float) -> Path:
-    """A case that identifies from its first instants."""
-    path.write_text(text + f"\n[algebraic]\nwindow = [0.0, {window}]\n")
-    return path
-
-
-def truth(case: Path) -> dict[str, float]:
-    """True values by name."""
-    return {f.name: f.true for f in build_machine(jaxid.load_case(case)).parameters.free}
-
-
-def chain(case: Path, actuated: list[int] | None = None) -> ChainMachine:
-    """The independent simulator's machine with the case's true values."""
-    values = truth(case)
-    of = lambda what: [v for name, v in values.items() if name.startswith(what)]
-    levels = of("coulomb_friction")
-    effects = {("coulomb_friction", k + 1): {"level": v} for k, v in enumerate(levels)}
-    return ChainMachine(of("mass"), of("damping"), of("stiffness"), effects, actuated)
-
-
-def run(
-    case: Path, seconds: float, *, identify: bool = False, actuated: list[int] | None = None
-) -> tuple[dict, jaxid.Live, list]:
-    """The case's controller on the independent machine; and what was told at every tick."""
-    live, told = jaxid.Live(case, identify=identify), []
-
-    def law(_: int, reading: np.ndarray) -> np.ndarray:
-        u = live.command(reading)
-        told.append(live.told)
-        return u
-
-    machine, rate = chain(case, actuated), 1 / live.period
-    log = simulate_under(machine, law, Sensor(0.0, 0.0), rate=rate, duration=seconds)
-    return log | {"reference": live.reference[: len(log["t"])]}, live, told
-
-
-def as_log(log: dict, source: str) -> jaxid.Log:
-    """What a person would have of it."""
-    return jaxid.Log(log["t"], log["position"], log["force"], reference=log["reference"], source=source)
+AIMS = {kind: 100 * aim for kind, aim in KINDS.items()}  # %
 
 
 def worst(found: Estimate, true: dict[str, float]) -> dict[str, tuple[float, int, int]]:
@@ -136,8 +77,8 @@ def first_instants(folder: Path) -> bool:
         for rate in (1e3, 1e4):
             name = f"{'with' if friction else 'without'}_{rate:g}"
             case = variant(folder, name, rate=rate, friction=friction)
-            log = as_log(run(case, FIRST)[0], "exact simulator")
-            true, shown = truth(case), ("yes" if friction else "no", f"{rate:g}")
+            log = driven(case, FIRST).log
+            true, shown = true_values(case), ("yes" if friction else "no", f"{rate:g}")
             for method in (*FORMS, "inverse_dynamics", "output_error"):
                 if "sign" in method and not friction:
                     continue
@@ -160,7 +101,7 @@ def first_instants(folder: Path) -> bool:
     return good
 
 
-def _locked(told, names: list[str], true: dict[str, float], rate: float) -> list[str]:
+def _locked(told: Told, names: list[str], true: dict[str, float], rate: float) -> list[str]:
     """When the last parameter of each kind is within its aim for good, and all are trusted."""
     out = []
     error = 100 * np.abs(told.theta / np.array([true[n] for n in names]) - 1)
@@ -183,9 +124,9 @@ def tracking(folder: Path) -> bool:
     table = Table("tracking from 0.2 s on, RMS error [mm]", head)
     for friction, law, identify in itertools.product((False, True), LAWS, (False, True)):
         case = variant(folder, f"track_{len(LAWS[law])}_{friction}", friction=friction, poles=LAWS[law])
-        log, live, told = run(case, SECONDS, identify=identify)
-        late = log["t"] >= TRACKED_FROM
-        rms = 1e3 * np.sqrt(np.mean((log["true_position"] - log["reference"])[late] ** 2, axis=0))
+        run = driven(case, SECONDS, identify=identify)
+        off = (run.position - run.log.reference)[run.log.time >= TRACKED_FROM]
+        rms, live = 1e3 * np.sqrt(np.mean(off**2, axis=0)), run.live
         switched = "never" if live.switched is None else f"{1e3 * live.switched * live.period:.0f}"
         who = "what was found" if identify else "the paper's wrong values"
         shown = f"{rms[1]:.3f}", f"{rms.max():.3f}", switched if identify else "-"
@@ -193,67 +134,28 @@ def tracking(folder: Path) -> bool:
         if identify:
             good &= bool(rms[1] <= 0.5)
         if identify and law == "(4)-(5)":
-            figures(folder, case, log, told, friction)
+            suffix = "with" if friction else "without"
+            wi_figures.estimates(folder / f"estimates_{suffix}_friction.png", run, true_values(case))
+            wi_figures.tracking(folder / f"tracking_{suffix}_friction.png", run)
     table.show(time.perf_counter() - begin)
     print(f"x2 within 0.5 mm: {'yes' if good else 'NO'}")
     return good
 
 
-def figures(folder: Path, case: Path, log: dict, told: list, friction: bool) -> None:
-    """Estimates over the first instants, positions and forces over the whole run."""
-    true, first = truth(case), [x for x in told if x is not None]
-    kinds = [k for k in AIMS if any(n.startswith(k) for n in true)]
-    units = {"mass": "kg", "stiffness": "N/m", "damping": "N s/m", "coulomb_friction": "N"}
-    size = {"sharex": True, "layout": "constrained"}
-    figure, axes = plt.subplots(len(kinds), 1, figsize=(7, 2.1 * len(kinds)), **size)
-    changed = next((k for k, x in enumerate(first) if x is first[-1]), len(first))
-    t = 1e3 * log["t"][1 : changed + 2]
-    theta = np.stack([x.theta for x in first[: len(t)]])
-    for ax, kind in zip(axes, kinds, strict=True):
-        own = [k for k, n in enumerate(true) if n.startswith(kind)]
-        for colour, k in enumerate(own):
-            value = list(true.values())[k]
-            ax.plot(t, theta[:, k], color=f"C{colour}", label=f"{colour + 1}")
-            ax.axhline(value, color=f"C{colour}", lw=0.6, ls=":")
-        values = [list(true.values())[k] for k in own]
-        ax.set_ylim(0.0, 1.6 * max(values))
-        ax.set_ylabel(f"{kind.replace('coulomb_friction', 'friction')} [{units[kind]}]")
-    axes[kinds.index("stiffness")].legend(ncols=7, fontsize="small", title="mass or spring; dotted: true")
-    axes[-1].set_xlabel("time [ms]")
-    suffix = "with" if friction else "without"
-    figure.savefig(folder / f"estimates_{suffix}_friction.png", dpi=130)
-    figure, axes = plt.subplots(3, 1, figsize=(8, 8), **size)
-    for k in range(6):
-        axes[0].plot(log["t"], 1e3 * log["true_position"][:, k], label=f"{k + 1}")
-        axes[1].plot(log["t"], 1e3 * (log["true_position"] - log["reference"])[:, k])
-        axes[2].plot(log["t"], log["force"][:, k])
-    axes[1].set_ylim(-2, 2)
-    for ax, words in zip(axes, ("position [mm]", "tracking error [mm]", "force [N]"), strict=True):
-        ax.set_ylabel(words)
-    axes[0].legend(ncols=2, title="mass", fontsize="small", loc="upper right")
-    axes[-1].set_xlabel("time [s]")
-    figure.savefig(folder / f"tracking_{suffix}_friction.png", dpi=130)
-    plt.close("all")
-
-
 def partial(folder: Path) -> bool:
     """Only mass 2 driven, every position measured: what can be told as the others begin to slide."""
     begin = time.perf_counter()
-    text = (folder / "chain6.toml").read_text().replace('kind = "chain"', 'kind = "chain"\nactuated = [2]')
-    text = re.sub(r"level = \[0.03.*?\]\nrise_time = \[.*?\]", "level = 0.05\nrise_time = 0.1", text)
-    case = written(folder / "partial.toml", text, 1.0)
-    log = run(case, 1.0, actuated=[2])[0]
-    true, slid = truth(case), np.abs(log["true_velocity"]) > 1e-3
-    first = [f"{1e3 * log['t'][np.argmax(s)]:.0f}" if s.any() else "never" for s in slid.T]
+    case = one_driven(folder, 1.0)
+    run = driven(case, 1.0, on=machine(case, [2]))
+    true, slid = true_values(case), np.abs(run.velocity) > 1e-3
+    first = [f"{1e3 * run.log.time[np.argmax(s)]:.0f}" if s.any() else "never" for s in slid.T]
     print(f"\nonly mass 2 driven: the masses first slide at {', '.join(first)} ms")
     head = ["until [s]", *AIMS, "not told"]
     table = Table("told from the first instants: largest error [%] (how many)", head)
     good = True
     for until in (0.05, 0.1, 0.2, 0.3, 0.5, 1.0):
-        case = written(folder / "partial.toml", text, until)
-        n = round(until * 1e3) + 1
-        part = as_log({k: v[:n] for k, v in log.items()}, "exact simulator")
-        found = jaxid.identify(case, part, method="algebraic").estimate
+        case, log = one_driven(folder, until), _head(run.log, until)
+        found = jaxid.identify(case, log, method="algebraic").estimate
         errors = worst(found, true)
         blind = [n for n, told in zip(found.names, found.identifiable, strict=True) if not told]
         short = [n.replace("coulomb_friction", "friction").replace(".level", "") for n in blind]
@@ -263,52 +165,11 @@ def partial(folder: Path) -> bool:
     return good
 
 
-def noise(folder: Path, runs: int = RUNS) -> bool:
-    """What the paper leaves out: every form, inverse dynamics and output error against noise."""
-    text = (folder / "chain6.toml").read_text().replace("duration = 10.0", f"duration = {FIRST}")
-    names = ", ".join(f'"{m}"' for m in (*FORMS, "inverse_dynamics", "output_error"))
-    levels = ", ".join(f"{10.0**k:g}" for k in range(5))
-    text += f"\n[sensor]\nposition_noise = 1e-9\n\n[study]\nestimators = [{names}]\nnoise = [{levels}]\n"
-    case, out, begin = written(folder / "noise.toml", text, FIRST), folder / "noise", time.perf_counter()
-    rows = jaxid.study(case, runs=runs, folder=out, resume=(out / "study.json").exists()).summary
-    figure, axes = plt.subplots(2, 2, figsize=(11, 8), sharex=True, layout="constrained")
-    table = Table(
-        "RMS error, median over the parameters of a kind [%]; failed [%]",
-        ["method", "noise [m]", *AIMS, "failed"],
-    )
-    estimators, at = list(dict.fromkeys(r["estimator"] for r in rows)), sorted({r["noise"] for r in rows})
-    for ax, kind in zip(axes.flat, AIMS, strict=True):
-        bound = [_median(rows, estimators[0], level, kind, "bound") for level in at]
-        ax.loglog(1e-9 * np.array(at), bound, "k:", label="Cramer-Rao")
-        for colour, name in enumerate(estimators):
-            spread = [_median(rows, name, level, kind, "spread") for level in at]
-            bias = [_median(rows, name, level, kind, "bias") for level in at]
-            if not np.isfinite(spread).any():
-                continue
-            ax.loglog(1e-9 * np.array(at), spread, f"C{colour}-o", ms=3, label=name)
-            ax.loglog(1e-9 * np.array(at), bias, f"C{colour}--", lw=0.8)
-        ax.set(title=kind.replace("_", " "), ylabel="relative error [%]", ylim=(1e-4, 1e4))
-        ax.grid(alpha=0.3)
-    axes[1, 0].set_xlabel("position noise [m]")
-    axes[1, 1].set_xlabel("position noise [m]; solid: spread, dashed: bias")
-    axes[0, 0].legend(fontsize="x-small")
-    figure.savefig(folder / "noise.png", dpi=130)
-    plt.close("all")
-    for name in estimators:
-        for level in at:
-            cells = [f"{_median(rows, name, level, kind, 'rmse'):.2g}" for kind in AIMS]
-            own = [r["failed"] for r in rows if (r["estimator"], r["noise"]) == (name, level)]
-            table.row(name, f"{1e-9 * level:g}", *cells, f"{100 * np.mean(own):.0f}")
-    table.show(time.perf_counter() - begin)
-    return True
-
-
-def _median(rows: list[dict], estimator: str, level: float, kind: str, what: str) -> float:
-    own = [
-        100 * abs(r[what] / r["true"]) for r in rows
-        if (r["estimator"], r["noise"]) == (estimator, level) and r["parameter"].startswith(kind)
-    ]
-    return float(np.median(own)) if own else np.nan
+def _head(log: jaxid.Log, until: float) -> jaxid.Log:
+    """What was known by then: the whole log would tell the filters more."""
+    cut = log.time < until + 0.5 * log.period
+    signals = {name: getattr(log, name)[cut] for name in ("time", "position", "force", "reference")}
+    return replace(log, rows=(0, 0), **signals)
 
 
 def cost(folder: Path) -> bool:
@@ -317,7 +178,7 @@ def cost(folder: Path) -> bool:
     table = Table("cost against masses, 0.1 s at 1 kHz", head)
     begin, times = time.perf_counter(), []
     for n in (2, 5, 10, 20, 50):
-        case = written(folder / f"chain_{n}.toml", long_chain(n), FIRST)
+        case = long_chain(folder, n)
         log = jaxid.simulate(case).log
         whole, own, session = [], [], jaxid.open_session(case, log)
         for _ in range(4):
@@ -346,38 +207,6 @@ def _a_sample(case: Path, log: jaxid.Log) -> float:
     return min(seconds) / log.samples
 
 
-def long_chain(n: int) -> str:
-    """A chain of n masses like the six, every one driven and following."""
-    many = lambda make, count: "[" + ", ".join(make(k) for k in range(count)) + "]"
-    value = lambda guess, true: f"{{ guess = {guess}, true = {true} }}"
-    return f"""
-[plant]
-kind = "chain"
-[plant.parameters]
-mass = {many(lambda k: value(2.5, 2.0 + 0.5 * (k % 6)), n)}
-damping = {many(lambda k: value(5.0, 5.5 - 0.5 * (k % 6)), n)}
-stiffness = {many(lambda k: value(700.0, 1000.0 - 100.0 * (k % 7)), n + 1)}
-[[effects]]
-kind = "coulomb_friction"
-joint = {many(lambda k: str(k + 1), n)}
-level = {many(lambda k: value(4.905, 4.0 + 0.2 * (k % 5)), n)}
-[controller]
-kind = "flatness"
-poles = [-60.0, -60.0]
-epsilon = 1e-3
-period = 0.001
-[reference]
-kind = "quarter_sine"
-level = {many(lambda k: f"{0.03 + 0.01 * ((3 * k) % 4)}", n)}
-rise_time = {many(lambda k: f"{0.07 + 0.01 * ((2 * k) % 5)}", n)}
-hold_until = 5.0
-return_until = 10.0
-[simulation]
-duration = {FIRST}
-sample_rate = 1000.0
-"""
-
-
 def hidden(folder: Path) -> bool:
     """Friction that the case leaves out at one mass, and a cubic spring at one place: named with it."""
     begin, good = time.perf_counter(), True
@@ -385,34 +214,15 @@ def hidden(folder: Path) -> bool:
     for kind, place, values in (
         ("coulomb_friction", 3, {"level": 4.7}), ("cubic_stiffness", 4, {"coefficient": 4e5}),
     ):
-        case = folder / f"hidden_{kind}.toml"
-        text = without_effects((folder / "chain6.toml").read_text())
-        text = re.sub(r"\[reference\].*?(?=\[simulation\])", SWEEP, text, flags=re.S)
-        case.write_text(text + "\n[sensor]\nposition_noise = 1e-6\n")
-        plain = chain(case)
-        live = jaxid.Live(case)
-        log = simulate_under(
-            plain.with_effect(kind, place, **values), lambda k, reading, live=live: live.command(reading),
-            Sensor(0.0, 1e-6), rate=1 / live.period, duration=SECONDS,
-        )
-        found = jaxid.discover(case, as_log(log | {"reference": live.reference}, "exact simulator"))
+        case = undeclared(folder, f"hidden_{kind}")
+        log = driven(case, SECONDS, noise=1e-6, on=machine(case).with_effect(kind, place, **values)).log
+        found = jaxid.discover(case, log)
         named = ", ".join(e.label for e in found.effects) or "-"
         evidence = ", ".join(f"{e.score.evidence:.0f}" for e in found.effects)
         table.row(name_of(kind, place), found.verdict, named, evidence)
         good &= [e.label for e in found.effects] == [name_of(kind, place)]
     table.show(time.perf_counter() - begin)
     return good
-
-
-# Every mass to and fro on its own beat, so that springs and frictions are told apart.
-SWEEP = """[reference]
-kind = "trapezoid"
-start = 0.0
-targets = [0.02, -0.015, 0.03, 0.005, -0.025, 0.0]
-speed = [0.05, 0.08, 0.11, 0.06, 0.09, 0.07]
-acceleration = [1.0, 1.6, 2.2, 1.2, 1.8, 1.4]
-
-"""
 
 
 PARTS: dict[str, Callable[[Path], bool]] = {
@@ -425,7 +235,7 @@ def main() -> int:
     parser = parser_of(__doc__, "results/wi_mimo_coulomb")
     parser.add_argument("--only", choices=PARTS, help="one part")
     args = parser.parse_args()
-    folder = copied(args.o, ("chain6.toml",))
+    folder = copied(args.o, (CASE,))
     results = {name: part(folder) for name, part in PARTS.items() if args.only in (None, name)}
     print("\n" + ", ".join(f"{name}: {'accepted' if good else 'rejected'}" for name, good in results.items()))
     return 0

@@ -185,6 +185,11 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     return eqx.tree_at(lambda r: (r.position, r.velocity), replay, moved)
 
 
+def from_rest(replay: Replay) -> Replay:
+    """The same run, nothing moving at its start."""
+    return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
+
+
 @eqx.filter_jit
 def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, ...]) -> Array:
     def residual(nudge: Array) -> Array:

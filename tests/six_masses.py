@@ -1,19 +1,42 @@
-"""The six masses of the experiment, the case's controller in the loop of the exact chain."""
+"""The six masses of the experiment, or a case like theirs, its controller in the loop of the exact chain.
+
+Shared by the tests and `experiments/wi_mimo_coulomb.py`.
+"""
 
 import functools
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from chain_stepper import ChainMachine, simulate_under
 from stepper import Sensor
 
+from jaxid.estimators.online import Told
 from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.live import Live
 from jaxid.machine import build_machine
 
 CASE = Path(__file__).parent.parent / "experiments" / "cases" / "chain6.toml"
+# What is asked of each kind of parameter, relative.
 KINDS = {"mass": 0.01, "stiffness": 0.01, "damping": 0.05, "coulomb_friction": 0.05}
+
+
+class Driven(NamedTuple):
+    """A run of the exact chain: what a person would have of it, and the truth behind it.
+
+    Attributes:
+        log: Readings, commands and references.
+        live: The controller that ran.
+        told: What it was told on-line at every tick; None where nothing was.
+        position, velocity: True ones, (time, n).
+    """
+
+    log: Log
+    live: Live
+    told: list[Told | None]
+    position: np.ndarray
+    velocity: np.ndarray
 
 
 def text(**changes: str) -> str:
@@ -25,32 +48,47 @@ def text(**changes: str) -> str:
     return out
 
 
-def true_values() -> dict[str, float]:
-    return {f.name: f.true for f in build_machine(load_case(CASE)).parameters.free}
+def true_values(case: Path = CASE) -> dict[str, float]:
+    """By name."""
+    return {f.name: f.true for f in build_machine(load_case(case)).parameters.free}
 
 
-def machine() -> ChainMachine:
-    values = true_values()
+def machine(case: Path = CASE, actuated: list[int] | None = None) -> ChainMachine:
+    """The exact simulator's machine with the case's true values."""
+    values = true_values(case)
     of = lambda kind: [v for name, v in values.items() if name.startswith(kind)]
     levels = enumerate(of("coulomb_friction"), start=1)
     effects = {("coulomb_friction", k): {"level": v} for k, v in levels}
-    return ChainMachine(of("mass"), of("damping"), of("stiffness"), effects)
+    return ChainMachine(of("mass"), of("damping"), of("stiffness"), effects, actuated)
 
 
-def driven(live: Live, seconds: float, noise: float = 0.0) -> tuple[Log, dict]:
-    """A log of the exact chain under a controller that is called tick by tick, and the truth."""
+def driven(
+    case: Path, seconds: float, *, identify: bool = False, noise: float = 0.0, seed: int = 0,
+    on: ChainMachine | None = None,
+) -> Driven:
+    """The case's controller called tick by tick on the exact chain, `on` in place of the case's own.
+
+    Noise of the readings [m] goes through the loop: the controller sees what the log holds.
+    """
+    live, told = Live(case, identify=identify), []
+
+    def law(_: int, reading: np.ndarray) -> np.ndarray:
+        u = live.command(reading)
+        told.append(live.told)
+        return u
+
     ran = simulate_under(
-        machine(), lambda k, reading: live.command(reading), Sensor(0.0, noise),
-        rate=1 / live.period, duration=seconds,
-    )  # fmt: skip
+        on or machine(case), law, Sensor(0.0, noise), rate=1 / live.period, duration=seconds, seed=seed
+    )
     reference = live.reference[: len(ran["t"])]
-    return Log(ran["t"], ran["position"], ran["force"], reference=reference, source="six masses"), ran
+    log = Log(ran["t"], ran["position"], ran["force"], reference=reference, source="exact simulator")
+    return Driven(log, live, told, ran["true_position"], ran["true_velocity"])
 
 
 @functools.cache
 def first_instants() -> Log:
     """The first 0.1 s at 1 kHz, without noise."""
-    return driven(Live(CASE), 0.1)[0]
+    return driven(CASE, 0.1).log
 
 
 def errors(names: list[str], theta: np.ndarray) -> dict[str, float]:

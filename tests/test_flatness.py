@@ -1,12 +1,13 @@
 """Flatness: the error obeys the poles; the law on a machine that is not jaxid's; live, and switched."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 from six_masses import CASE, KINDS, driven, errors, text, true_values
 
-from jaxid.controllers import Flatness, Path, flat_inputs
+from jaxid.controllers import Flatness, Path, Tick, flat_inputs
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
@@ -70,6 +71,27 @@ def test_reconstructed_velocity_does_not_see_the_counts():
     assert jitter[3] < 0.1 * jitter[2]
 
 
+def test_reconstructed_velocity_rests_with_its_joint():
+    """Stuck by friction that the model lacks: the command ramps with the error's integral, no more."""
+    effects = (EFFECTS["viscous_friction"](coefficient=DRAG), EFFECTS["linear_stiffness"](coefficient=STIFF))
+    law = Flatness(
+        poles=(-30.0, -40.0, -50.0), epsilon=jnp.asarray(1e-6), model=Axis(MASS, effects=effects),
+        gain=jnp.asarray([GAIN]), period=PERIOD,
+    )
+    at, none = 0.01, jnp.zeros(1)
+    tick = Tick(jnp.full(1, at), Path(none, none, none), (0,))
+    memory, given, command = law.start(tick, none), [], eqx.filter_jit(law.command)
+    for _ in range(300):
+        u, memory = command(tick, memory, none)
+        given.append(float(u[0]))
+    b1, b0 = np.poly(law.poles)[2:]
+    integral = at * PERIOD * np.arange(1, 301)
+    # The first sample's error counts half a tick.
+    expected = (STIFF * at - MASS * (b1 * at + b0 * (integral - 0.5 * at * PERIOD))) / GAIN
+    # Without the reset the model's velocity would follow its force, away from the stuck joint's.
+    np.testing.assert_allclose(given, expected, rtol=1e-9)
+
+
 def test_flat_output_gives_all_inputs():
     """Three masses driven open loop by what their trajectories ask for follow them."""
     plant = Chain([2.0, 1.4, 2.6], [8.0, 7.0, 9.0], [1700.0, 1600.0, 1900.0, 1500.0])
@@ -93,19 +115,19 @@ def test_live_identifies_switches_and_tracks(tmp_path):
     case.write_text(text(duration="1.0"))
     late = {}
     for identify in (False, True):
-        live = Live(case, identify=identify)
-        log, ran = driven(live, 1.0)
-        off = (ran["true_position"] - live.reference)[200:, 1]
+        run = driven(case, 1.0, identify=identify)
+        off = (run.position - run.log.reference)[200:, 1]
         late[identify] = float(np.sqrt(np.mean(off**2)))
-    assert 30 < live.switched <= 100
-    found = errors(list(true_values()), live.told.theta)
+    switched = run.live.switched
+    assert 30 < switched <= 100
+    found = errors(list(true_values()), run.live.told.theta)
     assert all(found[kind] <= aim for kind, aim in KINDS.items())
     assert late[True] < 1e-4 < 2e-4 < late[False]
-    told = follow(case, log)
-    assert told.trusted[live.switched - 1].all()
+    told = follow(case, run.log)
+    assert told.trusted[switched - 1].all()
     assert not told.trusted[5].any()
     # What is trusted is within what trust means.
-    worst = errors(list(true_values()), told.theta[live.switched - 1])
+    worst = errors(list(true_values()), told.theta[switched - 1])
     assert max(worst.values()) < 0.05
 
 

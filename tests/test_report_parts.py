@@ -1,12 +1,18 @@
 """What the report is drawn and written with: digits, thinned lines, figures."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from jaxid.estimators import METHODS
 from jaxid.report import CandidateScore, LogView, SearchStep
 from jaxid.report.curves import binned_mean, envelope
 from jaxid.report.numbers import plain, pretty_unit, scaled_unit, with_std
 from jaxid.report.plots import plot_candidates, plot_fit, plot_residual_against
+from jaxid.report.study import _answer
+from jaxid.report.study_plots import _look, plot_coverage, plot_errors
+from jaxid.report.tables import GapRow, _gaps_words
 
 
 def _view(**changes):
@@ -101,3 +107,44 @@ def test_candidates_are_ranked():
     (ax,) = plot_candidates(step).axes
     names = [label.get_text() for label in ax.get_yticklabels()]
     assert names == ["coulomb", "hysteresis", "cogging", "backlash"]
+
+
+def test_many_joints_in_one_sentence():
+    rows = [GapRow("force, joint 1", "fit", "N", 2.0, x, 0.02) for x in (0.003, 0.001, 0.002)]
+    assert _gaps_words("force", rows) == (
+        "The force residual of the 3 joints on the fit log falls from 2.00 N to 0.00100–0.00300 N (RMS), "
+        "at noise floors of 0.0200 N"
+    )
+    small = [GapRow("force, joint 1", "fit", "N", after=x) for x in (0.003, 0.001, 0.002)]
+    assert _gaps_words("force", small).endswith("is 1.00–3.00 mN (RMS)")
+
+
+def _row(estimator, **numbers):
+    row = dict.fromkeys(("rmse", "std", "bound", "coverage_95"), np.nan)
+    row |= {"estimator": estimator, "noise": 1.0, "parameter": "inertia", "unit": "kg", "used": 8}
+    return row | numbers
+
+
+def test_study_of_estimators_without_deviation_or_value():
+    """Neither a nan in a sentence, nor a line of nothing in a legend."""
+    rows = [_row("a", rmse=0.1, std=0.1, coverage_95=0.9), _row("b", rmse=0.2), _row("c", used=0)]
+    table = {"converged": np.zeros(24)}
+    study = SimpleNamespace(summary=rows, failures=[{"runs": 8}], table=_Table(table, ["a", "b", "c"]))
+    assert _answer(study) == (
+        "95 % intervals held the truth, over all parameters and settings, in: a: 90 %. "
+        "8 of 24 fits gave no value for some parameter. c gave none at all."
+    )
+    drawn = lambda figure: [t.get_text() for t in figure.legends[0].get_texts()]
+    assert drawn(plot_errors(rows)) == ["a", "b", "reported σ"]
+    assert drawn(plot_coverage(rows)) == ["a", "nominal"]
+
+
+class _Table(dict):
+    def __init__(self, data, estimators):
+        super().__init__(data)
+        self.estimator = SimpleNamespace(values=estimators)
+
+
+def test_every_method_looks_its_own():
+    looks = {(_look(k)["color"], _look(k)["marker"]) for k in range(len(METHODS) + 1)}
+    assert len(looks) == len(METHODS) + 1

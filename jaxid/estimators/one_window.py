@@ -63,8 +63,8 @@ class Stretch:
         """Cut a window out of a log; with a stated cut-off its positions are the filtered ones.
 
         Raises:
-            InputError: If the window holds too few samples, the command is not held, or the balance
-                is not linear in the unknowns.
+            InputError: If the window leaves the log or holds too few samples, the command is not held,
+                or the balance is not linear in the unknowns.
         """
         if log.hold != "zero_order":
             raise InputError(
@@ -72,6 +72,13 @@ class Stretch:
                 mend="leave out [algebraic] window, or use inverse_dynamics",
             )
         start, end = window or (log.time[0], log.time[-1])
+        # A log of 0.1 s ends one sample before 0.1 s.
+        if start < log.time[0] - 1.5 * log.period or end > log.time[-1] + 1.5 * log.period:
+            raise InputError(
+                f"[algebraic] window = [{start:g}, {end:g}] s is not within the log, which runs from "
+                f"{log.time[0]:g} to {log.time[-1]:g} s",
+                where=log.source, mend="choose one that is",
+            )
         inside = (log.time >= start - 1e-9) & (log.time <= end + 1e-9)
         if inside.sum() < 4 * _SHORTEST:
             raise InputError(

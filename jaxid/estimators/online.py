@@ -144,7 +144,8 @@ class Online(eqx.Module):
 
         Raises:
             InputError: If an unknown does not enter the balance in proportion, or an effect has a
-                memory of its own or delays the command: that asks for `inverse_dynamics`.
+                memory of its own, delays the command or changes with time: that asks for
+                `inverse_dynamics`.
         """
         check_linear(machine)
         # A joint that never moves has no velocity of its own.
@@ -319,20 +320,42 @@ def check_linear(machine: Machine) -> None:
     """Refuse what the recursion cannot hold.
 
     Raises:
-        InputError: If an unknown does not enter in proportion, or an effect remembers or delays.
+        InputError: If an effect remembers, delays or changes with time, or an unknown does not enter in
+            proportion.
     """
+    where = "algebraic, over one window"
+    for e in machine.plant.effects:
+        if e.initial_state(jnp.zeros(())) is not None or not isinstance(e.command_delay(), float):
+            mend = "leave it out, or use inverse_dynamics"
+            raise InputError(f"{e.kind} has a memory or a delay", where=where, mend=mend)
+    if _ages(machine):
+        raise InputError(
+            "the balance changes with time", where=where,
+            mend="leave out what does (friction_drift), or use inverse_dynamics",
+        )
     odd = [machine.parameters.names[k] for k in np.flatnonzero(~linear_unknowns(machine))]
     if odd:
         raise InputError(
-            f"{odd[0]} does not enter the balance in proportion", where="algebraic, over one window",
+            f"{odd[0]} does not enter the balance in proportion", where=where,
             mend="declare it known, friction by its level, or use inverse_dynamics",
         )
-    for e in machine.plant.effects:
-        if e.initial_state(jnp.zeros(())) is not None or not isinstance(e.command_delay(), float):
-            raise InputError(
-                f"{e.kind} has a memory or a delay", where="algebraic, over one window",
-                mend="leave it out, or use inverse_dynamics",
-            )
+
+
+def _ages(machine: Machine) -> bool:
+    """Whether time stands in the balance, by its value along random motion now and later."""
+    plant, parameters, random = machine.plant, machine.parameters, np.random.default_rng(0)
+    theta = np.where(parameters.guess == 0, 1.0, parameters.guess)
+    motion, u = random.uniform(0.5, 1.5, (3, plant.joints)), random.uniform(0.5, 1.5, machine.gain.size)
+    early, late = (_value(plant, parameters.places, theta, motion, u, np.asarray(t)) for t in (0.0, 1.0))
+    return bool(np.any(np.asarray(early) != np.asarray(late)))
+
+
+@eqx.filter_jit
+def _value(
+    plant: Plant, places: tuple, theta: Array, motion: Array, u: Array, t: Array
+) -> Float[Array, " n"]:
+    plant = scatter(places, plant, jnp.asarray(theta))
+    return plant.balance(*motion, u, t, plant.initial_states(u)).residual
 
 
 @eqx.filter_jit

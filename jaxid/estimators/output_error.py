@@ -36,7 +36,7 @@ _LOST = 0.5
 _NOISE_LIMITED = 3.0
 # In a loop an error of the start dies out. On a log of at most so many samples it may not be small
 # beside the rest, and the start is fitted too where that explains more than so many times chance.
-_SHORT = 2000
+SHORT = 2000
 _CLEARLY = 10.0
 # See `_turning_steps`: what a step misses, how much of the noise that may be, and most steps for it.
 _TURNING = 0.04
@@ -135,7 +135,7 @@ def output_error_steps(
     replay = make_replay(machine, log, numerics)
     replay = with_fitted_start(replay, machine.plant, log)
     looped = replay.controller is not None
-    fixed = numerics.segment or (looped and log.samples > _SHORT)
+    fixed = numerics.segment or (looped and log.samples > SHORT)
     nuisance = 0 if fixed else 2 * log.position.shape[1]
     p = len(machine.parameters.free)
     problem = _problem(machine, replay, log, nuisance)

@@ -73,13 +73,18 @@ def _answer(result: Study) -> str:
     rows = [r for r in result.summary if r["used"]]
     if not rows:
         return "No run gave an estimate."
-    held = {}
+    held: dict[str, list[float]] = {}
     for r in rows:
         held.setdefault(r["estimator"], []).append(r["coverage_95"])
-    parts = [f"{name}: {100 * np.mean(x):.0f} %" for name, x in held.items()]
+    # Some estimators give no standard deviation.
+    told = {name: np.array(x)[np.isfinite(x)] for name, x in held.items()}
+    parts = [f"{name}: {100 * np.mean(x):.0f} %" for name, x in told.items() if len(x)]
     failed = sum(f["runs"] for f in result.failures)
     fits = result.table["converged"].size
-    return (
-        f"95 % intervals held the truth, over all parameters and settings, in: {'; '.join(parts)}. "
-        f"{failed} of {fits} fits gave no value for some parameter."
-    )
+    lines = [f"{failed} of {fits} fits gave no value for some parameter."]
+    if parts:
+        held_words = "95 % intervals held the truth, over all parameters and settings, in: "
+        lines.insert(0, f"{held_words}{'; '.join(parts)}.")
+    silent = [str(name) for name in result.table.estimator.values if str(name) not in held]
+    lines += [f"{', '.join(silent)} gave none at all."] if silent else []
+    return " ".join(lines)

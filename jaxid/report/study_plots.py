@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import matplotlib.ticker
@@ -15,8 +16,8 @@ from jaxid.report.axes import FONT, TEXT, dress
 from jaxid.report.numbers import pretty_unit
 from jaxid.studies.settings import widest, words_of
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-_MARKS = ("o", "s", "^", "D", "v", "P")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#6b6b6b")
+_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _COLUMNS = 3
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _AXES = {
@@ -42,14 +43,14 @@ def plot_errors(rows: Sequence[dict]) -> Figure:
             # Of more than there are dashes, the later lines are thinner.
             dash, width = _DASHES[o % len(_DASHES)], 1.3 / (1 + o // len(_DASHES))
             here = [r for r in own if words_of(r, without=against) == other]
-            for k, estimator in enumerate(_estimators(rows)):
+            for k, estimator in _estimators(rows, "rmse"):
                 line = {r[against]: r for r in here if r["estimator"] == estimator}
-                style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5, "ls": dash, "lw": width}
+                style = {**_look(k), "ls": dash, "lw": width}
                 values = np.array([line[x]["rmse"] for x in at])
                 ax.plot(at, values, label=None if o else estimator, **style)
                 if len(others) == 1:
                     stated = np.array([line[x]["std"] for x in at])
-                    ax.plot(at, stated, lw=0.9, ls=":", color=COLOURS[k % 6])
+                    ax.plot(at, stated, lw=0.9, ls=":", color=_look(k)["color"])
             bound = np.array([next(r["bound"] for r in here if r[against] == x) for x in at])
             if np.any(np.isfinite(bound)):
                 dash = "--" if len(others) == 1 else dash
@@ -69,23 +70,23 @@ def plot_coverage(rows: Sequence[dict]) -> Figure:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
-    against, estimators, others = widest(rows), _estimators(rows), others_of(rows)
-    sides = [(estimator, other) for estimator in range(len(estimators)) for other in range(len(others))]
+    against, others = widest(rows), others_of(rows)
+    sides = list(itertools.product(_estimators(rows, "coverage_95"), range(len(others))))
     for name, ax in zip(names, panels, strict=True):
         own = [r for r in rows if r["parameter"] == name]
         places = sorted({r[against] for r in own})
-        for side, (k, o) in enumerate(sides):
+        for side, ((k, estimator), o) in enumerate(sides):
             line = {
                 r[against]: r for r in own
-                if r["estimator"] == estimators[k] and words_of(r, without=against) == others[o] and r["used"]
+                if r["estimator"] == estimator and words_of(r, without=against) == others[o] and r["used"]
             }
             step = min(0.12, 0.8 / len(sides))
             at = np.array([places.index(x) for x in line]) + step * (side - 0.5 * (len(sides) - 1))
             held = np.array([r["coverage_95"] for r in line.values()])
             ends = np.array([_proportion(r["coverage_95"], r["used"]) for r in line.values()]).reshape(-1, 2)
-            style = {"color": COLOURS[k % 6], "marker": _MARKS[k % 6], "ms": 5}
-            ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=COLOURS[k % 6], lw=1.2)
-            ax.plot(at, 100 * held, ls="", label=None if o else estimators[k], **style)
+            style = _look(k)
+            ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=style["color"], lw=1.2)
+            ax.plot(at, 100 * held, ls="", label=None if o else estimator, **style)
         ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
         dress(ax, _AXES[against], f"{name}\nin the 95 % interval [%]")
         ax.set_ylim(0, 103)
@@ -112,7 +113,7 @@ def plot_scatter(table: xr.Dataset) -> Figure:
             z = ((one["estimate"] - one["truth"]) / one["std"]).values[used]
             if len(z):
                 bins = np.linspace(-4.5, 4.5, max(11, min(41, 2 * int(np.sqrt(len(z))) + 1)))
-                style = {"color": COLOURS[i % 6], "lw": 1.4, "histtype": "step", "density": True}
+                style = {"color": _look(i)["color"], "lw": 1.4, "histtype": "step", "density": True}
                 ax.hist(np.clip(z, -4.5, 4.5), bins, label=str(estimator), **style)
         ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
         dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
@@ -141,8 +142,16 @@ def _grid(count: int) -> tuple[Figure, list[Axes]]:
     return figure, list(axes[:count])
 
 
-def _estimators(rows: Sequence[dict]) -> list[str]:
-    return list(dict.fromkeys(r["estimator"] for r in rows))
+def _estimators(rows: Sequence[dict], what: str) -> list[tuple[int, str]]:
+    """Those of which there is any such number, each with its place among all."""
+    names = list(dict.fromkeys(r["estimator"] for r in rows))
+    told = {r["estimator"] for r in rows if np.isfinite(r[what])}
+    return [(k, name) for k, name in enumerate(names) if name in told]
+
+
+def _look(k: int) -> dict:
+    """Colour and mark of an estimator."""
+    return {"color": COLOURS[k % len(COLOURS)], "marker": _MARKS[k % len(_MARKS)], "ms": 5}
 
 
 def _logarithmic(ax: Axes, at: np.ndarray) -> None:

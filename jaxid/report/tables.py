@@ -69,9 +69,13 @@ def answer(data: ReportData) -> str:
             "unexplained": "Model and log disagree, and no known effect explains it",
         }
         lines = [openings.get(data.verdict, "The declared model was fitted to the log")]
-        # One line for each quantity (and joint): the table below has the other logs.
+        # One line for each quantity, of two joints at most one each: the table below has the other logs.
         rows = {r.quantity: r for r in reversed(_gap_rows(data)) if is_number(r.after)}
-        lines += [_gap_words(row) for row in reversed(rows.values())]
+        groups: dict[str, list[GapRow]] = {}
+        for row in reversed(rows.values()):
+            groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
+        for quantity, own in groups.items():
+            lines += [_gaps_words(quantity, own)] if len(own) > 2 else [_gap_words(row) for row in own]
     return unbroken(" ".join(line if line[-1] in ".!?:;" else f"{line}." for line in lines))
 
 
@@ -209,6 +213,22 @@ def _gap_words(row: GapRow) -> str:
     fall = f"falls from {before} to {after}" if row.before is not None else f"is {after}"
     floor = f", at a noise floor of {_gap_cells(row)[4]}" if is_number(row.floor) else ""
     return f"The {row.quantity} residual on the {log} log {fall} (RMS){floor}"
+
+
+def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
+    """The same of many joints at once, as ranges."""
+    numbers = [x for r in rows for x in (r.before, r.after, r.floor) if is_number(x)]
+    scale, unit = scaled_unit(rows[0].unit, numbers)
+
+    def span(values: list[float | None]) -> str:
+        told = [x / scale for x in values if is_number(x)]
+        ends = dict.fromkeys(plain(x) for x in (min(told), max(told))) if told else ()
+        return f"{'–'.join(ends)} {unit}".strip() if ends else ""
+
+    before, after, floor = (span([getattr(r, k) for r in rows]) for k in ("before", "after", "floor"))
+    fall = f"falls from {before} to {after}" if before else f"is {after}"
+    over = f", at noise floors of {floor}" if floor else ""
+    return f"The {quantity} residual of the {len(rows)} joints on the {rows[0].log} log {fall} (RMS){over}"
 
 
 def _gap_rows(data: ReportData) -> list[GapRow]:
