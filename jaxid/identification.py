@@ -10,14 +10,13 @@ import numpy as np
 
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS
-from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
 from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
 from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.replay import TooStiffError, make_replay, needed_steps, with_fitted_start
+from jaxid.replay import TooStiffError, exact_numerics, make_replay, with_fitted_start
 from jaxid.session import Run, Session, open_session
 from jaxid.solvers import SOLVERS
 
@@ -147,11 +146,9 @@ def simulated(machine: Machine, log: Log) -> SimulationGap | None:
         machine = replace(machine, controller=None)
     # Nothing is differentiated here: friction sticks exactly, break-away friction too.
     try:
-        steps = needed_steps(machine, log)
+        numerics = exact_numerics(machine, log)
     except TooStiffError:
         return None
-    numerics = choose_numerics(machine, log, segments=False)
-    numerics = replace(numerics, segment=None, set_valued=True, substeps=steps)
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     gap = simulation_gap(machine, replay, log)
     return gap if np.all(np.isfinite(gap.rms)) and np.all(gap.relative < 1e3) else None

@@ -24,6 +24,8 @@ from jaxid.solvers import Adaptive
 
 # Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
 _FINE = 0.2
+# Ticks of past command that a delay in a loop may reach back.
+_LONGEST_DELAY = 12
 # A band-limited command is refined so often, then joined by lines.
 _REFINE = 8
 
@@ -246,6 +248,23 @@ def local_line(log: Log, k: int, reach: int = 10) -> tuple[np.ndarray, np.ndarra
 def start_velocity(log: Log) -> np.ndarray:
     """Velocity at the first sample."""
     return local_line(log, 0)[1]
+
+
+def exact_numerics(machine: Machine, log: Log, steps: int | None = None) -> Numerics:
+    """Integration for a run of which nothing is differentiated: dry friction sticks exactly.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        steps: Between samples of the command; absent: as many as the machine asks for.
+
+    Raises:
+        TooStiffError: If the machine asks for more steps than any sound one.
+    """
+    delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
+    looped = machine.controller is not None
+    steps = needed_steps(machine, log) if steps is None else steps
+    return Numerics(substeps=steps, longest_delay=_LONGEST_DELAY if delayed and looped else 0)
 
 
 # More integration steps a sample than that no machine asks for: a fit or a guess has run away.

@@ -23,7 +23,7 @@ from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess, full_hessian
-from jaxid.replay import Numerics, Replay, make_replay, needed_steps, with_fitted_start
+from jaxid.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
 from jaxid.simulation import Drive, needed_substeps
 from jaxid.solvers import RELATIVE
 
@@ -215,11 +215,9 @@ def choose_numerics(
         solver: One of `jaxid.solvers.SOLVERS`; None: fixed steps.
     """
     kinds = {e.kind for e in machine.plant.effects}
-    numerics = Numerics(
-        set_valued="static_friction" not in kinds and solver is None,
-        substeps=1 if solver else needed_steps(machine, log),
-        longest_delay=12 if "input_delay" in kinds and machine.controller is not None else 0,
-        solver=solver,
+    numerics = replace(
+        exact_numerics(machine, log, 1 if solver else None),
+        set_valued="static_friction" not in kinds and solver is None, solver=solver,
     )
     if not numerics.set_valued and solver is None:
         numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))
