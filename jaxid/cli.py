@@ -14,8 +14,8 @@ from jaxid import _cache
 from jaxid.errors import InputError, suggest
 
 METHODS = (
-    "output_error", "inverse_dynamics", "algebraic", "algebraic_single_time", "algebraic_ratio",
-    "algebraic_sign_changed", "algebraic_sign_unchanged",
+    "output_error", "inverse_dynamics", "instrumental_variable", "didim", "power", "algebraic",
+    "algebraic_single_time", "algebraic_ratio", "algebraic_sign_changed", "algebraic_sign_unchanged",
 )
 SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
 

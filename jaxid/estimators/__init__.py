@@ -41,6 +41,28 @@ def _output_error(
     )
 
 
+def _instrumental_variable(
+    session: Session, *, numerics: Numerics | None = None
+) -> Steps[Estimate]:
+    from jaxid.estimators.instrumental_variable import instrumental_variable_steps
+
+    run = session.fit
+    return instrumental_variable_steps(session.machine, run.log, run.data, numerics=numerics)
+
+
+def _didim(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
+    from jaxid.estimators.didim import didim_steps
+
+    run = session.fit
+    return didim_steps(session.machine, run.log, run.data, numerics=numerics)
+
+
+def _power(session: Session) -> Steps[Estimate]:
+    from jaxid.estimators.power import power_steps
+
+    return power_steps(session.machine, session.fit.data)
+
+
 def _algebraic(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.algebraic import algebraic_steps
     from jaxid.estimators.one_window import least_squares_steps
@@ -66,9 +88,15 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
 _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 
+# Methods that simulate, and can be told how.
+SIMULATING = ("output_error", "instrumental_variable", "didim")
+
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
     "inverse_dynamics": _inverse_dynamics,
+    "instrumental_variable": _instrumental_variable,
+    "didim": _didim,
+    "power": _power,
     "algebraic": _algebraic,
     **{f"algebraic_{name}": _form(f"algebraic_{name}") for name in _FORMS},
 }
