@@ -39,8 +39,8 @@ from jaxid.readings import drive_own_states, drive_ratio
 
 # A hill of speed stands out by this part of the RMS speed.
 _HILL = 0.5
-# Of a hill's mean length, in windows: two on its rise and two on its fall, half overlapping.
-_A_HILL = 0.25
+# Windows, over the mean length of a hill: four on its rise and four on its fall, half overlapping.
+_A_HILL = 0.125
 # Windows are no shorter than so many periods of the band's edge: below, they hold little but noise.
 _SHORTEST = 2.0
 # Windows for each unknown, at least.
@@ -55,12 +55,16 @@ class PowerData(eqx.Module):
         weight: Of each window's equation, (window, k): zero where nothing moves in it.
         half: Half the length of a window, in samples.
         first: Sample at which the first window opens.
+        smooth: Low-pass on forces and velocities alike, without decimation. In a loop the command
+            holds the noise of the velocity, and their product does not average out; a sharper one
+            would blur reversals.
     """
 
     data: ForceData
     weight: Float[Array, "window k"]
     half: int = eqx.field(static=True)
     first: int = eqx.field(static=True)
+    smooth: signals.Decimator = eqx.field(static=True)
 
 
 def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]:
@@ -72,7 +76,7 @@ def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]
         Gautier (1997), ICRA: Dynamic identification of robots with power model; here each window
         opens and closes as a half cosine, which asks for no velocity at its very ends.
     """
-    kinetic, power = _energies(plant, windows.data)
+    kinetic, power = _energies(plant, windows)
     half, period = windows.half, windows.data.period
     # At the middles of samples, so that both halves mirror each other.
     s = (np.arange(half) + 0.5) / half
@@ -92,11 +96,14 @@ def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]
     return windows.weight * (opened[:-1] + closed[1:])
 
 
-def _energies(plant: Plant, data: ForceData) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
+def _energies(
+    plant: Plant, windows: PowerData
+) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
     """Kinetic energy [J], and the power of all else less half the rate of the mass [W].
 
     In declared units: over the ratio of the force at the load to the declared one.
     """
+    data = windows.data
     joints = data.q.shape[1]
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
@@ -105,23 +112,25 @@ def _energies(plant: Plant, data: ForceData) -> tuple[Float[Array, "time k"], Fl
     times = data.start + data.period * jnp.arange(data.q.shape[0])
     apart = plant.diagonal or joints == 1
 
-    def at(q: Array, v: Array, u: Array, t: Array, own: tuple) -> tuple[Array, Array, Array]:
-        zero = jnp.zeros_like(q)
+    def at(q: Array, v: Array, u: Array, t: Array, own: tuple) -> tuple[Array, ...]:
+        zero, one = jnp.zeros_like(q), jnp.ones_like(q)
 
         def mass(q: Array) -> Array:
-            return jax.jacfwd(lambda a: plant.balance(q, v, a, u, t, own).residual)(zero)
+            balance = lambda a: plant.balance(q, v, a, u, t, own).residual
+            return jax.jvp(balance, (zero,), (one,))[1] if apart else jax.jacfwd(balance)(zero)
 
-        inertia, rate = jax.jvp(mass, (q,), (v,))
         rest = plant.balance(q, v, zero, u, t, own)
-        force = rest.residual - 0.5 * rate @ v
-        return v * 0.5 * (inertia @ v), v * force, rest.drive
+        return *jax.jvp(mass, (q,), (v,)), rest.residual, rest.drive
 
-    kinetic, power, drive = jax.vmap(at)(data.q, data.qd, u, times, own)
+    mass, rate, rest, drive = jax.vmap(at)(data.q, data.qd, u, times, own)
+    v, rest = windows.smooth(data.qd), windows.smooth(rest)
     if apart:
         ratio = drive_ratio(plant, drive, u, joints)
-        return kinetic / ratio, power / ratio
+        return 0.5 * mass * v**2 / ratio, v * (rest - 0.5 * rate * v) / ratio
     ratio = jnp.sqrt((jnp.sum(drive**2) + 1e-300) / (jnp.sum(u**2) + 1e-300))
-    return jnp.sum(kinetic, axis=1, keepdims=True) / ratio, jnp.sum(power, axis=1, keepdims=True) / ratio
+    kinetic = 0.5 * jnp.einsum("ti,tij,tj->t", v, mass, v)
+    power = jnp.einsum("ti,ti->t", v, rest) - 0.5 * jnp.einsum("ti,tij,tj->t", v, rate, v)
+    return kinetic[:, None] / ratio, power[:, None] / ratio
 
 
 @eqx.filter_jit
@@ -172,7 +181,7 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
         converged=converged,
         message="converged" if converged else f"no convergence within {int(fit.steps)} steps",
         residual=np.where(rows, e, np.nan), samples=int(rows.sum()), steps=int(fit.steps),
-        notes=(f"{int(rows.sum())} windows of {length:.3g} s, half overlapping: two on a rise of speed",),
+        notes=(f"{int(rows.sum())} windows of {length:.3g} s, half overlapping: four on a rise of speed",),
     )
 
 
@@ -202,7 +211,8 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     floor = rest**2 * np.sum(hann**2)
     weight = np.where(squares > floor, 1 / (period * np.sqrt(squares * np.sum(hann**2)) + 1e-300), 0.0)
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
-    return PowerData(ForceData.of(data), weight, half, first), force
+    smooth = signals.Decimator(1, 0, min(1.0, 2 * data.recipe.cutoff_hz * period))
+    return PowerData(ForceData.of(data), weight, half, first, smooth), force
 
 
 def _half(data: Prepared) -> int:

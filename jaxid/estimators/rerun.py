@@ -56,7 +56,9 @@ class Rerun:
         """
         numerics = numerics or exact_numerics(machine, log)
         numerics = replace(numerics, set_valued=True, segment=None, solver=None)
-        replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
+        # A rounded reading would put a noise of its own into the simulated loop.
+        exact = replace(machine, sensor=replace(machine.sensor, position_resolution=None))
+        replay = with_fitted_start(make_replay(exact, log, numerics), machine.plant, log)
         return cls(machine, log, data, replay)
 
     @property
