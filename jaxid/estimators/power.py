@@ -1,4 +1,4 @@
-"""Energy balances over windows: no acceleration is needed, and nothing is left out at rest.
+"""Energy balances over windows: no acceleration is needed.
 
 The balance of forces times the velocities is a balance of powers. What is inertial in it is the rate
 of the kinetic energy, less half of what the mass changes by; over a window that opens and closes
@@ -9,7 +9,8 @@ smoothly, w, it is integrated by parts:
 so that it takes no more than the velocity. M is read off the plant's one balance, as its slope in the
 accelerations, and its rate as the slope of that along the motion. All else, weight and springs
 included, is force times velocity, integrated as it is. At rest nothing does work: a force of friction
-that is anything there is multiplied by zero.
+that is anything there is multiplied by zero. Only windows in whose middle a joint with dry friction
+stops or turns are left out.
 
 Where no joint's acceleration enters another's balance, each joint has an equation of its own, else
 the machine has one.
@@ -22,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxid import signals
 from jaxid.errors import InputError
@@ -31,10 +32,10 @@ from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquar
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.machine import Machine
-from jaxid.model import Plant
+from jaxid.model import Balance, Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess
-from jaxid.preprocess import Prepared
+from jaxid.preprocess import Prepared, lasting
 from jaxid.readings import drive_own_states, drive_ratio
 
 # A hill of speed stands out by this part of the RMS speed.
@@ -44,7 +45,7 @@ _A_HILL = 0.125
 # Windows are no shorter than so many periods of the band's edge: below, they hold little but noise.
 _SHORTEST = 2.0
 # Windows for each unknown, at least.
-_FEWEST = 5
+_FEWEST = 2
 
 
 class PowerData(eqx.Module):
@@ -55,16 +56,12 @@ class PowerData(eqx.Module):
         weight: Of each window's equation, (window, k): zero where nothing moves in it.
         half: Half the length of a window, in samples.
         first: Sample at which the first window opens.
-        smooth: Low-pass on forces and velocities alike, without decimation. In a loop the command
-            holds the noise of the velocity, and their product does not average out; a sharper one
-            would blur reversals.
     """
 
     data: ForceData
     weight: Float[Array, "window k"]
     half: int = eqx.field(static=True)
     first: int = eqx.field(static=True)
-    smooth: signals.Decimator = eqx.field(static=True)
 
 
 def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]:
@@ -74,13 +71,13 @@ def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]
 
     Source:
         Gautier (1997), ICRA: Dynamic identification of robots with power model; here each window
-        opens and closes as a half cosine, which asks for no velocity at its very ends.
+        opens and closes smoothly, which asks for no velocity at its very ends.
     """
-    kinetic, power = _energies(plant, windows)
+    kinetic, power = _energies(plant, windows.data)
     half, period = windows.half, windows.data.period
     # At the middles of samples, so that both halves mirror each other.
     s = (np.arange(half) + 0.5) / half
-    up, slope = 0.5 * (1 - np.cos(np.pi * s)), 0.5 * np.pi * np.sin(np.pi * s) / half
+    up, slope = window(s), window_slope(s) / half
     count = windows.weight.shape[0] + 1
     stretch = slice(windows.first, windows.first + count * half)
 
@@ -92,18 +89,30 @@ def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]
 
     # What closes is the mirror of what opens, with the slope's sign turned.
     opened = period * over(power, up) - over(kinetic, slope)
-    closed = period * over(power, up[::-1]) + over(kinetic, slope)
+    closed = period * over(power, up[::-1]) + over(kinetic, slope[::-1])
     return windows.weight * (opened[:-1] + closed[1:])
 
 
+def window(s: np.ndarray) -> np.ndarray:
+    """A window that is open at 1 and closed at 0 and 2, with no corner in its slope.
+
+    Of smoother ones the plain sum over samples is the integral, to fourth order in their distance.
+    """
+    return np.sin(0.5 * np.pi * s) ** 4
+
+
+def window_slope(s: np.ndarray) -> np.ndarray:
+    """Derivative of `window`."""
+    return 2 * np.pi * np.sin(0.5 * np.pi * s) ** 3 * np.cos(0.5 * np.pi * s)
+
+
 def _energies(
-    plant: Plant, windows: PowerData
+    plant: Plant, data: ForceData
 ) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
     """Kinetic energy [J], and the power of all else less half the rate of the mass [W].
 
     In declared units: over the ratio of the force at the load to the declared one.
     """
-    data = windows.data
     joints = data.q.shape[1]
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
@@ -123,7 +132,7 @@ def _energies(
         return *jax.jvp(mass, (q,), (v,)), rest.residual, rest.drive
 
     mass, rate, rest, drive = jax.vmap(at)(data.q, data.qd, u, times, own)
-    v, rest = windows.smooth(data.qd), windows.smooth(rest)
+    v = data.qd
     if apart:
         ratio = drive_ratio(plant, drive, u, joints)
         return 0.5 * mass * v**2 / ratio, v * (rest - 0.5 * rate * v) / ratio
@@ -186,10 +195,10 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
 
 
 def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
-    """Windows over a log, and the RMS force that its drives have put in while moving [N or N m].
+    """Windows over a log, and the RMS force of its drives [N or N m].
 
     A window's energy is taken over the root of its integrals of w^2 and (w qd)^2: what is left is
-    then a force, whose noise is as large in slow windows as in fast ones, down to rest.
+    then a force, whose noise is as large in slow windows as in fast ones.
     """
     joints, period = data.q.shape[1], data.period
     half, first = _half(data), data.recipe.trim * data.recipe.decimation
@@ -201,18 +210,47 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
             mend="take a longer log, or use inverse_dynamics",
         )
     apart = machine.plant.diagonal or joints == 1
-    speed = data.qd if apart else np.sqrt(np.sum(data.qd**2, axis=1, keepdims=True))
-    s = (np.arange(2 * half) + 0.5) / half
-    hann = 0.5 * (1 - np.cos(np.pi * s))
-    starts = first + half * np.arange(count)
-    squares = np.stack([hann**2 @ speed[k : k + 2 * half] ** 2 for k in starts])
-    rest = np.asarray(data.recipe.rest_velocity)
-    rest = rest if apart else np.sqrt(np.sum(rest**2, keepdims=True))
-    floor = rest**2 * np.sum(hann**2)
-    weight = np.where(squares > floor, 1 / (period * np.sqrt(squares * np.sum(hann**2)) + 1e-300), 0.0)
+    slowest, halts = np.asarray(data.recipe.rest_velocity), _halts(machine.plant, data)
+    speed = data.qd
+    if not apart:
+        speed, slowest = (np.sqrt(np.sum(x**2, axis=-1, keepdims=True)) for x in (speed, slowest))
+        halts = np.any(halts, axis=1, keepdims=True)
+    weigh = window((np.arange(2 * half) + 0.5) / half)
+    middle = slice(half // 2, 2 * half - half // 2)
+    cut = [slice(k, k + 2 * half) for k in first + half * np.arange(count)]
+    squares = np.stack([weigh**2 @ speed[c] ** 2 for c in cut])
+    moves = squares > slowest**2 * np.sum(weigh**2)
+    passes = np.stack([np.any(halts[c][middle], axis=0) for c in cut])
+    # A motion that is all reversals keeps them: there is no other.
+    counts = moves & ~passes if np.sum(moves & ~passes) >= fewest else moves
+    mean = period * np.sqrt(np.where(counts, squares, 1.0) * np.sum(weigh**2))
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
-    smooth = signals.Decimator(1, 0, min(1.0, 2 * data.recipe.cutoff_hz * period))
-    return PowerData(ForceData.of(data), weight, half, first, smooth), force
+    return PowerData(ForceData.of(data), np.where(counts, 1 / mean, 0.0), half, first), force
+
+
+def _halts(plant: Plant, data: Prepared) -> Bool[np.ndarray, "time n"]:
+    """Samples at which a joint with dry friction rests or turns.
+
+    Friction jumps there, or holds; its velocity, limited to a band, is neither zero nor reverses
+    quite when the machine does, so that energy seems to be lost. A stated recipe keeps what only
+    turns, as it does in inverse dynamics.
+    """
+    joints, u = data.q.shape[1], data.force[0]
+
+    def at_start(plant: Plant) -> Balance:
+        return plant.balance(
+            data.q[0], data.qd[0], data.qdd[0], u, jnp.zeros(()), plant.initial_states(jnp.asarray(u))
+        )
+
+    # Traced: a number that no compiled code sees counts as nothing there.
+    slides = eqx.filter_eval_shape(at_start, plant).slides
+    dry = {i for port in slides for i in plant.reached(port, joints)}
+    halts = np.abs(data.qd) < np.asarray(data.recipe.rest_velocity)
+    if data.recipe.keeps_reversals:
+        halts = lasting(halts, 2 * data.recipe.decimation)
+    else:
+        halts |= np.diff(np.sign(data.qd), axis=0, append=np.sign(data.qd[-1:])) != 0
+    return halts & np.array([i in dry for i in range(joints)])
 
 
 def _half(data: Prepared) -> int:
