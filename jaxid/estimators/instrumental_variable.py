@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import (
@@ -22,7 +21,7 @@ from jaxid.estimators.inverse_dynamics import (
     inverse_dynamics_steps,
     sharpened,
 )
-from jaxid.estimators.rerun import Rerun, bounded_step, settled
+from jaxid.estimators.rerun import Rerun, bounded_step, settled, span
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.io.log import Log
@@ -31,8 +30,6 @@ from jaxid.model import Plant
 from jaxid.preprocess import Prepared
 from jaxid.replay import Numerics
 
-# Columns of the regressor that are, to this part, sums of others tell nothing of their own.
-_ROUNDING = 1e-6
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
 # deviation says little of its motion.
 _LOST = 0.5
@@ -137,7 +134,7 @@ def _search(
         # Those of the step before still are instruments where the simulation runs away.
         if run is not None:
             _, simulated = yield from along(ForceData.of(run, rows), theta)
-            basis = _span(simulated[rows])
+            basis = span(simulated[rows])
         if basis is None:
             return _Found(theta, e, columns, None, "the simulation diverged from these starting values", step)
         change = bounded_step(basis.T @ columns[rows], basis.T @ e[rows], theta, bounds)
@@ -158,10 +155,3 @@ def _lost(run: Prepared, log: Log) -> bool:
     """Whether a simulated motion has drifted away from the measured one."""
     off = np.sqrt(np.mean((run.q - log.position) ** 2, axis=0))
     return bool(np.any(off > _LOST * np.std(log.position, axis=0)))
-
-
-def _span(columns: Float[np.ndarray, "rows p"]) -> Float[np.ndarray, "rows r"]:
-    """Orthonormal basis of what columns span."""
-    norm = np.linalg.norm(columns, axis=0)
-    u, s, _ = np.linalg.svd(columns / np.where(norm > 0, norm, 1.0), full_matrices=False)
-    return u[:, s > _ROUNDING * s[0]]

@@ -133,3 +133,10 @@ def settled(change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], s
     """
     small = _SMALL * np.linalg.norm(e) / np.sqrt(max(e.size, 1))
     return bool(np.linalg.norm(change) <= max(small, 1e-10 * size))
+
+
+def span(columns: Float[np.ndarray, "rows p"]) -> Float[np.ndarray, "rows r"]:
+    """Orthonormal basis of what columns span."""
+    norm = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns / np.where(norm > 0, norm, 1.0), full_matrices=False)
+    return u[:, s > _ROUNDING * s[0]]
