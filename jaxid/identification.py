@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS
+from jaxid.estimators.output_error import OUTPUTS
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
 from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
@@ -83,6 +84,7 @@ def identify(
     *,
     method: str = "output_error",
     solver: str | None = None,
+    on: str | None = None,
     validate: Sequence[Log | str | Path] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
@@ -95,17 +97,23 @@ def identify(
         solver: For `output_error`, one of `jaxid.solvers.SOLVERS`: diffrax then integrates between
             samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
             of the fixed steps either way.
+        on: For `output_error`, what of the simulated loop is to meet its log: one of
+            `jaxid.estimators.output_error.OUTPUTS`; None: as the case says, or position.
         validate: Logs to validate on, beside the case's own.
         progress: Called with a line at every stage.
 
     Raises:
-        InputError: If case, log, method or solver are unsound.
+        InputError: If case, log, method, solver or `on` are unsound.
     """
     if method not in METHODS:
         raise InputError(
             f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
         )
-    options = {} if solver is None else {"solver": _checked_solver(solver, method)}
+    options = {}
+    if solver is not None:
+        options["solver"] = _checked("solver", solver, SOLVERS, method)
+    if on is not None:
+        options["on"] = _checked("on", on, OUTPUTS, method)
     session = open_session(case, log, validate)
     if not session.machine.parameters.free:
         raise InputError(
@@ -121,15 +129,15 @@ def identify(
     )
 
 
-def _checked_solver(solver: str, method: str) -> str:
+def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
     if method != "output_error":
         raise InputError(
-            f"solver {solver!r} goes only with output_error",
-            mend=f"leave out solver, or method {method!r}",
+            f"{option} {value!r} goes only with output_error",
+            mend=f"leave out {option}, or method {method!r}",
         )
-    if solver not in SOLVERS:
-        raise InputError(f"solver {solver!r} is not known", mend=suggest(solver, SOLVERS))
-    return solver
+    if value not in known:
+        raise InputError(f"{option} {value!r} is not known", mend=suggest(value, known))
+    return value
 
 
 def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:

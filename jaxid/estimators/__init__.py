@@ -25,7 +25,8 @@ def _inverse_dynamics(session: Session) -> Steps[Estimate]:
 
 
 def _output_error(
-    session: Session, *, solver: str | None = None, numerics: Numerics | None = None
+    session: Session, *, solver: str | None = None, on: str | None = None,
+    numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.output_error import choose_numerics, output_error_steps
@@ -37,7 +38,10 @@ def _output_error(
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, session.fit.log, solver=solver)
     return (
-        yield from output_error_steps(session.machine, session.fit.log, start=start, numerics=numerics)
+        yield from output_error_steps(
+            session.machine, session.fit.log, start=start, numerics=numerics,
+            on=on or session.case.output_error.get("on", "position"),
+        )
     )
 
 
@@ -94,9 +98,9 @@ SIMULATING = ("output_error", "instrumental_variable", "didim")
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
     "inverse_dynamics": _inverse_dynamics,
+    "algebraic": _algebraic,
     "instrumental_variable": _instrumental_variable,
     "didim": _didim,
     "power": _power,
-    "algebraic": _algebraic,
     **{f"algebraic_{name}": _form(f"algebraic_{name}") for name in _FORMS},
 }

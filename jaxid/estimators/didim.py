@@ -6,9 +6,10 @@ motion, which has no noise, and compared with the measured force.
 
 The unknowns are where the regressor along that motion is orthogonal to the residual force. Steps
 towards them take the regressor for the slope of the simulated force, as if the motion stayed: a rough
-slope where the loop is loose, but one that finds the way from far off. The precision takes the true
-slope, the derivative through plant and loop. A joint without a drive is moved by no loop, and its
-balance along a simulated motion says nothing: the true slope then takes the regressor's place.
+slope where the loop is loose, but one that finds the way from far off. Late steps and the precision
+take the true slope, the derivative through plant and loop. A joint without a drive is moved by no
+loop, and its balance along a simulated motion says nothing: the true slope then takes the
+regressor's place.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ from jaxid.replay import Numerics, Replay
 
 _MOST_STEPS = 30
 _HALVINGS = 8
+# After so many steps by the regressor, those that have not arrived go on by the true slope.
+_ROUGH_STEPS = 8
 # After so many, the samples that count stay: one that comes and goes would keep a fit from settling.
 _CHOOSING = 4
 # A step is taken unless the mean square rises by more than this: the regressor is not quite the
@@ -128,7 +131,9 @@ def didim_steps(
     message, step = f"no convergence within {_MOST_STEPS} steps", 0
     while step < _MOST_STEPS:
         step += 1
-        e, columns = look.e[look.rows], (look.regressor if held else look.slope)[look.rows]
+        columns = look.seen if held else look.slope
+        columns = look.regressor if held and step <= _ROUGH_STEPS else columns
+        e, columns = look.e[look.rows], columns[look.rows]
         change = bounded_step(columns, e, theta, machine.parameters.bounds)
         done = settled(columns @ change, e, look.size)
         for _ in range(_HALVINGS):
