@@ -14,9 +14,10 @@ from jaxid import _cache
 from jaxid.errors import InputError, suggest
 
 METHODS = (
-    "output_error", "inverse_dynamics", "algebraic", "algebraic_single_time", "algebraic_ratio",
-    "algebraic_sign_changed", "algebraic_sign_unchanged",
+    "output_error", "inverse_dynamics", "algebraic", "instrumental_variable", "didim", "power",
+    "algebraic_single_time", "algebraic_ratio", "algebraic_sign_changed", "algebraic_sign_unchanged",
 )
+OUTPUTS = ("position", "force", "both")
 SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
 
 
@@ -126,6 +127,11 @@ def _identify(commands: argparse._SubParsersAction) -> None:
     _logs(parser)
     parser.add_argument("--method", metavar="M", default="output_error", help=", ".join(METHODS))
     parser.add_argument(
+        "--on", metavar="WHAT",
+        help=f"what output_error fits in a closed loop: {', '.join(OUTPUTS)}; absent: as the case says, "
+        "or position",
+    )
+    parser.add_argument(
         "--solver", metavar="NAME",
         help="let diffrax integrate in output_error, dry friction smoothed: "
         f"{', '.join(SOLVERS)}; absent: fixed steps, dry friction exact",
@@ -230,14 +236,16 @@ def _run_identify(args: argparse.Namespace) -> int:
         )
     if args.solver is not None and args.solver not in SOLVERS:
         raise InputError(f"solver {args.solver!r} is not known", mend=suggest(args.solver, SOLVERS))
+    if args.on is not None and args.on not in OUTPUTS:
+        raise InputError(f"on {args.on!r} is not known", mend=suggest(args.on, OUTPUTS))
     _ready(args, "result.json", "report.html")
     with _progress(args, 4) as tell:
         tell("starting")
         from jaxid.identification import identify
 
         result = identify(
-            args.case, args.log, method=args.method, solver=args.solver, validate=args.validate,
-            progress=tell,
+            args.case, args.log, method=args.method, solver=args.solver, on=args.on,
+            validate=args.validate, progress=tell,
         )
     print(result)
     return _finish(args, result, "result.json", "report.html")

@@ -10,14 +10,14 @@ import numpy as np
 
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS
-from jaxid.estimators.output_error import SHORT, choose_numerics
+from jaxid.estimators.output_error import OUTPUTS
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
 from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
 from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.replay import TooStiffError, from_rest, make_replay, needed_steps, with_fitted_start
+from jaxid.replay import TooStiffError, exact_numerics, make_replay, with_fitted_start
 from jaxid.session import Run, Session, open_session
 from jaxid.solvers import SOLVERS
 
@@ -84,6 +84,7 @@ def identify(
     *,
     method: str = "output_error",
     solver: str | None = None,
+    on: str | None = None,
     validate: Sequence[Log | str | Path] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
@@ -96,17 +97,23 @@ def identify(
         solver: For `output_error`, one of `jaxid.solvers.SOLVERS`: diffrax then integrates between
             samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
             of the fixed steps either way.
+        on: For `output_error`, what of the simulated loop is to meet its log: one of
+            `jaxid.estimators.output_error.OUTPUTS`; None: as the case says, or position.
         validate: Logs to validate on, beside the case's own.
         progress: Called with a line at every stage.
 
     Raises:
-        InputError: If case, log, method or solver are unsound.
+        InputError: If case, log, method, solver or `on` are unsound.
     """
     if method not in METHODS:
         raise InputError(
             f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
         )
-    options = {} if solver is None else {"solver": _checked_solver(solver, method)}
+    options = {}
+    if solver is not None:
+        options["solver"] = _checked("solver", solver, SOLVERS, method)
+    if on is not None:
+        options["on"] = _checked("on", on, OUTPUTS, method)
     session = open_session(case, log, validate)
     if not session.machine.parameters.free:
         raise InputError(
@@ -122,52 +129,35 @@ def identify(
     )
 
 
-def _checked_solver(solver: str, method: str) -> str:
+def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
     if method != "output_error":
         raise InputError(
-            f"solver {solver!r} goes only with output_error",
-            mend=f"leave out solver, or method {method!r}",
+            f"{option} {value!r} goes only with output_error",
+            mend=f"leave out {option}, or method {method!r}",
         )
-    if solver not in SOLVERS:
-        raise InputError(f"solver {solver!r} is not known", mend=suggest(solver, SOLVERS))
-    return solver
+    if value not in known:
+        raise InputError(f"{option} {value!r} is not known", mend=suggest(value, known))
+    return value
 
 
 def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:
     """Gap of a machine on each log."""
     return tuple(
-        Gap(r.name, force_gap(r.machine(machine), r.data), _shown(r.machine(machine), r.log))
+        Gap(r.name, force_gap(r.machine(machine), r.data), simulated(r.machine(machine), r.log))
         for r in runs
     )
 
 
-def _shown(machine: Machine, log: Log) -> SimulationGap | None:
-    """The gap in position; on a short log in a loop that of a start at rest, where it is nearer.
-
-    Where a log begins with a jerk, a parabola through its first readings is no velocity: six masses that
-    start from rest had 0.2 m/s and were off by half a millimetre, whatever the parameters.
-    """
-    gap = simulated(machine, log)
-    if gap is None or gap.command is None or log.samples > SHORT:
-        return gap
-    rested = simulated(machine, log, at_rest=True)
-    nearer = rested is not None and np.sum(rested.rms**2) < np.sum(gap.rms**2)
-    return rested if nearer else gap
-
-
-def simulated(machine: Machine, log: Log, *, at_rest: bool = False) -> SimulationGap | None:
+def simulated(machine: Machine, log: Log) -> SimulationGap | None:
     """Gap in position over the whole log; None where the simulation cannot run or diverges."""
     if machine.controller is not None and log.reference is None:
         machine = replace(machine, controller=None)
     # Nothing is differentiated here: friction sticks exactly, break-away friction too.
     try:
-        steps = needed_steps(machine, log)
+        numerics = exact_numerics(machine, log)
     except TooStiffError:
         return None
-    numerics = choose_numerics(machine, log, segments=False)
-    numerics = replace(numerics, segment=None, set_valued=True, substeps=steps)
-    replay = make_replay(machine, log, numerics)
-    replay = from_rest(replay) if at_rest else with_fitted_start(replay, machine.plant, log)
+    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     gap = simulation_gap(machine, replay, log)
     seen = list(log.measured)
     return gap if np.all(np.isfinite(gap.rms[seen])) and np.all(gap.relative[seen] < 1e3) else None

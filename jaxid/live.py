@@ -120,6 +120,7 @@ def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> Tol
         InputError: If the case asks for what cannot be identified on-line.
     """
     case = case if isinstance(case, Case) else load_case(case)
+    log.need_every_encoder("on-line identification")
     machine = build_machine(case, period=log.period)
     fast = np.abs(np.diff(log.position, axis=0)).max(axis=0) / log.period
     rest = np.maximum(_REST * fast, _noise(machine, log.position.shape[1]) / log.period)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -22,6 +23,8 @@ _ROUNDING = 1e-12
 _NEGLIGIBLE = 0.1
 # Samples over which a residual may hang together: beyond, its covariance may wrap round.
 _REMEMBERED = 4096
+# Samples over which innovations of two residuals may hang together.
+_COMMON = 40
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,32 @@ def sandwich(
     return (real.T @ real + imaginary.T @ imaginary) / size
 
 
+def cross_sandwich(
+    jacobians: tuple[Float[np.ndarray, "time p"], Float[np.ndarray, "time p"]],
+    noises: tuple[NoiseModel, NoiseModel],
+    residuals: tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]],
+) -> Float[np.ndarray, "p p"]:
+    """J1' R12 J2 with R12 the covariance between two residuals.
+
+    Each is whitened by its own model; what their innovations have in common is a short covariance,
+    tapered, between the two models.
+    """
+    time = len(jacobians[0])
+    size = scipy.fft.next_fast_len(time + min(time, _REMEMBERED), real=True)
+    one, two = (n.whiten(e[:, None])[:, 0] for n, e in zip(noises, residuals, strict=True))
+    product = scipy.fft.rfft(one, 2 * size) * np.conj(scipy.fft.rfft(two, 2 * size))
+    lags = np.arange(-_COMMON, _COMMON + 1)
+    common = np.zeros(size)
+    common[lags] = scipy.fft.irfft(product, 2 * size)[lags] / time * (1 - np.abs(lags) / (_COMMON + 1))
+    first, second = (
+        n.innovation / scipy.fft.rfft(np.concatenate([[1.0], -n.coefficients]), size) for n in noises
+    )
+    weight = scipy.fft.rfft(common) * first * np.conj(second)
+    weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
+    spectra = [scipy.fft.rfft(j, size, axis=0) for j in jacobians]
+    return np.real(np.conj(spectra[0]).T @ (weight[:, None] * spectra[1])) / size
+
+
 @dataclass(frozen=True)
 class Precision:
     """What a Jacobian and a residual say of the parameters.
@@ -175,6 +204,7 @@ def assess(
     signal: float,
     scale: Float[np.ndarray, " p"],
     hessian: Float[np.ndarray, "p p"] | None = None,
+    crossed: bool = False,
 ) -> Precision:
     """Covariance of a least-squares fit under coloured noise, and its blind directions.
 
@@ -186,6 +216,8 @@ def assess(
         signal: 2-norm of the measured signal that the residual belongs to.
         scale: Natural size of each parameter, where its column vanishes.
         hessian: In place of J'J, for the full-Hessian form.
+        crossed: Whether the columns of the residual have noise in common, as a reading and the command
+            that a loop makes of it; else they count as independent.
 
     Returns:
         The precision. The residual's colour is an autoregressive model, by column of the residual.
@@ -201,11 +233,16 @@ def assess(
     normal[dead] = 0.0
     normal[:, dead] = 0.0
     meat = np.zeros_like(normal)
-    for i in range(residual.shape[1]):
-        noise = NoiseModel.fit(residual[:, i], counts[:, i])
+    noises = [NoiseModel.fit(e, c) for e, c in zip(residual.T, counts.T, strict=True)]
+    for i, noise in enumerate(noises):
         # Of a chain of many masses a balance holds few of the unknowns.
         own = np.flatnonzero(np.any(rows[:, i] != 0, axis=0))
         meat[np.ix_(own, own)] += sandwich(rows[:, i, own] / norm[own], noise)
+    for i, j in itertools.combinations(range(len(noises)) if crossed else (), 2):
+        if noises[i].innovation > 0 and noises[j].innovation > 0:
+            pair = [(rows[:, k] / norm, noises[k], residual[:, k]) for k in (i, j)]
+            both = cross_sandwich(*zip(*pair, strict=True))
+            meat += both + both.T
     values, vectors = np.linalg.eigh(normal)
     spread = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", vectors, meat, vectors), 0.0))
     safe = np.maximum(values, 1e-300)

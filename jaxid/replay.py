@@ -25,6 +25,8 @@ from jaxid.solvers import Adaptive
 
 # Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
 _FINE = 0.2
+# Ticks of past command that a delay in a loop may reach back.
+_LONGEST_DELAY = 12
 # A band-limited command is refined so often, then joined by lines.
 _REFINE = 8
 
@@ -185,11 +187,6 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     return eqx.tree_at(lambda r: (r.position, r.velocity), replay, moved)
 
 
-def from_rest(replay: Replay) -> Replay:
-    """The same run, nothing moving at its start."""
-    return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
-
-
 @eqx.filter_jit
 def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, ...]) -> Array:
     def residual(nudge: Array) -> Array:
@@ -289,6 +286,23 @@ def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, flo
 def start_velocity(log: Log) -> np.ndarray:
     """Velocity at the first sample."""
     return local_line(log, 0)[1]
+
+
+def exact_numerics(machine: Machine, log: Log, steps: int | None = None) -> Numerics:
+    """Integration for a run of which nothing is differentiated: dry friction sticks exactly.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        steps: Between samples of the command; absent: as many as the machine asks for.
+
+    Raises:
+        TooStiffError: If the machine asks for more steps than any sound one.
+    """
+    delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
+    looped = machine.controller is not None
+    steps = needed_steps(machine, log) if steps is None else steps
+    return Numerics(substeps=steps, longest_delay=_LONGEST_DELAY if delayed and looped else 0)
 
 
 # More integration steps a sample than that no machine asks for: a fit or a guess has run away.

@@ -49,6 +49,37 @@ def test_published_recipe_gives_the_published_parameters(emps):
     assert pulses.force.relative[0] <= 0.061
 
 
+PUBLISHED = {"inertia": 95.109, "viscous_friction.coefficient": 203.50, "coulomb_friction.level": 20.39}
+
+
+@needs_data
+@pytest.mark.parametrize("method", ["instrumental_variable", "didim", "power"])
+def test_every_method_gives_the_published_parameters(emps, method):
+    result = jaxid.identify(emps / "emps_recipe.toml", emps / "DATA_EMPS.mat", method=method)
+    assert result.converged
+    for name, value in PUBLISHED.items():
+        assert result.value(name) == pytest.approx(value, rel=0.02), name
+    fit, pulses = result.gaps
+    assert fit.force.relative[0] <= 0.042
+    assert pulses.force.relative[0] <= 0.061
+    assert pulses.simulation.relative[0] <= 1.5e-5
+
+
+@needs_data
+def test_output_error_sees_the_hold_that_the_published_recipe_does_not(emps):
+    """Half a sample is 2 % of the viscous friction; told of it, inverse dynamics says the same."""
+    recipe = (emps / "emps_recipe.toml").read_text()
+    aligned = emps / "aligned.toml"
+    aligned.write_text(recipe.replace("trim = 50", "trim = 50\nalign_hold = true"))
+    log = emps / "DATA_EMPS.mat"
+    seen = jaxid.identify(aligned, log, method="inverse_dynamics")
+    for on in ("position", "force", "both"):
+        fitted = jaxid.identify(emps / "emps_recipe.toml", log, on=on)
+        for name in PUBLISHED:
+            assert fitted.value(name) == pytest.approx(seen.value(name), rel=0.02), (on, name)
+    assert seen.gaps[1].force.relative[0] < 0.045
+
+
 @needs_data
 def test_friction_that_differs_by_direction_is_found_on_emps(emps):
     found = jaxid.discover(emps / "emps_bare.toml", emps / "DATA_EMPS.mat")

@@ -25,7 +25,8 @@ def _inverse_dynamics(session: Session) -> Steps[Estimate]:
 
 
 def _output_error(
-    session: Session, *, solver: str | None = None, numerics: Numerics | None = None
+    session: Session, *, solver: str | None = None, on: str | None = None,
+    numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.output_error import choose_numerics, output_error_steps
@@ -37,8 +38,34 @@ def _output_error(
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, session.fit.log, solver=solver)
     return (
-        yield from output_error_steps(session.machine, session.fit.log, start=start, numerics=numerics)
+        yield from output_error_steps(
+            session.machine, session.fit.log, start=start, numerics=numerics,
+            on=on or session.case.output_error.get("on", "position"),
+        )
     )
+
+
+def _instrumental_variable(
+    session: Session, *, numerics: Numerics | None = None
+) -> Steps[Estimate]:
+    from jaxid.estimators.instrumental_variable import instrumental_variable_steps
+
+    run = session.fit
+    return instrumental_variable_steps(session.machine, run.log, run.data, numerics=numerics)
+
+
+def _didim(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
+    from jaxid.estimators.didim import didim_steps
+
+    run = session.fit
+    return didim_steps(session.machine, run.log, run.data, numerics=numerics)
+
+
+def _power(session: Session) -> Steps[Estimate]:
+    from jaxid.estimators.power import power_steps
+
+    session.fit.log.need_every_encoder("power")
+    return power_steps(session.machine, session.fit.data)
 
 
 def _algebraic(session: Session) -> Steps[Estimate]:
@@ -46,6 +73,7 @@ def _algebraic(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.one_window import least_squares_steps
 
     run, window = session.fit, session.case.algebraic.get("window")
+    run.log.need_every_encoder("algebraic")
     if window is None:
         return algebraic_steps(session.machine, run.log, run.data)
     return least_squares_steps(session.machine, run.log, run.data, window)
@@ -58,6 +86,7 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
         from jaxid.estimators.one_window import FORMS
 
         run, window = session.fit, session.case.algebraic.get("window")
+        run.log.need_every_encoder(name)
         return FORMS[name](session.machine, run.log, run.data, window)
 
     return steps
@@ -66,9 +95,15 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
 _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 
+# Methods that simulate, and can be told how.
+SIMULATING = ("output_error", "instrumental_variable", "didim")
+
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
     "inverse_dynamics": _inverse_dynamics,
     "algebraic": _algebraic,
+    "instrumental_variable": _instrumental_variable,
+    "didim": _didim,
+    "power": _power,
     **{f"algebraic_{name}": _form(f"algebraic_{name}") for name in _FORMS},
 }

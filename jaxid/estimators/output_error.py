@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxid.errors import InputError
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
@@ -23,10 +24,12 @@ from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess, full_hessian
-from jaxid.replay import Numerics, Replay, make_replay, needed_steps, with_fitted_start
+from jaxid.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
 from jaxid.simulation import Drive, needed_substeps
 from jaxid.solvers import RELATIVE
 
+# What a fit may compare.
+OUTPUTS = ("position", "force", "both")
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
 # deviation is cut into segments.
 _LOST = 0.5
@@ -46,10 +49,10 @@ _MOST = 4
 _SEGMENTS = 40
 
 
-def position_residual(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array
+def output_residual(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, on: str = "position"
 ) -> Callable[[Array], Array]:
-    """Measured minus simulated position as a function of the unknowns, (time, n) [m or rad].
+    """Measured minus simulated output as a function of the unknowns, (time, k), weighted.
 
     In open loop the start's position and velocity may be unknowns too, behind the others.
     """
@@ -57,25 +60,44 @@ def position_residual(
     def residual(theta: Array) -> Array:
         extra = theta[len(places) :]
         nudge = extra if extra.size else None
-        return weight * (measured - replay(scatter(places, plant, theta), nudge).position)
+        run = replay(scatter(places, plant, theta), nudge)
+        outputs = {"position": (run.position,), "force": (replay.drive.gain * run.command,)}
+        outputs["both"] = outputs["position"] + outputs["force"]
+        return weight * (measured - jnp.concatenate(outputs[on], axis=1))
 
     return residual
+
+
+def _measured(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
+    """What a log holds of an output, (time, k), and which columns count; see `output_residual`."""
+    force = log.force * machine.gain
+    outputs = {"position": (log.filled,), "force": (force,), "both": (log.filled, force)}
+    counts = {"position": log.measured, "force": (True,) * force.shape[1]}
+    counts["both"] = counts["position"] + counts["force"]
+    return np.concatenate(outputs[on], axis=1), np.array(counts[on])
 
 
 @eqx.filter_jit
 def _fit(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array,
-    transform: Transform, bounds: tuple[Array, Array], active: Array,
+    transform: Transform, bounds: tuple[Array, Array], on: str, active: Array,
 ) -> Minimum:
-    residual = position_residual(replay, places, plant, measured, weight)
+    residual = output_residual(replay, places, plant, measured, weight, on)
     return levenberg_marquardt(residual, theta, transform, *bounds, active)
 
 
 @eqx.filter_jit
 def _hessian(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array, on: str
 ) -> Array:
-    return full_hessian(position_residual(replay, places, plant, measured, weight), theta)
+    return full_hessian(output_residual(replay, places, plant, measured, weight, on), theta)
+
+
+@eqx.filter_jit
+def _residual(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array, on: str
+) -> Array:
+    return output_residual(replay, places, plant, measured, weight, on)(theta)
 
 
 def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndarray:
@@ -96,7 +118,7 @@ def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndar
 def _jacobian(
     replay: Replay, places: tuple, plant: Plant, measured: Array, theta: Array
 ) -> Array:
-    residual = position_residual(replay, places, plant, measured, jnp.ones(measured.shape))
+    residual = output_residual(replay, places, plant, measured, jnp.ones(measured.shape))
     return jax.jacfwd(residual)(theta)
 
 
@@ -107,8 +129,9 @@ def output_error(
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     hessian: bool = False,
+    on: str = "position",
 ) -> Estimate:
-    """Fit the unknowns so that the simulated position meets the measured one.
+    """Fit the unknowns so that the simulated position, or force, meets the measured one.
 
     Args:
         machine: The machine; its controller closes the loop.
@@ -116,20 +139,30 @@ def output_error(
         start: In place of the guesses, for example from `inverse_dynamics`.
         numerics: How to integrate; chosen from plant and log where absent.
         hessian: Take the covariance from the full Hessian in place of Gauss-Newton's.
+        on: One of `OUTPUTS`. Both: each column over the standard deviation that a fit of the position
+            leaves in it. The force is that of a closed loop; an open loop is given its own.
 
     Returns:
         The estimate; its covariance takes the residual's colour into account.
+
+    Raises:
+        InputError: If the force is to be met and there is no loop that makes one.
     """
     return alone(
-        output_error_steps(machine, log, start=start, numerics=numerics, hessian=hessian)
+        output_error_steps(machine, log, start=start, numerics=numerics, hessian=hessian, on=on)
     )
 
 
 def output_error_steps(
     machine: Machine, log: Log, *, start: np.ndarray | None = None, numerics: Numerics | None = None,
-    hessian: bool = False,
+    hessian: bool = False, on: str = "position",
 ) -> Steps[Estimate]:
     """`output_error`, one solve at a time."""
+    if on != "position" and machine.controller is None:
+        raise InputError(
+            f"output_error on {on} needs a loop whose simulation makes a force", where=log.source,
+            mend="name the controller in [controller] and the reference's column in [log], or fit position",
+        )
     machine = machine if start is None else machine.with_estimate(start)
     numerics = numerics or choose_numerics(machine, log)
     replay = make_replay(machine, log, numerics)
@@ -138,29 +171,36 @@ def output_error_steps(
     fixed = numerics.segment or (looped and log.samples > SHORT)
     nuisance = 0 if fixed else 2 * log.position.shape[1]
     p = len(machine.parameters.free)
-    problem = _problem(machine, replay, log, nuisance)
     active = np.arange(p + nuisance) < p
+    problem = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
     minimum = yield Solve(_fit, (*problem, active))
+    if on == "both":
+        problem = _problem(machine.with_estimate(np.asarray(minimum.theta)[:p]), replay, log, nuisance, on)
+        e = yield Solve(_residual, (*problem[:6], on))
+        spread = np.maximum(np.std(np.asarray(e), axis=0), 1e-12 * np.std(problem[3], axis=0))
+        problem = (*problem[:4], problem[4] / spread, *problem[5:])
+        minimum = yield Solve(_fit, (*problem, active))
     if nuisance and looped:
         every = np.ones(p + nuisance, bool)
         freed = yield Solve(_fit, (*problem, every))
-        spare = _CLEARLY * nuisance / max(log.position.size - p - nuisance, 1)
+        spare = _CLEARLY * nuisance / max(problem[3].size - p - nuisance, 1)
         if bool(freed.converged) and float(freed.cost) * (1 + spare) < float(minimum.cost):
             minimum, active = freed, every
     elif nuisance:
         problem, active = _with_start(machine, log, problem, minimum)
         minimum = yield Solve(_fit, (*problem, active))
-    e = np.asarray(minimum.residual).reshape(log.position.shape)
-    counts = np.broadcast_to(log.measured, e.shape)
+    measured, weight = problem[3], problem[4]
+    e = np.asarray(minimum.residual).reshape(measured.shape)
+    counts = np.broadcast_to(weight[0] > 0, e.shape)
     jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
     theta = np.asarray(minimum.theta)
     names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
-    full = np.asarray((yield Solve(_hessian, (*problem[:5], minimum.theta)))) if hessian else None
+    full = np.asarray((yield Solve(_hessian, (*problem[:5], minimum.theta, on)))) if hessian else None
     precision = assess(
         names, jacobian[..., active], e, counts,
-        float(np.linalg.norm((log.filled - log.filled.mean(axis=0))[counts])),
+        float(np.linalg.norm(weight * (measured - measured.mean(axis=0)))),
         np.where(theta != 0, theta, 1.0)[active],
-        None if full is None else full[np.ix_(active, active)],
+        None if full is None else full[np.ix_(active, active)], crossed=on == "both",
     ).first(machine.parameters.names)
     converged = bool(minimum.converged)
     return Estimate(
@@ -173,7 +213,7 @@ def output_error_steps(
         residual=np.where(counts, e, np.nan),
         samples=int(counts.sum()),
         steps=int(minimum.steps),
-        notes=_notes(machine, numerics, log),
+        notes=_notes(machine, numerics, log, on),
     )
 
 
@@ -192,16 +232,15 @@ def _with_start(
     return problem, active
 
 
-def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int) -> tuple:
-    parameters = machine.parameters
+def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str) -> tuple:
+    parameters, (measured, counts) = machine.parameters, _measured(machine, log, on)
     lower, upper = parameters.bounds
     free = np.full(nuisance, np.inf)
     transform = Transform(np.concatenate([Transform.of(parameters).log, np.zeros(nuisance, bool)]))
     return (
-        replay, parameters.places, machine.plant, log.filled,
-        np.broadcast_to(np.asarray(log.measured, dtype=float), log.position.shape),
+        replay, parameters.places, machine.plant, measured, np.tile(counts.astype(float), (len(measured), 1)),
         np.concatenate([parameters.guess, np.zeros(nuisance)]), transform,
-        (np.concatenate([lower, -free]), np.concatenate([upper, free])),
+        (np.concatenate([lower, -free]), np.concatenate([upper, free])), on,
     )
 
 
@@ -220,11 +259,10 @@ def choose_numerics(
         solver: One of `jaxid.solvers.SOLVERS`; None: fixed steps.
     """
     kinds = {e.kind for e in machine.plant.effects}
-    numerics = Numerics(
-        set_valued="static_friction" not in kinds and solver is None,
-        substeps=1 if solver else max(needed_steps(machine, log), _turning_steps(machine, log)),
-        longest_delay=12 if "input_delay" in kinds and machine.controller is not None else 0,
-        solver=solver,
+    exact = exact_numerics(machine, log, 1 if solver else None)
+    numerics = replace(
+        exact, substeps=1 if solver else max(exact.substeps, _turning_steps(machine, log)),
+        set_valued="static_friction" not in kinds and solver is None, solver=solver,
     )
     if not numerics.set_valued and solver is None:
         numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))
@@ -274,13 +312,15 @@ def _failure(minimum: Minimum) -> str:
     return f"no convergence within {int(minimum.steps)} steps"
 
 
-def _notes(machine: Machine, numerics: Numerics, log: Log) -> tuple[str, ...]:
+def _notes(machine: Machine, numerics: Numerics, log: Log, on: str) -> tuple[str, ...]:
     where = "in the loop" if machine.controller is not None else "open loop"
     how = "sticks exactly" if numerics.sticks else "is smoothed"
     steps = f"{numerics.substeps} step(s) a sample"
     if numerics.solver is not None:
         steps = f"by diffrax's {numerics.solver}, each step within {RELATIVE:g}"
     notes = [f"simulated {where}, {steps}; dry friction {how}"]
+    if on != "position":
+        notes.append(f"fitted on {'position and force' if on == 'both' else 'force'}")
     if numerics.segment:
         seconds = numerics.segment * log.period
         notes.append(f"restarted from the log every {seconds:.3g} s: it drifts off otherwise")

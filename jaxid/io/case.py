@@ -25,6 +25,7 @@ from jaxid.io.case_entries import (
 )
 from jaxid.io.case_tables import (
     ALGEBRAIC,
+    OUTPUT_ERROR,
     PLANNED_CONTROLLERS,
     STUDY,
     TOP,
@@ -73,6 +74,7 @@ class Case:
         log: [log], as `jaxid.io.log.read_log` takes it; empty where it is absent.
         preprocess: [preprocess], for `jaxid.preprocess.choose_recipe`.
         algebraic: [algebraic], for the estimators of that name.
+        output_error: [output_error], likewise.
         controller: [controller].
         sensor: [sensor].
         limits: [limits], for `jaxid.discovery.limits`.
@@ -92,6 +94,7 @@ class Case:
     log: dict[str, Any] = field(default_factory=dict)
     preprocess: dict[str, Any] = field(default_factory=dict)
     algebraic: dict[str, Any] = field(default_factory=dict)
+    output_error: dict[str, Any] = field(default_factory=dict)
     controller: dict[str, Any] | None = None
     sensor: dict[str, Any] = field(default_factory=dict)
     limits: dict[str, Any] = field(default_factory=dict)
@@ -164,6 +167,7 @@ def load_case(path: str | Path) -> Case:
         log=_log(tables, plant, file),
         preprocess=read("preprocess", preprocess_keys(joints)),
         algebraic=read("algebraic", ALGEBRAIC),
+        output_error=read("output_error", OUTPUT_ERROR),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
         limits=read("limits", limits_keys(joints, drives)),

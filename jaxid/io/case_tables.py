@@ -49,6 +49,7 @@ TOP = {
     "log": False,
     "preprocess": False,
     "algebraic": False,
+    "output_error": False,
     "controller": False,
     "sensor": False,
     "limits": False,
@@ -82,6 +83,7 @@ PLANT: Keys = {
     "units": Key(inline({"position": Key(text), "force": Key(text)})),
 }
 ALGEBRAIC: Keys = {"window": Key(span(), "from and to [s]; absent: many windows over the log")}
+OUTPUT_ERROR: Keys = {"on": Key(choice(("position", "force", "both")))}
 STUDY: Keys = {
     "estimators": Key(several(choice((*METHODS, "discover")))),
     "hidden": Key(several(text)),

@@ -95,6 +95,18 @@ class Log:
         """Which joints have an encoder."""
         return tuple(bool(m) for m in ~np.isnan(self.position[0]))
 
+    def need_every_encoder(self, method: str) -> None:
+        """Refuse a log in which a joint has no encoder, for a method that needs its position.
+
+        Raises:
+            InputError: If there is one.
+        """
+        if not all(self.measured):
+            raise InputError(
+                f"joint {self.measured.index(False) + 1} has no position, which {method} needs",
+                where=self.source, mend="name its column (load_position), or use output_error",
+            )
+
     @property
     def filled(self) -> Float[np.ndarray, "samples joints"]:
         """Positions in which joints without an encoder stand where the others are, on average."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.estimators import METHODS
+from jaxid.estimators import METHODS, SIMULATING
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.result import Estimate
@@ -54,7 +54,7 @@ class Runner:
         at = self.plan.levels[level]
         log = alone(at.scene.virtual(at.scene.machine, self.plan.drawn(0)[2])).log
         session = session_around(at.model, at.machine, log)
-        if "output_error" not in self.plan.estimators:
+        if not set(SIMULATING) & set(self.plan.estimators):
             return Ways(session.recipe, None)
         first = inverse_dynamics(session.machine, session.fit.data)
         machine = first.machine if first.told else session.machine
@@ -89,7 +89,7 @@ class Runner:
         virtual = yield from at.scene.virtual(at.scene.machine.with_estimate(truth), rng)
         session = session_around(at.model, machine, virtual.log, ways.recipe)
         for method in plan.estimators:
-            options = {"numerics": ways.numerics} if method == "output_error" else {}
+            options = {"numerics": ways.numerics} if method in SIMULATING else {}
             try:
                 if method == DISCOVER:
                     aligned = replace(ways.recipe, align_hold=True)

@@ -1,0 +1,208 @@
+"""Direct and inverse dynamic identification: forces alone, the motion is that of the simulated loop.
+
+A good loop moves a wrong model nearly as the machine: its motion follows the reference, and only
+the forces that this takes tell the two apart. Inverse dynamics is then taken along the simulated
+motion, which has no noise, and compared with the measured force.
+
+The unknowns are where the regressor along that motion is orthogonal to the residual force. Steps
+towards them take the regressor for the slope of the simulated force, as if the motion stayed: a rough
+slope where the loop is loose, but one that finds the way from far off. Late steps and the precision
+take the true slope, the derivative through plant and loop. A joint without a drive is moved by no
+loop, and its balance along a simulated motion says nothing: the true slope then takes the
+regressor's place.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid import signals
+from jaxid.errors import InputError
+from jaxid.estimators.inverse_dynamics import (
+    ForceData,
+    force_and_columns,
+    force_precision,
+    force_size,
+    inverse_dynamics_steps,
+    sharpened,
+)
+from jaxid.estimators.rerun import Rerun, bounded_step, settled, span
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Solve, Steps, alone
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.model import Plant
+from jaxid.parameters import scatter
+from jaxid.precision import Precision
+from jaxid.preprocess import Prepared
+from jaxid.replay import Numerics, Replay
+
+_MOST_STEPS = 30
+_HALVINGS = 8
+# After so many steps by the regressor, those that have not arrived go on by the true slope.
+_ROUGH_STEPS = 8
+# After so many, the samples that count stay: one that comes and goes would keep a fit from settling.
+_CHOOSING = 4
+# A step is taken unless the mean square rises by more than this: the regressor is not quite the
+# slope of the simulated force, and near the end a good step may raise it a little.
+_WORSE = 1.1
+# Moving samples that a step asks for, by unknown.
+_FEWEST = 5
+
+
+def didim(machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None) -> Estimate:
+    """Fit the unknowns to the measured force along the motion of the simulated loop.
+
+    Of the measured position only the start is used, and what the filter was chosen by; where a joint
+    has no drive, the first guess too, by inverse dynamics.
+
+    Args:
+        machine: The machine, with its controller.
+        log: The log, with its reference.
+        data: The same, prepared; the simulated motion passes the same filters.
+        numerics: How to integrate; absent: as machine and log ask.
+
+    Returns:
+        The estimate; its covariance takes the residual's colour into account.
+
+    Raises:
+        InputError: If the machine has no controller, or the log no reference.
+
+    Source:
+        Gautier, Janot & Vandanjon (2013), IEEE Trans. Control Syst. Technol. 21: DIDIM.
+    """
+    return alone(didim_steps(machine, log, data, numerics=numerics))
+
+
+class _Look(NamedTuple):
+    """What is seen along a simulated motion.
+
+    Args:
+        e: Residual, (kept, n).
+        regressor: Its Jacobian, the motion held, (kept, n, p).
+        slope: Its Jacobian, the motion moving too; the regressor where that is not finite.
+        rows: Samples that count, (kept, n).
+        size: 2-norm of the measured force there.
+    """
+
+    e: np.ndarray
+    regressor: np.ndarray
+    slope: np.ndarray
+    rows: np.ndarray
+    size: float
+
+    @property
+    def cost(self) -> float:
+        return float(np.mean(self.e[self.rows] ** 2))
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Slope as far as the regressor sees it: with that the formulas of least squares hold."""
+        basis = span(self.regressor[self.rows])
+        out = np.zeros_like(self.slope)
+        out[self.rows] = basis @ (basis.T @ self.slope[self.rows])
+        return out
+
+
+def didim_steps(
+    machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
+) -> Steps[Estimate]:
+    """`didim`, one solve at a time."""
+    if machine.controller is None:
+        raise InputError(
+            "didim simulates the loop, and the controller is not known", where=log.source,
+            mend="name it in [controller] and the reference's column in [log], or use inverse_dynamics",
+        )
+    plant, theta = sharpened(machine.plant, data), machine.parameters.guess
+    held = len(plant.driven(log.position.shape[1])) == log.position.shape[1]
+    if not held:
+        first = yield from inverse_dynamics_steps(machine, data)
+        theta = first.theta if first.told else theta
+    rerun = Rerun.of(machine.with_estimate(theta), log, data, numerics)
+    look = yield from _look(rerun, plant, theta)
+    if look is None:
+        return _nothing(machine, log)
+    message, step = f"no convergence within {_MOST_STEPS} steps", 0
+    while step < _MOST_STEPS:
+        step += 1
+        columns = look.seen if held else look.slope
+        columns = look.regressor if held and step <= _ROUGH_STEPS else columns
+        e, columns = look.e[look.rows], columns[look.rows]
+        change = bounded_step(columns, e, theta, machine.parameters.bounds)
+        done = settled(columns @ change, e, look.size)
+        for _ in range(_HALVINGS):
+            rows = None if step <= _CHOOSING else look.rows
+            tried = yield from _look(rerun, plant, theta + change, rows)
+            if tried is not None and tried.cost <= _WORSE * look.cost:
+                theta, look = theta + change, tried
+                break
+            change = 0.5 * change
+        else:
+            message = "no step lowers the residual, or the simulation diverges at every one"
+            break
+        if done:
+            message = "converged"
+            break
+    used = "the start is used" if held else "the start, and inverse dynamics for a first guess, is used"
+    columns = look.seen if held else look.slope
+    return Estimate(
+        method="didim", machine=machine.with_estimate(theta), theta=theta,
+        precision=force_precision(machine, look.size, theta, look.e, columns, look.rows),
+        converged=message == "converged", message=message,
+        residual=np.where(look.rows, look.e, np.nan), samples=int(look.rows.sum()), steps=step,
+        notes=(f"the motion is that of the simulated loop; of the measured position only {used}",),
+    )
+
+
+def _look(
+    rerun: Rerun, plant: Plant, theta: np.ndarray, rows: np.ndarray | None = None
+) -> Steps[_Look | None]:
+    """Simulate at some values; None where that diverges, or hardly moves.
+
+    `rows` are the samples that count, (kept, n); absent: those of driven joints that move.
+    """
+    run = yield from rerun.steps(theta, own_command=False)
+    if run is None or run.fitted.sum() < _FEWEST * len(theta):
+        return None
+    joints, places = run.q.shape[1], rerun.machine.parameters.places
+    if rows is None:
+        rows = run.fitted & np.isin(np.arange(joints), plant.driven(joints))
+    arrays = ForceData.of(run, rows)
+    e, regressor = yield Solve(force_and_columns, (plant, places, arrays, theta))
+    slope = yield Solve(_slope, (rerun.replay, places, rerun.machine.plant, arrays, theta))
+    size = yield Solve(force_size, (plant, arrays))
+    regressor, slope = np.asarray(regressor), np.asarray(slope)
+    slope = slope if np.all(np.isfinite(slope)) else regressor
+    return _Look(np.asarray(e), regressor, slope, rows, float(size))
+
+
+@eqx.filter_jit
+def _slope(
+    replay: Replay, places: tuple, plant: Plant, data: ForceData, theta: Array
+) -> Float[Array, "kept n p"]:
+    """Derivative of the force of the simulated loop, by joint, seen and filtered as the logged one."""
+
+    def force(theta: Array) -> Array:
+        u = replay.drive.gain * replay(scatter(places, plant, theta)).command
+        # Delays of the plant are in the simulation already; how the command is held is not.
+        u = signals.delayed(u, jnp.zeros(()), data.period, hold=data.hold)
+        return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
+
+    return jax.jacfwd(force)(theta)
+
+
+def _nothing(machine: Machine, log: Log) -> Estimate:
+    """What is said where not even the guesses can be simulated."""
+    p = len(machine.parameters.free)
+    blank = Precision(np.full((p, p), np.nan), np.zeros(p, bool), [], np.zeros(p))
+    return Estimate(
+        method="didim", machine=machine, theta=machine.parameters.guess, precision=blank,
+        converged=False, message="the simulation diverged from these starting values, or does not move",
+        residual=np.full(log.position.shape, np.nan), samples=0,
+    )

@@ -1,0 +1,157 @@
+"""Instrumental variables: the regressor of the measured motion, seen through that of the simulated one.
+
+Noise on a measured position is in the regressor too, and in the residual with it, so that least
+squares is biased: towards zero where the noise is large. The same columns along a simulated motion
+go with the true ones and not with the noise, and where the residual is orthogonal to them, the
+unknowns are what they are on average.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.estimators.inverse_dynamics import (
+    ForceData,
+    force_and_columns,
+    force_precision,
+    force_size,
+    inverse_dynamics_steps,
+    sharpened,
+)
+from jaxid.estimators.rerun import Rerun, bounded_step, settled, span
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Solve, Steps, alone
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.model import Plant
+from jaxid.preprocess import Prepared
+from jaxid.replay import Numerics
+
+# An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
+# deviation says little of its motion.
+_LOST = 0.5
+_MOST_STEPS = 30
+_HALVINGS = 8
+
+
+def instrumental_variable(
+    machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
+) -> Estimate:
+    """Fit the unknowns so that the residual force is orthogonal to a simulated regressor.
+
+    Args:
+        machine: The machine. Instruments come from its loop; without a controller, or a reference
+            in the log, from the measured force in open loop. Noise of the force sensor is then in the
+            instruments too: they are free only of that of the position.
+        log: The log.
+        data: The same, prepared; the simulated motion passes the same filters.
+        numerics: How to integrate; absent: as machine and log ask.
+
+    Returns:
+        The estimate; its covariance takes the residual's colour into account. It starts from
+        inverse dynamics where that tells all unknowns.
+
+    Raises:
+        InputError: If the simulation in open loop loses the log.
+
+    Source:
+        Janot, Vandanjon & Gautier (2014), IEEE Trans. Control Syst. Technol. 22: IDIM-IV. What
+        enters nonlinearly is linearised anew at every step.
+    """
+    return alone(instrumental_variable_steps(machine, log, data, numerics=numerics))
+
+
+def instrumental_variable_steps(
+    machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
+) -> Steps[Estimate]:
+    """`instrumental_variable`, one solve at a time."""
+    first = yield from inverse_dynamics_steps(machine, data)
+    theta = first.theta if first.told else machine.parameters.guess
+    if log.reference is None:
+        machine = replace(machine, controller=None)
+    rerun = Rerun.of(machine.with_estimate(theta), log, data, numerics)
+    plant, rows, places = sharpened(machine.plant, data), data.fitted, machine.parameters.places
+    arrays = ForceData.of(data, rows)
+    size = yield Solve(force_size, (plant, arrays))
+    found = yield from _search(rerun, plant, arrays, rows, theta, float(size))
+    theta, e, columns, basis = found.theta, found.e, found.columns, found.basis
+    # Seen through the instruments: with it the formulas of least squares are those of instruments.
+    seen = np.zeros((*rows.shape, len(places)))
+    seen[rows] = columns[rows] if basis is None else basis @ (basis.T @ columns[rows])
+    precision = force_precision(machine, size, theta, e, seen, rows)
+    how = "in its loop" if rerun.looped else "in open loop from the measured force"
+    return Estimate(
+        method="instrumental_variable", machine=machine.with_estimate(theta), theta=theta,
+        precision=precision, converged=found.message == "converged", message=found.message,
+        residual=np.where(rows, e, np.nan), samples=int(rows.sum()), steps=found.steps,
+        notes=(f"instruments: the regressor along the motion simulated {how}",),
+    )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Where the search ended.
+
+    Args:
+        theta: The unknowns.
+        e, columns: Residual and Jacobian there, (kept, n) and (kept, n, p).
+        basis: Of what the instruments span, (rows, r); None where nothing could be simulated.
+        message: What came of it.
+        steps: Taken.
+    """
+
+    theta: np.ndarray
+    e: np.ndarray
+    columns: np.ndarray
+    basis: np.ndarray | None
+    message: str
+    steps: int
+
+
+def _search(
+    rerun: Rerun, plant: Plant, arrays: ForceData, rows: np.ndarray, theta: np.ndarray, size: float
+) -> Steps[_Found]:
+    """Instruments at the estimate, the estimate by the instruments, until it stays where it is."""
+    places, bounds = rerun.machine.parameters.places, rerun.machine.parameters.bounds
+
+    def along(data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
+        e, columns = yield Solve(force_and_columns, (plant, places, data, theta))
+        return np.asarray(e), np.asarray(columns)
+
+    e, columns = yield from along(arrays, theta)
+    basis = None
+    for step in range(1, _MOST_STEPS + 1):
+        run = yield from rerun.steps(theta, own_command=True)
+        if not rerun.looped and (run is None or _lost(run, rerun.log)) and step == 1:
+            raise InputError(
+                "the simulation from the measured force loses the log, and makes no instruments",
+                where=rerun.log.source, mend="name the controller in [controller] and the reference's "
+                "column in [log], or use inverse_dynamics",
+            )
+        # Those of the step before still are instruments where the simulation runs away.
+        if run is not None:
+            _, simulated = yield from along(ForceData.of(run, rows), theta)
+            basis = span(simulated[rows])
+        if basis is None:
+            return _Found(theta, e, columns, None, "the simulation diverged from these starting values", step)
+        change = bounded_step(basis.T @ columns[rows], basis.T @ e[rows], theta, bounds)
+        was = float(np.linalg.norm(basis.T @ e[rows]))
+        done = settled(basis.T @ columns[rows] @ change, e[rows], size)
+        for _ in range(_HALVINGS):
+            tried = yield from along(arrays, theta + change)
+            if np.linalg.norm(basis.T @ tried[0][rows]) <= was:
+                theta, (e, columns) = theta + change, tried
+                break
+            change = 0.5 * change
+        if done:
+            return _Found(theta, e, columns, basis, "converged", step)
+    return _Found(theta, e, columns, basis, f"no convergence within {_MOST_STEPS} steps", _MOST_STEPS)
+
+
+def _lost(run: Prepared, log: Log) -> bool:
+    """Whether a simulated motion has drifted away from the measured one."""
+    off = np.sqrt(np.mean((run.q - log.position) ** 2, axis=0))
+    return bool(np.any(off > _LOST * np.std(log.position, axis=0)))
