@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxid.affine import affine
 from jaxid.model import Plant
 from jaxid.readings import overshot, own_reaction, small_solve
 
@@ -73,7 +74,7 @@ def complete_motion(
     period = times[1] - times[0]
     h = period / steps
 
-    def flow(at: list[Motion], x: tuple, u: Array, t: Array, reaction: Array) -> tuple:
+    def flow(at: list[Motion], x: tuple, u: Array, reaction: Array, t: Array) -> tuple:
         go = lambda slope, c: jax.tree.map(lambda a, b: a + c * h * b, x, slope)
         k1 = rate(at[0], x, u, t, reaction)
         k2 = rate(at[1], go(k1, 0.5), u, t, reaction)
@@ -81,15 +82,20 @@ def complete_motion(
         k4 = rate(at[2], go(k3, 1.0), u, t, reaction)
         return jax.tree.map(lambda a, *b: a + h / 6 * (b[0] + 2 * b[1] + 2 * b[2] + b[3]), x, k1, k2, k3, k4)
 
+    # Where forces are affine, a step is one matrix, worked out here once.
+    x0 = (start, together[1], memory)
+    matrix = affine(flow, ([first] * 3, x0, u[0], none), (times[0],))
+    go_on = flow if matrix is None else lambda at, x, u, reaction, t: matrix(at, x, u, reaction)
+
     def step(at: list[Motion], x: tuple, u: Array, t: Array) -> tuple[tuple, Array]:
         """The state a step later, and the reaction of dry friction over it: it sticks exactly."""
-        free = flow(at, x, u, t, none)
+        free = go_on(at, x, u, none, t)
         middle = tuple(0.5 * (a + b) for a, b in zip(x[:2], free[:2], strict=True))
         levels = balance(at[1], (*middle, none), x[2], u, t, none)
         dry, stick = (a[jnp.asarray(hidden)] for a in (levels.dry, levels.stick))
         own = h / jnp.diagonal(solved(at[1], x, u, t, none)[1])
         reaction, stuck, part = own_reaction(own, free[1], x[1], dry, dry + stick)
-        q, v, memory = flow(at, x, u, t, reaction)
+        q, v, memory = go_on(at, x, u, reaction, t)
         v = jnp.where(stuck, 0.0, v)
         return (q - overshot(x[1], v, part, h), v, memory), reaction
 
@@ -98,13 +104,14 @@ def complete_motion(
         for k in range(steps):
             at = [_between(ends, (k + c) / steps, period) for c in (0.0, 0.5, 1.0)]
             x, reaction = step(at, x, u, t)
-        return x, (x[0], x[1], solved(at[2], x, u, t, reaction)[0])
+        return x, (x, reaction)
 
-    x0 = (start, together[1], memory)
     ends = tuple(tuple(a[k : len(a) - 1 + k] for a in known) for k in range(2))
-    _, later = jax.lax.scan(advance, x0, (ends, u[:-1], times[:-1]))
+    _, (later, reactions) = jax.lax.scan(advance, x0, (ends, u[:-1], times[:-1]))
+    accelerations = jax.vmap(lambda *now: solved(*now)[0])(ends[1], later, u[:-1], times[1:], reactions)
     at_start = (start, together[1], together[2])
-    own = [jnp.concatenate([a[None], b]) for a, b in zip(at_start, later, strict=True)]
+    found = (*later[:2], accelerations)
+    own = [jnp.concatenate([a[None], b]) for a, b in zip(at_start, found, strict=True)]
     return tuple(jax.vmap(joined)(a, b) for a, b in zip(known, own, strict=True))
 
 

@@ -153,5 +153,5 @@ def _search(
 
 def _lost(run: Prepared, log: Log) -> bool:
     """Whether a simulated motion has drifted away from the measured one."""
-    off = np.sqrt(np.mean((run.q - log.position) ** 2, axis=0))
-    return bool(np.any(off > _LOST * np.std(log.position, axis=0)))
+    off = np.sqrt(np.mean((run.q - log.filled) ** 2, axis=0))
+    return bool(np.any(off > _LOST * np.std(log.filled, axis=0)))

@@ -83,8 +83,12 @@ class Rerun:
         if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > largest:
             return None
         force = np.asarray(command) if own_command and self.looped else self.log.force
+        # What has no encoder has none here: its motion is found as that of the log is.
+        position = np.where(self.log.measured, position, np.nan)
         run = replace(self.log, position=position, force=force)
-        return replace(prepare(run, self.machine.gain, self.data.recipe), hold=self.data.hold)
+        return replace(
+            prepare(run, self.machine.gain, self.data.recipe), hold=self.data.hold, steps=self.data.steps
+        )
 
 
 @eqx.filter_jit
