@@ -213,6 +213,7 @@ def hidden(folder: Path) -> bool:
     table = Table("hidden in the six masses, nothing declared", ["true", "verdict", "named", "evidence"])
     for kind, place, values in (
         ("coulomb_friction", 3, {"level": 4.7}), ("cubic_stiffness", 4, {"coefficient": 4e5}),
+        ("backlash", 4, {"gap": 1e-3}),
     ):
         case = undeclared(folder, f"hidden_{kind}")
         log = driven(case, SECONDS, noise=1e-6, on=machine(case).with_effect(kind, place, **values)).log

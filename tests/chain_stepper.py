@@ -243,7 +243,7 @@ def elongations(position: np.ndarray) -> np.ndarray:
 
 def name_of(kind: str, place: int) -> str:
     """An effect as results name it."""
-    return f"{kind}[{'spring ' if kind in SPRING_EFFECTS else ''}{place}]"
+    return f"{kind}[{'spring ' if kind in ('backlash', *SPRING_EFFECTS) else ''}{place}]"
 
 
 def column_names(log: Mapping[str, np.ndarray]) -> list[str]:
