@@ -1,0 +1,340 @@
+"""Least squares on the minimal model that a log allows, and from its coefficients to the parameters.
+
+The coefficients chi are fitted by ordinary least squares, as published; then the parameters to the
+coefficients, which is a weighted least-squares problem of a handful of numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.errors import InputError
+from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import Solve, Steps
+from jaxid.minimal.basis import Basis, basis_of, chi_of
+from jaxid.minimal.columns import Regression, regression_of
+from jaxid.minimal.filtering import choose_filtering, spectrum_of
+from jaxid.minimal.matrices import delays_command, natural_frequencies, require_linear
+from jaxid.minimal.models import (
+    Form,
+    Structure,
+    coefficients_at,
+    form_of,
+    known_at,
+    rigid_rows_hold,
+    structure_of,
+)
+from jaxid.minimal.report import minimal_json, minimal_notes
+from jaxid.minimal.statistics import Constraint, Fit, chance, least_squares
+from jaxid.model import Plant
+from jaxid.parameters import Parameters, scatter
+from jaxid.precision import assess
+from jaxid.preprocess import Recipe
+
+if TYPE_CHECKING:
+    from jaxid.session import Session
+
+# The band follows the natural frequency that is found, until that moves by less than this.
+_SETTLED = 0.1
+_PASSES = 4
+# Samples that a coefficient needs at least.
+_A_COEFFICIENT = 5
+# Relative to the largest, below this a singular value of the scaled slopes is rounding.
+_RANK = 1e-6
+
+
+@dataclass(frozen=True)
+class Model:
+    """A minimal model of a machine.
+
+    Args:
+        structure: Which coefficients there are.
+        basis: What they are made of.
+        known: Values of those that no unknown is in.
+    """
+
+    structure: Structure
+    basis: Basis
+    known: Float[np.ndarray, " known"]
+
+    @property
+    def maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """For `chi_of`."""
+        return self.basis.gather, self.basis.constant
+
+
+@eqx.filter_jit
+def _read_back(
+    plant: Plant, places: tuple, structure: Structure, maps: tuple[Array, Array], target: Array,
+    root: Array, rest: Array, theta: Array, transform: Transform, bounds: tuple[Array, Array],
+) -> tuple[Minimum, Array, Array]:
+    """Parameters whose chi is nearest to a target, that chi, and its slopes.
+
+    `rest` is the norm of what no coefficients explain: by it the solver knows when it is done.
+    """
+
+    def chi(theta: Array) -> Array:
+        return chi_of(scatter(places, plant, theta), structure, *maps)
+
+    def residual(theta: Array) -> Array:
+        return jnp.append(root @ (chi(theta) - target), rest)
+
+    fit = levenberg_marquardt(residual, theta, transform, *bounds)
+    return fit, chi(fit.theta), jax.jacfwd(chi)(fit.theta)
+
+
+@eqx.filter_jit
+def _frequencies(
+    plant: Plant, places: tuple, held: tuple[int, ...], modes: tuple[int, ...], theta: Array
+) -> tuple[Array, Array]:
+    """Natural frequencies [Hz] and their slopes."""
+    at = lambda theta: (natural_frequencies(scatter(places, plant, theta), held, modes),) * 2
+    slopes, values = jax.jacfwd(at, has_aux=True)(theta)
+    return values, slopes
+
+
+def minimal_model_steps(session: Session, printed: bool = False) -> Steps[Estimate]:
+    """Fit the minimal model of what was measured.
+
+    Args:
+        session: Case and log: with motor and load position, load acceleration and motor position, or
+            motor position alone.
+        printed: Take the model with an acceleration as the paper prints it.
+
+    Returns:
+        The estimate; `details["minimal"]` holds coefficients, statistics and the constraint's test.
+
+    Raises:
+        InputError: If the plant is not linear away from rest, the log does not suit, or too few samples
+            are left.
+
+    Source:
+        Janot, Gautier, Jubien and Vandanjon, "Experimental joint stiffness identification depending on
+        measurements availability".
+    """
+    machine, log, stated = session.machine, session.fit.log, session.case.preprocess
+    where = str(session.case.path)
+    form = _form(session, printed)
+    model = _model(machine.plant, machine.parameters, form, session, where)
+    parameters, theta = machine.parameters, machine.parameters.guess
+    natural = np.asarray(natural_frequencies(machine.plant))
+    for _ in range(_PASSES):
+        coefficients = coefficients_at(machine.plant, parameters.places, model.structure, theta[None])[0][0]
+        spectrum = spectrum_of(log, machine, model.structure, np.asarray(coefficients), model.known, natural)
+        recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
+        data = regression_of(log, machine, model.structure, model.basis, model.known, recipe)
+        _require_samples(data, model, log.source)
+        weight = _weights(form, model.structure.rows, natural)
+        fit = least_squares(model.basis.names, data, weight)
+        options = (Transform.of(parameters), parameters.bounds)
+        found, chi, slopes = yield Solve(_read_back, (
+            machine.plant, parameters.places, model.structure, model.maps, fit.chi, fit.root,
+            np.asarray(np.linalg.norm(fit.residual)), parameters.guess, *options,
+        ))
+        theta, before = np.asarray(found.theta), natural
+        natural = np.asarray(natural_frequencies(parameters.insert(machine.plant, theta)))
+        settled = natural.size == 0 or abs(natural.max() / before.max() - 1) < _SETTLED
+        if settled or "cutoff_hz" in stated:
+            break
+    constraint = yield from _constraint(machine.plant, parameters, model, fit, theta, np.asarray(slopes))
+    return _estimate(
+        session, model, data, fit, weight, (found, np.asarray(chi), np.asarray(slopes)), constraint, recipe,
+        notes,
+    )
+
+
+def _form(session: Session, printed: bool) -> Form:
+    """The model that the log allows; the plant suits it."""
+    plant, log, where = session.machine.plant, session.fit.log, str(session.case.path)
+    require_linear(plant, where)
+    unknown = {f.path[1] for f in session.machine.parameters.free if f.path[0] == "effects"}
+    if any(delays_command(e) and k in unknown for k, e in enumerate(plant.effects)):
+        raise InputError(
+            "the delay of the command is unknown, which no minimal model holds", where=where,
+            mend="give it as known, or use output_error",
+        )
+    accelerated = log.load_acceleration is not None
+    form = form_of(plant.joints, log.measured, accelerated, printed)
+    if printed and not form.accelerated:
+        raise InputError(
+            "minimal_model_printed is the model with the load's acceleration and the motor's position",
+            where=where, mend="name load_acceleration in [log] and leave out load_position, or use minimal_model",
+        )
+    if form.accelerated and log.load_acceleration.shape[1] != len(form.hidden):
+        raise InputError(
+            f"load_acceleration has {log.load_acceleration.shape[1]} columns where {len(form.hidden)} belong",
+            where=log.source, mend="name the column of the load's accelerometer",
+        )
+    if form.accelerated and not rigid_rows_hold(plant, form):
+        raise InputError(
+            "the model with an acceleration needs a machine that no spring ties to the ground", where=where,
+            mend="leave out load_acceleration, or the spring",
+        )
+    return form
+
+
+def _model(plant: Plant, parameters: Parameters, form: Form, session: Session, where: str) -> Model:
+    try:
+        structure = structure_of(plant, parameters, form)
+    except ValueError as error:
+        raise InputError(
+            f"{error}, and with it the scale of all other unknowns", where=where,
+            mend="give actuator_gain as known, or use output_error",
+        ) from error
+    # A row from which a joint was eliminated has no scale without a force.
+    if form.hidden and not form.accelerated and None in structure.leading:
+        raise InputError(
+            "without the motion of some joints there is a row without a force", where=where,
+            mend="use inverse_dynamics or output_error",
+        )
+    basis = basis_of(plant, parameters, structure, session.machine.units)
+    known = np.asarray(known_at(parameters.insert(plant, parameters.guess), structure))
+    return Model(structure, basis, known)
+
+
+def _require_samples(data: Regression, model: Model, source: str) -> None:
+    left = int(data.counts.sum())
+    if left < _A_COEFFICIENT * len(model.basis.names):
+        raise InputError(
+            f"only {left} samples lie farther from rest than the filters reach", where=source,
+            mend="take a log with longer moves, lower rest_velocity, or raise cutoff_hz",
+        )
+
+
+def _weights(form: Form, rows: int, natural: np.ndarray) -> np.ndarray:
+    """On each row: what was differentiated twice is brought to the size of a force.
+
+    That is its size at the natural frequency. As printed all rows count as they are, so that the
+    rigid one tells nothing but what stands in no other.
+    """
+    if not form.accelerated or form.printed:
+        return np.ones(rows)
+    return np.append(np.full(rows - 1, (2 * np.pi * natural.max()) ** -2), 1.0)
+
+
+def _constraint(
+    plant: Plant, parameters: Parameters, model: Model, fit: Fit, theta: np.ndarray, slopes: np.ndarray
+) -> Steps[Constraint | None]:
+    """Test whether the coefficients can be those of a plant, where there are more than a plant has.
+
+    Where there are not, friction of hidden joints is moved to the measured ones first, as published.
+    """
+    covariance = fit.precision.covariance
+    if not np.all(np.isfinite(covariance)):
+        return None
+    pinned: tuple[int, ...] = ()
+    freedom = len(fit.chi) - _rank(slopes, covariance, theta)
+    form = model.structure.form
+    if freedom == 0:
+        # With an acceleration the coefficients are the parameters themselves.
+        pinned = () if form.accelerated else _regroupable(plant, parameters, form.hidden)
+        if not pinned:
+            return None
+    rest = tuple(k for k in range(len(theta)) if k not in pinned)
+    bare = parameters.insert(plant, np.where(np.isin(np.arange(len(theta)), pinned), 0.0, theta))
+    part = Parameters(tuple(parameters.free[k] for k in rest))
+    wide = np.full(len(rest), np.inf)
+    # chi may lie beyond a bound by chance, which is not what is tested.
+    transform = Transform.of(part)
+    floor = np.where(transform.log, part.bounds[0], -wide)
+    root = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    found, _, slopes = yield Solve(_read_back, (
+        bare, part.places, model.structure, model.maps, fit.chi, root, np.asarray(1.0),
+        theta[list(rest)], transform, (floor, wide),
+    ))
+    freedom = len(fit.chi) - _rank(np.asarray(slopes), covariance, np.asarray(found.theta))
+    if freedom == 0:
+        return None
+    square = max(2 * float(found.cost) - 1.0, 0.0)
+    names = tuple(parameters.names[k] for k in pinned)
+    return Constraint(square, freedom, chance(square, freedom), names)
+
+
+def _rank(slopes: np.ndarray, covariance: np.ndarray, theta: np.ndarray) -> int:
+    """Of the slopes of chi, each over its standard deviation, columns of one length."""
+    scaled = slopes / np.sqrt(np.diag(covariance))[:, None]
+    norm = np.linalg.norm(scaled, axis=0)
+    return int(np.linalg.matrix_rank(scaled[:, norm > 0] / norm[norm > 0], tol=_RANK))
+
+
+def _regroupable(plant: Plant, parameters: Parameters, hidden: tuple[int, ...]) -> tuple[int, ...]:
+    """Unknown friction of hidden joints that a measured joint has too."""
+    kinds = [_friction(plant, f.path, f.index) for f in parameters.free]
+    seen = {kind for kind, joint in (k for k in kinds if k is not None) if joint not in hidden}
+    return tuple(
+        k for k, at in enumerate(kinds) if at is not None and at[1] in hidden and at[0] in seen
+    )
+
+
+def _friction(plant: Plant, path: tuple, index: int | None) -> tuple[str, int] | None:
+    """Kind and joint of friction whose strength an unknown is."""
+    if path[0] == "effects":
+        effect = plant.effects[path[1]]
+        regroups = effect.kind in ("viscous_friction", "coulomb_friction") and effect.port < plant.joints
+        return (effect.kind, effect.port) if regroups else None
+    from jaxid.effects import EFFECTS
+
+    for joint in range(plant.joints):
+        if plant.twin(EFFECTS["viscous_friction"], joint) == (path[0], index):
+            return "viscous_friction", joint
+    return None
+
+
+def _estimate(
+    session: Session, model: Model, data: Regression, fit: Fit, weight: np.ndarray,
+    found: tuple[Minimum, np.ndarray, np.ndarray], constraint: Constraint | None, recipe: Recipe,
+    notes: tuple[str, ...],
+) -> Estimate:
+    machine, parameters = session.machine, session.machine.parameters
+    solved, chi, slopes = found
+    theta = np.asarray(solved.theta)
+    w = np.where(data.counts[..., None], data.w * weight[:, None], 0.0)
+    residual = fit.residual + w @ (fit.chi - chi)
+    precision = assess(
+        parameters.names, w @ slopes, residual, data.counts, fit.size, np.where(theta != 0, theta, 1.0)
+    )
+    converged = bool(solved.converged) and bool(np.all(np.isfinite(theta)))
+    at = machine.with_estimate(theta)
+    modes = _natural(at.plant, parameters, theta, precision.covariance)
+    names = [n for n, t, low in zip(parameters.names, theta, parameters.bounds[0], strict=True) if t <= low]
+    pressed = (f"at its bound: {', '.join(names)}",) if names else ()
+    form = model.structure.form
+    return Estimate(
+        method="minimal_model_printed" if form.printed else "minimal_model", machine=at, theta=theta,
+        precision=precision, converged=converged,
+        message="solved" if converged else f"no convergence within {int(solved.steps)} steps",
+        residual=np.where(data.counts, residual, np.nan), samples=int(data.counts.any(axis=1).sum()),
+        steps=int(solved.steps),
+        notes=(*notes, *minimal_notes(form, fit, model.basis, constraint), *pressed),
+        details={"minimal": minimal_json(form, fit, model.basis, constraint, modes, recipe)},
+    )
+
+
+def _natural(
+    plant: Plant, parameters: Parameters, theta: np.ndarray, covariance: np.ndarray
+) -> dict[str, list[tuple[float, float]]]:
+    """Natural frequencies and their standard deviations [Hz], with the drives free and locked."""
+    known = np.isfinite(np.diag(covariance))
+    inner = np.where(np.outer(known, known), covariance, 0.0)
+    out: dict[str, Any] = {}
+    for name, held in (("free", ()), ("motor_locked", plant.driven(plant.joints))):
+        count = natural_frequencies(plant, held).size
+        modes = tuple(range(plant.joints - len(held) - count, plant.joints - len(held)))
+        values, slopes = (
+            np.asarray(a) for a in _frequencies(plant, parameters.places, held, modes, theta)
+        )
+        std = np.sqrt(np.maximum(np.einsum("mi,ij,mj->m", slopes, inner, slopes), 0.0))
+        blind = np.any((slopes != 0) & ~known, axis=1)
+        out[name] = [(float(v), float("nan") if b else float(s)) for v, s, b in zip(values, std, blind, strict=True)]
+    return out
+
+
+__all__ = ["Model", "minimal_model_steps"]
