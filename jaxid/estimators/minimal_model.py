@@ -7,7 +7,7 @@ coefficients, which is a weighted least-squares problem of a handful of numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -22,16 +22,13 @@ from jaxid.estimators.steps import Solve, Steps
 from jaxid.minimal.basis import Basis, basis_of, chi_of
 from jaxid.minimal.columns import Regression, regression_of
 from jaxid.minimal.filtering import choose_filtering, spectrum_of
-from jaxid.minimal.matrices import delays_command, natural_frequencies, require_linear
-from jaxid.minimal.models import (
-    Form,
-    Structure,
-    coefficients_at,
-    form_of,
-    known_at,
-    rigid_rows_hold,
-    structure_of,
+from jaxid.minimal.matrices import (
+    Frequencies,
+    delays_command,
+    natural_frequencies,
+    require_linear,
 )
+from jaxid.minimal.models import Form, Structure, form_of, rigid_rows_hold, structure_of
 from jaxid.minimal.report import minimal_json, minimal_notes
 from jaxid.minimal.statistics import Constraint, Fit, chance, least_squares
 from jaxid.model import Plant
@@ -59,11 +56,13 @@ class Model:
         structure: Which coefficients there are.
         basis: What they are made of.
         known: Values of those that no unknown is in.
+        guess: Of the others at the guesses.
     """
 
     structure: Structure
     basis: Basis
     known: Float[np.ndarray, " known"]
+    guess: Float[np.ndarray, " terms"]
 
     @property
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
@@ -91,16 +90,6 @@ def _read_back(
     return fit, chi(fit.theta), jax.jacfwd(chi)(fit.theta)
 
 
-@eqx.filter_jit
-def _frequencies(
-    plant: Plant, places: tuple, held: tuple[int, ...], modes: tuple[int, ...], theta: Array
-) -> tuple[Array, Array]:
-    """Natural frequencies [Hz] and their slopes."""
-    at = lambda theta: (natural_frequencies(scatter(places, plant, theta), held, modes),) * 2
-    slopes, values = jax.jacfwd(at, has_aux=True)(theta)
-    return values, slopes
-
-
 def minimal_model_steps(session: Session, printed: bool = False) -> Steps[Estimate]:
     """Fit the minimal model of what was measured.
 
@@ -124,11 +113,11 @@ def minimal_model_steps(session: Session, printed: bool = False) -> Steps[Estima
     where = str(session.case.path)
     form = _form(session, printed)
     model = _model(machine.plant, machine.parameters, form, session, where)
-    parameters, theta = machine.parameters, machine.parameters.guess
-    natural = np.asarray(natural_frequencies(machine.plant))
+    parameters, coefficients = machine.parameters, model.guess
+    frequencies = natural_frequencies(machine.plant, parameters.places, parameters.guess)
     for _ in range(_PASSES):
-        coefficients = coefficients_at(machine.plant, parameters.places, model.structure, theta[None])[0][0]
-        spectrum = spectrum_of(log, machine, model.structure, np.asarray(coefficients), model.known, natural)
+        natural = frequencies.free
+        spectrum = spectrum_of(log, machine, model.structure, coefficients, model.known, natural)
         recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
         data = regression_of(log, machine, model.structure, model.basis, model.known, recipe)
         _require_samples(data, model, log.source)
@@ -139,15 +128,17 @@ def minimal_model_steps(session: Session, printed: bool = False) -> Steps[Estima
             machine.plant, parameters.places, model.structure, model.maps, fit.chi, fit.root,
             np.asarray(np.linalg.norm(fit.residual)), parameters.guess, *options,
         ))
-        theta, before = np.asarray(found.theta), natural
-        natural = np.asarray(natural_frequencies(parameters.insert(machine.plant, theta)))
-        settled = natural.size == 0 or abs(natural.max() / before.max() - 1) < _SETTLED
-        if settled or "cutoff_hz" in stated:
+        chi, slopes = np.asarray(chi), np.asarray(slopes)
+        coefficients = model.basis.constant + model.basis.spread @ chi
+        frequencies = natural_frequencies(machine.plant, parameters.places, np.asarray(found.theta))
+        moved = np.abs(frequencies.free / natural - 1) if natural.size else np.zeros(1)
+        if moved.max() < _SETTLED or "cutoff_hz" in stated:
             break
-    constraint = yield from _constraint(machine.plant, parameters, model, fit, theta, np.asarray(slopes))
+    constraint = yield from _constraint(
+        machine.plant, parameters, model, fit, np.asarray(found.theta), slopes
+    )
     return _estimate(
-        session, model, data, fit, weight, (found, np.asarray(chi), np.asarray(slopes)), constraint, recipe,
-        notes,
+        session, model, data, fit, weight, (found, chi, slopes), frequencies, constraint, recipe, notes
     )
 
 
@@ -166,14 +157,15 @@ def _form(session: Session, printed: bool) -> Form:
     if printed and not form.accelerated:
         raise InputError(
             "minimal_model_printed is the model with the load's acceleration and the motor's position",
-            where=where, mend="name load_acceleration in [log] and leave out load_position, or use minimal_model",
+            where=where,
+            mend="name load_acceleration in [log] and leave out load_position, or use minimal_model",
         )
     if form.accelerated and log.load_acceleration.shape[1] != len(form.hidden):
         raise InputError(
             f"load_acceleration has {log.load_acceleration.shape[1]} columns where {len(form.hidden)} belong",
             where=log.source, mend="name the column of the load's accelerometer",
         )
-    if form.accelerated and not rigid_rows_hold(plant, form):
+    if form.accelerated and not rigid_rows_hold(plant):
         raise InputError(
             "the model with an acceleration needs a machine that no spring ties to the ground", where=where,
             mend="leave out load_acceleration, or the spring",
@@ -183,7 +175,7 @@ def _form(session: Session, printed: bool) -> Form:
 
 def _model(plant: Plant, parameters: Parameters, form: Form, session: Session, where: str) -> Model:
     try:
-        structure = structure_of(plant, parameters, form)
+        structure, samples = structure_of(plant, parameters, form)
     except ValueError as error:
         raise InputError(
             f"{error}, and with it the scale of all other unknowns", where=where,
@@ -195,9 +187,9 @@ def _model(plant: Plant, parameters: Parameters, form: Form, session: Session, w
             "without the motion of some joints there is a row without a force", where=where,
             mend="use inverse_dynamics or output_error",
         )
-    basis = basis_of(plant, parameters, structure, session.machine.units)
-    known = np.asarray(known_at(parameters.insert(plant, parameters.guess), structure))
-    return Model(structure, basis, known)
+    basis = basis_of(structure, samples, parameters, session.machine.units)
+    known, guess = (samples.of(w, structure.leading)[0][-1] for w in (structure.known, structure.unknown))
+    return Model(structure, basis, known, guess)
 
 
 def _require_samples(data: Regression, model: Model, source: str) -> None:
@@ -290,8 +282,8 @@ def _friction(plant: Plant, path: tuple, index: int | None) -> tuple[str, int] |
 
 def _estimate(
     session: Session, model: Model, data: Regression, fit: Fit, weight: np.ndarray,
-    found: tuple[Minimum, np.ndarray, np.ndarray], constraint: Constraint | None, recipe: Recipe,
-    notes: tuple[str, ...],
+    found: tuple[Minimum, np.ndarray, np.ndarray], frequencies: Frequencies,
+    constraint: Constraint | None, recipe: Recipe, notes: tuple[str, ...],
 ) -> Estimate:
     machine, parameters = session.machine, session.machine.parameters
     solved, chi, slopes = found
@@ -303,7 +295,7 @@ def _estimate(
     )
     converged = bool(solved.converged) and bool(np.all(np.isfinite(theta)))
     at = machine.with_estimate(theta)
-    modes = _natural(at.plant, parameters, theta, precision.covariance)
+    modes = _modes(frequencies, precision.covariance)
     names = [n for n, t, low in zip(parameters.names, theta, parameters.bounds[0], strict=True) if t <= low]
     pressed = (f"at its bound: {', '.join(names)}",) if names else ()
     form = model.structure.form
@@ -318,23 +310,17 @@ def _estimate(
     )
 
 
-def _natural(
-    plant: Plant, parameters: Parameters, theta: np.ndarray, covariance: np.ndarray
-) -> dict[str, list[tuple[float, float]]]:
-    """Natural frequencies and their standard deviations [Hz], with the drives free and locked."""
+def _modes(found: Frequencies, covariance: np.ndarray) -> dict[str, list[tuple[float, float]]]:
+    """Natural frequencies and their standard deviations [Hz], NaN where an unknown in one cannot be told."""
     known = np.isfinite(np.diag(covariance))
     inner = np.where(np.outer(known, known), covariance, 0.0)
-    out: dict[str, Any] = {}
-    for name, held in (("free", ()), ("motor_locked", plant.driven(plant.joints))):
-        count = natural_frequencies(plant, held).size
-        modes = tuple(range(plant.joints - len(held) - count, plant.joints - len(held)))
-        values, slopes = (
-            np.asarray(a) for a in _frequencies(plant, parameters.places, held, modes, theta)
-        )
+    parts = {
+        "free": (found.free, found.free_slopes),
+        "motor_locked": (found.locked, found.locked_slopes),
+    }
+    out = {}
+    for name, (values, slopes) in parts.items():
         std = np.sqrt(np.maximum(np.einsum("mi,ij,mj->m", slopes, inner, slopes), 0.0))
-        blind = np.any((slopes != 0) & ~known, axis=1)
-        out[name] = [(float(v), float("nan") if b else float(s)) for v, s, b in zip(values, std, blind, strict=True)]
+        std = np.where(np.any((slopes != 0) & ~known, axis=1), np.nan, std)
+        out[name] = [(float(v), float(s)) for v, s in zip(values, std, strict=True)]
     return out
-
-
-__all__ = ["Model", "minimal_model_steps"]

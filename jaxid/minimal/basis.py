@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.minimal.models import Structure, Term, coefficients_at, drawn
+from jaxid.minimal.models import Samples, Structure, Term
 from jaxid.model import Plant
 from jaxid.parameters import Parameters
 from jaxid.units import Units
@@ -38,7 +38,9 @@ class Basis:
         return np.linalg.pinv(self.spread)
 
 
-def basis_of(plant: Plant, parameters: Parameters, structure: Structure, units: Units) -> Basis:
+def basis_of(
+    structure: Structure, samples: Samples, parameters: Parameters, units: Units
+) -> Basis:
     """Regroup the coefficients of a model.
 
     Where they are linear in the unknowns these are the unknowns themselves, those with the same
@@ -48,12 +50,8 @@ def basis_of(plant: Plant, parameters: Parameters, structure: Structure, units: 
     Source:
         Mayeda, Yoshida and Osuka (1990), Gautier and Khalil (1990) for regrouping by columns.
     """
-    guess, places = parameters.guess, parameters.places
-    scale = np.where(guess != 0, guess, 1.0)
-    free = np.array([f.sign == "free" for f in parameters.free])
-    # The last two: where offsets are zero, and the guesses.
-    draws = np.concatenate([drawn(scale), [np.where(free, 0.0, scale), guess]])
-    values, slopes = (np.asarray(a) for a in coefficients_at(plant, places, structure, draws))
+    guess = samples.guess
+    values, slopes = samples.of(structure.unknown, structure.leading)
     entries = [_entry(t, structure) for _, t in structure.unknown]
     labels = [_label(t, structure, units) for _, t in structure.unknown]
     if all(np.allclose(s, slopes[0], rtol=_RANK, atol=_RANK * np.abs(slopes[0]).max()) for s in slopes):

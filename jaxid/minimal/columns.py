@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxid import signals
 from jaxid.io.log import Log
@@ -105,6 +106,16 @@ def _value(moved: dict, term: Term) -> np.ndarray:
     return -x if term.signal == "force" else x
 
 
+@eqx.filter_jit
+def _decimated(decimator: signals.Decimator, x: np.ndarray) -> Array:
+    return decimator(x)
+
+
+@eqx.filter_jit
+def _delayed(force: np.ndarray, delays: np.ndarray, period: float, hold: float) -> Array:
+    return signals.delayed(force, delays, period, hold=hold)
+
+
 def _signals(
     log: Log, machine: Machine, structure: Structure, recipe: Recipe
 ) -> dict[tuple[str, int], list[np.ndarray]]:
@@ -118,7 +129,7 @@ def _signals(
     hold = 0.0
     if recipe.align_hold and log.hold == "zero_order":
         hold = log.period if machine.controller is None else machine.controller.period
-    force = np.asarray(signals.delayed(log.force * machine.gain, delays, log.period, hold=hold))
+    force = np.asarray(_delayed(log.force * machine.gain, delays, log.period, hold))
     seen = [i for i, m in enumerate(log.measured) if m]
     raw = {"position": (seen, log.position[:, seen]), "force": (range(force.shape[1]), force)}
     if "acceleration" in highest:
@@ -133,7 +144,8 @@ def _signals(
     decimator = decimator_of(recipe, log.rate_hz)
     out = {("speed", i): [moved["position"][1][:, k]] for k, i in enumerate(seen)}
     widths = [(n, j, a.shape[1]) for n, many in moved.items() for j, a in enumerate(many)]
-    whole = np.asarray(decimator(np.concatenate([moved[n][j] for n, j, _ in widths], axis=1)))
+    whole = np.concatenate([moved[n][j] for n, j, _ in widths], axis=1)
+    whole = np.asarray(_decimated(decimator, whole))
     at = 0
     for name, _, width in widths:
         index = raw[name][0] if name in raw else range(width)

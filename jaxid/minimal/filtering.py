@@ -129,7 +129,8 @@ def choose_filtering(
     )
     why = f"the band ends at {edge:.3g} Hz, {edge / top:.2g} times the natural frequency of {top:.3g} Hz"
     if limit < _ABOVE * top:
-        why += f": noise, as derivatives up to order {highest_order(structure)} amplify it, takes over at {limit:.3g} Hz"
+        amplified = f"noise, as derivatives up to order {highest_order(structure)} amplify it"
+        why += f": {amplified}, takes over at {limit:.3g} Hz"
     notes = [f"{why}; one sample in {decimation} is kept, {_A_PERIOD:g} periods of that"]
     if limit < _AT_LEAST * top:
         notes.append(

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.affine import affine, depends
+from jaxid.affine import depends, is_affine
 from jaxid.errors import InputError
 from jaxid.minimal.polynomials import Matrix
 from jaxid.model import Balance, Effect, Plant
-from jaxid.parameters import effect_name
+from jaxid.parameters import effect_name, scatter
 
 # Relative to the highest squared frequency, below this one is that of a rigid motion.
 _RIGID = 1e-9
@@ -100,40 +102,57 @@ def _balance(
 
 
 def _slides(plant: Plant) -> tuple[int, ...]:
-    return _balance(plant, *_at_rest(plant), jnp.zeros(())).slides
+    found = []
+    jax.eval_shape(lambda: found.append(_balance(plant, *_at_rest(plant), jnp.zeros(())).slides))
+    return found[0]
 
 
 def _linear(plant: Plant) -> bool:
     zeros, t = _at_rest(plant), jnp.zeros(())
-    if affine(lambda *args: _balance(plant, *args).residual, zeros, (t,)) is None:
+    if not is_affine(lambda *args: _balance(plant, *args).residual, zeros, (t,)):
         return False
     return not depends(lambda *args: _balance(plant, *args).dry, (*zeros, t))
 
 
-def natural_frequencies(
-    plant: Plant, held: tuple[int, ...] = (), modes: tuple[int, ...] | None = None
-) -> Float[Array, " modes"]:
-    """Undamped natural frequencies of a plant [Hz], lowest first; motions without stiffness left out.
+@dataclass(frozen=True)
+class Frequencies:
+    """Undamped natural frequencies, lowest first; motions without stiffness left out.
 
     Args:
-        plant: The plant, its balance linear.
-        held: Joints that are held still.
-        modes: Which of all modes; for compiled code, which cannot choose by value.
+        free, locked: With the drives free and held still [Hz], (modes,).
+        free_slopes, locked_slopes: In the unknowns, (modes, p).
     """
-    free = jnp.asarray([i for i in range(plant.joints) if i not in held], dtype=int)
-    if not free.size:
-        return jnp.zeros(0)
-    motion = linear_balance(plant).motion
-    stiffness, mass = (motion[k][free][:, free] for k in (0, 2))
-    root = jnp.linalg.inv(jnp.linalg.cholesky(mass))
-    squared = jnp.linalg.eigvalsh(root @ stiffness @ root.T)
-    if modes is None:
-        modes = elastic_modes(squared)
-    return jnp.sqrt(squared[jnp.asarray(modes, dtype=int)]) / (2 * jnp.pi)
+
+    free: Float[np.ndarray, " modes"]
+    free_slopes: Float[np.ndarray, "modes p"]
+    locked: Float[np.ndarray, " modes"]
+    locked_slopes: Float[np.ndarray, "modes p"]
 
 
-def elastic_modes(squared: Array) -> tuple[int, ...]:
-    """Which of some squared frequencies, lowest first, are not of a rigid motion."""
-    values = np.asarray(squared)
-    return tuple(int(k) for k in np.flatnonzero(values > _RIGID * np.abs(values).max(initial=0.0)))
+def natural_frequencies(plant: Plant, places: tuple, theta: Float[np.ndarray, " p"]) -> Frequencies:
+    """Natural frequencies of a plant at some values of the unknowns at `places`."""
+    parts = []
+    for squared, slopes in _squared_frequencies(plant, places, theta):
+        squared, slopes = np.asarray(squared), np.asarray(slopes)
+        elastic = squared > _RIGID * np.abs(squared).max(initial=0.0)
+        f = np.sqrt(squared[elastic]) / (2 * np.pi)
+        parts += [f, slopes[elastic] / (8 * np.pi**2 * f[:, None])]
+    return Frequencies(*parts)
 
+
+@eqx.filter_jit
+def _squared_frequencies(plant: Plant, places: tuple, theta: Array) -> list[tuple[Array, Array]]:
+    """Squared angular frequencies and their slopes, with the drives free and held."""
+    driven, out = plant.driven(plant.joints), []
+    for held in ((), driven):
+        free = np.asarray([i for i in range(plant.joints) if i not in held], dtype=int)
+
+        def squared(theta: Array, free: np.ndarray = free) -> tuple[Array, Array]:
+            motion = linear_balance(scatter(places, plant, theta)).motion
+            stiffness, mass = (motion[k][free][:, free] for k in (0, 2))
+            root = jnp.linalg.inv(jnp.linalg.cholesky(mass))
+            return (jnp.linalg.eigvalsh(root @ stiffness @ root.T),) * 2
+
+        slopes, values = jax.jacfwd(squared, has_aux=True)(theta)
+        out.append((values, slopes))
+    return out

@@ -11,7 +11,7 @@ Source:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -163,9 +163,9 @@ def neighbour(joint: int, measured: tuple[int, ...]) -> int:
     return min(measured, key=lambda i: abs(i - joint))
 
 
-def rigid_rows_hold(plant: Plant, form: Form) -> bool:
+def rigid_rows_hold(plant: Plant) -> bool:
     """Whether springs drop out of the sum of all rows, which the model with an acceleration needs."""
-    stiffness = np.asarray(linear_balance(plant).motion[0])
+    stiffness = np.asarray(eqx.filter_jit(linear_balance)(plant).motion[0])
     return bool(np.all(np.abs(stiffness.sum(axis=0)) <= _NOTHING * np.abs(stiffness).sum(axis=0)))
 
 
@@ -216,45 +216,56 @@ class Structure:
     unknown: tuple[tuple[int, Term], ...]
     known: tuple[tuple[int, Term], ...]
 
-    def coefficients(self, plant: Plant, known: bool = False) -> Float[Array, " terms"]:
-        """The unknown (or known) coefficients of a plant, each over its row's leading one."""
-        values = _flat(plant, self.form)
-        wanted = self.known if known else self.unknown
-        if not wanted:
-            return jnp.zeros(0)
-        one = jnp.ones(())
+    def coefficients(self, plant: Plant) -> Float[Array, " terms"]:
+        """The unknown coefficients of a plant, each over its row's leading one; differentiable."""
+        values, one = _flat(plant, self.form), jnp.ones(())
         divisors = [one if k is None else values[k[0]] for k in self.leading]
-        return jnp.stack([values[k] / divisors[t.row] for k, t in wanted])
+        return jnp.stack([values[k] / divisors[t.row] for k, t in self.unknown])
+
+
+@dataclass(frozen=True)
+class Samples:
+    """All coefficients of a model at some values of the unknowns.
+
+    Args:
+        values: (draws, all).
+        slopes: (draws, all, p).
+        guess: The last draw: what the unknowns are guessed as. The one before has offsets of zero.
+    """
+
+    values: Float[np.ndarray, "draws all"]
+    slopes: Float[np.ndarray, "draws all p"]
+    guess: Float[np.ndarray, " p"]
+
+    def of(
+        self, wanted: tuple[tuple[int, Term], ...], leading: tuple[tuple[int, Term] | None, ...]
+    ) -> tuple[Float[np.ndarray, "draws terms"], Float[np.ndarray, "draws terms p"]]:
+        """Some coefficients over their rows' leading ones, and the slopes of that."""
+        places = [k for k, _ in wanted]
+        values, slopes = self.values[:, places], self.slopes[:, places]
+        for j, (_, t) in enumerate(wanted):
+            if leading[t.row] is not None:
+                k = leading[t.row][0]
+                values[:, j] /= self.values[:, k]
+                slopes[:, j] -= values[:, j, None] * self.slopes[:, k]
+                slopes[:, j] /= self.values[:, k, None]
+        return values, slopes
 
 
 @eqx.filter_jit
-def _sampled(plant: Plant, places: tuple, form: Form, draws: Array) -> tuple[Array, Array, Array]:
-    """All coefficients, the size of their terms and what a force does, at some values of the unknowns."""
-    moved = lambda theta: scatter(places, plant, theta)
-    return (
-        jax.vmap(lambda theta: _flat(moved(theta), form))(draws),
-        jax.vmap(lambda theta: _flat(moved(theta), form, True))(draws),
-        jax.vmap(lambda theta: linear_balance(moved(theta)).force)(draws),
-    )
+def _sampled(plant: Plant, places: tuple, form: Form, draws: Array) -> tuple[Array, ...]:
+    """All coefficients, their slopes, the size of their terms, and what a force does, by draw."""
+
+    def at(theta: Array) -> tuple[Array, tuple[Array, ...]]:
+        moved = scatter(places, plant, theta)
+        values = _flat(moved, form)
+        return values, (values, _flat(moved, form, True), linear_balance(moved).force)
+
+    slopes, (values, size, force) = jax.vmap(jax.jacfwd(at, has_aux=True))(draws)
+    return values, slopes, size, force
 
 
-@eqx.filter_jit
-def coefficients_at(
-    plant: Plant, places: tuple, structure: Structure, draws: Array
-) -> tuple[Float[Array, "draws terms"], Float[Array, "draws terms p"]]:
-    """Unknown coefficients and their slopes at some values of the unknowns, (draws, p)."""
-    at = lambda theta: (structure.coefficients(scatter(places, plant, theta)),) * 2
-    slopes, values = jax.vmap(jax.jacfwd(at, has_aux=True))(draws)
-    return values, slopes
-
-
-@eqx.filter_jit
-def known_at(plant: Plant, structure: Structure) -> Float[Array, " known"]:
-    """Known coefficients of a plant."""
-    return structure.coefficients(plant, known=True)
-
-
-def structure_of(plant: Plant, parameters: Parameters, form: Form) -> Structure:
+def structure_of(plant: Plant, parameters: Parameters, form: Form) -> tuple[Structure, Samples]:
     """Read off a plant which coefficients of a model are nothing, known or unknown.
 
     Args:
@@ -265,29 +276,29 @@ def structure_of(plant: Plant, parameters: Parameters, form: Form) -> Structure:
     Raises:
         ValueError: If the gain of the drive is among the unknowns.
     """
-    guess = np.where(parameters.guess != 0, parameters.guess, 1.0)
-    draws = drawn(guess)
-    terms, places = _terms(plant, form), parameters.places
-    values, size, force = (np.asarray(a) for a in _sampled(plant, places, form, draws))
+    guess = parameters.guess
+    scale = np.where(guess != 0, guess, 1.0)
+    offset = np.array([f.sign == "free" for f in parameters.free])
+    random = np.random.default_rng(0)
+    draws = scale * np.exp(random.uniform(-1.0, 1.0, (_DRAWS, len(guess))))
+    draws = np.concatenate([draws, [np.where(offset, 0.0, scale), guess]])
+    terms = _terms(plant, form)
+    values, slopes, size, force = (
+        np.asarray(a) for a in _sampled(plant, parameters.places, form, draws)
+    )
     if np.any(force != force[0]):
         raise ValueError("the gain between the declared force and the joints is unknown")
     there = np.any(np.abs(values) > _NOTHING * size, axis=0)
     rows = 1 + max(t.row for t in terms)
     leading = tuple(_leading(r, terms, there) for r in range(rows))
     every = tuple((k, t) for k, t in enumerate(terms) if there[k] and (k, t) not in leading)
-    whole = Structure(form, rows, leading, every, ())
-    own, slopes = (np.asarray(a) for a in coefficients_at(plant, places, whole, draws))
-    moves = np.abs(slopes * guess).max(axis=(0, 2), initial=0.0) > _NOTHING * np.abs(own).max(axis=0)
-    return replace(
-        whole, unknown=tuple(e for e, m in zip(every, moves, strict=True) if m),
-        known=tuple(e for e, m in zip(every, moves, strict=True) if not m),
-    )
-
-
-def drawn(guess: Float[np.ndarray, " p"]) -> Float[np.ndarray, "draws p"]:
-    """Values of the unknowns by which what holds for all of them is told: factors of e^-1 to e."""
-    random = np.random.default_rng(0)
-    return guess * np.exp(random.uniform(-1.0, 1.0, (_DRAWS, len(guess))))
+    samples = Samples(values, slopes, guess)
+    own, steep = samples.of(every, leading)
+    moves = np.abs(steep * scale).max(axis=(0, 2), initial=0.0) > _NOTHING * np.abs(own).max(axis=0)
+    return Structure(
+        form, rows, leading, tuple(e for e, m in zip(every, moves, strict=True) if m),
+        tuple(e for e, m in zip(every, moves, strict=True) if not m),
+    ), samples
 
 
 def _leading(row: int, terms: list[Term], there: np.ndarray) -> tuple[int, Term] | None:

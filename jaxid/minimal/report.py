@@ -63,7 +63,8 @@ def minimal_notes(form: Form, fit: Fit, basis: Basis, constraint: Constraint | N
     if blind:
         out.append(f"coefficients that this log cannot tell: {', '.join(blind)}")
     if constraint is not None:
-        moved = f", {', '.join(constraint.regrouped)} regrouped with the motor's" if constraint.regrouped else ""
+        names = ", ".join(constraint.regrouped)
+        moved = f", {names} regrouped with the motor's" if names else ""
         said = "are not" if constraint.p_value < 0.01 else "may be"
         out.append(
             f"{len(fit.chi)} coefficients {said} those of a plant with {len(fit.chi) - constraint.freedom} "
