@@ -92,14 +92,16 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
     return steps
 
 
-def _minimal_model(session: Session, *, printed: bool = False) -> Steps[Estimate]:
+def _minimal_model(
+    session: Session, *, printed: bool = False, weight: float | None = None
+) -> Steps[Estimate]:
     from jaxid.estimators.minimal_model import minimal_model_steps
 
-    return minimal_model_steps(session, printed)
+    return minimal_model_steps(session, printed, weight)
 
 
-def _minimal_model_printed(session: Session) -> Steps[Estimate]:
-    return _minimal_model(session, printed=True)
+def _minimal_model_printed(session: Session, *, weight: float | None = None) -> Steps[Estimate]:
+    return _minimal_model(session, printed=True, weight=weight)
 
 
 _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")

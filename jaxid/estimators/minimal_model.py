@@ -6,20 +6,16 @@ coefficients, which is a weighted least-squares problem of a handful of numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxid.errors import InputError
-from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.least_squares import Minimum, Transform
+from jaxid.estimators.minimal_read_back import Model, constraint_steps, read_back
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
-from jaxid.minimal.basis import Basis, basis_of, chi_of
+from jaxid.minimal.basis import basis_of
 from jaxid.minimal.columns import Regression, regression_of
 from jaxid.minimal.filtering import choose_filtering, spectrum_of
 from jaxid.minimal.matrices import (
@@ -28,11 +24,11 @@ from jaxid.minimal.matrices import (
     natural_frequencies,
     require_linear,
 )
-from jaxid.minimal.models import Form, Structure, form_of, rigid_rows_hold, structure_of
+from jaxid.minimal.models import Form, form_of, rigid_rows_hold, structure_of
 from jaxid.minimal.report import minimal_json, minimal_notes
-from jaxid.minimal.statistics import Constraint, Fit, chance, least_squares
+from jaxid.minimal.statistics import Constraint, Fit, least_squares
 from jaxid.model import Plant
-from jaxid.parameters import Parameters, scatter
+from jaxid.parameters import Parameters
 from jaxid.precision import assess
 from jaxid.preprocess import Recipe
 
@@ -44,59 +40,19 @@ _SETTLED = 0.1
 _PASSES = 4
 # Samples that a coefficient needs at least.
 _A_COEFFICIENT = 5
-# Relative to the largest, below this a singular value of the scaled slopes is rounding.
-_RANK = 1e-6
 
 
-@dataclass(frozen=True)
-class Model:
-    """A minimal model of a machine.
-
-    Args:
-        structure: Which coefficients there are.
-        basis: What they are made of.
-        known: Values of those that no unknown is in.
-        guess: Of the others at the guesses.
-    """
-
-    structure: Structure
-    basis: Basis
-    known: Float[np.ndarray, " known"]
-    guess: Float[np.ndarray, " terms"]
-
-    @property
-    def maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """For `chi_of`."""
-        return self.basis.gather, self.basis.constant
-
-
-@eqx.filter_jit
-def _read_back(
-    plant: Plant, places: tuple, structure: Structure, maps: tuple[Array, Array], target: Array,
-    root: Array, rest: Array, theta: Array, transform: Transform, bounds: tuple[Array, Array],
-) -> tuple[Minimum, Array, Array]:
-    """Parameters whose chi is nearest to a target, that chi, and its slopes.
-
-    `rest` is the norm of what no coefficients explain: by it the solver knows when it is done.
-    """
-
-    def chi(theta: Array) -> Array:
-        return chi_of(scatter(places, plant, theta), structure, *maps)
-
-    def residual(theta: Array) -> Array:
-        return jnp.append(root @ (chi(theta) - target), rest)
-
-    fit = levenberg_marquardt(residual, theta, transform, *bounds)
-    return fit, chi(fit.theta), jax.jacfwd(chi)(fit.theta)
-
-
-def minimal_model_steps(session: Session, printed: bool = False) -> Steps[Estimate]:
+def minimal_model_steps(
+    session: Session, printed: bool = False, weight: float | None = None
+) -> Steps[Estimate]:
     """Fit the minimal model of what was measured.
 
     Args:
         session: Case and log: with motor and load position, load acceleration and motor position, or
             motor position alone.
         printed: Take the model with an acceleration as the paper prints it.
+        weight: On its rows that were differentiated twice, beside one on that of the forces [s^2].
+            Absent: 1 as printed, else what brings them to the size of a force at the resonance.
 
     Returns:
         The estimate; `details["minimal"]` holds coefficients, statistics and the constraint's test.
@@ -121,10 +77,10 @@ def minimal_model_steps(session: Session, printed: bool = False) -> Steps[Estima
         recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
         data = regression_of(log, machine, model.structure, model.basis, model.known, recipe)
         _require_samples(data, model, log.source)
-        weight = _weights(form, model.structure.rows, natural)
-        fit = least_squares(model.basis.names, data, weight)
+        weights = _weights(form, model.structure.rows, natural, weight)
+        fit = least_squares(model.basis.names, data, weights)
         options = (Transform.of(parameters), parameters.bounds)
-        found, chi, slopes = yield Solve(_read_back, (
+        found, chi, slopes = yield Solve(read_back, (
             machine.plant, parameters.places, model.structure, model.maps, fit.chi, fit.root,
             np.asarray(np.linalg.norm(fit.residual)), parameters.guess, *options,
         ))
@@ -134,11 +90,11 @@ def minimal_model_steps(session: Session, printed: bool = False) -> Steps[Estima
         moved = np.abs(frequencies.free / natural - 1) if natural.size else np.zeros(1)
         if moved.max() < _SETTLED or "cutoff_hz" in stated:
             break
-    constraint = yield from _constraint(
+    constraint = yield from constraint_steps(
         machine.plant, parameters, model, fit, np.asarray(found.theta), slopes
     )
     return _estimate(
-        session, model, data, fit, weight, (found, chi, slopes), frequencies, constraint, recipe, notes
+        session, model, data, fit, weights, (found, chi, slopes), frequencies, constraint, recipe, notes
     )
 
 
@@ -201,83 +157,13 @@ def _require_samples(data: Regression, model: Model, source: str) -> None:
         )
 
 
-def _weights(form: Form, rows: int, natural: np.ndarray) -> np.ndarray:
-    """On each row: what was differentiated twice is brought to the size of a force.
-
-    That is its size at the natural frequency. As printed all rows count as they are, so that the
-    rigid one tells nothing but what stands in no other.
-    """
-    if not form.accelerated or form.printed:
+def _weights(form: Form, rows: int, natural: np.ndarray, weight: float | None) -> np.ndarray:
+    """On each row; that of the forces is the last where others are differentiated twice."""
+    if not form.accelerated:
         return np.ones(rows)
-    return np.append(np.full(rows - 1, (2 * np.pi * natural.max()) ** -2), 1.0)
-
-
-def _constraint(
-    plant: Plant, parameters: Parameters, model: Model, fit: Fit, theta: np.ndarray, slopes: np.ndarray
-) -> Steps[Constraint | None]:
-    """Test whether the coefficients can be those of a plant, where there are more than a plant has.
-
-    Where there are not, friction of hidden joints is moved to the measured ones first, as published.
-    """
-    covariance = fit.precision.covariance
-    if not np.all(np.isfinite(covariance)):
-        return None
-    pinned: tuple[int, ...] = ()
-    freedom = len(fit.chi) - _rank(slopes, covariance, theta)
-    form = model.structure.form
-    if freedom == 0:
-        # With an acceleration the coefficients are the parameters themselves.
-        pinned = () if form.accelerated else _regroupable(plant, parameters, form.hidden)
-        if not pinned:
-            return None
-    rest = tuple(k for k in range(len(theta)) if k not in pinned)
-    bare = parameters.insert(plant, np.where(np.isin(np.arange(len(theta)), pinned), 0.0, theta))
-    part = Parameters(tuple(parameters.free[k] for k in rest))
-    wide = np.full(len(rest), np.inf)
-    # chi may lie beyond a bound by chance, which is not what is tested.
-    transform = Transform.of(part)
-    floor = np.where(transform.log, part.bounds[0], -wide)
-    root = np.linalg.cholesky(np.linalg.inv(covariance)).T
-    found, _, slopes = yield Solve(_read_back, (
-        bare, part.places, model.structure, model.maps, fit.chi, root, np.asarray(1.0),
-        theta[list(rest)], transform, (floor, wide),
-    ))
-    freedom = len(fit.chi) - _rank(np.asarray(slopes), covariance, np.asarray(found.theta))
-    if freedom == 0:
-        return None
-    square = max(2 * float(found.cost) - 1.0, 0.0)
-    names = tuple(parameters.names[k] for k in pinned)
-    return Constraint(square, freedom, chance(square, freedom), names)
-
-
-def _rank(slopes: np.ndarray, covariance: np.ndarray, theta: np.ndarray) -> int:
-    """Of the slopes of chi, each over its standard deviation, columns of one length."""
-    scaled = slopes / np.sqrt(np.diag(covariance))[:, None]
-    norm = np.linalg.norm(scaled, axis=0)
-    return int(np.linalg.matrix_rank(scaled[:, norm > 0] / norm[norm > 0], tol=_RANK))
-
-
-def _regroupable(plant: Plant, parameters: Parameters, hidden: tuple[int, ...]) -> tuple[int, ...]:
-    """Unknown friction of hidden joints that a measured joint has too."""
-    kinds = [_friction(plant, f.path, f.index) for f in parameters.free]
-    seen = {kind for kind, joint in (k for k in kinds if k is not None) if joint not in hidden}
-    return tuple(
-        k for k, at in enumerate(kinds) if at is not None and at[1] in hidden and at[0] in seen
-    )
-
-
-def _friction(plant: Plant, path: tuple, index: int | None) -> tuple[str, int] | None:
-    """Kind and joint of friction whose strength an unknown is."""
-    if path[0] == "effects":
-        effect = plant.effects[path[1]]
-        regroups = effect.kind in ("viscous_friction", "coulomb_friction") and effect.port < plant.joints
-        return (effect.kind, effect.port) if regroups else None
-    from jaxid.effects import EFFECTS
-
-    for joint in range(plant.joints):
-        if plant.twin(EFFECTS["viscous_friction"], joint) == (path[0], index):
-            return "viscous_friction", joint
-    return None
+    if weight is None:
+        weight = 1.0 if form.printed else float((2 * np.pi * natural.max()) ** -2)
+    return np.append(np.full(rows - 1, weight), 1.0)
 
 
 def _estimate(

@@ -134,7 +134,7 @@ def choose_filtering(
     notes = [f"{why}; one sample in {decimation} is kept, {_A_PERIOD:g} periods of that"]
     if limit < _AT_LEAST * top:
         notes.append(
-            "that is within the band: stiffness and inertias will be biased; take a finer encoder, or excite "
+            "that is within the band: stiffness and inertias may be biased; take a finer encoder, or excite "
             "the resonance more"
         )
     return recipe, tuple(notes)
