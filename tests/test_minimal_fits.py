@@ -9,8 +9,10 @@ import pytest
 
 from jaxid.cli import main
 from jaxid.estimators import METHODS
+from jaxid.estimators.minimal_model import filtering_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
+from jaxid.report.minimal_plots import plot_filtering
 from jaxid.session import open_session
 
 T = flexible.TRUTH
@@ -95,6 +97,20 @@ def test_the_loads_acceleration(log):
     assert biased["viscous_friction[1].coefficient"]["value"] > 1.5 * 92
     assert biased[both]["value"] > own[both]["value"]
     assert biased["stiffness"]["value"] == pytest.approx(8e5, rel=0.02)
+
+
+def test_why_a_log_is_filtered_so(log):
+    path = log.parent / "why.toml"
+    path.write_text(flexible.case("motor", far=1.0))
+    spectrum, recipe, notes = filtering_of(open_session(path, log))
+    assert spectrum.natural == pytest.approx([29.37], abs=0.01)
+    assert "29.4 Hz" in notes[0]
+    # Nothing but noise is left up there; nine in ten, since a density scatters.
+    high = spectrum.frequency > 200
+    assert np.mean(spectrum.noise[high] > spectrum.force[high]) > 0.9
+    assert 29.4 < spectrum.limit_hz < 80
+    figure = plot_filtering(spectrum, recipe, 1000.0)
+    assert "natural frequency" in [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
 
 
 def test_the_published_filter_folds_and_says_so(log):

@@ -17,7 +17,7 @@ from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
 from jaxid.minimal.basis import basis_of
 from jaxid.minimal.columns import Regression, regression_of
-from jaxid.minimal.filtering import choose_filtering, spectrum_of
+from jaxid.minimal.filtering import Spectrum, choose_filtering, spectrum_of
 from jaxid.minimal.matrices import (
     Frequencies,
     delays_command,
@@ -96,6 +96,22 @@ def minimal_model_steps(
     return _estimate(
         session, model, data, fit, weights, (found, chi, slopes), frequencies, constraint, recipe, notes
     )
+
+
+def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Recipe, tuple[str, ...]]:
+    """Force and noise over frequency at a session's guesses, the recipe that follows, and why.
+
+    Around an estimate (`session.with_machine(estimate.machine)`) it is the one that was used.
+
+    Raises:
+        InputError: As `minimal_model_steps`.
+    """
+    machine, log = session.machine, session.fit.log
+    form = _form(session, printed)
+    model = _model(machine.plant, machine.parameters, form, session, str(session.case.path))
+    natural = natural_frequencies(machine.plant, machine.parameters.places, machine.parameters.guess).free
+    spectrum = spectrum_of(log, machine, model.structure, model.guess, model.known, natural)
+    return spectrum, *choose_filtering(log, session.case.preprocess, model.structure, spectrum)
 
 
 def _form(session: Session, printed: bool) -> Form:
