@@ -101,13 +101,20 @@ def test_the_loads_acceleration(log):
 
 def test_why_a_log_is_filtered_so(log):
     path = log.parent / "why.toml"
-    path.write_text(flexible.case("motor", far=1.0))
+    sensor = "[sensor]\nposition_noise = 3e-8"
+    path.write_text(flexible.case("motor", extra=sensor, far=1.0))
     spectrum, recipe, notes = filtering_of(open_session(path, log))
     assert spectrum.natural == pytest.approx([29.37], abs=0.01)
     assert "29.4 Hz" in notes[0]
-    # Nothing but noise is left up there; nine in ten, since a density scatters.
-    high = spectrum.frequency > 200
-    assert np.mean(spectrum.noise[high] > spectrum.force[high]) > 0.9
+    # Of the encoder by (13), at guesses whose friction is 100 N s/m on both sides, and the force's own.
+    f = spectrum.frequency
+    s, c = 2j * np.pi * f, 126.0
+    motor, load = 72.3 * s**2 + (100 + c) * s + 8e5, 34.8 * s**2 + (100 + c) * s + 8e5
+    amplified = np.abs((motor * load - (c * s + 8e5) ** 2) / load) ** 2 * 2 * 3e-8**2 / 1000
+    own = spectrum.noise - amplified
+    assert np.ptp(own) < 1e-6 * own.max()
+    # White noise of NOISE on the command; a tenth of it is what the loop makes of the encoder's.
+    assert own[0] == pytest.approx(2 * (NOISE * flexible.GAIN) ** 2 / 1000, rel=0.1)
     assert 29.4 < spectrum.limit_hz < 80
     figure = plot_filtering(spectrum, recipe, 1000.0)
     assert "natural frequency" in [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
