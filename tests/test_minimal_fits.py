@@ -84,6 +84,17 @@ def test_the_motor_alone(log):
     assert constraint["p_value"] < 1e-6
 
 
+def test_the_load_turns_round_unseen(tmp_path):
+    """Where it does its friction has another sign than the motor's: left in, 0.10 N at a sample."""
+    made = flexible.flexible_log(duration=12.0, force_noise=0.0, resolution=0.0)
+    estimate = fitted(flexible.write(made, tmp_path), "motor")
+    assert np.nanmax(np.abs(estimate.residual)) < 0.05
+    # What twelve digits in the file leave.
+    for name in ("motor_inertia", "load_inertia", "stiffness"):
+        assert estimate.value(name) == pytest.approx(T[name], rel=1e-4)
+    assert estimate.value("viscous_friction[2].coefficient") == pytest.approx(110, rel=1e-3)
+
+
 def test_the_loads_acceleration(log):
     """Corrected it finds the inertias; as printed its third row lacks the load's friction."""
     estimate = fitted(log, "acceleration")

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import equinox as eqx
 import numpy as np
+from jaxtyping import Array
 
 from jaxid.errors import InputError
 from jaxid.estimators.least_squares import Minimum, Transform
@@ -20,7 +22,9 @@ from jaxid.minimal.columns import Regression, regression_of
 from jaxid.minimal.filtering import Spectrum, choose_filtering, spectrum_of
 from jaxid.minimal.matrices import (
     Frequencies,
+    LinearBalance,
     delays_command,
+    linear_balance,
     natural_frequencies,
     require_linear,
 )
@@ -28,7 +32,7 @@ from jaxid.minimal.models import Form, form_of, rigid_rows_hold, structure_of
 from jaxid.minimal.report import minimal_json, minimal_notes
 from jaxid.minimal.statistics import Constraint, Fit, least_squares
 from jaxid.model import Plant
-from jaxid.parameters import Parameters
+from jaxid.parameters import Parameters, scatter
 from jaxid.precision import assess
 from jaxid.preprocess import Recipe
 
@@ -40,6 +44,11 @@ _SETTLED = 0.1
 _PASSES = 4
 # Samples that a coefficient needs at least.
 _A_COEFFICIENT = 5
+
+
+@eqx.filter_jit
+def _linear_balance(plant: Plant, places: tuple, theta: Array) -> LinearBalance:
+    return linear_balance(scatter(places, plant, theta))
 
 
 def minimal_model_steps(
@@ -71,11 +80,13 @@ def minimal_model_steps(
     model = _model(machine.plant, machine.parameters, form, session, where)
     parameters, coefficients = machine.parameters, model.guess
     frequencies = natural_frequencies(machine.plant, parameters.places, parameters.guess)
-    for _ in range(_PASSES):
+    theta = parameters.guess
+    for k in range(_PASSES):
         natural = frequencies.free
         spectrum = spectrum_of(log, machine, model.structure, coefficients, model.known, natural)
         recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
-        data = regression_of(log, machine, model.structure, model.basis, model.known, recipe)
+        balance = _linear_balance(machine.plant, parameters.places, theta)
+        data = regression_of(log, machine, model.structure, model.basis, model.known, recipe, balance)
         _require_samples(data, model, log.source)
         weights = _weights(form, model.structure.rows, natural, weight)
         fit = least_squares(model.basis.names, data, weights)
@@ -84,15 +95,14 @@ def minimal_model_steps(
             machine.plant, parameters.places, model.structure, model.maps, fit.chi, fit.root,
             np.asarray(np.linalg.norm(fit.residual)), parameters.guess, *options,
         ))
-        chi, slopes = np.asarray(chi), np.asarray(slopes)
+        chi, slopes, theta = (np.asarray(a) for a in (chi, slopes, found.theta))
         coefficients = model.basis.constant + model.basis.spread @ chi
-        frequencies = natural_frequencies(machine.plant, parameters.places, np.asarray(found.theta))
+        frequencies = natural_frequencies(machine.plant, parameters.places, theta)
         moved = np.abs(frequencies.free / natural - 1) if natural.size else np.zeros(1)
-        if moved.max() < _SETTLED or "cutoff_hz" in stated:
+        # Where a hidden joint turns round is not known at the guesses.
+        if k >= bool(form.hidden) and (moved.max() < _SETTLED or "cutoff_hz" in stated):
             break
-    constraint = yield from constraint_steps(
-        machine.plant, parameters, model, fit, np.asarray(found.theta), slopes
-    )
+    constraint = yield from constraint_steps(machine.plant, parameters, model, fit, theta, slopes)
     return _estimate(
         session, model, data, fit, weights, (found, chi, slopes), frequencies, constraint, recipe, notes
     )

@@ -16,6 +16,7 @@ from jaxid import signals
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.minimal.basis import Basis
+from jaxid.minimal.matrices import LinearBalance
 from jaxid.minimal.models import Structure, Term, neighbour
 from jaxid.preprocess import Recipe, affordable, lasting, smeared, turning
 
@@ -72,7 +73,8 @@ def reach_of(recipe: Recipe, rate_hz: float, order: int) -> int:
 
 
 def regression_of(
-    log: Log, machine: Machine, structure: Structure, basis: Basis, known: np.ndarray, recipe: Recipe
+    log: Log, machine: Machine, structure: Structure, basis: Basis, known: np.ndarray, recipe: Recipe,
+    balance: LinearBalance,
 ) -> Regression:
     """Columns of a model along a log.
 
@@ -83,8 +85,9 @@ def regression_of(
         basis: What its coefficients are made of.
         known: Its known coefficients.
         recipe: How the log is filtered.
+        balance: As it is known so far, by which a reversal of a hidden joint is seen.
     """
-    moved = _signals(log, machine, structure, recipe)
+    moved = _signals(log, machine, structure, recipe, balance)
     kept = len(decimator_of(recipe, log.rate_hz).kept(log.samples))
     rows = structure.rows
     y, d = np.zeros((kept, rows)), np.zeros((kept, rows, len(structure.unknown)))
@@ -117,12 +120,14 @@ def _delayed(force: np.ndarray, delays: np.ndarray, period: float, hold: float) 
 
 
 def _signals(
-    log: Log, machine: Machine, structure: Structure, recipe: Recipe
+    log: Log, machine: Machine, structure: Structure, recipe: Recipe, balance: LinearBalance
 ) -> dict[tuple[str, int], list[np.ndarray]]:
-    """Derivatives of each signal at the kept samples; under "speed" of each measured joint at all."""
+    """Derivatives of each signal at the kept samples; under "speed" of each joint at all samples."""
     every = [t for _, t in (*structure.unknown, *structure.known)]
     every += [lead[1] for lead in structure.leading if lead is not None]
     highest: dict[str, int] = {"position": 1, "force": 0}
+    if structure.form.hidden:
+        highest = {"position": 3, "force": 1}
     for t in every:
         highest[t.signal] = max(highest.get(t.signal, 0), t.order)
     delays = np.asarray(machine.plant.command_delays(log.force.shape[1]))
@@ -143,6 +148,8 @@ def _signals(
     moved["one"] = [np.ones((log.samples, len(moving)))]
     decimator = decimator_of(recipe, log.rate_hz)
     out = {("speed", i): [moved["position"][1][:, k]] for k, i in enumerate(seen)}
+    for i in structure.form.hidden:
+        out["speed", i] = [_hidden_speed(i, moved, seen, balance)]
     widths = [(n, j, a.shape[1]) for n, many in moved.items() for j, a in enumerate(many)]
     whole = np.concatenate([moved[n][j] for n, j, _ in widths], axis=1)
     whole = np.asarray(_decimated(decimator, whole))
@@ -155,6 +162,24 @@ def _signals(
     return out
 
 
+def _hidden_speed(
+    joint: int, moved: dict[str, list[np.ndarray]], seen: list[int], balance: LinearBalance
+) -> Float[np.ndarray, " time"]:
+    """Speed of a hidden joint, by what the spring to it must do in the balance of a measured one.
+
+    A resonance turns it round where the motor only slows down, and its friction with it.
+    """
+    motion = np.asarray(balance.motion)
+    row = max(seen, key=lambda r: abs(motion[0, r, joint]))
+    if motion[0, row, joint] == 0:
+        return moved["position"][1][:, seen.index(neighbour(joint, tuple(seen)))]
+    pull = -moved["force"][1] @ np.asarray(balance.force)[row]
+    for k, i in enumerate(seen):
+        for order in range(3):
+            pull = pull + motion[order, row, i] * moved["position"][order + 1][:, k]
+    return -pull / motion[0, row, joint]
+
+
 def _counting(
     moved: dict, log: Log, structure: Structure, recipe: Recipe
 ) -> Bool[np.ndarray, "kept rows"]:
@@ -163,9 +188,12 @@ def _counting(
     Without eliminated joints a reversal harms no more than in inverse dynamics. With them the model
     lacks the derivatives of the sign, and leaves out all that the filters have seen of a reversal.
     """
-    seen = [i for i, m in enumerate(log.measured) if m]
-    speed = np.stack([moved["speed", i][0] for i in seen], axis=1)
-    still = np.abs(speed) < np.asarray(recipe.rest_velocity)[seen]
+    seen = tuple(i for i, m in enumerate(log.measured) if m)
+    joints = range(len(log.measured))
+    near = [i if i in seen else neighbour(i, seen) for i in joints]
+    speed = np.stack([moved["speed", i][0] for i in joints], axis=1)
+    still = np.abs(speed) < np.asarray(recipe.rest_velocity)[near]
+    still |= speed * speed[:, near] < 0
     decimator = decimator_of(recipe, log.rate_hz)
     order = max((t.order for _, t in structure.unknown if t.signal == "force"), default=0)
     order = max(order, max((k[1].order for k in structure.leading if k is not None), default=0))
@@ -179,10 +207,10 @@ def _counting(
         slow = smeared(still | (turning(speed) & (reach > 0)), reach)
     kept = decimator.kept(log.samples)
     fine = ~slow[kept]
-    needs = np.zeros((structure.rows, len(seen)), bool)
+    needs = np.zeros((structure.rows, len(joints)), bool)
     for _, t in (*structure.unknown, *structure.known):
         if t.signal == "sign":
-            needs[t.row, seen.index(t.index if t.index in seen else neighbour(t.index, tuple(seen)))] = True
+            needs[t.row, t.index] = True
     if order:
         needs[:] = True
     return np.stack([fine[:, n].all(axis=1) for n in needs], axis=1)
