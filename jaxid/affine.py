@@ -68,6 +68,14 @@ def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
     return Affine(jax.tree.unflatten(jax.tree.structure(shape), offset), matrices)
 
 
+def is_affine(f: Callable, args: tuple, fixed: tuple = ()) -> bool:
+    """Whether `affine` finds a matrix; cheaper where that is not asked for."""
+    zeros = jax.tree.map(jnp.zeros_like, args)
+    closed = jax.make_jaxpr(f)(*zeros, *fixed)
+    entering = [_AFFINE] * len(jax.tree.leaves(args)) + [_OTHER] * len(jax.tree.leaves(fixed))
+    return max(_follow(closed.jaxpr, entering), default=_CONSTANT) != _OTHER
+
+
 def depends(f: Callable, args: tuple) -> bool:
     """Whether what a function returns depends on its arguments, or may."""
     closed = jax.make_jaxpr(f)(*jax.tree.map(jnp.zeros_like, args))

@@ -16,6 +16,7 @@ from jaxid.errors import InputError, suggest
 METHODS = (
     "output_error", "inverse_dynamics", "algebraic", "instrumental_variable", "didim", "power",
     "algebraic_single_time", "algebraic_ratio", "algebraic_sign_changed", "algebraic_sign_unchanged",
+    "minimal_model", "minimal_model_printed",
 )
 OUTPUTS = ("position", "force", "both")
 SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")

@@ -264,11 +264,11 @@ def prepare(
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
     reach = recipe.decimator.reach
     if recipe.derivatives == "spectral":
-        reach = _affordable(at_rest, _turning(qd), max(reach, recipe.decimation - 1))
+        reach = affordable(at_rest, turning(qd), max(reach, recipe.decimation - 1))
         # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
-        at_rest = at_rest | (_turning(qd) & (reach > 0))
-    moving = ~_smeared(at_rest, reach)[kept] & log.measured
-    fitted = ~_smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
+        at_rest = at_rest | (turning(qd) & (reach > 0))
+    moving = ~smeared(at_rest, reach)[kept] & log.measured
+    fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
     held = recipe.align_hold and log.hold == "zero_order"
     hold = (hold_period or log.period) if held else 0.0
     return Prepared(
@@ -278,24 +278,24 @@ def prepare(
     )
 
 
-def _affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
+def affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
     """How many samples about stops and reversals to leave out, so that most of the motion remains."""
     for part in (1.0, 0.75, 0.5, 0.25):
         near = int(np.ceil(part * reach))
-        lost = _smeared(at_rest | turning, near) & ~at_rest
+        lost = smeared(at_rest | turning, near) & ~at_rest
         if np.all(lost.sum(axis=0) < _MOSTLY * np.maximum((~at_rest).sum(axis=0), 1)):
             return near
     return 0
 
 
-def _turning(v: np.ndarray) -> np.ndarray:
+def turning(v: np.ndarray) -> np.ndarray:
     """Samples between which a velocity changes its sign: a fast reversal has none at rest."""
     turns = np.diff(np.sign(v), axis=0) != 0
     edge = np.zeros((1, v.shape[1]), bool)
     return np.concatenate([turns, edge]) | np.concatenate([edge, turns])
 
 
-def _smeared(flags: np.ndarray, reach: int) -> np.ndarray:
+def smeared(flags: np.ndarray, reach: int) -> np.ndarray:
     """Flags and their neighbours: the parallel filter smears a stop, which goes with them."""
     width = 2 * reach + 1
     count = np.cumsum(np.pad(flags, ((reach + 1, reach), (0, 0))), axis=0)

@@ -45,16 +45,16 @@ def central_difference(
 
 
 def spectral_derivatives(
-    x: Float[np.ndarray, "time k"], period: float, cutoff_hz: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Band-limit a signal and differentiate it twice, exactly within the band.
+    x: Float[np.ndarray, "time k"], period: float, cutoff_hz: float, orders: int = 2
+) -> tuple[np.ndarray, ...]:
+    """Band-limit a signal and differentiate it, twice or so many times, exactly within the band.
 
     Central differences are 10 % short where ten samples make a period; a resonance near a tenth
     of the sampling rate needs this instead. A cubic through the ends is taken off first, so that
     the periodic continuation has neither a jump nor a corner, and the roll-off is `roll_off`.
 
     Returns:
-        The signal, its first and its second derivative.
+        The signal, its first, its second and so many derivatives.
     """
     n, span = len(x), (len(x) - 1) * period
     powers = np.linspace(0.0, 1.0, n)[:, None] ** np.arange(4)
@@ -66,11 +66,11 @@ def spectral_derivatives(
     f = f[f[:, 0] < cutoff_hz]
     spectrum = scipy.fft.rfft(rest, axis=0)[: len(f)] * roll_off(f, cutoff_hz)
     out = []
-    for _ in range(3):
+    for _ in range(orders + 1):
         out.append(scipy.fft.irfft(spectrum, len(rest), axis=0)[:n] + powers[:, : len(cubic)] @ cubic)
         spectrum = spectrum * (2j * np.pi * f)
         cubic = cubic[1:] * np.arange(1, len(cubic))[:, None] / span
-    return out[0], out[1], out[2]
+    return tuple(out)
 
 
 def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
@@ -119,6 +119,7 @@ class Decimator:
     factor: int
     trim: int
     edge: float | None = None
+    band: float | None = None
 
     def __call__(self, x: Float[Array, "time k"]) -> Float[Array, "kept k"]:
         """Filter along the first axis, decimate and trim."""
@@ -134,13 +135,15 @@ class Decimator:
     @property
     def filters(self) -> bool:
         """Whether anything is filtered."""
-        return self.factor > 1 or self.edge is not None
+        return self.factor > 1 or self.edge is not None or self.band is not None
 
     @property
     def pass_band(self) -> float:
         """Edge of the pass band (3 dB down) over half the sampling rate."""
         if self.edge is not None:
             return self.edge * float(np.sqrt(np.log10(2) / 2))
+        if self.band is not None:
+            return self.band
         return 0.8 / self.factor if self.filters else 1.0
 
     @property

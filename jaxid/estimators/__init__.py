@@ -92,6 +92,18 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
     return steps
 
 
+def _minimal_model(
+    session: Session, *, printed: bool = False, weight: float | None = None
+) -> Steps[Estimate]:
+    from jaxid.estimators.minimal_model import minimal_model_steps
+
+    return minimal_model_steps(session, printed, weight)
+
+
+def _minimal_model_printed(session: Session, *, weight: float | None = None) -> Steps[Estimate]:
+    return _minimal_model(session, printed=True, weight=weight)
+
+
 _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 
@@ -106,4 +118,6 @@ METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "didim": _didim,
     "power": _power,
     **{f"algebraic_{name}": _form(f"algebraic_{name}") for name in _FORMS},
+    "minimal_model": _minimal_model,
+    "minimal_model_printed": _minimal_model_printed,
 }

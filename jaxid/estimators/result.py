@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,6 +28,7 @@ class Estimate:
         samples: How many samples counted.
         steps: Evaluations of the Jacobian.
         notes: What a user should know of how it was done.
+        details: What the method has to say of its own, by the key under which results hold it.
     """
 
     method: str
@@ -38,6 +41,7 @@ class Estimate:
     samples: int
     steps: int = 1
     notes: tuple[str, ...] = field(default=())
+    details: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:

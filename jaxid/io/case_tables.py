@@ -36,6 +36,8 @@ METHODS = (
     "algebraic_ratio",
     "algebraic_sign_changed",
     "algebraic_sign_unchanged",
+    "minimal_model",
+    "minimal_model_printed",
     "recursive",
     "power",
     "output_error",

@@ -131,6 +131,7 @@ def identification_json(result: Identification) -> dict[str, Any]:
         "parameters": parameters_json(estimate),
         **({"derived": follows} if follows else {}),
         "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
+        **estimate.details,
         "gap": gap_json(result.session, result.gaps, result.noise_floor),
         "preprocess": recipe_json(result.session),
         "notes": notes(result.session, estimate),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.io import results
+from jaxid.minimal.report import minimal_rows
 from jaxid.report.numbers import with_std
 from jaxid.report.tables import place_words
 
@@ -61,7 +62,14 @@ def identification_table(result: Identification) -> str:
     ]
     told = parameter_lines(estimate, results.derived(result))
     notes = _notes(results.notes(result.session, estimate))
-    return "\n".join([head, "", told, *_blind(estimate), "", aligned(rows), *notes])
+    own = _minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []
+    return "\n".join([head, "", told, *_blind(estimate), *own, "", aligned(rows), *notes])
+
+
+def _minimal(content: dict[str, Any]) -> list[str]:
+    """Coefficients and statistics of a minimal model."""
+    rows, lines = minimal_rows(content)
+    return ["", aligned(rows), *lines]
 
 
 def discovery_table(result: Discovery) -> str:

@@ -1,0 +1,158 @@
+"""Coefficient matrices of a balance that is linear in motion away from rest, off the balance itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.affine import depends, is_affine
+from jaxid.errors import InputError
+from jaxid.minimal.polynomials import Matrix
+from jaxid.model import Balance, Effect, Plant
+from jaxid.parameters import effect_name, scatter
+
+# Relative to the highest squared frequency, below this one is that of a rigid motion.
+_RIGID = 1e-9
+
+
+class LinearBalance(eqx.Module):
+    """P(s) q + S sign(q') + c = B u, s being d/dt.
+
+    Args:
+        motion: P: stiffness, damping and mass, (3, n, n).
+        sign: S, levels of dry friction by the joint on which they act, (n, n).
+        constant: c, weights and offsets, (n,).
+        force: B, of the declared forces, (n, m).
+    """
+
+    motion: Matrix
+    sign: Float[Array, "n n"]
+    constant: Float[Array, " n"]
+    force: Float[Array, "n m"]
+
+
+def linear_balance(plant: Plant) -> LinearBalance:
+    """Differentiate a plant's balance; only of use where `require_linear` lets it pass."""
+    zeros = _at_rest(plant)
+
+    def residual(*args: Array) -> Array:
+        return _balance(plant, *args, jnp.zeros(())).residual
+
+    stiffness, damping, mass, force, reaction = jax.jacfwd(residual, argnums=(0, 1, 2, 3, 4))(*zeros)
+    n = plant.joints
+    levels = _balance(plant, *zeros, jnp.zeros(())).dry
+    return LinearBalance(
+        jnp.stack([stiffness, damping, mass]), -(reaction * levels)[:, :n], residual(*zeros), -force
+    )
+
+
+def require_linear(plant: Plant, where: str) -> None:
+    """See that away from rest the balance is linear in the motion, with constant coefficients.
+
+    Args:
+        plant: The plant.
+        where: For the message.
+
+    Raises:
+        InputError: If it is not; the text names the effect.
+    """
+    mend = "leave it out of the case, or use inverse_dynamics or output_error"
+    for k, effect in enumerate(plant.effects):
+        name = effect_name(eqx.tree_at(lambda p: p.effects, plant, plant.effects[:k]), effect)
+        alone = eqx.tree_at(lambda p: p.effects, plant, (effect,))
+        if jax.tree.leaves(effect.initial_state(jnp.zeros(()))):
+            raise InputError(f"{name} has a memory, which a minimal model has not", where=where, mend=mend)
+        if not _linear(alone) and _linear(eqx.tree_at(lambda p: p.effects, plant, ())):
+            raise InputError(
+                f"{name} is not linear in the motion, as a minimal model is away from rest",
+                where=where, mend=mend,
+            )
+        if any(i >= plant.joints for i in _slides(alone)):
+            raise InputError(
+                f"{name} is dry friction in a spring, whose direction no encoder tells",
+                where=where, mend=mend,
+            )
+    if not _linear(plant):
+        raise InputError(
+            f"{plant.kind} with these effects is not linear in its motion, as a minimal model is",
+            where=where, mend="use inverse_dynamics or output_error",
+        )
+
+
+def delays_command(effect: Effect) -> bool:
+    """Whether an effect delays the command."""
+    return type(effect).command_delay is not Effect.command_delay
+
+
+def _at_rest(plant: Plant) -> tuple[Array, ...]:
+    """Position, velocity, acceleration, declared force and reaction, all zero."""
+    q = jnp.zeros(plant.joints)
+    return q, q, q, jnp.zeros(len(plant.driven(plant.joints))), jnp.zeros(plant.ports(q).size)
+
+
+def _balance(
+    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, reaction: Array, t: Array
+) -> Balance:
+    return plant.balance(q, qd, qdd, u, t, plant.initial_states(u), reaction)
+
+
+def _slides(plant: Plant) -> tuple[int, ...]:
+    found = []
+    jax.eval_shape(lambda: found.append(_balance(plant, *_at_rest(plant), jnp.zeros(())).slides))
+    return found[0]
+
+
+def _linear(plant: Plant) -> bool:
+    zeros, t = _at_rest(plant), jnp.zeros(())
+    if not is_affine(lambda *args: _balance(plant, *args).residual, zeros, (t,)):
+        return False
+    return not depends(lambda *args: _balance(plant, *args).dry, (*zeros, t))
+
+
+@dataclass(frozen=True)
+class Frequencies:
+    """Undamped natural frequencies, lowest first; motions without stiffness left out.
+
+    Args:
+        free, locked: With the drives free and held still [Hz], (modes,).
+        free_slopes, locked_slopes: In the unknowns, (modes, p).
+    """
+
+    free: Float[np.ndarray, " modes"]
+    free_slopes: Float[np.ndarray, "modes p"]
+    locked: Float[np.ndarray, " modes"]
+    locked_slopes: Float[np.ndarray, "modes p"]
+
+
+def natural_frequencies(plant: Plant, places: tuple, theta: Float[np.ndarray, " p"]) -> Frequencies:
+    """Natural frequencies of a plant at some values of the unknowns at `places`."""
+    parts = []
+    for squared, slopes in _squared_frequencies(plant, places, theta):
+        squared, slopes = np.asarray(squared), np.asarray(slopes)
+        elastic = squared > _RIGID * np.abs(squared).max(initial=0.0)
+        f = np.sqrt(squared[elastic]) / (2 * np.pi)
+        parts += [f, slopes[elastic] / (8 * np.pi**2 * f[:, None])]
+    return Frequencies(*parts)
+
+
+@eqx.filter_jit
+def _squared_frequencies(plant: Plant, places: tuple, theta: Array) -> list[tuple[Array, Array]]:
+    """Squared angular frequencies and their slopes, with the drives free and held."""
+    driven, out = plant.driven(plant.joints), []
+    for held in ((), driven):
+        free = np.asarray([i for i in range(plant.joints) if i not in held], dtype=int)
+
+        def squared(theta: Array, free: np.ndarray = free) -> tuple[Array, Array]:
+            motion = linear_balance(scatter(places, plant, theta)).motion
+            stiffness, mass = (motion[k][free][:, free] for k in (0, 2))
+            root = jnp.linalg.inv(jnp.linalg.cholesky(mass))
+            return (jnp.linalg.eigvalsh(root @ stiffness @ root.T),) * 2
+
+        slopes, values = jax.jacfwd(squared, has_aux=True)(theta)
+        out.append((values, slopes))
+    return out

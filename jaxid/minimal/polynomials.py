@@ -1,0 +1,71 @@
+"""Algebra of small polynomial matrices in the derivative operator s.
+
+A polynomial is an array of coefficients, lowest order first, (orders,); a matrix of them is
+(orders, rows, columns). All is unrolled and differentiable: matrices here have a handful of rows.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Polynomial = Float[Array, " orders"]
+Matrix = Float[Array, "orders rows columns"]
+
+
+def product(a: Matrix, b: Matrix) -> Matrix:
+    """Product of two matrices."""
+    out = [jnp.zeros((a.shape[1], b.shape[2]))] * (len(a) + len(b) - 1)
+    for i, left in enumerate(a):
+        for j, right in enumerate(b):
+            out[i + j] = out[i + j] + left @ right
+    return jnp.stack(out)
+
+
+def scaled(p: Polynomial, a: Matrix) -> Matrix:
+    """A matrix, each entry times one polynomial."""
+    out = [jnp.zeros(a.shape[1:])] * (len(p) + len(a) - 1)
+    for i in range(len(p)):
+        for j in range(len(a)):
+            out[i + j] = out[i + j] + p[i] * a[j]
+    return jnp.stack(out)
+
+
+def total(a: Matrix, b: Matrix) -> Matrix:
+    """Sum of two matrices of any orders."""
+    orders = max(len(a), len(b))
+    padded = (jnp.pad(x, ((0, orders - len(x)), (0, 0), (0, 0))) for x in (a, b))
+    return sum(padded, jnp.zeros(()))
+
+
+def determinant(a: Matrix, sign: float = -1.0) -> Polynomial:
+    """Determinant of a square matrix by its first row; that of none is one.
+
+    With `sign` one it is the permanent, of matrices of magnitudes: how large the terms are that a
+    determinant adds up.
+    """
+    n = a.shape[1]
+    if n == 0:
+        return jnp.ones(1)
+    parts = [
+        sign**j * jnp.convolve(a[:, 0, j], determinant(_minor(a, 0, j), sign)) for j in range(n)
+    ]
+    return sum(parts[1:], parts[0])
+
+
+def adjugate(a: Matrix, sign: float = -1.0) -> Matrix:
+    """Matrix whose product with `a` is its determinant times one; `sign` as in `determinant`."""
+    n = a.shape[1]
+    if n == 0:
+        return jnp.zeros((1, 0, 0))
+    rows = [
+        jnp.stack([sign ** (i + j) * determinant(_minor(a, i, j), sign) for i in range(n)], axis=1)
+        for j in range(n)
+    ]
+    return jnp.stack(rows, axis=1)
+
+
+def _minor(a: Matrix, row: int, column: int) -> Matrix:
+    rows = jnp.asarray([i for i in range(a.shape[1]) if i != row], dtype=int)
+    columns = jnp.asarray([j for j in range(a.shape[2]) if j != column], dtype=int)
+    return a[:, rows][:, :, columns]
