@@ -65,10 +65,12 @@ def record(
     return simulate_chain(axis, [loop], sensor, rate=RATE, duration=duration, seed=seed)
 
 
-def columns(log: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a user would have: t, q, q_load, u, ref."""
+def columns(log: dict[str, np.ndarray], noise: float = 0.01) -> dict[str, np.ndarray]:
+    """What a user would have: t, q, q_load, a_load (through so much noise [m/s^2]), u, ref."""
+    accelerometer = noise * np.random.default_rng(len(log["t"])).standard_normal(len(log["t"]))
     return {
         "t": log["t"], "q": log["position"][:, 0], "q_load": log["position"][:, 1],
+        "a_load": log["true_acceleration"][:, 1] + accelerometer,
         "u": log["force"][:, 0], "ref": log["reference"][:, 0],
     }
 
@@ -84,7 +86,7 @@ def write(log: dict[str, np.ndarray], path) -> None:
 
 def text(
     *, load: bool = True, known: dict[str, float] | None = None, pulses: bool = True,
-    sensor: Sensor = SENSOR, offset: bool = False,
+    sensor: Sensor = SENSOR, offset: bool = False, accelerometer: bool = False,
 ) -> str:
     """The case file: all of the axis unknown but what is given as known."""
     known = known or {}
@@ -101,6 +103,7 @@ def text(
         lines += ["[[effects]]", f'kind = "{kind}"', f"{key} = [{both}]"]
     lines += ["[actuator]", f"gain = {GAIN}", "[log]", 'time = "t"', 'position = "q"', 'force = "u"']
     lines += ['reference = "ref"'] + (['load_position = "q_load"'] if load else [])
+    lines += ['load_acceleration = "a_load"'] if accelerometer else []
     lines += ["[controller]", 'kind = "cascade_pd"', *[f"{k} = {v}" for k, v in LAW.items()], "limit = 10.0"]
     if pulses:
         lines += ["disturbance = { " + ", ".join(f"{k} = {v}" for k, v in PULSES.items()) + " }"]

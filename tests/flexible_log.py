@@ -1,44 +1,26 @@
 """Logs of a flexible ball-screw axis at the published values, made without jax and jaxid.
 
 Source:
-    Janot, Gautier, Jubien and Vandanjon, Table 2: truth, in a loop like that of their axis. Encoders of
-    100000 counts a revolution and a lead of 5 mm; noise on the logged command chosen.
+    The axis of `flexible_axes`, in another loop and with pulses that excite its resonance; noise on the
+    logged command chosen.
 """
 
 from pathlib import Path
 
 import numpy as np
-from chain_stepper import ChainMachine, simulate_chain
+from chain_stepper import simulate_chain
+from flexible_axes import COUNT, GAIN, RATE, machine
+from flexible_axes import TRUTH as TRUTH
 from stepper import Loop, Sensor
 from stepper_machines import moves
 
-TRUTH = {
-    "motor_inertia": 72.3, "load_inertia": 34.8, "stiffness": 8.0e5, "damping": 126.0,
-    "viscous_friction[1].coefficient": 92.0, "viscous_friction[2].coefficient": 110.0,
-    "coulomb_friction[1].level": 10.0, "coulomb_friction[2].level": 10.4,
-}  # fmt: skip
 FRICTION = (("viscous_friction", "coefficient", 100.0), ("coulomb_friction", "level", 10.0))
-GAIN = 35.15  # N/V
-STEP = 5e-3 / 100000  # m, of the encoders
-RATE = 1000.0  # Hz
 PULSES = {"level": 4.0, "on": 0.012, "off": 0.119, "start": 0.25}  # V, s: 83 ms excites 30 Hz
-
-
-def machine(**changed: float) -> ChainMachine:
-    """The axis at Table 2's values, or others by the names of results."""
-    v = TRUTH | changed
-    return ChainMachine(
-        (v["motor_inertia"], v["load_inertia"]),
-        tuple(v[f"viscous_friction[{k}].coefficient"] for k in (1, 2)), (0.0, v["stiffness"], 0.0),
-        actuated=(1,), actuator_gain=GAIN, coupling=(0.0, v["damping"], 0.0),
-    ).with_effect("coulomb_friction", 1, level=v["coulomb_friction[1].level"]).with_effect(
-        "coulomb_friction", 2, level=v["coulomb_friction[2].level"]
-    )  # fmt: skip
 
 
 def flexible_log(
     *, duration: float = 20.0, force_noise: float = 0.02, seed: int = 1, pulses: dict | None = PULSES,
-    resolution: float = STEP, **changed: float,
+    resolution: float = COUNT, **changed: float,
 ) -> dict[str, np.ndarray]:
     """Trapezoids of velocity with pulses of force, in closed loop; as `simulate_chain` returns it.
 
