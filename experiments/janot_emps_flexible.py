@@ -43,9 +43,11 @@ TABLE_2 = {
 # What Tables 2 to 5 print.
 PAPER = {
     "(6)": {n: f"{v:.4g}" for n, (v, _) in TABLE_2.items()},
-    "(7)": {}, "(7) as printed": {
-        "motor_inertia": "69.6", "viscous_friction[1].coefficient": "170", "coulomb_friction[1].level": "22.8",
-        "stiffness": "8.3e+05", "damping": "430", "load_inertia": "35.5", "viscous_friction[2].coefficient": "-29.8",
+    "(7)": {},
+    "(7) as printed": {
+        "motor_inertia": "69.6", "viscous_friction[1].coefficient": "170", "stiffness": "8.3e+05",
+        "coulomb_friction[1].level": "22.8", "damping": "430", "load_inertia": "35.5",
+        "viscous_friction[2].coefficient": "-29.8",
     },
     "(13)": {
         "motor_inertia": "71", "viscous_friction[1].coefficient": "210 (sum)", "load_inertia": "35",
@@ -290,7 +292,8 @@ level = { guess = 40.0 }
 """
 
 PARTS: dict[str, Callable[[Path], bool]] = {
-    "first_model": first_model, "minimal_models": minimal_models, "trajectories": trajectories, "added_mass": added_mass,
+    "first_model": first_model, "minimal_models": minimal_models, "trajectories": trajectories,
+    "added_mass": added_mass,
     "motor_alone": motor_alone, "resolution": resolution, "hidden": hidden,
 }
 
