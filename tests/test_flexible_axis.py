@@ -12,6 +12,7 @@ from jaxid.cli import main
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
 from jaxid.io.log import Log
+from jaxid.io.results import derived_json
 from jaxid.machine import build_machine
 from jaxid.replay import make_replay
 from jaxid.session import open_session
@@ -21,6 +22,8 @@ WITHIN = {
     "motor_inertia": 0.01, "load_inertia": 0.02, "stiffness": 0.02,
     "coulomb_friction[1].level": 0.05, "coulomb_friction[2].level": 0.05,
 }
+# Free motor, free load, undamped [Hz].
+FREQUENCY = np.sqrt(8e5 * (1 / 72.3 + 1 / 34.8)) / (2 * np.pi)
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +69,8 @@ def test_finds_table_2(folder, case, method):
     assert np.abs(z_scores(result)).max() < 3.5
     for name, part in WITHIN.items():
         assert result.value(name) == pytest.approx(axes.TRUTH[name], rel=part)
+    swing = derived_json(result.session, result.estimate)["derived"]["natural_frequency"]
+    assert abs(swing["value"] - FREQUENCY) < 3.5 * swing["std"] < 0.02 * FREQUENCY
     told = result.gaps[0].simulation
     assert told.rms[0] < 2 * axes.COUNT
     assert np.isnan(told.rms[1]) == (case == "motor")
@@ -177,12 +182,8 @@ def test_names_the_flexibility_that_a_rigid_model_lacks(tmp_path):
     motor = axes.text(load=False)
     found = search(tmp_path, axes.machine(), RIGID + motor[motor.index("[actuator]") :])
     assert found.kinds == ["joint_flexibility"]
-    own = found.after.machine.plant.effects[-1]
-    k, load = float(own.stiffness), float(own.load_inertia)
-    motor = found.after.value("inertia") - load
-    frequency = np.sqrt(k * (1 / load + 1 / motor)) / (2 * np.pi)
-    truth = np.sqrt(8e5 * (1 / 72.3 + 1 / 34.8)) / (2 * np.pi)
-    assert frequency == pytest.approx(truth, rel=0.03)
+    swing = derived_json(found.session, found.after)["derived"]["natural_frequency"]["value"]
+    assert swing == pytest.approx(FREQUENCY, rel=0.03)
     assert found.gaps_after[-1].force.rms[0] < 0.4 * found.gaps_before[-1].force.rms[0]
 
 

@@ -112,24 +112,31 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     return out
 
 
-def derived(result: Identification) -> list[Derived]:
-    """Friction in its other form, where the case states the gravity that a coefficient refers to."""
-    from jaxid.estimators.derived import dry_friction
+def derived(session: Session, estimate: Estimate) -> list[Derived]:
+    """Natural frequency; friction in its other form where the case states the gravity that it refers to."""
+    from jaxid.estimators.derived import dry_friction, natural_frequency
 
-    return [] if result.session.case.plant.gravity is None else dry_friction(result.estimate)
+    friction = [] if session.case.plant.gravity is None else dry_friction(estimate)
+    return [*natural_frequency(estimate), *friction]
+
+
+def derived_json(session: Session, estimate: Estimate) -> dict[str, Any]:
+    """The `derived` object of results; nothing where there is none."""
+    told = [d for d in derived(session, estimate) if np.isfinite(d.std)]
+    follows = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in told}
+    return {"derived": follows} if follows else {}
 
 
 def identification_json(result: Identification) -> dict[str, Any]:
     """Content of result.json."""
-    estimate, more = result.estimate, derived(result)
-    follows = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in more if np.isfinite(d.std)}
+    estimate = result.estimate
     return {
         "method": estimate.method,
         "converged": estimate.converged,
         "message": estimate.message,
         "samples": estimate.samples,
         "parameters": parameters_json(estimate),
-        **({"derived": follows} if follows else {}),
+        **derived_json(result.session, estimate),
         "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
         **estimate.details,
         "gap": gap_json(result.session, result.gaps, result.noise_floor),
@@ -227,6 +234,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
             k: v for k, v in parameters_json(result.after).items()
             if any(n == k or n.startswith(f"{k}[") for n in own)
         },
+        **derived_json(result.session, result.after),
         "unidentifiable": [{"combination": c} for c in result.after.precision.unidentifiable],
         "fit_gap": gap_json(result.session, after, result.noise_floor),
         "method": result.after.method,

@@ -60,7 +60,7 @@ def identification_table(result: Identification) -> str:
         ["simulated position", _number(simulation["fit"]), _number(simulation["validation"]),
          simulation["unit"]],
     ]
-    told = parameter_lines(estimate, results.derived(result))
+    told = parameter_lines(estimate, results.derived(result.session, result.estimate))
     notes = _notes(results.notes(result.session, estimate))
     own = _minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []
     return "\n".join([head, "", told, *_blind(estimate), *own, "", aligned(rows), *notes])
@@ -93,7 +93,8 @@ def discovery_table(result: Discovery) -> str:
             name = (f"{name}, " if step["added"] else "") + f"- {step['dropped']}"
             name += "" if step["added"] else where
         rows.append([name, f"{_number(step['fit'])} {gap['unit']}", _number(step["validation"])])
-    lines += ["", aligned(rows), "", parameter_lines(result.after), *_blind(result.after), ""]
+    told = parameter_lines(result.after, results.derived(result.session, result.after))
+    lines += ["", aligned(rows), "", told, *_blind(result.after), ""]
     lines.append(
         f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {gap['unit']} "
         f"(noise floor {_number(gap['noise_floor'])}); simulated position "
