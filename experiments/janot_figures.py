@@ -6,28 +6,35 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
+_SHOWN = {
+    "load_inertia": "load inertia", "stiffness": "stiffness",
+    "coulomb_friction[1].level": "Coulomb friction, motor",
+}
 
-def resolution(path: Path, counts: list[int], errors: dict[tuple[str, int], dict[str, float]]) -> None:
-    """Error of stiffness, load inertia and friction by counts a revolution, a line a method."""
-    shown = {
-        "motor_inertia": "motor inertia", "load_inertia": "load inertia", "stiffness": "stiffness",
-        "coulomb_friction[1].level": "Coulomb friction, motor",
-    }
-    figure, axes = plt.subplots(2, 2, figsize=(10, 7), sharex=True, sharey=True, layout="constrained")
-    names = list(dict.fromkeys(label for label, _ in errors))
-    for axis, (name, title) in zip(axes.flat, shown.items(), strict=True):
-        for k, label in enumerate(names):
-            points = [(c, errors[label, c].get(name)) for c in counts]
-            told = [(c, max(e, 1e-4)) for c, e in points if e is not None]
-            if told:
-                axis.loglog(*zip(*told, strict=True), marker="osv^Dx"[k % 6], color=f"C{k}", label=label)
-        axis.set_title(title)
-        axis.grid(alpha=0.3)
-    for axis in axes[1]:
+
+def resolution(
+    path: Path, counts: list[int], errors: dict[tuple[str, str, int], dict[str, float]]
+) -> None:
+    """Error by counts a revolution: a row a parameter, a column a set of sensors, a line a method."""
+    sensors = list(dict.fromkeys(s for s, _, _ in errors))
+    methods = list(dict.fromkeys(m for _, m, _ in errors))
+    figure, axes = plt.subplots(
+        len(_SHOWN), len(sensors), figsize=(10, 9), sharex=True, sharey="row", layout="constrained"
+    )
+    for row, (name, title) in zip(axes, _SHOWN.items(), strict=True):
+        row[0].set_ylabel(f"error of {title} [%]")
+        for axis, of in zip(row, sensors, strict=True):
+            for k, method in enumerate(methods):
+                points = [(c, errors.get((of, method, c), {}).get(name)) for c in counts]
+                told = [(c, max(e, 1e-4)) for c, e in points if e is not None]
+                if told:
+                    axis.loglog(*zip(*told, strict=True), marker="osv^Dx"[k], color=f"C{k}", label=method)
+            axis.grid(alpha=0.3)
+    for axis, of in zip(axes[0], sensors, strict=True):
+        axis.set_title(of)
+    for axis in axes[-1]:
         axis.set_xlabel("encoder counts a revolution (5 mm)")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("error [%]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
