@@ -158,3 +158,6 @@ def test_the_command_line(log, tmp_path, capsys):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["minimal"]["coefficients"]["load_inertia"]["std_white"] > 0
     assert np.isfinite(result["minimal"]["condition"])
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "The minimal model" in page
+    assert "natural frequency, motor locked" in page

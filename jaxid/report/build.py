@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxid.io import results
 from jaxid.io.proposals import sentence
+from jaxid.minimal.report import minimal_rows
 from jaxid.report.data import (
     CandidateScore,
     ExperimentView,
@@ -34,6 +35,7 @@ def identification_report(result: Identification) -> str:
     """The report of `identify`, as one page of HTML."""
     content = results.identification_json(result)
     session = result.session
+    rows, below = minimal_rows(content["minimal"]) if "minimal" in content else ((), ())
     return render(
         ReportData(
             title=f"Identification of {session.case.path.stem}",
@@ -44,6 +46,8 @@ def identification_report(result: Identification) -> str:
             unidentifiable=tuple(content["unidentifiable"]),
             views=_views(session, None, result.gaps),
             converged=result.converged,
+            coefficients=tuple(rows),
+            statistics=tuple(below),
             **_common(session, result.estimate, content["notes"]),
         )
     )
@@ -86,6 +90,7 @@ def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
         "case_name": session.case.path.name,
         "log_name": Path(session.fit.log.source).name,
         "parameters": _rows(estimate),
+        "derived": _derived(session, estimate),
         "units": units_of(session),
         "notes": tuple(notes),
         "versions": {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")},
@@ -112,6 +117,12 @@ def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         )
         for f, v, s, told in rows
     )
+
+
+def _derived(session: Session, estimate: Estimate) -> tuple[ParameterRow, ...]:
+    """What follows from the parameters."""
+    told = [d for d in results.derived(session, estimate) if np.isfinite(d.std)]
+    return tuple(ParameterRow(d.name, d.value, d.std, d.unit) for d in told)
 
 
 def _views(

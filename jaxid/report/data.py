@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -164,6 +164,9 @@ class ReportData:
         notes: Remarks, warnings, proposals; one sentence or more each.
         versions: Program names and versions.
         converged: Whether the solver converged, where that is known.
+        derived: What follows from the parameters.
+        coefficients: Rows of a minimal model's table, its head first; empty without one.
+        statistics: Lines below it.
     """
 
     title: str
@@ -185,3 +188,6 @@ class ReportData:
     notes: tuple[str, ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     converged: bool | None = None
+    derived: tuple[ParameterRow, ...] = ()
+    coefficients: tuple[Sequence[str], ...] = ()
+    statistics: tuple[str, ...] = ()

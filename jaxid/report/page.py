@@ -57,7 +57,7 @@ def render(data: ReportData) -> str:
         verdict_class=tables.verdict_class(data),
         answer=tables.answer(data),
         gap=tables.gap_table(data),
-        parameters=tables.parameter_lines(data.parameters),
+        parameters=tables.parameter_lines((*data.parameters, *data.derived)),
         effects=tables.effect_entries(data.effects),
         unidentifiable=tables.unidentifiable_lines(data.unidentifiable),
         untold=[row.name for row in data.parameters if not row.identifiable],
