@@ -20,9 +20,11 @@ import numpy as np
 from common import Table, parser_of
 
 import jaxid
+from jaxid.estimators.minimal_model import filtering_of
 from jaxid.estimators.result import Estimate
 from jaxid.io.results import derived_json
-from jaxid.session import Session
+from jaxid.report.minimal_plots import plot_filtering
+from jaxid.session import Session, open_session
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import flexible_axes as axes
@@ -120,6 +122,13 @@ def minimal_models(folder: Path) -> bool:
         ]
         table.row(name, f"{value:.4g}", *cells)
     table.show(time.perf_counter() - begin)
+    motor = axes.text(load=False, sensor=QUIET)
+    case, data = written(folder, "rigid", log, RIGID + motor[motor.index("[actuator]") :])
+    rigid = jaxid.identify(case, data, method="didim").estimate
+    print(f"Table 1, a rigid model by DIDIM (published 106, 208, 20.0; true sums 107.1, 202, 20.4):\n{rigid}")
+    session = open_session(folder / "minimal_13.toml", folder / "minimal_13.csv")
+    spectrum, recipe, _ = filtering_of(session.with_machine(found["(13)"].estimate.machine))
+    plot_filtering(spectrum, recipe, axes.RATE).savefig(folder / "filtering.png", dpi=110)
     split = [n for n in found["(13)"].estimate.names if "coulomb" in n]
     told = dict(zip(found["(13)"].estimate.names, found["(13)"].estimate.identifiable, strict=True))
     return _sound(found["(6)"]) and not any(told[n] for n in split)
