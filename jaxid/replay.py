@@ -161,6 +161,11 @@ def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: 
     )
 
 
+def from_rest(replay: Replay) -> Replay:
+    """The same run, nothing moving at its start."""
+    return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
+
+
 def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100) -> Replay:
     """An open-loop run whose initial position and velocity fit the first samples of its log.
 

@@ -17,7 +17,8 @@ from jaxid.report.numbers import pretty_unit
 from jaxid.studies.settings import widest, words_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#6b6b6b")
-_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
+# One more than colours, so that pairs of both do not soon come again.
+_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 _COLUMNS = 3
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _AXES = {
