@@ -48,7 +48,6 @@ TABLE_2 = {
 # What Tables 2 to 5 print.
 PAPER = {
     "(6)": {n: f"{v:.4g}" for n, (v, _) in TABLE_2.items()},
-    "(7)": {},
     "(7) as printed": {
         "motor_inertia": "69.6", "viscous_friction[1].coefficient": "170", "stiffness": "8.3e+05",
         "coulomb_friction[1].level": "22.8", "damping": "430", "load_inertia": "35.5",
@@ -101,13 +100,14 @@ def first_model(folder: Path) -> bool:
 
 
 def minimal_models(folder: Path) -> bool:
-    """Tables 2 to 5 by the minimal models themselves, and what each names as untold."""
+    """Tables 2 to 5 by the minimal models themselves, and what else the motor alone tells."""
     begin = time.perf_counter()
     log = axes.record(duration=SECONDS, sensor=QUIET)
     ways = {
         "(6)": ("minimal_model", {}), "(7)": ("minimal_model", {"load": False, "accelerometer": True}),
         "(7) as printed": ("minimal_model_printed", {"load": False, "accelerometer": True}),
         "(13)": ("minimal_model", {"load": False}),
+        **{f"motor alone, {m}": (m, {"load": False}) for m in ("inverse_dynamics", "didim", "output_error")},
     }
     found = {}
     for name, (method, options) in ways.items():
@@ -115,12 +115,12 @@ def minimal_models(folder: Path) -> bool:
         case, data = written(folder, stem, log, axes.text(sensor=QUIET, **options))
         found[name] = jaxid.identify(case, data, method=method)
         print(f"{name}:\n{found[name]}\n")
-    table = Table("Tables 2 to 5", ["parameter", "true", *(f"{n}, published" for n in found)])
+    head = [f"{n}, published" if n in PAPER else n for n in found]
+    table = Table("Tables 2 to 5, and what else the motor alone tells", ["parameter", "true", *head])
     for name, (value, _) in TABLE_2.items():
-        cells = [
-            f"{cell_of(f.estimate, name)}, {PAPER[n].get(name, '-')}" for n, f in found.items()
-        ]
-        table.row(name, f"{value:.4g}", *cells)
+        cells = [cell_of(f.estimate, name) for f in found.values()]
+        said = [f", {PAPER[n].get(name, '-')}" if n in PAPER else "" for n in found]
+        table.row(name, f"{value:.4g}", *(a + b for a, b in zip(cells, said, strict=True)))
     table.show(time.perf_counter() - begin)
     motor = axes.text(load=False, sensor=QUIET)
     case, data = written(folder, "rigid", log, RIGID + motor[motor.index("[actuator]") :])
