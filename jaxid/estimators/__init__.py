@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Steps
 
@@ -31,18 +33,19 @@ def _output_error(
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.output_error import choose_numerics, output_error_steps
 
+    log, on = session.fit.log, on or session.case.output_error.get("on", "position")
     # Inverse dynamics gives the start where it tells all unknowns.
     first = yield from inverse_dynamics_steps(session.machine, session.fit.data)
     start = first.theta if first.told else None
     if solver is not None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
-        numerics = choose_numerics(machine, session.fit.log, solver=solver)
-    return (
-        yield from output_error_steps(
-            session.machine, session.fit.log, start=start, numerics=numerics,
-            on=on or session.case.output_error.get("on", "position"),
-        )
-    )
+        numerics = choose_numerics(machine, log, solver=solver)
+    found = yield from output_error_steps(session.machine, log, start=start, numerics=numerics, on=on)
+    if start is None or all(log.measured):
+        return found
+    # Without an encoder on every joint inverse dynamics may end far off, of coarse readings above all.
+    other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on)
+    return min((found, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
 
 def _instrumental_variable(
