@@ -246,7 +246,7 @@ def assess(
     values, vectors = np.linalg.eigh(normal)
     spread = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", vectors, meat, vectors), 0.0))
     safe = np.maximum(values, 1e-300)
-    blind = (values < _ROUNDING * values[-1]) | (spread / safe > _UNTOLD * signal)
+    blind = (values < _ROUNDING * values[-1]) | (spread > _UNTOLD * signal * safe)
     seen = vectors[:, ~blind]
     inverse = seen @ np.diag(1 / values[~blind]) @ seen.T if (~blind).any() else 0 * normal
     covariance = inverse @ meat @ inverse / np.outer(norm, norm)
