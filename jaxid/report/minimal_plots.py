@@ -28,18 +28,19 @@ def plot_filtering(
     ax.loglog(spectrum.frequency, spectrum.force**0.5, color="#0072B2", lw=1.0, label="force")
     ax.loglog(
         spectrum.frequency, spectrum.noise**0.5, color="#D55E00", lw=1.0,
-        label="noise, as the model's derivatives amplify it",
+        label="amplified noise",
     )
     for k, f in enumerate(spectrum.natural):
         ax.axvline(f, color="#555555", ls=":", label="natural frequency" if k == 0 else None)
     ends = {
         "low-pass": (recipe.cutoff_hz, "-."),
-        "parallel filter": (decimator_of(recipe, rate_hz).band_hz(rate_hz), "--"),
-        "half the rate that is kept": (rate_hz / (2 * recipe.decimation), "-"),
+        "parallel filter, 3 dB": (decimator_of(recipe, rate_hz).band_hz(rate_hz), "--"),
+        "half the rate kept": (rate_hz / (2 * recipe.decimation), "-"),
     }
     for label, (f, style) in ends.items():
         ax.axvline(f, color="#009E73", ls=style, lw=1.0, label=label)
     ax.set_xlabel("frequency [Hz]")
-    ax.set_ylabel(f"density [{unit}/Hz^0.5]")
+    ax.set_ylabel(f"density [{unit}/√Hz]")
+    ax.grid(color="#e6e6e6", lw=0.7)
     legend(ax)
     return figure
