@@ -76,6 +76,20 @@ def test_finds_table_2(folder, case, method):
     assert np.isnan(told.rms[1]) == (case == "motor")
 
 
+def test_didim_tells_the_split_from_forces_alone(folder):
+    result = jaxid.identify(folder / "motor.toml", folder / "log.csv", method="didim")
+    assert result.converged
+    assert result.estimate.identifiable.all()
+    assert np.abs(z_scores(result)).max() < 3.5
+    assert np.all(result.estimate.std[-2:] < 1.0)  # N
+
+
+@pytest.mark.parametrize("method", ["power", "algebraic"])
+def test_what_needs_every_encoder_says_so(folder, method):
+    with pytest.raises(InputError, match="joint 2 has no position.*load_position"):
+        jaxid.identify(folder / "motor.toml", folder / "log.csv", method=method)
+
+
 def test_tells_the_zero_offset_of_the_second_encoder(tmp_path):
     log = axes.record(duration=4.0)
     log["position"][:, 1] += 2.5e-3
