@@ -122,8 +122,7 @@ def minimal_models(folder: Path) -> bool:
         said = [f", {PAPER[n].get(name, '-')}" if n in PAPER else "" for n in found]
         table.row(name, f"{value:.4g}", *(a + b for a, b in zip(cells, said, strict=True)))
     table.show(time.perf_counter() - begin)
-    motor = axes.text(load=False, sensor=QUIET)
-    case, data = written(folder, "rigid", log, RIGID + motor[motor.index("[actuator]") :])
+    case, data = written(folder, "rigid", log, axes.rigid_text(QUIET))
     rigid = jaxid.identify(case, data, method="didim").estimate
     print(f"Table 1, a rigid model by DIDIM (published 106, 208, 20.0; true sums 107.1, 202, 20.4):\n{rigid}")
     session = open_session(folder / "minimal_13.toml", folder / "minimal_13.csv")
@@ -265,9 +264,8 @@ def _cell(errors: dict[str, float], name: str) -> str:
 def hidden(folder: Path) -> bool:
     """A rigid model of the flexible axis; clearance that the flexible one lacks."""
     begin, good = time.perf_counter(), True
-    motor = axes.text(load=False)
     cases = {
-        "joint_flexibility": (axes.machine(), RIGID + motor[motor.index("[actuator]") :]),
+        "joint_flexibility": (axes.machine(), axes.rigid_text()),
         "backlash": (axes.machine().with_effect("backlash", 2, gap=60e-6), axes.text()),
     }
     for kind, (machine, text) in cases.items():
@@ -286,18 +284,6 @@ def hidden(folder: Path) -> bool:
     print(f"{time.perf_counter() - begin:.0f} s")
     return good
 
-
-RIGID = """[plant]
-kind = "axis"
-[plant.parameters]
-inertia = { guess = 60.0 }
-[[effects]]
-kind = "viscous_friction"
-coefficient = { guess = 100.0 }
-[[effects]]
-kind = "coulomb_friction"
-level = { guess = 40.0 }
-"""
 
 PARTS: dict[str, Callable[[Path], bool]] = {
     "first_model": first_model, "minimal_models": minimal_models, "trajectories": trajectories,

@@ -110,3 +110,22 @@ def text(
     lines += ["[sensor]"]
     lines += [f"{f.name} = {v}" for f in dataclasses.fields(sensor) if (v := getattr(sensor, f.name)) > 0]
     return "\n".join(lines) + "\n"
+
+
+def rigid_text(sensor: Sensor = SENSOR) -> str:
+    """The case of who takes the axis for one inertia, and reads the motor alone."""
+    motor = text(load=False, sensor=sensor)
+    return _RIGID + motor[motor.index("[actuator]") :]
+
+
+_RIGID = """[plant]
+kind = "axis"
+[plant.parameters]
+inertia = { guess = 60.0 }
+[[effects]]
+kind = "viscous_friction"
+coefficient = { guess = 100.0 }
+[[effects]]
+kind = "coulomb_friction"
+level = { guess = 40.0 }
+"""

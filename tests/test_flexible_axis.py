@@ -169,19 +169,6 @@ def test_backlash_needs_a_spring(tmp_path):
         load_case(tmp_path / "case.toml")
 
 
-RIGID = """[plant]
-kind = "axis"
-[plant.parameters]
-inertia = { guess = 60.0 }
-[[effects]]
-kind = "viscous_friction"
-coefficient = { guess = 100.0 }
-[[effects]]
-kind = "coulomb_friction"
-level = { guess = 40.0 }
-"""
-
-
 def search(folder, machine, case: str):
     """What is missing, and the gap before and after, on a log of another stroke and speed."""
     axes.write(axes.record(machine), folder / "log.csv")
@@ -193,8 +180,7 @@ def search(folder, machine, case: str):
 
 @pytest.mark.slow
 def test_names_the_flexibility_that_a_rigid_model_lacks(tmp_path):
-    motor = axes.text(load=False)
-    found = search(tmp_path, axes.machine(), RIGID + motor[motor.index("[actuator]") :])
+    found = search(tmp_path, axes.machine(), axes.rigid_text())
     assert found.kinds == ["joint_flexibility"]
     swing = derived_json(found.session, found.after)["derived"]["natural_frequency"]["value"]
     assert swing == pytest.approx(FREQUENCY, rel=0.03)
