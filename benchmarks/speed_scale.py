@@ -86,7 +86,7 @@ def chain(masses: int, samples: int, repeats: int) -> dict:
     import jax.numpy as jnp
 
     import jaxid
-    from jaxid.estimators.output_error import choose_numerics, position_residual
+    from jaxid.estimators.output_error import choose_numerics, output_residual
     from jaxid.replay import make_replay
     from jaxid.session import open_session
 
@@ -97,7 +97,7 @@ def chain(masses: int, samples: int, repeats: int) -> dict:
         machine = open_session(case, log).machine
     replay = make_replay(machine, log, choose_numerics(machine, log))
     places, plant, theta = machine.parameters.places, machine.plant, jnp.asarray(machine.parameters.guess)
-    residual = position_residual(replay, places, plant, jnp.asarray(log.position), 1.0)
+    residual = output_residual(replay, places, plant, jnp.asarray(log.position), 1.0)
 
     def normal(theta: jax.Array) -> tuple:
         jacobian, e = jax.jacfwd(lambda x: (residual(x).ravel(),) * 2, has_aux=True)(theta)
