@@ -378,14 +378,13 @@ def own_reaction(
         The reaction, which ports rest at the step's end, and the part of the step before a port comes
         to rest; one where it does not.
     """
-    slid = speed - jnp.sign(before) * own * dry
+    starts = before == 0.0
+    drag = jnp.sign(jnp.where(starts, speed, before)) * dry
+    slid = speed - own * drag
     turns = before * slid < 0.0
     part = jnp.where(turns, before / jnp.where(turns, before - slid, 1.0), 1.0)
-    rests = (before == 0.0) | (part < 1.0)
-    stuck = rests & (jnp.abs(speed - before) <= own * hold)
-    way = jnp.where(before == 0.0, jnp.sign(speed), jnp.sign(before))
-    sliding = way * dry * jnp.where(part < 1.0, 1.0 - 2.0 * part, -1.0)
-    return jnp.where(stuck, -speed / own, sliding), stuck, part
+    stuck = (starts | turns) & (jnp.abs(speed - before) <= own * hold)
+    return jnp.where(stuck, -speed / own, (1.0 - 2.0 * part) * drag), stuck, part
 
 
 def _turned(x: State, end: State, part: Array, h: Array, slides: tuple[int, ...]) -> State:
