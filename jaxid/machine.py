@@ -138,10 +138,10 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
         if isinstance(given, tuple):
             values[name] = [v.start(true) for v in given]
             for k, v in enumerate(given):
-                free += _free(v, f"{name}[{k + 1}]", (name,), info, case, true, index=k)
+                free += _free(v, f"{name}[{k + 1}]", (name,), info, info.motion, case, true, index=k)
         elif given is not None:
             values[name] = given.start(true)
-            free += _free(given, name, (name,), info, case, true)
+            free += _free(given, name, (name,), info, info.motion, case, true)
     return entry.cls(**values, **options), free
 
 
@@ -156,7 +156,8 @@ def _with_effect(
     for name, info in parameters_of(entry.cls).items():
         if name in values:
             path = ("effects", len(plant.effects), name)
-            free += _free(values[name], f"{key}.{name}", path, info, case, true)
+            motion = plant.motion(effect.port)
+            free += _free(values[name], f"{key}.{name}", path, info, motion, case, true)
     return plant.with_effect(effect), free
 
 
@@ -165,6 +166,7 @@ def _free(
     name: str,
     path: tuple[str | int, ...],
     info: ParameterInfo,
+    motion: str | None,
     case: Case,
     true: bool,
     *,
@@ -173,7 +175,7 @@ def _free(
     """The unknown that a value is; empty where it is known."""
     if not value.free:
         return []
-    unit = case.plant.units.label(info.dimension)
+    unit = case.plant.units.label(info.dimension, motion)
     guess, bounds = value.start(true), (value.lower, value.upper)
     return [Free(name, path, unit, info.sign, guess, *bounds, index=index, true=value.true)]
 

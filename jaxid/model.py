@@ -8,6 +8,7 @@ lives in `jaxid.readings`.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -33,6 +34,7 @@ class ParameterInfo:
         doc: One line for the tables.
         optional: May be absent (None).
         more: Of a list that is as long as the plant has joints, and so many more; None: no list.
+        motion: "linear" or "rotary", of a machine that has both; None: as the case says.
     """
 
     dimension: str
@@ -40,16 +42,18 @@ class ParameterInfo:
     doc: str
     optional: bool = False
     more: int | None = None
+    motion: str | None = None
 
 
 def parameter(
-    dimension: str, sign: str, doc: str, *, optional: bool = False, more: int | None = None
+    dimension: str, sign: str, doc: str, *, optional: bool = False, more: int | None = None,
+    motion: str | None = None,
 ) -> Any:
     """Declare a field of a plant or effect as a physical parameter, a float64 array leaf.
 
     The conversion matters: a Python float is no array leaf and would silently count as known.
     """
-    info = ParameterInfo(dimension, sign, doc, optional, more)
+    info = ParameterInfo(dimension, sign, doc, optional, more, motion)
     convert = _optional_array if optional else as_array
     if optional:
         return eqx.field(converter=convert, metadata={"parameter": info}, default=None)
@@ -112,6 +116,7 @@ class Action(eqx.Module):
         force: On the port [N or N m]; may depend on the acceleration (added mass).
         dry: Level of set-valued friction; its force is -dry times a direction in [-1, 1].
         stick: Level above `dry` that must be overcome to leave rest.
+        rising: Level above `dry` while speed grows, forwards and backwards.
         drive: What leaves the actuator path in place of `Signals.u`.
         rate: Time derivative of the effect's own state; affine in that state.
     """
@@ -119,6 +124,7 @@ class Action(eqx.Module):
     force: Array | float = 0.0
     dry: Array | float = 0.0
     stick: Array | float = 0.0
+    rising: tuple[Array, Array] | None = None
     drive: Array | None = None
     rate: Array | None = None
 
@@ -242,17 +248,21 @@ class Balance(eqx.Module):
         residual: Force that is missing for equilibrium, by coordinate [N or N m].
         dry: Level of dry friction, by port.
         stick: Level above it at rest, by port.
+        rising: Level above it while speed grows, (2, ports): forwards and backwards.
         rates: Time derivatives of the effects' own states.
         drive: Force at the load of each drive, after all effects in its path [N or N m].
         slides: Ports on which any effect is dry friction.
+        rises: Ports on which it is more while speed grows.
     """
 
     residual: Array
     dry: Array
     stick: Array
+    rising: Array
     rates: tuple
     drive: Array
     slides: tuple[int, ...] = eqx.field(static=True)
+    rises: tuple[int, ...] = eqx.field(static=True)
 
 
 class Plant(eqx.Module):
@@ -268,6 +278,8 @@ class Plant(eqx.Module):
     diagonal: ClassVar[bool] = False
     # Joint behind an elastic coupling, which may go without an encoder; None where there is none.
     load: ClassVar[int | None] = None
+    # Classes by the coupling that a case may state; none where there is no choice.
+    couplings: ClassVar[Mapping[str, type[Plant]]] = {}
     # Joints that are driven, 0-based, in the order of their drives; None: the first ones, all of them.
     actuated = None
     effects: eqx.AbstractVar[tuple[Effect, ...]]
@@ -287,13 +299,32 @@ class Plant(eqx.Module):
         return None
 
     @classmethod
+    def parts(cls, joints: int) -> int:
+        """How many ports are called joints: a part that another moves rigidly has a port without a motion."""
+        return joints
+
+    @classmethod
     def springs(cls, joints: int) -> int:
-        """How many ports behind the joints are elongations of springs."""
+        """How many ports behind the parts are elongations of springs."""
         return 0
+
+    @classmethod
+    def motion(cls, port: int) -> str | None:
+        """Whether a port is "linear" or "rotary", of a machine that has both; None: as the case says."""
+        return None
+
+    @property
+    def geared(self) -> tuple[tuple[int, int, Array], ...]:
+        """Ports that move in proportion to a joint: port, joint, and ratio (positive).
+
+        Their dry friction is that joint's: two that slide as one share no load that anything could tell.
+        """
+        return ()
 
     def place(self, port: int) -> tuple[str, int]:
         """What a port is called: a joint or a spring, counted from 1."""
-        return ("joint", port + 1) if port < self.joints else ("spring", port - self.joints + 1)
+        parts = self.parts(self.joints)
+        return ("joint", port + 1) if port < parts else ("spring", port - parts + 1)
 
     def reached(self, port: int, joints: int) -> tuple[int, ...]:
         """Joints in whose balance a force on a port stands; all by default."""
@@ -325,7 +356,7 @@ class Plant(eqx.Module):
         springs = self.springs(self.joints) > 0
         if effect.with_springs not in (None, springs):
             return False
-        if springs and effect.of_spring != (port >= self.joints):
+        if springs and effect.of_spring != (port >= self.parts(self.joints)):
             return False
         return not effect.in_drive or self.drive_of(port, drives) is not None
 
@@ -340,6 +371,10 @@ class Plant(eqx.Module):
     def port_normal(self, q: Array) -> Array:
         """Force that presses the sliding surfaces of each port together [N]."""
         return jnp.zeros_like(self.ports(q))
+
+    def port_width(self, q: Array) -> Array:
+        """Velocity of each port over which the sign is smoothed."""
+        return jnp.broadcast_to(self.width, self.ports(q).shape)
 
     def port_spring(self, q: Array) -> tuple[Array, Array]:
         """Stiffness and damping of the plant's own spring at each port; zero on joints."""
@@ -399,10 +434,10 @@ class Plant(eqx.Module):
             Residual `M qdd + h - effects - drive`, levels of dry friction, rates of the states, drive.
         """
         y, yd, ydd = port_motion(self, q, qd, qdd)
-        gravity, normal, width = self.port_gravity(q), self.port_normal(q), self.width
+        gravity, normal, width = self.port_gravity(q), self.port_normal(q), self.port_width(q)
         stiffness, damping = self.port_spring(q)
         # Sums by port and drive in lists: arrays updated in place compile much more slowly.
-        force, dry, stick, dry_scale = ([x] * y.size for x in (0.0, 0.0, 0.0, 1.0))
+        force, dry, stick, dry_scale, forth, back = ([x] * y.size for x in (0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
         for e in self.effects:
             dry_scale[e.port] = dry_scale[e.port] + e.dry_drift(t)
         drive, rates = [u[j] for j in range(u.size)], []
@@ -411,7 +446,7 @@ class Plant(eqx.Module):
         for run in alike(self.effects, drives):
             signals = [
                 Signals(
-                    y[i], yd[i], ydd[i], jnp.zeros(()) if j is None else drive[j], t, width,
+                    y[i], yd[i], ydd[i], jnp.zeros(()) if j is None else drive[j], t, width[i],
                     jnp.asarray(dry_scale[i]), gravity[i], normal[i], stiffness[i], damping[i],
                 )
                 for i, j in ((ports[k], drives[k]) for k in run)
@@ -421,24 +456,44 @@ class Plant(eqx.Module):
                 i, j = ports[k], drives[k]
                 force[i], dry[i] = force[i] + action.force, dry[i] + action.dry
                 stick[i] = stick[i] + action.stick
+                if action.rising is not None:
+                    forth[i], back[i] = forth[i] + action.rising[0], back[i] + action.rising[1]
                 if j is not None and action.drive is not None:
                     drive[j] = action.drive
                 rates.append(action.rate)
-        slides = tuple(
-            i for i in range(y.size) if not (isinstance(dry[i], float) and isinstance(stick[i], float))
-        )
-        scale = _stack(dry_scale)
-        at_rest_only, levels = _stack(stick) * scale, _stack(dry) * scale
+        for levels in (dry, stick, forth, back):
+            for i in (i for i in range(y.size) if not isinstance(levels[i], float)):
+                levels[i] = levels[i] * dry_scale[i]
+            for i, joint, ratio in self.geared:
+                if not isinstance(levels[i], float):
+                    levels[i], levels[joint] = 0.0, levels[joint] + ratio * levels[i]
+        rises = _given(forth)
+        slides = tuple(sorted({*_given(dry), *_given(stick), *rises}))
+        at_rest_only, levels, rising = _stack(stick), _stack(dry), jnp.stack([_stack(forth), _stack(back)])
         if reaction is None:
             held = levels
             # Not even added where it is nothing: its exponential would be evaluated all the same.
             if not all(isinstance(s, float) for s in stick):
                 held = held + at_rest_only * (smooth.at_rest(yd, width) / smooth.REST_PEAK)
-            reaction = -held * smooth.sign(yd, width)
+            way = smooth.sign(yd, width)
+            reaction = -held * way
+            if rises:
+                reaction = reaction - _while_rising(rising, way, ydd)
         react = _pull_back(self, q, _stack(force) + reaction)
         u = _stack(drive)
         residual = self.inertial(q, qd, qdd) - react - self.applied(u, q.size)
-        return Balance(residual, levels, at_rest_only, tuple(rates), u, slides)
+        return Balance(residual, levels, at_rest_only, rising, tuple(rates), u, slides, rises)
+
+
+def _given(levels: list[Array | float]) -> tuple[int, ...]:
+    """Ports for which anything was said."""
+    return tuple(i for i, x in enumerate(levels) if not isinstance(x, float))
+
+
+def _while_rising(rising: Float[Array, "2 ports"], way: Array, ydd: Array) -> Array:
+    """Friction that acts while speed grows only; `way` is the smoothed sign of the velocity."""
+    forth = jnp.where(ydd > 0, 0.5 * (1 + way) * rising[0], 0.0)
+    return forth - jnp.where(ydd < 0, 0.5 * (1 - way) * rising[1], 0.0)
 
 
 def port_motion(

@@ -164,7 +164,7 @@ def free_effect(
         Free(
             name=f"{name}.{field}",
             path=("effects", position, field),
-            unit=units.label(info.dimension),
+            unit=units.label(info.dimension, plant.motion(effect.port)),
             sign=info.sign,
             guess=float(getattr(effect, field)),
         )
@@ -190,4 +190,4 @@ def label(plant: Plant, kind: str, port: int) -> str:
 
 def several_places(plant: Plant) -> bool:
     """Whether effects need a place to be told apart."""
-    return plant.joints + plant.springs(plant.joints) > 1
+    return plant.parts(plant.joints) + plant.springs(plant.joints) > 1

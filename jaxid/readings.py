@@ -17,8 +17,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxid.affine import Affine, affine, depends
+from jaxid.errors import InputError
 from jaxid.model import Balance, Plant, port_motion
-from jaxid.smooth import sharp_clip
+from jaxid.smooth import sharp_clip, sign
 
 # Coordinates, velocities, and own states in one array.
 Split = tuple[Array, Array, Array]
@@ -67,12 +68,36 @@ def acceleration(
         reaction: Dry-friction force by port from a set-valued step; absent: smoothed.
     """
 
-    def residual(qdd: Array) -> tuple[Array, Array]:
-        r = plant.balance(x.q, x.qd, qdd, u, t, x.own, reaction).residual
-        return r, r
+    def residual(qdd: Array) -> tuple[Array, Balance]:
+        balance = plant.balance(x.q, x.qd, qdd, u, t, x.own, reaction)
+        return balance.residual, balance
 
     mass, rest = _mass(plant, residual, x.q)
-    return _solved(mass, -rest)
+    if reaction is not None or not rest.rises:
+        return _solved(mass, -rest.residual)
+    # At rest in acceleration the balance has nothing of what acts while speed grows: that resists what
+    # is left of the force, as far as it goes.
+    each = _need_apart(plant, mass, rest.rises)
+    way = sign(x.qd, plant.port_width(x.q)[: x.q.size])
+    forth, back = (_spread(_picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
+    left = -rest.residual
+    left = left - jnp.clip(left, -0.5 * (1 - way) * back, 0.5 * (1 + way) * forth)
+    return left / each
+
+
+def _need_apart(plant: Plant, mass: Array, rises: tuple[int, ...]) -> Array:
+    """Mass of each joint, where none pushes another.
+
+    Raises:
+        InputError: If friction that depends on the acceleration is on anything else.
+    """
+    apart = mass.ndim == 1 or mass.shape == (1, 1)
+    if apart and max(rises) < mass.shape[0]:
+        return mass if mass.ndim == 1 else mass[0]
+    raise InputError(
+        f"friction that grows with speeding up cannot be simulated on kind = {plant.kind!r}",
+        mend="put velocity_hysteresis on a joint of a machine whose joints do not push each other",
+    )
 
 
 def _mass(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple[Array, Any]:
@@ -311,30 +336,38 @@ def set_valued_step(
 
     own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
     alone = mobility.ndim == 1 or own.size == 1
+    if levels.rises:
+        _need_apart(plant, mass, levels.rises)
 
-    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, Array, Array]:
+    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, ...]:
         dry = _picked(levels.dry, slides)
         held = _picked(at_rest.dry, slides) + _picked(at_rest.stick, slides)
         if alone:
-            reaction, stuck, part = own_reaction(own, speed, before, dry, held)
+            more = [
+                jnp.stack([_picked(r, slides) for r in b.rising]) if b.rises else None
+                for b in (levels, at_rest)
+            ]
+            reaction, *ways = own_reaction(own, speed, before, dry, held, *more)
         else:
             # The level at rest acts until a port slides, and again where it would pass through rest.
             slid = speed - jnp.sign(before) * own * dry
             rests = (before == 0.0) | (before * slid < 0.0)
             reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
-            part = jnp.ones_like(speed)
-        return _spread(reaction, slides, ports), stuck, part
+            ways = stuck, jnp.zeros_like(stuck), jnp.ones_like(speed)
+        return _spread(reaction, slides, ports), *ways
 
     zero = jnp.zeros_like(x.q)
-    moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in ("dry", "stick")], (midway,))
+    named = ("dry", "stick", "rising")
+    moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in named], (midway,))
     at_rest = residual(zero, zero)[1] if moves else levels
-    reaction, stuck, part = answered(levels, at_rest)
+    reaction, *ways = answered(levels, at_rest)
     if moves:
         # Without friction motion begins too fast, and friction that falls with speed is too small.
         slowed = free.qd + h * _solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
-        reaction, stuck, part = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
+        reaction, *ways = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
+    stuck, stands, part = ways
     end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
-    return _turned(x, end_of_step, part, h, slides) if alone else end_of_step
+    return _turned(x, end_of_step, stands, part, h, slides) if alone else end_of_step
 
 
 def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
@@ -364,8 +397,9 @@ def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> A
 
 
 def own_reaction(
-    own: Array, speed: Array, before: Array, dry: Array, hold: Array
-) -> tuple[Array, Array, Array]:
+    own: Array, speed: Array, before: Array, dry: Array, hold: Array, rising: Array | None = None,
+    rising_at_rest: Array | None = None,
+) -> tuple[Array, Array, Array, Array]:
     """Mean reaction over a step of ports that do not push each other.
 
     Args:
@@ -373,27 +407,46 @@ def own_reaction(
         speed: At the step's end without reaction.
         before: At its start.
         dry, hold: Levels, sliding and at rest.
+        rising, rising_at_rest: What comes on top while speed grows, forwards and backwards, (2, ports). It
+            takes up what would speed a port up, as far as it goes: where it is not all used, the
+            velocity stands.
 
     Returns:
-        The reaction, which ports rest at the step's end, and the part of the step before a port comes
-        to rest; one where it does not.
+        The reaction, which ports rest at the step's end, which do not change their velocity at all, and
+        the part of the step before a port comes to rest; one where it does not.
     """
     starts = before == 0.0
     drag = jnp.sign(jnp.where(starts, speed, before)) * dry
     slid = speed - own * drag
     turns = before * slid < 0.0
     part = jnp.where(turns, before / jnp.where(turns, before - slid, 1.0), 1.0)
+    if rising is not None:
+        hold = hold + jnp.where(speed > before, rising_at_rest[0], rising_at_rest[1])
     stuck = (starts | turns) & (jnp.abs(speed - before) <= own * hold)
-    return jnp.where(stuck, -speed / own, (1.0 - 2.0 * part) * drag), stuck, part
+    stands, reaction = starts & stuck, (1.0 - 2.0 * part) * drag
+    if rising is not None:
+        # After a turn a port speeds up for the rest of the step, the other way.
+        way = jnp.where(turns, -1.0, 1.0) * jnp.sign(jnp.where(starts, speed, before))
+        left = way * (speed - before) / own - dry
+        most = jnp.where(way > 0, rising[0], rising[1])
+        reaction = reaction - way * jnp.where(turns, 1.0 - part, 1.0) * jnp.clip(left, 0.0, most)
+        stands = stands | (~turns & (left > 0.0) & (left < most))
+    return jnp.where(stuck, -speed / own, reaction), stuck, stands, part
 
 
-def _turned(x: State, end: State, part: Array, h: Array, slides: tuple[int, ...]) -> State:
-    """The end of a step with the positions of joints that came to rest within it."""
+def _turned(
+    x: State, end: State, stands: Array, part: Array, h: Array, slides: tuple[int, ...]
+) -> State:
+    """The end of a step with the motion of joints that came to rest within it, or kept their velocity."""
     joints = [k for k, i in enumerate(slides) if i < x.qd.size]
     if not joints:
         return end
-    own = _spread(part - 1.0, slides, max(*slides, x.qd.size - 1) + 1)[: x.qd.size] + 1.0
-    return State(end.q - overshot(x.qd, end.qd, own, h), end.qd, end.own)
+    size = max(*slides, x.qd.size - 1) + 1
+    own = _spread(part - 1.0, slides, size)[: x.qd.size] + 1.0
+    # The reaction balances the mean force; damping within the step leaves a trace that would add up.
+    keeps = _spread(stands, slides, size).astype(bool)[: x.qd.size]
+    q = jnp.where(keeps, x.q + h * x.qd, end.q - overshot(x.qd, end.qd, own, h))
+    return State(q, jnp.where(keeps, x.qd, end.qd), end.own)
 
 
 def overshot(before: Array, after: Array, part: Array, h: Array) -> Array:

@@ -25,9 +25,14 @@ class Units:
     position: str | None = None
     force: str | None = None
 
-    def label(self, dimension: str) -> str:
-        """Turn a dimension such as "force*time/position" into a label such as "N s/m"."""
-        labels = dict(_LABELS[self.motion])
+    def label(self, dimension: str, motion: str | None = None) -> str:
+        """Turn a dimension such as "force*time/position" into a label such as "N s/m".
+
+        Args:
+            dimension: Of force, position, time, inertia.
+            motion: Of a joint that is not like the others.
+        """
+        labels = dict(_LABELS[motion or self.motion])
         if self.position is not None or self.force is not None:
             labels["position"] = self.position or labels["position"]
             labels["force"] = self.force or labels["force"]

@@ -94,7 +94,7 @@ def complete_motion(
         levels = balance(at[1], (*middle, none), x[2], u, t, none)
         dry, stick = (a[jnp.asarray(hidden)] for a in (levels.dry, levels.stick))
         own = h / jnp.diagonal(solved(at[1], x, u, t, none)[1])
-        reaction, stuck, part = own_reaction(own, free[1], x[1], dry, dry + stick)
+        reaction, stuck, _, part = own_reaction(own, free[1], x[1], dry, dry + stick)
         q, v, memory = go_on(at, x, u, reaction, t)
         v = jnp.where(stuck, 0.0, v)
         return (q - overshot(x[1], v, part, h), v, memory), reaction

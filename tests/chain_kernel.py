@@ -49,14 +49,12 @@ def advance(masses, springs, q, v, drive, pull, h):
     for i in range(q.size):
         p = masses[i]
         force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0) + axis.velocity_force(p, v[i])
-        slip, hold = axis.slip_level(p, abs(v[i]), 1.0), p.coulomb + p.stribeck + p.static
-        middle[i] = axis.kick(v[i], half, force, slip, hold, p.mass)
+        middle[i] = axis.kick(p, v[i], abs(v[i]), half, force, 1.0)
     pull_of_springs(springs, q, middle, pull)
     for i in range(q.size):
         p, mid = masses[i], middle[i]
         force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0) + axis.velocity_force(p, mid)
-        slip, hold = axis.slip_level(p, abs(mid), 1.0), p.coulomb + p.stribeck + p.static
-        v[i] = axis.kick(v[i], h, force, slip, hold, p.mass)
+        v[i] = axis.kick(p, v[i], abs(mid), h, force, 1.0)
         q[i] += half * v[i]
 
 
@@ -84,10 +82,12 @@ def run(
     """Fill u, reading and truth (position, velocity, acceleration, force) tick by tick.
 
     Shapes: u (time, drives), reference, noise and reading (time, masses), truth (time, masses, 4),
-    memory (drives, 2). `driven` holds the mass of each drive; `bursts` is empty.
+    memory (drives, 2). `driven` holds the mass of each drive; `bursts` is empty. A drive with a lag
+    starts at zero force.
     """
     steps = int(math.ceil(period / step - 1e-6))
     h = period / steps
+    target = np.zeros(q.size)
     for k in range(u.shape[0]):
         for i in range(q.size):
             reading[k, i] = q[i] + noise[k, i]
@@ -97,14 +97,26 @@ def run(
             i = driven[d]
             if laws[d].kind != axis.OPEN:
                 u[k, d] = axis.command(laws[d], k, reference[:, i], reading[:, i], memory[d], period)
-            drive[i] = masses[i].gain * u[k, d]
+            target[i] = masses[i].gain * u[k, d]
+            if masses[i].lag == 0.0:
+                drive[i] = target[i]
         pull_of_springs(springs, q, v, pull)
         for i in range(q.size):
             force = drive[i] + pull[i]
             truth[k, i, 0], truth[k, i, 1], truth[k, i, 3] = q[i], v[i], drive[i]
             truth[k, i, 2] = axis.acceleration(masses[i], bursts, q[i], v[i], 0.0, force, 0.0)
         for _ in range(steps):
+            lagging(masses, drive, target, 0.5 * h)
             advance(masses, springs, q, v, drive, pull, h)
+            lagging(masses, drive, target, 0.5 * h)
+
+
+@njit(cache=True)
+def lagging(masses, drive, target, h):
+    """Let drives with a lag come nearer to their targets for h [s], in place."""
+    for i in range(drive.size):
+        if masses[i].lag > 0.0:
+            drive[i] = target[i] + (drive[i] - target[i]) * math.exp(-h / masses[i].lag)
 
 
 @njit(cache=True)

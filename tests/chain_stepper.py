@@ -22,7 +22,7 @@ SPRING_EFFECTS = {"quadratic_stiffness": 2, "cubic_stiffness": 3}
 MASS_EFFECTS = (
     "viscous_friction", "coulomb_friction", "static_friction", "stribeck_friction",
     "asymmetric_viscous", "quadratic_drag", "cubic_friction", "quartic_friction",
-    "constant_force", "cogging", "actuator_gain", "added_mass",
+    "constant_force", "cogging", "velocity_hysteresis", "actuator_lag", "actuator_gain", "added_mass",
 )  # fmt: skip
 Place = tuple[str, int]
 _PHYSICS = np.dtype([(name, float) for name in Physics._fields])
@@ -109,6 +109,8 @@ def physics(machine: ChainMachine) -> tuple[np.ndarray, np.ndarray]:
         if not 1 <= place <= n + (kind in SPRING_EFFECTS):
             raise ValueError(f"{kind} cannot act at {place}: there are {n} masses.")
         names = EFFECTS[kind]
+        if kind == "velocity_hysteresis":  # the same both ways where nothing else is said
+            values = {"level_negative": values["level"], **values}
         if set(values) != set(names):
             raise ValueError(f"{kind} takes {sorted(names)}, got {sorted(values)}.")
         if kind in SPRING_EFFECTS:

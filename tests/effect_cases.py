@@ -37,6 +37,7 @@ class Row:
         beside: Effects without which it would do nothing, declared before it.
         own: Own state for the force test; None where it has none.
         dry: Whether it makes, or changes, set-valued friction.
+        affine: Whether its force is affine in the acceleration.
     """
 
     kind: str
@@ -45,6 +46,7 @@ class Row:
     beside: tuple = ()
     own: float | tuple[float, ...] | None = None
     dry: bool = False
+    affine: bool = True
     effects: tuple = field(init=False)
 
     def __post_init__(self):
@@ -109,6 +111,15 @@ ROWS: dict[str, Row] = {
     # own state: friction over its level, here 0.6
     "hysteresis": Row(
         "hysteresis", {"stiffness": 1e5, "level": 30.0}, lambda x: x.u - 30.0 * x.z, own=0.6
+    ),
+    "velocity_hysteresis": Row(
+        "velocity_hysteresis",
+        {"level": 30.0, "velocity": 0.3, "level_negative": 12.0},
+        lambda x: x.u - math.exp(-((x.v / 0.3) ** 2)) * (
+            30.0 * (x.v > 0 and x.a > 0) - 12.0 * (x.v < 0 and x.a < 0)
+        ),
+        dry=True,
+        affine=False,
     ),
     "actuator_gain": Row("actuator_gain", {"gain": 1.2}, lambda x: 1.2 * x.u),
     "actuator_lag": Row("actuator_lag", {"time_constant": 5e-3}, lambda x: x.z, own=70.0),

@@ -35,6 +35,9 @@ EFFECTS = {
     "quadratic_stiffness": {"coefficient": "stiffness2"},
     "cubic_stiffness": {"coefficient": "stiffness3"},
     "cogging": {"amplitude": "cogging", "period": "cogging_period", "phase": "cogging_phase"},
+    "velocity_hysteresis": {
+        "level": "rising_forth", "level_negative": "rising_back", "velocity": "rising_velocity",
+    },
     "hysteresis": {"stiffness": "dahl_stiffness", "level": "dahl_level"},
     "actuator_gain": {"gain": "gain"},
     "actuator_lag": {"time_constant": "lag"},
@@ -144,6 +147,8 @@ def physics(machine: Machine) -> kernel.Physics:
         if kind not in EFFECTS:
             raise ValueError(f"The stepper has no effect {kind!r}; it has {sorted(EFFECTS)}.")
         names = EFFECTS[kind]
+        if kind == "velocity_hysteresis":  # the same both ways where nothing else is said
+            values.setdefault("level_negative", values["level"])
         if set(values) != set(names):
             raise ValueError(f"{kind} takes {sorted(names)}, got {sorted(values)}.")
         fields |= {names[name]: float(value) for name, value in values.items()}

@@ -40,6 +40,9 @@ class Physics(NamedTuple):
     static: float = 0.0  # N, above Coulomb, at rest only
     stribeck: float = 0.0  # N, above Coulomb
     stribeck_velocity: float = 1.0  # m/s
+    rising_forth: float = 0.0  # N, above Coulomb while speeding up forwards
+    rising_back: float = 0.0  # N, backwards
+    rising_velocity: float = 1.0  # m/s
     dahl_stiffness: float = 0.0  # N/m
     dahl_level: float = 1.0  # N
     drift: float = 0.0  # 1/s, of every dry level
@@ -91,28 +94,42 @@ def slip_level(p, w, scale):
 
 
 @njit(cache=True)
+def rising_level(p, side, w, scale):
+    """What comes on top while speeding up to `side` at speed w [N]."""
+    level = p.rising_forth if side > 0.0 else p.rising_back
+    return scale * level * math.exp(-((w / p.rising_velocity) ** 2)) if level != 0.0 else 0.0
+
+
+@njit(cache=True)
 def drift_scale(p, t):
     """Factor on every dry level at t [s]; a level cannot turn negative."""
     return max(0.0, 1.0 + p.drift * t)
 
 
 @njit(cache=True)
-def kick(v, h, net, slip, hold, mass):
+def kick(p, v, w, h, net, scale):
     """Velocity after h [s] under a constant force, dry friction solved exactly.
 
-    Slides until it stops; the rest of h is spent at rest if |net| does not
-    exceed `hold`, else it leaves in the direction of `net`.
+    Slides until it stops; the rest of h is spent at rest if friction can hold |net|, else it leaves
+    in the direction of `net`. What acts while speeding up only cannot do more than hold the speed.
+    Levels are those at speed w.
     """
+    slip = slip_level(p, w, scale)
     if v != 0.0:
         side = 1.0 if v > 0.0 else -1.0
-        rate = (net - side * slip) / mass
+        pull = side * net - slip
+        if pull > 0.0:
+            pull = max(pull - rising_level(p, side, w, scale), 0.0)
+        rate = side * pull / p.mass
         after = v + h * rate
         if after * side > 0.0:
             return after
         h += v / rate  # rate opposes v here: v / rate is minus the time to stop
-    if abs(net) <= hold:
+    side = 1.0 if net > 0.0 else -1.0
+    hold = p.coulomb + p.stribeck + p.static
+    if abs(net) <= scale * hold + rising_level(p, side, 0.0, scale):
         return 0.0
-    return h * (net - math.copysign(slip, net)) / mass
+    return h * side * max(abs(net) - slip - rising_level(p, side, w, scale), 0.0) / p.mass
 
 
 @njit(cache=True)
@@ -155,10 +172,8 @@ def advance(p, bursts, q, v, z, lagged, target, t, h):
     lagged = target + (middle - target) * decay
     force = min(max(middle, -p.clip), p.clip) + p.weight
     force += outside_force(p, bursts, t, h) + position_force(p, q, z)
-    hold = scale * (p.coulomb + p.stribeck + p.static)
-    middle = kick(v, half, force + velocity_force(p, v), slip_level(p, abs(v), scale), hold, p.mass)
-    slip = slip_level(p, abs(middle), scale)
-    v = kick(v, h, force + velocity_force(p, middle), slip, hold, p.mass)
+    middle = kick(p, v, abs(v), half, force + velocity_force(p, v), scale)
+    v = kick(p, v, abs(middle), h, force + velocity_force(p, middle), scale)
     z = dahl(p, z, half * v, scale)
     q += half * v
     return q, v, z, lagged
@@ -172,12 +187,13 @@ def acceleration(p, bursts, q, v, z, drive, t):
     net += outside_force(
         p, bursts, t, 1e-9
     )  # chosen: 1 ns, short against a step, long against the rounding of t
-    slip = slip_level(p, abs(v), scale)
-    if v != 0.0:
-        return (net - math.copysign(slip, v)) / p.mass
-    if abs(net) <= scale * (p.coulomb + p.stribeck + p.static):
+    side = v if v != 0.0 else net
+    pull = math.copysign(1.0, side) * net - slip_level(p, abs(v), scale)
+    more = rising_level(p, side, abs(v), scale)
+    hold = scale * (p.coulomb + p.stribeck + p.static)
+    if v == 0.0 and abs(net) <= hold + more:
         return 0.0
-    return (net - math.copysign(slip, net)) / p.mass
+    return math.copysign(1.0, side) * (max(pull - more, 0.0) if pull > 0.0 else pull) / p.mass
 
 
 @njit(cache=True)

@@ -118,6 +118,7 @@ CLOSE = {
     "hysteresis": 1e-6,
     "quadratic_drag": 2e-9,
     "stribeck_friction": 2e-8,
+    "velocity_hysteresis": 2e-8,
     "friction_drift": 1e-6,
 }
 
@@ -137,7 +138,9 @@ def test_one_step_a_tick_turns_where_friction_does(name):
     assert distance(name, 1) < 1e-9 * STROKE
 
 
-@pytest.mark.parametrize(("name", "part"), [("stribeck_friction", 0.1), ("friction_drift", 0.4)])
+@pytest.mark.parametrize(
+    ("name", "part"), [("stribeck_friction", 0.1), ("velocity_hysteresis", 0.1), ("friction_drift", 0.4)]
+)
 def test_distance_to_the_truth_falls_with_the_step(name, part):
     # Second order, and first, as said above: a sixteenth and a fourth.
     assert distance(name, 16) < part * distance(name, 4)

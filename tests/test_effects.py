@@ -108,7 +108,7 @@ def test_residual_is_in_declared_units():
 @each_row
 def test_balance_is_affine_in_the_acceleration_and_rates_in_their_states(row):
     plant, own = plant_of(row.effects), own_of(row)
-    for x in instants(row, 3):
+    for x in instants(row, 3) if row.affine else ():
         at = [balance(plant, x._replace(a=a), own).residual[0] for a in (0.0, x.a, 2 * x.a)]
         # a rounding of forces of a few hundred N
         assert float(at[2] - 2 * at[1] + at[0]) == pytest.approx(0.0, abs=1e-11)

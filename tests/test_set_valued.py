@@ -12,6 +12,7 @@ from jaxid.simulation import Drive, open_loop
 MASS, RATE, SECONDS = 2.5, 500.0, 0.6
 COULOMB = {"coulomb_friction": {"level": 11.8}}
 STRIBECK = COULOMB | {"stribeck_friction": {"level": 3.7, "velocity": 0.05}}
+RISING = COULOMB | {"velocity_hysteresis": {"level": 3.7, "velocity": 0.05, "level_negative": 1.5}}
 BREAK_AWAY = COULOMB | {"static_friction": {"level": 3.7}}
 # Up through the level at which it breaks loose, and back down until it stops.
 COMMAND = 25.0 * np.sin(2 * np.pi * 1.3 * np.arange(round(SECONDS * RATE)) / RATE)
@@ -34,7 +35,9 @@ def error(effects, substeps: int) -> float:
     return float(np.abs(np.asarray(run.position)[:, 0] - true).max() / np.abs(true).max())
 
 
-@pytest.mark.parametrize("effects", [COULOMB, STRIBECK, BREAK_AWAY], ids=["coulomb", "stribeck", "static"])
+@pytest.mark.parametrize(
+    "effects", [COULOMB, STRIBECK, RISING, BREAK_AWAY], ids=["coulomb", "stribeck", "rising", "static"]
+)
 def test_motion_from_rest_is_the_exact_one(effects):
     assert error(effects, 1) < 2e-3
     assert error(effects, 8) < 3e-4

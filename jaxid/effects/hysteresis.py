@@ -40,3 +40,34 @@ class Hysteresis(Effect):
             {"stiffness": scales.force / (scales.position * s), "level": scales.force}
             for s in slips
         ]
+
+
+@register("velocity_hysteresis")
+class VelocityHysteresis(Effect):
+    """-C exp(-(v/v_s)^2) sign v while speed grows, nothing while it falls: Stribeck's friction with memory.
+
+    C is `level` forwards and `level_negative` backwards; without the latter it is the same both ways. As
+    printed the law has no answer where a force exceeds friction without this term and not with it: then
+    the velocity stands, and the term is what is missing to balance. At rest it is part of what holds.
+
+    Source:
+        Bogdan and Abba, "Identification of mechanical parameters at low velocities for a micropositioning
+        stage using a velocity hysteresis model", (7), (9), (10). (10) lacks a minus sign: as printed the
+        term drives the table when it moves backwards.
+    """
+
+    level: Array = parameter("force", "nonnegative", "C, above sliding friction at low velocity")
+    velocity: Array = parameter("position/time", "positive", "v_s, where it fades")
+    level_negative: Array | None = parameter(
+        "force", "nonnegative", "C for negative velocity, where it differs", optional=True
+    )
+
+    def act(self, x: Signals, state: None) -> Action:
+        fading = jnp.exp(-((x.yd / self.velocity) ** 2))
+        back = self.level if self.level_negative is None else self.level_negative
+        return Action(rising=(self.level * fading, back * fading))
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        widths = (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)
+        return [{"level": scales.force, "velocity": scales.velocity * w} for w in widths]

@@ -10,7 +10,7 @@ from typing import Any
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.io.case_places import check_places, read_ports
-from jaxid.io.case_tables import PLANNED_EFFECTS, PLANNED_PLANTS, PLANT
+from jaxid.io.case_tables import PLANNED_PLANTS, PLANT
 from jaxid.io.case_values import Value, read_value, read_values
 from jaxid.io.schema import (
     Key,
@@ -96,8 +96,12 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
     """
     spot = Spot(file, "[plant]")
     cls = PLANTS[read_kind(table, PLANTS, PLANNED_PLANTS, spot)]
-    joints = _count_joints(table.get("parameters"), cls, spot)
     keys = {"kind": Key(lambda value, spot: value), **PLANT}
+    if cls.couplings:
+        keys["coupling"] = Key(choice(tuple(cls.couplings)))
+        if "coupling" in table:
+            cls = cls.couplings[keys["coupling"].read(table["coupling"], spot.at("coupling"))]
+    joints = _count_joints(table.get("parameters"), cls, spot)
     if "actuated" in cls.__dataclass_fields__:
         keys["actuated"] = Key(_actuated(joints))
     keys["parameters"] = Key(lambda v, s: _plant_parameters(v, cls, joints, file))
@@ -105,7 +109,7 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
     if "parameters" not in given:
         needed = ", ".join(f"{name} = {_shape(info)}" for name, info in parameters_of(cls).items())
         raise spot.fault("'parameters' is missing", f"add [plant.parameters] with {needed}")
-    motion = given.get("motion", "linear")
+    motion = given.get("motion", cls.motion(0) or "linear")
     vertical = given.get("orientation") == "vertical"
     if vertical and motion == "rotary":
         mend = 'leave orientation out, or set motion = "linear"; an unbalanced load is an effect'
@@ -200,7 +204,7 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
     if ":" in str(table.get("kind", "")) or str(table.get("kind", "")).endswith(".py"):
         cls = user_effect(str(table["kind"]), path.parent, spot.at("kind"))
     else:
-        cls = EFFECTS[read_kind(table, EFFECTS, PLANNED_EFFECTS, spot)]
+        cls = EFFECTS[read_kind(table, EFFECTS, (), spot)]
     spot = Spot(str(path), f"[[effects]] {index} ({cls.kind})")
     infos = parameters_of(cls)
     _check_keys(table, list(infos), spot)

@@ -22,7 +22,7 @@ def read_ports(
     places = [name for name in ("joint", "spring", "passive") if name in table]
     if len(places) > 1:
         raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
-    springs = plant.cls.springs(plant.joints)
+    parts, springs = plant.cls.parts(plant.joints), plant.cls.springs(plant.joints)
     if cls.with_springs not in (None, springs > 0):
         has, mend = ("no springs", "chain or flexible_axis") if cls.with_springs else (
             "springs of its own", "axis, or state the spring there",
@@ -38,9 +38,9 @@ def read_ports(
             mend = "name a joint; on springs act the stiffness effects"
             raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", mend)
         chosen = _places(table, "spring", springs, spot)
-        return tuple(plant.joints + k for k in chosen), "spring"
+        return tuple(parts + k for k in chosen), "spring"
     if "joint" in table:
-        chosen = _places(table, "joint", plant.joints, spot)
+        chosen = _places(table, "joint", parts, spot)
         undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]
         if cls.in_drive and undriven:
             driven = ", ".join(str(k + 1) for k in plant.actuated)
@@ -48,10 +48,10 @@ def read_ports(
             raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
         return chosen, "joint"
     if cls.of_spring and springs:
-        return tuple(range(plant.joints, plant.joints + springs)), "spring"
+        return tuple(range(parts, parts + springs)), "spring"
     if cls.in_drive and plant.actuated is not None:
         return plant.actuated, "joint"
-    return tuple(range(plant.joints)), "joint"
+    return tuple(range(parts)), "joint"
 
 
 def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[int, ...]:

@@ -25,8 +25,7 @@ from jaxid.io.schema import (
 )
 
 # Names that the case file promises and this version does not have yet.
-PLANNED_PLANTS = ("micropositioning_stage", "serial_arm", "five_bar")
-PLANNED_EFFECTS = ("velocity_hysteresis",)
+PLANNED_PLANTS = ("serial_arm", "five_bar")
 PLANNED_CONTROLLERS = ("computed_torque", "adaptive")
 METHODS = (
     "inverse_dynamics",

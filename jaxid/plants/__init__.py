@@ -7,5 +7,9 @@ from jaxid.model import Plant
 from jaxid.plants.axis import Axis as Axis
 from jaxid.plants.chain import Chain as Chain
 from jaxid.plants.flexible_axis import FlexibleAxis as FlexibleAxis
+from jaxid.plants.micropositioning_stage import MicropositioningStage as MicropositioningStage
+from jaxid.plants.micropositioning_stage import RigidMicropositioningStage as RigidMicropositioningStage
 
-PLANTS: dict[str, type[Plant]] = {"axis": Axis, "chain": Chain, "flexible_axis": FlexibleAxis}
+PLANTS: dict[str, type[Plant]] = {
+    cls.kind: cls for cls in (Axis, Chain, FlexibleAxis, MicropositioningStage)
+}

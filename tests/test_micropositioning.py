@@ -1,0 +1,92 @@
+"""The micropositioning stage: its motion against the independent chain, what its places are called."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import stages
+
+from jaxid.cli import main
+from jaxid.errors import InputError
+from jaxid.io.case import load_case
+from jaxid.io.log import Log
+from jaxid.machine import build_machine
+from jaxid.parameters import label
+from jaxid.replay import Numerics, make_replay
+
+
+def replayed(case, log: dict, columns: tuple[str, ...], substeps: int):
+    """Trajectory of the case's machine at its true values, in the loop of a log."""
+    made = Log(
+        time=log["t"], position=np.column_stack([log[c] for c in columns]), force=log["i"][:, None],
+        reference=log["ref"][:, None],
+    )
+    machine = build_machine(case, true=True, period=1 / stages.RATE)
+    replay = make_replay(machine, made, Numerics(substeps=substeps))
+    replay = dataclasses.replace(replay, velocity=np.zeros(len(columns)))
+    return replay(machine.plant)
+
+
+@pytest.mark.parametrize("data", [1, 2])
+def test_rigid_stage_moves_as_the_exact_one(tmp_path, data):
+    """In its loop, through the lag of the current, the quantiser and every friction of the table."""
+    log = stages.record(stages.machine(data, rigid=True), stages.move(0.5, **stages.MOVES[data]))
+    (tmp_path / "case.toml").write_text(stages.text(data))
+    run = replayed(load_case(tmp_path / "case.toml"), log, ("q",), 64)
+    assert np.ptp(log["true_q"]) > 0.5 * stages.MOVES[data]["distance"] / stages.R
+    # The same counts at every tick, or a current would differ by milliamperes.
+    assert np.abs(np.asarray(run.command)[:, 0] - log["true_i"]).max() < 1e-12
+    assert np.abs(np.asarray(run.position)[:, 0] - log["true_q"]).max() < 1e-2 * stages.COUNT
+
+
+def test_elastic_stage_moves_as_the_exact_one(tmp_path):
+    """The table swings at 1 kHz behind its screw, and sticks and slips in it: that asks for fine steps."""
+    log = stages.record(
+        stages.machine(1), stages.move(0.2, **stages.MOVES[1]), resolution=0.0, step=1e-6,
+    )
+    (tmp_path / "case.toml").write_text(stages.text(1, coupling="elastic", resolution=0.0))
+    run = replayed(load_case(tmp_path / "case.toml"), log, ("q", "x"), 2560)
+    assert np.abs(np.asarray(run.position)[:, 0] - log["true_q"]).max() < 1e-4 * np.ptp(log["true_q"])
+    lag = log["x"] - stages.R * log["true_q"]
+    ours = np.asarray(run.position) @ [-stages.R, 1.0]
+    # The screw gives by F / k, about half a micrometre.
+    assert np.ptp(lag) > 3e-7
+    assert np.abs(ours - lag).max() < 0.01 * np.ptp(lag)
+
+
+def test_a_stiff_screw_is_no_screw():
+    """On the motor's side both do the same, but for starts and stops: there the motor winds up its screw."""
+    reference = stages.move(0.3, **stages.MOVES[1])
+    both = [
+        stages.record(stages.machine(1, rigid=rigid), reference, resolution=0.0)["true_q"]
+        for rigid in (True, False)
+    ]
+    assert np.sqrt(np.mean((both[0] - both[1]) ** 2)) < 0.01 * np.ptp(both[0])
+
+
+def test_places_are_the_motor_and_the_table(tmp_path):
+    (tmp_path / "case.toml").write_text(stages.text(1))
+    machine = build_machine(load_case(tmp_path / "case.toml"))
+    units = {f.name: f.unit for f in machine.parameters.free}
+    assert units["motor_inertia"] == "kg m^2"
+    assert units["table_mass"] == "kg"
+    assert units["coulomb_friction[1].level"] == "N m"
+    assert units["coulomb_friction[2].level"] == "N"
+    assert units["viscous_friction[1].coefficient"] == "N m s/rad"
+    assert units["velocity_hysteresis[2].velocity"] == "m/s"
+    assert label(machine.plant, "cogging", 1) == "cogging[2]"
+    # One coordinate: the table's friction counts at the motor, and nowhere else.
+    zero = np.zeros(1)
+    balance = machine.plant.balance(zero, zero, zero, zero, 0.0, machine.plant.initial_states(zero))
+    assert balance.slides == balance.rises == (0,)
+    dry = stages.combined(stages.TRUTH[1])["dry"]
+    np.testing.assert_allclose(balance.dry, [dry, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(balance.rising[:, 0], stages.R * np.array([2.23, 1.12]), rtol=1e-12)
+
+
+def test_a_coupling_that_there_is_not_is_refused(tmp_path):
+    (tmp_path / "case.toml").write_text(stages.text(1).replace('"rigid"', '"loose"'))
+    with pytest.raises(InputError, match=r'coupling = "loose" is unknown.*elastic.*rigid'):
+        load_case(tmp_path / "case.toml")
+    (tmp_path / "case.toml").write_text(stages.text(1).replace("pitch", "stiffness = 1e7\npitch"))
+    assert main(["check", str(tmp_path / "case.toml"), str(tmp_path / "log.csv")]) == 2
