@@ -236,14 +236,15 @@ def _noise_cutoff(log: Log) -> float:
 
 
 def differentiate(
-    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Filtered signal and its two derivatives, by "central" differences or "spectral"."""
+    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str, orders: int = 2
+) -> tuple[np.ndarray, ...]:
+    """Filtered signal and its derivatives up to an order, by "central" differences or "spectral"."""
     if how == "spectral":
-        return signals.spectral_derivatives(x, period, cutoff_hz)
-    q = signals.butterworth_zero_phase(x, cutoff_hz, order, 1 / period)
-    qd = signals.central_difference(q, period)
-    return q, qd, signals.central_difference(qd, period)
+        return signals.spectral_derivatives(x, period, cutoff_hz, orders)
+    out = [signals.butterworth_zero_phase(x, cutoff_hz, order, 1 / period)]
+    for _ in range(orders):
+        out.append(signals.central_difference(out[-1], period))
+    return tuple(out)
 
 
 def prepare(

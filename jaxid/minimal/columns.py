@@ -6,6 +6,7 @@ differentiated by the same operator and decimated by the same filter, so that no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from jaxid.machine import Machine
 from jaxid.minimal.basis import Basis
 from jaxid.minimal.matrices import LinearBalance
 from jaxid.minimal.models import Structure, Term, neighbour
-from jaxid.preprocess import Recipe, affordable, lasting, smeared, turning
+from jaxid.preprocess import Recipe, affordable, differentiate, lasting, smeared, turning
 
 # Of the response to a jump of force, what a sample may still hold: beyond, a reversal is forgotten.
 _FORGOTTEN = 0.01
@@ -45,18 +46,6 @@ def decimator_of(recipe: Recipe, rate_hz: float) -> signals.Decimator:
         return recipe.decimator
     band = max(0.8 / recipe.decimation, 2 * recipe.cutoff_hz / rate_hz)
     return signals.Decimator(recipe.decimation, recipe.trim, band=min(band, 0.99))
-
-
-def derivatives(
-    x: Float[np.ndarray, "time k"], period: float, recipe: Recipe, orders: int
-) -> list[np.ndarray]:
-    """A filtered signal and its derivatives up to an order, each (time, k)."""
-    if recipe.derivatives == "spectral":
-        return list(signals.spectral_derivatives(x, period, recipe.cutoff_hz, orders))
-    out = [signals.butterworth_zero_phase(x, recipe.cutoff_hz, recipe.order, 1 / period)]
-    for _ in range(orders):
-        out.append(signals.central_difference(out[-1], period))
-    return out
 
 
 def reach_of(recipe: Recipe, rate_hz: float, order: int) -> int:
@@ -139,7 +128,8 @@ def _signals(
     raw = {"position": (seen, log.position[:, seen]), "force": (range(force.shape[1]), force)}
     if "acceleration" in highest:
         raw["acceleration"] = (structure.form.hidden, log.load_acceleration)
-    through = lambda x, orders: derivatives(x, log.period, recipe, orders)
+    how = (log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives)
+    through = lambda x, orders: differentiate(x, *how, orders)
     moved = {name: through(x, highest[name]) for name, (_, x) in raw.items()}
     direction = {i: np.sign(moved["position"][1][:, k]) for k, i in enumerate(seen)}
     joints = range(len(log.measured))
@@ -163,7 +153,7 @@ def _signals(
 
 
 def _hidden_speed(
-    joint: int, moved: dict[str, list[np.ndarray]], seen: list[int], balance: LinearBalance
+    joint: int, moved: dict[str, Sequence[np.ndarray]], seen: list[int], balance: LinearBalance
 ) -> Float[np.ndarray, " time"]:
     """Speed of a hidden joint, by what the spring to it must do in the balance of a measured one.
 
