@@ -55,6 +55,16 @@ class Recipe:
         """Edge of the band in which forces are compared."""
         return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
 
+    def hold(self, log: Log, period: float | None = None) -> float:
+        """For how long each command of a log is held from its sample on [s]; zero where that is not to count.
+
+        Args:
+            log: The log.
+            period: Of the controller [s]; absent: the log's sampling time.
+        """
+        held = self.align_hold and log.hold == "zero_order"
+        return (period or log.period) if held else 0.0
+
     @property
     def independent(self) -> float:
         """Part of the kept samples whose noise is independent: half where the band is just filled."""
@@ -270,11 +280,9 @@ def prepare(
         at_rest = at_rest | (turning(qd) & (reach > 0))
     moving = ~smeared(at_rest, reach)[kept] & log.measured
     fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
-    held = recipe.align_hold and log.hold == "zero_order"
-    hold = (hold_period or log.period) if held else 0.0
     return Prepared(
         q, qd, qdd, log.force * gain, log.period,
-        hold, recipe, moving,
+        recipe.hold(log, hold_period), recipe, moving,
         fitted if recipe.keeps_reversals else moving, kept, measured=log.measured,
     )
 

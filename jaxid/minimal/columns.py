@@ -120,9 +120,7 @@ def _signals(
     for t in every:
         highest[t.signal] = max(highest.get(t.signal, 0), t.order)
     delays = np.asarray(machine.plant.command_delays(log.force.shape[1]))
-    hold = 0.0
-    if recipe.align_hold and log.hold == "zero_order":
-        hold = log.period if machine.controller is None else machine.controller.period
+    hold = recipe.hold(log, machine.hold_period)
     force = np.asarray(_delayed(log.force * machine.gain, delays, log.period, hold))
     seen = [i for i, m in enumerate(log.measured) if m]
     raw = {"position": (seen, log.position[:, seen]), "force": (range(force.shape[1]), force)}
