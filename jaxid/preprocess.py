@@ -55,6 +55,13 @@ class Recipe:
         """Edge of the band in which forces are compared."""
         return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
 
+    def response(self, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
+        """Gain of the zero-phase low-pass at each frequency [Hz], without the parallel filter."""
+        if self.derivatives == "spectral":
+            return signals.roll_off(frequency, self.cutoff_hz)
+        sos = scipy.signal.butter(self.order, self.cutoff_hz, fs=rate_hz, output="sos")
+        return np.abs(scipy.signal.freqz_sos(sos, worN=frequency, fs=rate_hz)[1]) ** 2
+
     def hold(self, log: Log, period: float | None = None) -> float:
         """For how long each command of a log is held from its sample on [s]; zero where that is not to count.
 

@@ -50,13 +50,8 @@ def decimator_of(recipe: Recipe, rate_hz: float) -> signals.Decimator:
 
 def reach_of(recipe: Recipe, rate_hz: float, order: int) -> int:
     """Samples of the log over which a jump of force shows in its derivative of some order."""
-    f = np.fft.rfftfreq(1 << 14)
-    through = decimator_of(recipe, rate_hz).response(f, 1.0)
-    cutoff = recipe.cutoff_hz / rate_hz
-    if recipe.derivatives == "spectral":
-        through = through * signals.roll_off(f, cutoff)
-    else:
-        through = through / (1 + (f / cutoff) ** (2 * recipe.order))
+    f = np.fft.rfftfreq(1 << 14, 1 / rate_hz)
+    through = decimator_of(recipe, rate_hz).response(f, rate_hz) * recipe.response(f, rate_hz)
     response = np.abs(np.fft.irfft(through * (1j * f) ** max(order - 1, 0)))[: 1 << 13]
     return int(np.flatnonzero(response > _FORGOTTEN * response.max())[-1]) + 1
 
