@@ -19,8 +19,10 @@ from jaxid.io.log import Log
 # The surroundings of reversals that are left out are less of the motion than this.
 _MOSTLY = 0.5
 # Decimation keeps 1 / 0.4 samples a period of the band's edge, and of a short log so many in all.
-_A_PERIOD = 0.4
+A_PERIOD = 0.4
 _ENOUGH = 100
+# Periods of the band's edge that are left out at each end.
+_ENDS = 3
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class Recipe:
         """Part of the kept samples whose noise is independent: half where the band is just filled."""
         if self.edge is None:
             return 0.5
-        return min(0.5, 0.5 * self.decimation * self.edge / (2 * _A_PERIOD))
+        return min(0.5, 0.5 * self.decimation * self.edge / (2 * A_PERIOD))
 
     @property
     def decimator(self) -> signals.Decimator:
@@ -207,7 +209,7 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         cutoff_hz=cutoff,
         order=int(stated.get("order", 4)),
         decimation=decimation,
-        trim=int(stated.get("trim", _trim(log, band, decimation, literal))),
+        trim=int(stated.get("trim", trimmed(log, band, decimation, literal=literal))),
         rest_velocity=tuple(float(r) for r in rest),
         align_hold=bool(stated.get("align_hold", not literal)),
         derivatives="central" if literal else "spectral",
@@ -222,15 +224,25 @@ def _decimation(log: Log, band_hz: float) -> int:
     What else is left out (ends, stops, reversals) is left out in whole samples; of twenty-five
     kept ones too few would remain. Their noise is correlated, which whitening takes care of.
     """
-    return max(1, min(int(_A_PERIOD * log.rate_hz / band_hz), log.samples // _ENOUGH))
+    return max(1, min(spaced(log.rate_hz, band_hz), log.samples // _ENOUGH))
 
 
-def _trim(log: Log, band_hz: float, decimation: int, literal: bool) -> int:
+def spaced(rate_hz: float, band_hz: float) -> int:
+    """One sample in how many a band needs."""
+    return max(1, int(A_PERIOD * rate_hz / band_hz))
+
+
+def trimmed(log: Log, band_hz: float, decimation: int, *, literal: bool, periods: int = _ENDS) -> int:
     """Kept samples to leave out at each end: as far as the ends of filters reach.
 
-    That is three periods of the band's edge; of a short log not more than an eighth.
+    Args:
+        log: The log.
+        band_hz: Edge of the band.
+        decimation: One sample in so many is kept.
+        literal: Whether the recipe is stated; else of a short log not more than an eighth.
+        periods: Of the band's edge, over which filters forget the ends.
     """
-    reach = int(np.ceil(3 * log.rate_hz / (band_hz * decimation)))
+    reach = int(np.ceil(periods * log.rate_hz / (band_hz * decimation)))
     return reach if literal else min(reach, log.samples // decimation // 8)
 
 
