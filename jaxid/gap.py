@@ -8,10 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
 from jaxtyping import Array, Float
 
-from jaxid import signals
 from jaxid.estimators.inverse_dynamics import (
     ForceData,
     force_residual,
@@ -131,7 +129,7 @@ def noise_density(
     mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
     w = 2 * np.pi * f[:, None, None]
     impedance = _seen(-mass * w**2 + 1j * w * damping + stiffness, data.measured)
-    through = np.abs(_position_filter(f, recipe, rate)) * recipe.decimator.response(f, rate)
+    through = recipe.response(f, rate) * recipe.decimator.response(f, rate)
     density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
     power = np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
     stated = machine.sensor.force_noise
@@ -153,13 +151,6 @@ def _seen(impedance: np.ndarray, measured: tuple[bool, ...]) -> np.ndarray:
     out = np.zeros_like(impedance)
     out[:, seen[:, None], seen] = part(seen, seen) - through
     return out
-
-
-def _position_filter(f: np.ndarray, recipe: object, rate: float) -> np.ndarray:
-    if recipe.derivatives == "spectral":
-        return signals.roll_off(f, recipe.cutoff_hz)
-    sos = scipy.signal.butter(recipe.order, recipe.cutoff_hz, fs=rate, output="sos")
-    return np.abs(scipy.signal.freqz_sos(sos, worN=f, fs=rate)[1]) ** 2
 
 
 @eqx.filter_jit

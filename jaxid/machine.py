@@ -53,6 +53,11 @@ class Machine:
     sensor: Sensor = Sensor()
     hold: str = "zero_order"
 
+    @property
+    def hold_period(self) -> float | None:
+        """For how long the controller holds a command [s]; None where there is none."""
+        return None if self.controller is None else self.controller.period
+
     def with_plant(self, plant: Plant, parameters: Parameters) -> Machine:
         """The same machine around another plant and its unknowns."""
         return replace(self, plant=plant, parameters=parameters)

@@ -19,8 +19,10 @@ from jaxid.io.log import Log
 # The surroundings of reversals that are left out are less of the motion than this.
 _MOSTLY = 0.5
 # Decimation keeps 1 / 0.4 samples a period of the band's edge, and of a short log so many in all.
-_A_PERIOD = 0.4
+A_PERIOD = 0.4
 _ENOUGH = 100
+# Periods of the band's edge that are left out at each end.
+_ENDS = 3
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,29 @@ class Recipe:
         """Edge of the band in which forces are compared."""
         return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
 
+    def response(self, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
+        """Gain of the zero-phase low-pass at each frequency [Hz], without the parallel filter."""
+        if self.derivatives == "spectral":
+            return signals.roll_off(frequency, self.cutoff_hz)
+        sos = scipy.signal.butter(self.order, self.cutoff_hz, fs=rate_hz, output="sos")
+        return np.abs(scipy.signal.freqz_sos(sos, worN=frequency, fs=rate_hz)[1]) ** 2
+
+    def hold(self, log: Log, period: float | None = None) -> float:
+        """For how long each command of a log is held from its sample on [s]; zero where that is not to count.
+
+        Args:
+            log: The log.
+            period: Of the controller [s]; absent: the log's sampling time.
+        """
+        held = self.align_hold and log.hold == "zero_order"
+        return (period or log.period) if held else 0.0
+
     @property
     def independent(self) -> float:
         """Part of the kept samples whose noise is independent: half where the band is just filled."""
         if self.edge is None:
             return 0.5
-        return min(0.5, 0.5 * self.decimation * self.edge / (2 * _A_PERIOD))
+        return min(0.5, 0.5 * self.decimation * self.edge / (2 * A_PERIOD))
 
     @property
     def decimator(self) -> signals.Decimator:
@@ -190,7 +209,7 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         cutoff_hz=cutoff,
         order=int(stated.get("order", 4)),
         decimation=decimation,
-        trim=int(stated.get("trim", _trim(log, band, decimation, literal))),
+        trim=int(stated.get("trim", trimmed(log, band, decimation, literal=literal))),
         rest_velocity=tuple(float(r) for r in rest),
         align_hold=bool(stated.get("align_hold", not literal)),
         derivatives="central" if literal else "spectral",
@@ -205,15 +224,25 @@ def _decimation(log: Log, band_hz: float) -> int:
     What else is left out (ends, stops, reversals) is left out in whole samples; of twenty-five
     kept ones too few would remain. Their noise is correlated, which whitening takes care of.
     """
-    return max(1, min(int(_A_PERIOD * log.rate_hz / band_hz), log.samples // _ENOUGH))
+    return max(1, min(spaced(log.rate_hz, band_hz), log.samples // _ENOUGH))
 
 
-def _trim(log: Log, band_hz: float, decimation: int, literal: bool) -> int:
+def spaced(rate_hz: float, band_hz: float) -> int:
+    """One sample in how many a band needs."""
+    return max(1, int(A_PERIOD * rate_hz / band_hz))
+
+
+def trimmed(log: Log, band_hz: float, decimation: int, *, literal: bool, periods: int = _ENDS) -> int:
     """Kept samples to leave out at each end: as far as the ends of filters reach.
 
-    That is three periods of the band's edge; of a short log not more than an eighth.
+    Args:
+        log: The log.
+        band_hz: Edge of the band.
+        decimation: One sample in so many is kept.
+        literal: Whether the recipe is stated; else of a short log not more than an eighth.
+        periods: Of the band's edge, over which filters forget the ends.
     """
-    reach = int(np.ceil(3 * log.rate_hz / (band_hz * decimation)))
+    reach = int(np.ceil(periods * log.rate_hz / (band_hz * decimation)))
     return reach if literal else min(reach, log.samples // decimation // 8)
 
 
@@ -236,14 +265,15 @@ def _noise_cutoff(log: Log) -> float:
 
 
 def differentiate(
-    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Filtered signal and its two derivatives, by "central" differences or "spectral"."""
+    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str, orders: int = 2
+) -> tuple[np.ndarray, ...]:
+    """Filtered signal and its derivatives up to an order, by "central" differences or "spectral"."""
     if how == "spectral":
-        return signals.spectral_derivatives(x, period, cutoff_hz)
-    q = signals.butterworth_zero_phase(x, cutoff_hz, order, 1 / period)
-    qd = signals.central_difference(q, period)
-    return q, qd, signals.central_difference(qd, period)
+        return signals.spectral_derivatives(x, period, cutoff_hz, orders)
+    out = [signals.butterworth_zero_phase(x, cutoff_hz, order, 1 / period)]
+    for _ in range(orders):
+        out.append(signals.central_difference(out[-1], period))
+    return tuple(out)
 
 
 def prepare(
@@ -269,11 +299,9 @@ def prepare(
         at_rest = at_rest | (turning(qd) & (reach > 0))
     moving = ~smeared(at_rest, reach)[kept] & log.measured
     fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
-    held = recipe.align_hold and log.hold == "zero_order"
-    hold = (hold_period or log.period) if held else 0.0
     return Prepared(
         q, qd, qdd, log.force * gain, log.period,
-        hold, recipe, moving,
+        recipe.hold(log, hold_period), recipe, moving,
         fitted if recipe.keeps_reversals else moving, kept, measured=log.measured,
     )
 

@@ -184,8 +184,7 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
             "the log's noise asks",
             where=log.source, mend="take a longer log, or lower decimation and trim in [preprocess]",
         )
-    hold = None if machine.controller is None else machine.controller.period
-    data = prepare(log, machine.gain, recipe, hold)
+    data = prepare(log, machine.gain, recipe, machine.hold_period)
     if not all(log.measured):
         data = replace(data, steps=needed_steps(machine, log))
     if data.moving.sum() < 5 * max(len(machine.parameters.free), 4):

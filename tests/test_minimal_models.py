@@ -15,7 +15,7 @@ from jaxid.io.case import load_case
 from jaxid.machine import build_machine
 from jaxid.minimal.basis import basis_of, chi_of
 from jaxid.minimal.columns import decimator_of, reach_of
-from jaxid.minimal.matrices import linear_balance, natural_frequencies
+from jaxid.minimal.matrices import linear_balance
 from jaxid.minimal.models import form_of, structure_of
 from jaxid.minimal.polynomials import adjugate, determinant, product, scaled
 from jaxid.preprocess import Recipe
@@ -119,16 +119,6 @@ def test_the_zero_offset_of_an_encoder_is_one_coefficient_more(tmp_path):
     chi = chi_at_truth(build_machine(load_case(path), period=1e-3), hidden=False)[0]
     assert len(chi) == len(T) + 1
     assert chi["c, row 1"] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_natural_frequencies(tmp_path):
-    machine = machine_of(tmp_path)
-    theta = np.array([T[n] for n in machine.parameters.names])
-    found = natural_frequencies(machine.plant, machine.parameters.places, theta)
-    assert found.free == pytest.approx([np.sqrt(K / J1 + K / J2) / (2 * np.pi)], rel=1e-9)
-    assert found.locked == pytest.approx([np.sqrt(K / J2) / (2 * np.pi)], rel=1e-9)
-    stiffness = machine.parameters.names.index("stiffness")
-    assert found.free_slopes[0, stiffness] == pytest.approx(found.free[0] / (2 * K), rel=1e-9)
 
 
 def test_a_stated_recipe_passes_its_band_and_folds_it():

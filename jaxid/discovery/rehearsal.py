@@ -91,11 +91,9 @@ class Stage:
         return Log(times, np.asarray(run.reading), command, hold=self.machine.hold, source="rehearsal")
 
     def _outcome(self, union: cand.Union, pair: Pair, log: Log) -> Outcome:
-        controller = self.machine.controller
-        hold = None if controller is None else controller.period
         if not np.all(np.isfinite(log.position)):
             return Outcome(0.0, TIE_NATS)
-        data = prepare(log, self.machine.gain, self.recipe, hold)
+        data = prepare(log, self.machine.gain, self.recipe, self.machine.hold_period)
         return compared(union, pair, cand.Samples(data))
 
 

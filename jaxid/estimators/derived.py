@@ -8,14 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jaxid.estimators.result import Estimate
+from jaxid.frequencies import natural_frequencies
 from jaxid.model import Plant
 from jaxid.parameters import effect_name
-from jaxid.readings import State, derivative
 
 
 @dataclass(frozen=True)
@@ -68,41 +66,17 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
 
 
 def natural_frequency(estimate: Estimate) -> list[Derived]:
-    """Of an axis with an elastic coupling, declared or found: the fastest swing, nothing held [Hz].
-
-    Eigenvalues of the plant linearised at rest, dry friction and damping of no account: their size.
-    Source of the slope: first-order perturbation, y' dA x / y' x with left and right eigenvectors.
-    """
+    """Of an axis with an elastic coupling, declared or found: the fastest swing, nothing held [Hz]."""
     plant, parameters = estimate.machine.plant, estimate.machine.parameters
     kinds = {e.kind for e in plant.effects}
     if plant.load is None and "joint_flexibility" not in kinds or "backlash" in kinds:
         return []
-    theta = jnp.asarray(estimate.theta)
-    matrix = lambda theta: _rates(parameters.insert(plant, theta))
-    a, slopes = np.asarray(matrix(theta)), np.asarray(jax.jacfwd(matrix)(theta))
-    if not np.all(np.isfinite(a)):
-        return []
-    values, left, right = scipy.linalg.eig(a, left=True)
-    k = int(np.argmax(np.where(np.abs(values.imag) > np.abs(values.real), np.abs(values), 0.0)))
-    if abs(values[k].imag) <= abs(values[k].real):
-        return []
-    y, x = left[:, k].conj(), right[:, k]
-    moves = np.einsum("i,ijp,j->p", y, slopes, x) / (y @ x)
-    slope = np.real(np.conj(values[k]) * moves) / abs(values[k]) / (2 * np.pi)
-    used = np.flatnonzero(np.abs(slope * estimate.theta) > 1e-9 * abs(values[k]))
-    covariance = estimate.precision.covariance[np.ix_(used, used)]
-    std = float(np.sqrt(slope[used] @ covariance @ slope[used]))
-    return [Derived("natural_frequency", float(abs(values[k]) / (2 * np.pi)), std, "Hz")]
-
-
-def _rates(plant: Plant) -> Array:
-    """State matrix at rest, dry friction left out."""
-    u = jnp.zeros(len(plant.driven(plant.joints)))
-    zero = jnp.zeros(plant.joints)
-    flat, back = ravel_pytree(State(zero, zero, plant.initial_states(u)))
-    none = jnp.zeros_like(plant.ports(zero))
-    rates = lambda x: ravel_pytree(derivative(plant, back(x), u, jnp.zeros(()), none))[0]
-    return jax.jacfwd(rates)(flat)
+    modes = natural_frequencies(plant, parameters.places, estimate.theta)
+    std = modes.std(estimate.precision.covariance)
+    return [
+        Derived("natural_frequency", float(f), float(s), "Hz")
+        for f, s in zip(modes.hz[-1:], std[-1:], strict=True)
+    ]
 
 
 def _before(plant: Plant, k: int) -> Plant:

@@ -17,17 +17,12 @@ from jaxid.estimators.least_squares import Minimum, Transform
 from jaxid.estimators.minimal_read_back import Model, constraint_steps, read_back
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
+from jaxid.frequencies import natural_frequencies
+from jaxid.machine import Machine
 from jaxid.minimal.basis import basis_of
 from jaxid.minimal.columns import Regression, regression_of
 from jaxid.minimal.filtering import Spectrum, choose_filtering, spectrum_of
-from jaxid.minimal.matrices import (
-    Frequencies,
-    LinearBalance,
-    delays_command,
-    linear_balance,
-    natural_frequencies,
-    require_linear,
-)
+from jaxid.minimal.matrices import LinearBalance, delays_command, linear_balance, require_linear
 from jaxid.minimal.models import Form, form_of, rigid_rows_hold, structure_of
 from jaxid.minimal.report import minimal_json, minimal_notes
 from jaxid.minimal.statistics import Constraint, Fit, least_squares
@@ -79,10 +74,10 @@ def minimal_model_steps(
     form = _form(session, printed)
     model = _model(machine.plant, machine.parameters, form, session, where)
     parameters, coefficients = machine.parameters, model.guess
-    frequencies = natural_frequencies(machine.plant, parameters.places, parameters.guess)
     theta = parameters.guess
+    now = natural_frequencies(machine.plant, parameters.places, theta).hz
     for k in range(_PASSES):
-        natural = frequencies.free
+        natural = now
         spectrum = spectrum_of(log, machine, model.structure, coefficients, model.known, natural)
         recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
         balance = _linear_balance(machine.plant, parameters.places, theta)
@@ -97,15 +92,13 @@ def minimal_model_steps(
         ))
         chi, slopes, theta = (np.asarray(a) for a in (chi, slopes, found.theta))
         coefficients = model.basis.constant + model.basis.spread @ chi
-        frequencies = natural_frequencies(machine.plant, parameters.places, theta)
-        moved = np.abs(frequencies.free / natural - 1) if natural.size else np.zeros(1)
+        now = natural_frequencies(machine.plant, parameters.places, theta).hz
+        moved = np.abs(now / natural - 1) if natural.size else np.zeros(1)
         # Where a hidden joint turns round is not known at the guesses.
         if k >= bool(form.hidden) and (moved.max() < _SETTLED or "cutoff_hz" in stated):
             break
     constraint = yield from constraint_steps(machine.plant, parameters, model, fit, theta, slopes)
-    return _estimate(
-        session, model, data, fit, weights, (found, chi, slopes), frequencies, constraint, recipe, notes
-    )
+    return _estimate(session, model, data, fit, weights, (found, chi, slopes), constraint, recipe, notes)
 
 
 def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Recipe, tuple[str, ...]]:
@@ -119,7 +112,7 @@ def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Rec
     machine, log = session.machine, session.fit.log
     form = _form(session, printed)
     model = _model(machine.plant, machine.parameters, form, session, str(session.case.path))
-    natural = natural_frequencies(machine.plant, machine.parameters.places, machine.parameters.guess).free
+    natural = natural_frequencies(machine.plant, machine.parameters.places, machine.parameters.guess).hz
     spectrum = spectrum_of(log, machine, model.structure, model.guess, model.known, natural)
     return spectrum, *choose_filtering(log, session.case.preprocess, model.structure, spectrum)
 
@@ -194,8 +187,8 @@ def _weights(form: Form, rows: int, natural: np.ndarray, weight: float | None) -
 
 def _estimate(
     session: Session, model: Model, data: Regression, fit: Fit, weight: np.ndarray,
-    found: tuple[Minimum, np.ndarray, np.ndarray], frequencies: Frequencies,
-    constraint: Constraint | None, recipe: Recipe, notes: tuple[str, ...],
+    found: tuple[Minimum, np.ndarray, np.ndarray], constraint: Constraint | None, recipe: Recipe,
+    notes: tuple[str, ...],
 ) -> Estimate:
     machine, parameters = session.machine, session.machine.parameters
     solved, chi, slopes = found
@@ -207,7 +200,7 @@ def _estimate(
     )
     converged = bool(solved.converged) and bool(np.all(np.isfinite(theta)))
     at = machine.with_estimate(theta)
-    modes = _modes(frequencies, precision.covariance)
+    modes = _modes(at, precision.covariance)
     names = [n for n, t, low in zip(parameters.names, theta, parameters.bounds[0], strict=True) if t <= low]
     pressed = (f"at its bound: {', '.join(names)}",) if names else ()
     form = model.structure.form
@@ -222,17 +215,11 @@ def _estimate(
     )
 
 
-def _modes(found: Frequencies, covariance: np.ndarray) -> dict[str, list[tuple[float, float]]]:
-    """Natural frequencies and their standard deviations [Hz], NaN where an unknown in one cannot be told."""
-    known = np.isfinite(np.diag(covariance))
-    inner = np.where(np.outer(known, known), covariance, 0.0)
-    parts = {
-        "free": (found.free, found.free_slopes),
-        "motor_locked": (found.locked, found.locked_slopes),
-    }
+def _modes(machine: Machine, covariance: np.ndarray) -> dict[str, list[tuple[float, float]]]:
+    """Natural frequencies at an estimate and their standard deviations [Hz]."""
+    plant, parameters = machine.plant, machine.parameters
     out = {}
-    for name, (values, slopes) in parts.items():
-        std = np.sqrt(np.maximum(np.einsum("mi,ij,mj->m", slopes, inner, slopes), 0.0))
-        std = np.where(np.any((slopes != 0) & ~known, axis=1), np.nan, std)
-        out[name] = [(float(v), float(s)) for v, s in zip(values, std, strict=True)]
+    for name, held in (("free", ()), ("motor_locked", plant.driven(plant.joints))):
+        found = natural_frequencies(plant, parameters.places, parameters.guess, held)
+        out[name] = list(zip(found.hz.tolist(), found.std(covariance).tolist(), strict=True))
     return out

@@ -6,6 +6,7 @@ differentiated by the same operator and decimated by the same filter, so that no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from jaxid.machine import Machine
 from jaxid.minimal.basis import Basis
 from jaxid.minimal.matrices import LinearBalance
 from jaxid.minimal.models import Structure, Term, neighbour
-from jaxid.preprocess import Recipe, affordable, lasting, smeared, turning
+from jaxid.preprocess import Recipe, affordable, differentiate, lasting, smeared, turning
 
 # Of the response to a jump of force, what a sample may still hold: beyond, a reversal is forgotten.
 _FORGOTTEN = 0.01
@@ -47,27 +48,10 @@ def decimator_of(recipe: Recipe, rate_hz: float) -> signals.Decimator:
     return signals.Decimator(recipe.decimation, recipe.trim, band=min(band, 0.99))
 
 
-def derivatives(
-    x: Float[np.ndarray, "time k"], period: float, recipe: Recipe, orders: int
-) -> list[np.ndarray]:
-    """A filtered signal and its derivatives up to an order, each (time, k)."""
-    if recipe.derivatives == "spectral":
-        return list(signals.spectral_derivatives(x, period, recipe.cutoff_hz, orders))
-    out = [signals.butterworth_zero_phase(x, recipe.cutoff_hz, recipe.order, 1 / period)]
-    for _ in range(orders):
-        out.append(signals.central_difference(out[-1], period))
-    return out
-
-
 def reach_of(recipe: Recipe, rate_hz: float, order: int) -> int:
     """Samples of the log over which a jump of force shows in its derivative of some order."""
-    f = np.fft.rfftfreq(1 << 14)
-    through = decimator_of(recipe, rate_hz).response(f, 1.0)
-    cutoff = recipe.cutoff_hz / rate_hz
-    if recipe.derivatives == "spectral":
-        through = through * signals.roll_off(f, cutoff)
-    else:
-        through = through / (1 + (f / cutoff) ** (2 * recipe.order))
+    f = np.fft.rfftfreq(1 << 14, 1 / rate_hz)
+    through = decimator_of(recipe, rate_hz).response(f, rate_hz) * recipe.response(f, rate_hz)
     response = np.abs(np.fft.irfft(through * (1j * f) ** max(order - 1, 0)))[: 1 << 13]
     return int(np.flatnonzero(response > _FORGOTTEN * response.max())[-1]) + 1
 
@@ -131,15 +115,14 @@ def _signals(
     for t in every:
         highest[t.signal] = max(highest.get(t.signal, 0), t.order)
     delays = np.asarray(machine.plant.command_delays(log.force.shape[1]))
-    hold = 0.0
-    if recipe.align_hold and log.hold == "zero_order":
-        hold = log.period if machine.controller is None else machine.controller.period
+    hold = recipe.hold(log, machine.hold_period)
     force = np.asarray(_delayed(log.force * machine.gain, delays, log.period, hold))
     seen = [i for i, m in enumerate(log.measured) if m]
     raw = {"position": (seen, log.position[:, seen]), "force": (range(force.shape[1]), force)}
     if "acceleration" in highest:
         raw["acceleration"] = (structure.form.hidden, log.load_acceleration)
-    through = lambda x, orders: derivatives(x, log.period, recipe, orders)
+    how = (log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives)
+    through = lambda x, orders: differentiate(x, *how, orders)
     moved = {name: through(x, highest[name]) for name, (_, x) in raw.items()}
     direction = {i: np.sign(moved["position"][1][:, k]) for k, i in enumerate(seen)}
     joints = range(len(log.measured))
@@ -163,7 +146,7 @@ def _signals(
 
 
 def _hidden_speed(
-    joint: int, moved: dict[str, list[np.ndarray]], seen: list[int], balance: LinearBalance
+    joint: int, moved: dict[str, Sequence[np.ndarray]], seen: list[int], balance: LinearBalance
 ) -> Float[np.ndarray, " time"]:
     """Speed of a hidden joint, by what the spring to it must do in the balance of a measured one.
 

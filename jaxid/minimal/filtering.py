@@ -12,7 +12,7 @@ from jaxid import signals
 from jaxid.io.log import Log
 from jaxid.machine import Machine, position_noise
 from jaxid.minimal.models import Structure
-from jaxid.preprocess import Recipe, choose_recipe
+from jaxid.preprocess import A_PERIOD, Recipe, choose_recipe, spaced, trimmed
 
 # The band ends so many times above the highest natural frequency, as published (60 for 30 Hz).
 _ABOVE = 2.0
@@ -20,8 +20,6 @@ _ABOVE = 2.0
 _AT_LEAST = 1.2
 # Power of a signal over its noise at which the band ends.
 _OVER_NOISE = 4.0
-# Decimation keeps 1 / 0.4 samples a period of the band's edge.
-_A_PERIOD = 0.4
 # Periods of the band's edge that are left out at each end: the higher derivatives forget slowly.
 _ENDS = 6
 
@@ -114,15 +112,16 @@ def choose_filtering(
     if "cutoff_hz" in stated:
         recipe = replace(choose_recipe(log, stated), order=order)
         if "trim" not in stated:
-            recipe = replace(recipe, trim=_ends(log, recipe.cutoff_hz, recipe.decimation))
+            trim = trimmed(log, recipe.cutoff_hz, recipe.decimation, literal=True, periods=_ENDS)
+            recipe = replace(recipe, trim=trim)
         return recipe, _folds(recipe, log.rate_hz)
     recipe = replace(choose_recipe(log, stated), order=order)
     if not spectrum.natural.size:
         return recipe, ()
     top, limit = float(spectrum.natural.max()), spectrum.limit_hz
     edge = min(max(min(_ABOVE * top, limit), _AT_LEAST * top), 0.3 * log.rate_hz)
-    decimation = int(stated.get("decimation", max(1, int(_A_PERIOD * log.rate_hz / edge))))
-    trim = int(stated.get("trim", min(_ends(log, edge, decimation), log.samples // decimation // 8)))
+    decimation = int(stated.get("decimation", spaced(log.rate_hz, edge)))
+    trim = int(stated.get("trim", trimmed(log, edge, decimation, literal=False, periods=_ENDS)))
     recipe = replace(
         recipe, cutoff_hz=min(2 * edge, 0.45 * log.rate_hz), decimation=decimation, trim=trim,
         edge=2 * edge / log.rate_hz,
@@ -131,7 +130,7 @@ def choose_filtering(
     if limit < _ABOVE * top:
         amplified = f"noise, as derivatives up to order {highest_order(structure)} amplify it"
         why += f": {amplified}, takes over at {limit:.3g} Hz"
-    notes = [f"{why}; one sample in {decimation} is kept, {_A_PERIOD:g} periods of that"]
+    notes = [f"{why}; one sample in {decimation} is kept, {A_PERIOD:g} periods of that"]
     if limit < _AT_LEAST * top:
         notes.append(
             "that is within the band: stiffness and inertias may be biased; take a finer encoder, or excite "
@@ -140,15 +139,11 @@ def choose_filtering(
     return recipe, tuple(notes)
 
 
-def _ends(log: Log, band_hz: float, decimation: int) -> int:
-    return int(np.ceil(_ENDS * log.rate_hz / (band_hz * decimation)))
-
-
 def _folds(recipe: Recipe, rate_hz: float) -> tuple[str, ...]:
     nyquist = rate_hz / (2 * recipe.decimation)
     if nyquist >= recipe.cutoff_hz:
         return ()
-    most = max(1, int(_A_PERIOD * rate_hz / recipe.cutoff_hz))
+    most = spaced(rate_hz, recipe.cutoff_hz)
     return (
         f"warning: cutoff_hz = {recipe.cutoff_hz:g} with one sample in {recipe.decimation} folds what lies "
         f"above {nyquist:.3g} Hz, half the rate that is kept; decimation = {most} does not",

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.affine import depends, is_affine
 from jaxid.errors import InputError
 from jaxid.minimal.polynomials import Matrix
 from jaxid.model import Balance, Effect, Plant
-from jaxid.parameters import effect_name, scatter
-
-# Relative to the highest squared frequency, below this one is that of a rigid motion.
-_RIGID = 1e-9
+from jaxid.parameters import effect_name
 
 
 class LinearBalance(eqx.Module):
@@ -112,47 +106,3 @@ def _linear(plant: Plant) -> bool:
     if not is_affine(lambda *args: _balance(plant, *args).residual, zeros, (t,)):
         return False
     return not depends(lambda *args: _balance(plant, *args).dry, (*zeros, t))
-
-
-@dataclass(frozen=True)
-class Frequencies:
-    """Undamped natural frequencies, lowest first; motions without stiffness left out.
-
-    Args:
-        free, locked: With the drives free and held still [Hz], (modes,).
-        free_slopes, locked_slopes: In the unknowns, (modes, p).
-    """
-
-    free: Float[np.ndarray, " modes"]
-    free_slopes: Float[np.ndarray, "modes p"]
-    locked: Float[np.ndarray, " modes"]
-    locked_slopes: Float[np.ndarray, "modes p"]
-
-
-def natural_frequencies(plant: Plant, places: tuple, theta: Float[np.ndarray, " p"]) -> Frequencies:
-    """Natural frequencies of a plant at some values of the unknowns at `places`."""
-    parts = []
-    for squared, slopes in _squared_frequencies(plant, places, theta):
-        squared, slopes = np.asarray(squared), np.asarray(slopes)
-        elastic = squared > _RIGID * np.abs(squared).max(initial=0.0)
-        f = np.sqrt(squared[elastic]) / (2 * np.pi)
-        parts += [f, slopes[elastic] / (8 * np.pi**2 * f[:, None])]
-    return Frequencies(*parts)
-
-
-@eqx.filter_jit
-def _squared_frequencies(plant: Plant, places: tuple, theta: Array) -> list[tuple[Array, Array]]:
-    """Squared angular frequencies and their slopes, with the drives free and held."""
-    driven, out = plant.driven(plant.joints), []
-    for held in ((), driven):
-        free = np.asarray([i for i in range(plant.joints) if i not in held], dtype=int)
-
-        def squared(theta: Array, free: np.ndarray = free) -> tuple[Array, Array]:
-            motion = linear_balance(scatter(places, plant, theta)).motion
-            stiffness, mass = (motion[k][free][:, free] for k in (0, 2))
-            root = jnp.linalg.inv(jnp.linalg.cholesky(mass))
-            return (jnp.linalg.eigvalsh(root @ stiffness @ root.T),) * 2
-
-        slopes, values = jax.jacfwd(squared, has_aux=True)(theta)
-        out.append((values, slopes))
-    return out
