@@ -46,6 +46,7 @@ MOVES = {
 }
 CRITERION = {1: 8.70, 2: 5.35}
 RAMP = 0.05  # s
+_RISING = ("level", "level_negative", "velocity")
 
 
 def machine(data: int = 1, rigid: bool = False, **changed: float) -> ChainMachine:
@@ -55,7 +56,7 @@ def machine(data: int = 1, rigid: bool = False, **changed: float) -> ChainMachin
     effects = {
         ("actuator_lag", 1): {"time_constant": LAG},
         ("velocity_hysteresis", 2): {
-            k: p[f"velocity_hysteresis[2].{k}"] for k in ("level", "level_negative", "velocity")
+            k: p[f"velocity_hysteresis[2].{k}"] for k in _RISING
         },
         ("cogging", 2): {
             "amplitude": p["cogging[2].amplitude"], "period": PITCH, "phase": p["cogging[2].phase"],
@@ -142,7 +143,7 @@ def text(
         *effect("actuator_lag", "1", f"time_constant = {LAG}"),
         *effect("coulomb_friction", "", both("coulomb_friction.level")),
         *effect("viscous_friction", "", both("viscous_friction.coefficient")),
-        *effect("velocity_hysteresis", "2", *own("velocity_hysteresis", "level", "level_negative", "velocity")),
+        *effect("velocity_hysteresis", "2", *own("velocity_hysteresis", *_RISING)),
         *effect("cogging", "2", f"period = {PITCH}", *own("cogging", "amplitude", "phase")),
         "[actuator]", f"gain = {GAIN}", "[log]", 'time = "t"', 'position = "q"', 'force = "i"', reference,
         *(['load_position = "x"'] if coupling == "elastic" else []),
