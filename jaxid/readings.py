@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jaxid.affine import Affine, affine, depends
 from jaxid.errors import InputError
 from jaxid.model import Balance, Plant, port_motion
-from jaxid.smooth import sharp_clip, sign
+from jaxid.smooth import ramp, sharp_clip, sign
 
 # Coordinates, velocities, and own states in one array.
 Split = tuple[Array, Array, Array]
@@ -81,8 +81,9 @@ def acceleration(
     way = sign(x.qd, plant.port_width(x.q)[: x.q.size])
     forth, back = (_spread(_picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
     left = -rest.residual
-    left = left - jnp.clip(left, -0.5 * (1 - way) * back, 0.5 * (1 + way) * forth)
-    return left / each
+    forth, back = 0.5 * (1 + way) * forth, 0.5 * (1 - way) * back
+    more = ramp(left, forth, plant.sharpness * forth) - ramp(-left, back, plant.sharpness * back)
+    return (left - more) / each
 
 
 def _need_apart(plant: Plant, mass: Array, rises: tuple[int, ...]) -> Array:
@@ -338,6 +339,7 @@ def set_valued_step(
     alone = mobility.ndim == 1 or own.size == 1
     if levels.rises:
         _need_apart(plant, mass, levels.rises)
+        own = own * _picked(_yielding(plant, x, end, t, h), slides)
 
     def answered(levels: Balance, at_rest: Balance) -> tuple[Array, ...]:
         dry = _picked(levels.dry, slides)
@@ -347,7 +349,7 @@ def set_valued_step(
                 jnp.stack([_picked(r, slides) for r in b.rising]) if b.rises else None
                 for b in (levels, at_rest)
             ]
-            reaction, *ways = own_reaction(own, speed, before, dry, held, *more)
+            reaction, *ways = own_reaction(own, speed, before, dry, held, *more, plant.sharpness)
         else:
             # The level at rest acts until a port slides, and again where it would pass through rest.
             slid = speed - jnp.sign(before) * own * dry
@@ -368,6 +370,16 @@ def set_valued_step(
     stuck, stands, part = ways
     end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
     return _turned(x, end_of_step, stands, part, h, slides) if alone else end_of_step
+
+
+def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
+    """By how much less a force changes a velocity over a step than its impulse would, for damping.
+
+    A velocity that stands does so exactly or jumps: nothing may be lost between the two.
+    """
+    none = jnp.zeros_like(plant.ports(x.q))
+    slope = jax.jacfwd(lambda v: acceleration(plant, State(x.q, v, x.own), u, t, none))(x.qd)
+    return _phi(h * jnp.diagonal(slope))[1]
 
 
 def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
@@ -398,7 +410,7 @@ def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> A
 
 def own_reaction(
     own: Array, speed: Array, before: Array, dry: Array, hold: Array, rising: Array | None = None,
-    rising_at_rest: Array | None = None,
+    rising_at_rest: Array | None = None, corner: Array | float = 0.0,
 ) -> tuple[Array, Array, Array, Array]:
     """Mean reaction over a step of ports that do not push each other.
 
@@ -410,6 +422,7 @@ def own_reaction(
         rising, rising_at_rest: What comes on top while speed grows, forwards and backwards, (2, ports). It
             takes up what would speed a port up, as far as it goes: where it is not all used, the
             velocity stands.
+        corner: Over what part of that its two corners are rounded.
 
     Returns:
         The reaction, which ports rest at the step's end, which do not change their velocity at all, and
@@ -429,8 +442,8 @@ def own_reaction(
         way = jnp.where(turns, -1.0, 1.0) * jnp.sign(jnp.where(starts, speed, before))
         left = way * (speed - before) / own - dry
         most = jnp.where(way > 0, rising[0], rising[1])
-        reaction = reaction - way * jnp.where(turns, 1.0 - part, 1.0) * jnp.clip(left, 0.0, most)
-        stands = stands | (~turns & (left > 0.0) & (left < most))
+        more = ramp(left, most, corner * most)
+        reaction = reaction - way * jnp.where(turns, 1.0 - part, 1.0) * more
     return jnp.where(stuck, -speed / own, reaction), stuck, stands, part
 
 

@@ -94,14 +94,15 @@ def open_session(
     if align_hold is not None:
         recipe = replace(recipe, align_hold=align_hold)
     disturbance = machine.disturbance
-    opened = [Run("fit", fit, _prepare(fit, machine, recipe), disturbance)]
+    needed = enough(case, machine)
+    opened = [Run("fit", fit, _prepare(fit, machine, recipe, needed), disturbance)]
     names = {"fit"}
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
         read = _read(case, source, columns=entry.columns)
         findings += _check(case, read, machine)
-        opened.append(Run(entry.name, read, _prepare(read, machine, recipe), entry.disturbance))
+        opened.append(Run(entry.name, read, _prepare(read, machine, recipe, needed), entry.disturbance))
         names.add(entry.name)
     for extra in validate:
         read = _read(case, extra, whole=True)
@@ -110,7 +111,7 @@ def open_session(
         while name in names:
             name += "'"
         names.add(name)
-        opened.append(Run(name, read, _prepare(read, machine, recipe), disturbance))
+        opened.append(Run(name, read, _prepare(read, machine, recipe, needed), disturbance))
     machine = _scaled(machine, opened[0].data)
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
 
@@ -130,7 +131,7 @@ def session_around(
         InputError: If the log is too short, or moves too little.
     """
     recipe = recipe or choose_recipe(log, case.preprocess)
-    data = _prepare(log, machine, recipe)
+    data = _prepare(log, machine, recipe, enough(case, machine))
     run = Run("fit", log, data, machine.disturbance)
     return Session(case, _scaled(machine, data), run, (), recipe, ())
 
@@ -175,9 +176,14 @@ def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
     return findings
 
 
-def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
+def enough(case: Case, machine: Machine) -> int:
+    """Samples of motion that a log must have; any will do where a prior holds what it does not tell."""
+    return 1 if "prior" in case.output_error else 5 * max(len(machine.parameters.free), 4)
+
+
+def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepared:
     left = log.samples // recipe.decimation - 2 * recipe.trim
-    if left * log.position.shape[1] < 5 * max(len(machine.parameters.free), 4):
+    if left * log.position.shape[1] < needed:
         raise InputError(
             f"too short: {log.samples} samples leave {max(left, 0)} after decimation by "
             f"{recipe.decimation} and trimming {recipe.trim} at each end, as [preprocess] states or "
@@ -187,7 +193,7 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe) -> Prepared:
     data = prepare(log, machine.gain, recipe, machine.hold_period)
     if not all(log.measured):
         data = replace(data, steps=needed_steps(machine, log))
-    if data.moving.sum() < 5 * max(len(machine.parameters.free), 4):
+    if data.moving.sum() < needed:
         raise InputError(
             f"only {int(data.moving.sum())} samples move faster than the rest velocity "
             f"{min(recipe.rest_velocity):.3g}",

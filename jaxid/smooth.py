@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+_TINY = 1e-9
+
 
 def sign(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
     """Smoothed sign, tanh(x / width)."""
@@ -47,6 +49,17 @@ def within(
 ) -> Float[Array, "..."]:
     """Slope of `clip`: one inside plus or minus limit, zero outside."""
     return jax.nn.sigmoid((limit - x) / width) - jax.nn.sigmoid((-limit - x) / width)
+
+
+def ramp(
+    x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Smoothed clip of x to zero below and limit above, corners rounded over `width`, which may be zero."""
+    # Far above a limit that is next to nothing the two corners would cancel to a difference of infinities.
+    rounded = width > _TINY * jnp.abs(x)
+    safe = jnp.where(rounded, width, 1.0)
+    soft = safe * (jax.nn.softplus(x / safe) - jax.nn.softplus((x - limit) / safe))
+    return jnp.where(rounded, soft, jnp.clip(x, 0.0, limit))
 
 
 def sharp_clip(x: Float[Array, "..."], limit: Float[Array, "..."]) -> Float[Array, "..."]:

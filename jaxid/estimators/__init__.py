@@ -34,6 +34,11 @@ def _output_error(
     from jaxid.estimators.output_error import choose_numerics, output_error_steps
 
     log, on = session.fit.log, on or session.case.output_error.get("on", "position")
+    if "prior" in session.case.output_error:
+        from jaxid.estimators.directions import directions_steps
+
+        stated = {k: v for k, v in session.case.output_error.items() if k != "on"}
+        return (yield from directions_steps(session.machine, log, on=on, numerics=numerics, **stated))
     # Inverse dynamics gives the start where it tells all unknowns.
     first = yield from inverse_dynamics_steps(session.machine, session.fit.data)
     start = first.theta if first.told else None

@@ -99,6 +99,7 @@ def levenberg_marquardt(
     max_steps: int = 60,
     keep: bool = True,
     damping: float = DAMPING,
+    tolerance: float = _TOLERANCE,
 ) -> Minimum:
     """Minimise half the sum of squares of `residual` within bounds.
 
@@ -116,6 +117,7 @@ def levenberg_marquardt(
         max_steps: Most evaluations.
         keep: Return residual and Jacobian; without, batches need less memory.
         damping: At the start, relative to the diagonal. What is linear asks for none.
+        tolerance: It has converged where the cost can fall by no more than this part of itself.
 
     Returns:
         The minimum; `converged` is false where the steps ran out or the residual is not finite.
@@ -141,7 +143,7 @@ def levenberg_marquardt(
         return e, jacobian
 
     def advance(p: _Progress) -> _Progress:
-        return _advanced(p, *evaluate(p.trial), (lower, upper), moves, keep)
+        return _advanced(p, *evaluate(p.trial), (lower, upper), moves, keep, tolerance)
 
     x0 = jnp.clip(transform.inward(theta), lower, upper)
     p, size = theta.size, jax.eval_shape(residual, theta).size if keep else 0
@@ -160,7 +162,7 @@ def levenberg_marquardt(
 
 def _advanced(
     p: _Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
-    keep: bool,
+    keep: bool, tolerance: float,
 ) -> _Progress:
     """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
     lower, upper = bounds
@@ -182,7 +184,7 @@ def _advanced(
     change = trial - x
     predicted = -change @ gradient - 0.5 * change @ normal @ change
     # A step cut short by a bound says little of what is left: its unknown rests from now on.
-    small = (predicted <= _TOLERANCE * cost) & jnp.all(trial == aim)
+    small = (predicted <= tolerance * cost) & jnp.all(trial == aim)
     # A step that a bound bent may promise less than nothing.
     flat = (p.damping < _WHOLE) & (p.predicted > 0) & (p.predicted <= _FLAT * p.cost)
     rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))

@@ -68,7 +68,7 @@ def output_residual(
     return residual
 
 
-def _measured(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
+def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
     """What a log holds of an output, (time, k), and which columns count; see `output_residual`."""
     force = log.force * machine.gain
     outputs = {"position": (log.filled,), "force": (force,), "both": (log.filled, force)}
@@ -213,7 +213,7 @@ def output_error_steps(
         residual=np.where(counts, e, np.nan),
         samples=int(counts.sum()),
         steps=int(minimum.steps),
-        notes=_notes(machine, numerics, log, on),
+        notes=notes_of(machine, numerics, log, on),
     )
 
 
@@ -233,7 +233,7 @@ def _with_start(
 
 
 def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str) -> tuple:
-    parameters, (measured, counts) = machine.parameters, _measured(machine, log, on)
+    parameters, (measured, counts) = machine.parameters, measured_output(machine, log, on)
     lower, upper = parameters.bounds
     free = np.full(nuisance, np.inf)
     transform = Transform(np.concatenate([Transform.of(parameters).log, np.zeros(nuisance, bool)]))
@@ -312,7 +312,8 @@ def _failure(minimum: Minimum) -> str:
     return f"no convergence within {int(minimum.steps)} steps"
 
 
-def _notes(machine: Machine, numerics: Numerics, log: Log, on: str) -> tuple[str, ...]:
+def notes_of(machine: Machine, numerics: Numerics, log: Log, on: str) -> tuple[str, ...]:
+    """How it was simulated, for a user."""
     where = "in the loop" if machine.controller is not None else "open loop"
     how = "sticks exactly" if numerics.sticks else "is smoothed"
     steps = f"{numerics.substeps} step(s) a sample"

@@ -84,7 +84,13 @@ PLANT: Keys = {
     "units": Key(inline({"position": Key(text), "force": Key(text)})),
 }
 ALGEBRAIC: Keys = {"window": Key(span(), "from and to [s]; absent: many windows over the log")}
-OUTPUT_ERROR: Keys = {"on": Key(choice(("position", "force", "both")))}
+OUTPUT_ERROR: Keys = {
+    "on": Key(choice(("position", "force", "both"))),
+    "prior": Key(number("positive"), "relative standard deviation of the guesses; fits what the log tells"),
+    "starts": Key(whole(1), "how many, drawn within the prior"),
+    "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),
+    "profile": Key(flag, "profile likelihoods of what is fitted"),
+}
 STUDY: Keys = {
     "estimators": Key(several(choice((*METHODS, "discover")))),
     "hidden": Key(several(text)),
