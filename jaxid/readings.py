@@ -244,24 +244,28 @@ def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array
     Args:
         plant: The plant.
         x: Any state, for its shape.
-        u: Declared force at the ends of the step, once where it is held; for its shape.
+        u: Declared force at the ends of the step, as `course` takes it; for its shape.
         t: Any time: a force that depends on it is not affine.
         h: Step [s].
 
     Returns:
-        For `set_valued_step`, a function of state, force at the ends and reaction; or None.
+        For `set_valued_step`, a function of state, that force and reaction; or None.
     """
 
     def flow(x: State, u: tuple[Array, ...], reaction: Array, t: Array) -> State:
-        return step(plant, x, line(u), t, h, reaction)
+        return step(plant, x, course(u), t, h, reaction)
 
     return affine(flow, (x, u, jnp.zeros_like(plant.ports(x.q))), (t,))
 
 
-def line(ends: tuple[Array, ...]) -> Callable[[Array], Array]:
-    """From the first to the last value as a function of the fraction in [0, 1]."""
-    start, end = ends[0], ends[-1]
-    return lambda s: start if len(ends) == 1 else start + s * (end - start)
+def course(values: tuple[Array, ...]) -> Callable[[Array], Array]:
+    """Held at one value, a line through two, a parabola through three; of the fraction in [0, 1]."""
+    if len(values) == 3:
+        start, middle, end = values
+        bend = 2.0 * (start - 2.0 * middle + end)
+        return lambda s: start + s * (end - start + (s - 1.0) * bend)
+    start, end = values[0], values[-1]
+    return lambda s: start if len(values) == 1 else start + s * (end - start)
 
 
 def set_valued_step(
@@ -271,7 +275,7 @@ def set_valued_step(
     t: Array,
     h: Array,
     flow: Callable[..., State] | None = None,
-) -> State:
+) -> tuple[State, Array]:
     """One step under set-valued friction: flow without it, then the reaction that stops or drags.
 
     A port slides under the level of dry friction halfway. Where it comes to rest within the step it
@@ -288,6 +292,9 @@ def set_valued_step(
         h: Step [s].
         flow: `step` as a function of state and reaction (left out: zero), where there is a
             cheaper one.
+
+    Returns:
+        The state a step later, and the reaction of every port over the step.
     """
     ports = plant.ports(x.q).size
     if flow is None:
@@ -305,7 +312,7 @@ def set_valued_step(
     mass, levels = _mass(plant, lambda qdd: residual(qdd, midway), x.q)
     slides = levels.slides
     if not slides:
-        return free
+        return free, jnp.zeros(ports)
     speed, before = (_port_speed(plant, at, slides) for at in (free, x))
     mobility = h * _mobility(plant, mass, x.q, slides)
 
@@ -313,17 +320,17 @@ def set_valued_step(
     alone = mobility.ndim == 1 or own.size == 1
 
     def answered(levels: Balance, at_rest: Balance) -> tuple[Array, Array, Array]:
-        dry = _picked(levels.dry, slides)
-        held = _picked(at_rest.dry, slides) + _picked(at_rest.stick, slides)
+        dry = picked(levels.dry, slides)
+        held = picked(at_rest.dry, slides) + picked(at_rest.stick, slides)
         if alone:
-            reaction, stuck, part = own_reaction(own, speed, before, dry, held)
+            reaction, stuck, part = _own_reaction(own, speed, before, dry, held)
         else:
             # The level at rest acts until a port slides, and again where it would pass through rest.
             slid = speed - jnp.sign(before) * own * dry
             rests = (before == 0.0) | (before * slid < 0.0)
             reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
             part = jnp.ones_like(speed)
-        return _spread(reaction, slides, ports), stuck, part
+        return spread(reaction, slides, ports), stuck, part
 
     zero = jnp.zeros_like(x.q)
     moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in ("dry", "stick")], (midway,))
@@ -334,19 +341,22 @@ def set_valued_step(
         slowed = free.qd + h * _solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
         reaction, stuck, part = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
     end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
-    return _turned(x, end_of_step, part, h, slides) if alone else end_of_step
+    if alone:
+        end_of_step = _turned(x, end_of_step, part, h, slides)
+    return end_of_step, reaction
 
 
 def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
     """Velocities of some ports."""
-    return _picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
+    return picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
 
 
-def _picked(x: Array, ports: tuple[int, ...]) -> Array:
+def picked(x: Array, ports: tuple[int, ...]) -> Array:
+    """Values of some ports."""
     return x if len(ports) == x.size else jnp.stack([x[i] for i in ports])
 
 
-def _spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
+def spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
     """Values of some ports among all; zero elsewhere."""
     if len(ports) == size:
         return x
@@ -357,13 +367,13 @@ def _spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
 def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> Array:
     """Acceleration of some ports per unit force on each; the diagonal where that is all there is."""
     if mass.ndim == 1 and max(slides) < q.size:
-        return _picked(1.0 / mass, slides)
-    jacobian = jax.jacfwd(lambda q: _picked(plant.ports(q), slides))(q)
+        return picked(1.0 / mass, slides)
+    jacobian = jax.jacfwd(lambda q: picked(plant.ports(q), slides))(q)
     columns = [_solved(mass, row) for row in jacobian]
     return jnp.stack([jacobian @ c for c in columns], axis=1)
 
 
-def own_reaction(
+def _own_reaction(
     own: Array, speed: Array, before: Array, dry: Array, hold: Array
 ) -> tuple[Array, Array, Array]:
     """Mean reaction over a step of ports that do not push each other.
@@ -392,11 +402,11 @@ def _turned(x: State, end: State, part: Array, h: Array, slides: tuple[int, ...]
     joints = [k for k, i in enumerate(slides) if i < x.qd.size]
     if not joints:
         return end
-    own = _spread(part - 1.0, slides, max(*slides, x.qd.size - 1) + 1)[: x.qd.size] + 1.0
-    return State(end.q - overshot(x.qd, end.qd, own, h), end.qd, end.own)
+    own = spread(part - 1.0, slides, max(*slides, x.qd.size - 1) + 1)[: x.qd.size] + 1.0
+    return State(end.q - _overshot(x.qd, end.qd, own, h), end.qd, end.own)
 
 
-def overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
+def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
     """By how much one line of velocity over a step misses the stroke of a joint that came to rest in it.
 
     Until then, and from then on, velocity runs in lines; one line over the whole step is off by half
@@ -431,7 +441,7 @@ def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:
     """Take the rounding off the velocity of joints that stick."""
     joints = [k for k, i in enumerate(slides) if i < x.qd.size]
     if len(joints) == x.qd.size:
-        stuck = _picked(stuck, tuple(joints))
+        stuck = picked(stuck, tuple(joints))
     else:
         held = {slides[k]: stuck[k] for k in joints}
         stuck = jnp.stack([held.get(i, jnp.zeros((), bool)) for i in range(x.qd.size)])
