@@ -101,6 +101,9 @@ def complete_motion(
     memory, none = plant.initial_states(u[0]), jnp.zeros(hidden.size)
     pull = lambda q: carried.balance(q, *together[1:], force[0, 0], times[0], memory, none).residual
     relaxed = together[0] - small_solve(jax.jacfwd(pull)(together[0]), pull(together[0]))
+    # Within a clearance nothing pulls, and there is no such place.
+    nearer = jnp.all(jnp.abs(pull(relaxed)) <= jnp.abs(pull(together[0])))
+    relaxed = jnp.where(nearer, relaxed, together[0])
     x0 = State(relaxed, together[1], memory)
     flow = affine_flow(carried, x0, tuple(force[0]), times[0], h)
 
