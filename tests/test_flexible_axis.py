@@ -12,6 +12,8 @@ import pytest
 import jaxid
 from jaxid.cli import main
 from jaxid.errors import InputError
+from jaxid.estimators import METHODS
+from jaxid.estimators.steps import alone
 from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.io.results import derived_json
@@ -103,6 +105,22 @@ def test_didim_tells_the_split_from_forces_alone(folder):
     assert result.estimate.identifiable.all()
     assert np.abs(z_scores(result)).max() < 3.5
     assert np.all(result.estimate.std[-2:] < 1.0)  # N
+
+
+@pytest.mark.slow
+def test_coarse_readings_of_the_motor_alone_are_fitted_from_the_guesses_too(tmp_path):
+    """1000 counts a revolution: inverse dynamics ends at 2.6 N/mm, and a fit from there at 0.9."""
+    count = 100 * axes.COUNT
+    sensor = axes.Sensor(position_resolution=count, position_noise=0.5 * count, force_noise=0.1)
+    axes.write(axes.record(sensor=sensor, seed=2), tmp_path / "log.csv")
+    (tmp_path / "case.toml").write_text(axes.text(load=False, sensor=sensor))
+    session = open_session(tmp_path / "case.toml", tmp_path / "log.csv")
+    far = alone(METHODS["inverse_dynamics"](session))
+    assert far.told
+    assert far.value("stiffness") < 0.1 * axes.TRUTH["stiffness"]
+    found = alone(METHODS["output_error"](session))
+    assert found.converged
+    assert found.value("stiffness") == pytest.approx(axes.TRUTH["stiffness"], rel=0.025)
 
 
 @pytest.mark.parametrize("method", ["power", "algebraic"])
