@@ -13,11 +13,12 @@ import jaxid
 from jaxid.cli import main
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
+from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.steps import alone
 from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.io.results import derived_json
-from jaxid.machine import build_machine
+from jaxid.machine import build_machine, position_noise
 from jaxid.replay import make_replay
 from jaxid.session import open_session
 from jaxid.unmeasured import complete_motion
@@ -97,6 +98,20 @@ def test_finds_table_2(folder, case, method):
     told = result.gaps[0].simulation
     assert told.rms[0] < 2 * axes.COUNT
     assert np.isnan(told.rms[1]) == (case == "motor")
+
+
+def test_fits_take_the_steps_that_turning_friction_asks_for(folder):
+    session = open_session(folder / "motor.toml", folder / "log.csv")
+    machine, log = build_machine(session.case, true=True, period=1 / axes.RATE), session.fit.log
+    chosen = choose_numerics(machine, log)
+
+    def position(steps: int) -> np.ndarray:
+        replay = make_replay(machine, log, dataclasses.replace(chosen, substeps=steps))
+        return np.asarray(eqx.filter_jit(lambda r, p: r(p).position)(replay, machine.plant))[:, 0]
+
+    noise, fine = position_noise(machine, log)[0], position(24)
+    assert np.abs(position(chosen.substeps) - fine).max() < 0.3 * noise
+    assert np.abs(position(1) - fine).max() > noise
 
 
 def test_didim_tells_the_split_from_forces_alone(folder):
