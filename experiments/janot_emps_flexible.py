@@ -157,7 +157,7 @@ def trajectories(folder: Path) -> bool:
     # From 0.5 to 40 Hz, at a speed that stays the same.
     phase = 2 * np.pi * (0.5 * t + 0.5 * (39.5 / 8.0) * t**2)
     chirp = 0.05 / (0.5 + 39.5 / 8.0 * t) * 0.5 * np.sin(phase)
-    ways = {"trapezoid": (None, False), "with pulses": (None, True), "chirp": (chirp, False)}
+    ways = {"trapezoid": (None, None), "with pulses": (None, axes.PULSES), "chirp": (chirp, None)}
     table = Table(
         "std of the friction split, noise of the published size",
         ["trajectory", "sensors", "viscous 1", "viscous 2 [N s/m]", "Coulomb 1", "Coulomb 2 [N]"],

@@ -79,7 +79,7 @@ def acceleration(
     # is left of the force, as far as it goes.
     each = _need_apart(plant, mass, rest.rises)
     way = sign(x.qd, plant.port_width(x.q)[: x.q.size])
-    forth, back = (_spread(_picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
+    forth, back = (spread(picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
     left = -rest.residual
     forth, back = 0.5 * (1 + way) * forth, 0.5 * (1 - way) * back
     more = ramp(left, forth, plant.sharpness * forth) - ramp(-left, back, plant.sharpness * back)
@@ -270,24 +270,28 @@ def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array
     Args:
         plant: The plant.
         x: Any state, for its shape.
-        u: Declared force at the ends of the step, once where it is held; for its shape.
+        u: Declared force at the ends of the step, as `course` takes it; for its shape.
         t: Any time: a force that depends on it is not affine.
         h: Step [s].
 
     Returns:
-        For `set_valued_step`, a function of state, force at the ends and reaction; or None.
+        For `set_valued_step`, a function of state, that force and reaction; or None.
     """
 
     def flow(x: State, u: tuple[Array, ...], reaction: Array, t: Array) -> State:
-        return step(plant, x, line(u), t, h, reaction)
+        return step(plant, x, course(u), t, h, reaction)
 
     return affine(flow, (x, u, jnp.zeros_like(plant.ports(x.q))), (t,))
 
 
-def line(ends: tuple[Array, ...]) -> Callable[[Array], Array]:
-    """From the first to the last value as a function of the fraction in [0, 1]."""
-    start, end = ends[0], ends[-1]
-    return lambda s: start if len(ends) == 1 else start + s * (end - start)
+def course(values: tuple[Array, ...]) -> Callable[[Array], Array]:
+    """Held at one value, a line through two, a parabola through three; of the fraction in [0, 1]."""
+    if len(values) == 3:
+        start, middle, end = values
+        bend = 2.0 * (start - 2.0 * middle + end)
+        return lambda s: start + s * (end - start + (s - 1.0) * bend)
+    start, end = values[0], values[-1]
+    return lambda s: start if len(values) == 1 else start + s * (end - start)
 
 
 def set_valued_step(
@@ -297,7 +301,7 @@ def set_valued_step(
     t: Array,
     h: Array,
     flow: Callable[..., State] | None = None,
-) -> State:
+) -> tuple[State, Array]:
     """One step under set-valued friction: flow without it, then the reaction that stops or drags.
 
     A port slides under the level of dry friction halfway. Where it comes to rest within the step it
@@ -314,6 +318,9 @@ def set_valued_step(
         h: Step [s].
         flow: `step` as a function of state and reaction (left out: zero), where there is a
             cheaper one.
+
+    Returns:
+        The state a step later, and the reaction of every port over the step.
     """
     ports = plant.ports(x.q).size
     if flow is None:
@@ -331,7 +338,7 @@ def set_valued_step(
     mass, levels = _mass(plant, lambda qdd: residual(qdd, midway), x.q)
     slides = levels.slides
     if not slides:
-        return free
+        return free, jnp.zeros(ports)
     speed, before = (_port_speed(plant, at, slides) for at in (free, x))
     mobility = h * _mobility(plant, mass, x.q, slides)
 
@@ -339,24 +346,24 @@ def set_valued_step(
     alone = mobility.ndim == 1 or own.size == 1
     if levels.rises:
         _need_apart(plant, mass, levels.rises)
-        own = own * _picked(_yielding(plant, x, end, t, h), slides)
+        own = own * picked(_yielding(plant, x, end, t, h), slides)
 
     def answered(levels: Balance, at_rest: Balance) -> tuple[Array, ...]:
-        dry = _picked(levels.dry, slides)
-        held = _picked(at_rest.dry, slides) + _picked(at_rest.stick, slides)
+        dry = picked(levels.dry, slides)
+        held = picked(at_rest.dry, slides) + picked(at_rest.stick, slides)
         if alone:
             more = [
-                jnp.stack([_picked(r, slides) for r in b.rising]) if b.rises else None
+                jnp.stack([picked(r, slides) for r in b.rising]) if b.rises else None
                 for b in (levels, at_rest)
             ]
-            reaction, *ways = own_reaction(own, speed, before, dry, held, *more, plant.sharpness)
+            reaction, *ways = _own_reaction(own, speed, before, dry, held, *more, plant.sharpness)
         else:
             # The level at rest acts until a port slides, and again where it would pass through rest.
             slid = speed - jnp.sign(before) * own * dry
             rests = (before == 0.0) | (before * slid < 0.0)
             reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
             ways = stuck, jnp.zeros_like(stuck), jnp.ones_like(speed)
-        return _spread(reaction, slides, ports), *ways
+        return spread(reaction, slides, ports), *ways
 
     zero = jnp.zeros_like(x.q)
     named = ("dry", "stick", "rising")
@@ -369,7 +376,9 @@ def set_valued_step(
         reaction, *ways = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
     stuck, stands, part = ways
     end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
-    return _turned(x, end_of_step, stands, part, h, slides) if alone else end_of_step
+    if alone:
+        end_of_step = _turned(x, end_of_step, stands, part, h, slides)
+    return end_of_step, reaction
 
 
 def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
@@ -384,14 +393,15 @@ def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
 
 def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
     """Velocities of some ports."""
-    return _picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
+    return picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
 
 
-def _picked(x: Array, ports: tuple[int, ...]) -> Array:
+def picked(x: Array, ports: tuple[int, ...]) -> Array:
+    """Values of some ports."""
     return x if len(ports) == x.size else jnp.stack([x[i] for i in ports])
 
 
-def _spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
+def spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
     """Values of some ports among all; zero elsewhere."""
     if len(ports) == size:
         return x
@@ -402,13 +412,13 @@ def _spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
 def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> Array:
     """Acceleration of some ports per unit force on each; the diagonal where that is all there is."""
     if mass.ndim == 1 and max(slides) < q.size:
-        return _picked(1.0 / mass, slides)
-    jacobian = jax.jacfwd(lambda q: _picked(plant.ports(q), slides))(q)
+        return picked(1.0 / mass, slides)
+    jacobian = jax.jacfwd(lambda q: picked(plant.ports(q), slides))(q)
     columns = [_solved(mass, row) for row in jacobian]
     return jnp.stack([jacobian @ c for c in columns], axis=1)
 
 
-def own_reaction(
+def _own_reaction(
     own: Array, speed: Array, before: Array, dry: Array, hold: Array, rising: Array | None = None,
     rising_at_rest: Array | None = None, corner: Array | float = 0.0,
 ) -> tuple[Array, Array, Array, Array]:
@@ -444,6 +454,9 @@ def own_reaction(
         most = jnp.where(way > 0, rising[0], rising[1])
         more = ramp(left, most, corner * most)
         reaction = reaction - way * jnp.where(turns, 1.0 - part, 1.0) * more
+        # Twenty widths from a corner nothing is left of its rounding.
+        edge = 20.0 * corner * most
+        stands = stands | (~turns & (left > edge) & (left < most - edge))
     return jnp.where(stuck, -speed / own, reaction), stuck, stands, part
 
 
@@ -455,14 +468,14 @@ def _turned(
     if not joints:
         return end
     size = max(*slides, x.qd.size - 1) + 1
-    own = _spread(part - 1.0, slides, size)[: x.qd.size] + 1.0
+    own = spread(part - 1.0, slides, size)[: x.qd.size] + 1.0
     # The reaction balances the mean force; damping within the step leaves a trace that would add up.
-    keeps = _spread(stands, slides, size).astype(bool)[: x.qd.size]
-    q = jnp.where(keeps, x.q + h * x.qd, end.q - overshot(x.qd, end.qd, own, h))
+    keeps = spread(stands, slides, size).astype(bool)[: x.qd.size]
+    q = jnp.where(keeps, x.q + h * x.qd, end.q - _overshot(x.qd, end.qd, own, h))
     return State(q, jnp.where(keeps, x.qd, end.qd), end.own)
 
 
-def overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
+def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
     """By how much one line of velocity over a step misses the stroke of a joint that came to rest in it.
 
     Until then, and from then on, velocity runs in lines; one line over the whole step is off by half
@@ -497,7 +510,7 @@ def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:
     """Take the rounding off the velocity of joints that stick."""
     joints = [k for k, i in enumerate(slides) if i < x.qd.size]
     if len(joints) == x.qd.size:
-        stuck = _picked(stuck, tuple(joints))
+        stuck = picked(stuck, tuple(joints))
     else:
         held = {slides[k]: stuck[k] for k in joints}
         stuck = jnp.stack([held.get(i, jnp.zeros((), bool)) for i in range(x.qd.size)])

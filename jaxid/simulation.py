@@ -23,7 +23,7 @@ from jaxid.readings import (
     State,
     acceleration,
     affine_flow,
-    line,
+    course,
     set_valued_step,
     step,
     vector_field,
@@ -97,13 +97,13 @@ class Drive(eqx.Module):
 
         def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
             if not self.set_valued:
-                return step(plant, x, line(ends), t, h)
+                return step(plant, x, course(ends), t, h)
             bound = None if flow is None else lambda x, *reaction: flow(x, ends, *reaction)
-            return set_valued_step(plant, x, line(ends), t, h, bound)
+            return set_valued_step(plant, x, course(ends), t, h, bound)[0]
 
         def several(x: State, ends: tuple[Array, ...], t: Array) -> State:
             def inner(x: State, k: Array) -> tuple[State, None]:
-                part = [line(ends)((k + i) / self.substeps) for i in range(len(ends))]
+                part = [course(ends)((k + i) / self.substeps) for i in range(len(ends))]
                 return one(x, tuple(part), t + k * h), None
 
             return jax.lax.scan(inner, x, jnp.arange(self.substeps, dtype=jnp.float64))[0]

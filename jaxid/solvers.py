@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxid.errors import InputError, suggest
 from jaxid.model import Plant
-from jaxid.readings import State, derivative, line
+from jaxid.readings import State, course, derivative
 
 # Those of diffrax with an error estimate whose one right-hand side is all they ask for, by the names
 # of their classes: diffrax takes a third of a second to import, and few runs need it.
@@ -84,4 +84,4 @@ class Adaptive(eqx.Module):
 
 def _rate(since: Array, x: State, args: tuple) -> State:
     plant, ends, t, h = args
-    return derivative(plant, x, line(ends)(since / h), t + since)
+    return derivative(plant, x, course(ends)(since / h), t + since)

@@ -7,15 +7,65 @@ stays where it is.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.affine import affine
-from jaxid.model import Plant
-from jaxid.readings import overshot, own_reaction, small_solve
+from jaxid.model import Balance, Plant
+from jaxid.readings import (
+    State,
+    acceleration,
+    affine_flow,
+    course,
+    picked,
+    set_valued_step,
+    small_solve,
+    spread,
+)
 
 Motion = tuple[Array, Array, Array]
+
+
+class Carried(Plant):
+    """The joints without an encoder as a plant of their own, which the others' motion drives.
+
+    Its force is the declared one and, behind that, position, velocity and acceleration of the others.
+    Its ports are its joints: of dry friction only theirs is set-valued.
+
+    Args:
+        plant: The whole plant.
+        seen, hidden: Its joints with an encoder, and without.
+    """
+
+    plant: Plant
+    seen: tuple[int, ...] = eqx.field(static=True)
+    hidden: tuple[int, ...] = eqx.field(static=True)
+    effects: ClassVar[property] = property(lambda self: self.plant.effects)
+    sharpness: ClassVar[property] = property(lambda self: self.plant.sharpness)
+    velocity_scale: ClassVar[property] = property(lambda self: self.plant.velocity_scale)
+    diagonal: ClassVar[property] = property(lambda self: self.plant.diagonal)
+
+    def balance(
+        self, q: Array, qd: Array, qdd: Array, u: Array, t: Array, states: tuple,
+        reaction: Array | None = None,
+    ) -> Balance:
+        n = len(self.seen) + q.size
+        declared, known = jnp.split(u, [u.size - 3 * len(self.seen)])
+        pairs = zip(known.reshape(3, -1), (q, qd, qdd), strict=True)
+        motion = (spread(a, self.seen, n) + spread(b, self.hidden, n) for a, b in pairs)
+        if reaction is not None:
+            reaction = spread(reaction, self.hidden, self.plant.ports(jnp.zeros(n)).size)
+        whole = self.plant.balance(*motion, declared, t, states, reaction)
+        rows = (picked(a, self.hidden) for a in (whole.residual, whole.dry, whole.stick))
+        rising = jnp.stack([picked(r, self.hidden) for r in whole.rising])
+        slides, rises = (
+            tuple(k for k, i in enumerate(self.hidden) if i in ports) for ports in (whole.slides, whole.rises)
+        )
+        return Balance(*rows, rising, whole.rates, whole.drive, slides, rises)
 
 
 def complete_motion(
@@ -38,86 +88,46 @@ def complete_motion(
     """
     if all(measured):
         return q, qd, qdd
-    seen = [i for i, m in enumerate(measured) if m]
-    hidden = [i for i, m in enumerate(measured) if not m]
-    order = jnp.argsort(jnp.asarray(seen + hidden))
-
-    def joined(known: Array, own: Array) -> Array:
-        return jnp.concatenate([known, own])[order]
-
-    ports = plant.ports(jnp.zeros(len(measured))).size
-    at_ports = jnp.zeros((ports, len(hidden))).at[jnp.asarray(hidden), jnp.arange(len(hidden))].set(1.0)
-
-    def balance(known: Motion, own: Motion, memory: tuple, u: Array, t: Array, reaction: Array) -> tuple:
-        motion = (joined(a, b) for a, b in zip(known, own, strict=True))
-        return plant.balance(*motion, u, t, memory, at_ports @ reaction)
-
-    def solved(known: Motion, x: tuple, u: Array, t: Array, reaction: Array) -> tuple[Array, Array]:
-        """Accelerations, and the mass that they are of."""
-        force = lambda a: balance(known, (*x[:2], a), x[2], u, t, reaction).residual[jnp.asarray(hidden)]
-        zero = jnp.zeros_like(x[0])
-        mass = jax.jacfwd(force)(zero)
-        return small_solve(mass, -force(zero)), mass
-
-    def rate(known: Motion, x: tuple, u: Array, t: Array, reaction: Array) -> tuple:
-        hdd, _ = solved(known, x, u, t, reaction)
-        return x[1], hdd, balance(known, (*x[:2], hdd), x[2], u, t, reaction).rates
-
-    known = tuple(a[:, jnp.asarray(seen)] for a in (q, qd, qdd))
-    first = tuple(a[0] for a in known)
-    together = [jnp.broadcast_to(jnp.mean(a), (len(hidden),)) for a in first]
-    memory, none = plant.initial_states(u[0]), jnp.zeros(len(hidden))
-    pull = lambda h: balance(
-        first, (h, *together[1:]), memory, u[0], times[0], none
-    ).residual[jnp.asarray(hidden)]
-    start = together[0] - small_solve(jax.jacfwd(pull)(together[0]), pull(together[0]))
+    seen, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
+    carried = Carried(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
+    known = tuple(a[:, seen] for a in (q, qd, qdd))
     period = times[1] - times[0]
     h = period / steps
+    # Force of the carried plant at the start, in the middle and at the end of every step.
+    parts = (np.arange(steps)[:, None] + np.array([0.0, 0.5, 1.0])) / steps
+    force = jax.vmap(
+        lambda s: jnp.concatenate([u[:-1], *_between(known, s, period)], axis=1), out_axes=1
+    )(parts.ravel()).reshape((len(u) - 1) * steps, 3, -1)
+    starts = (times[:-1, None] + h * np.arange(steps)).ravel()
 
-    def flow(at: list[Motion], x: tuple, u: Array, reaction: Array, t: Array) -> tuple:
-        go = lambda slope, c: jax.tree.map(lambda a, b: a + c * h * b, x, slope)
-        k1 = rate(at[0], x, u, t, reaction)
-        k2 = rate(at[1], go(k1, 0.5), u, t, reaction)
-        k3 = rate(at[1], go(k2, 0.5), u, t, reaction)
-        k4 = rate(at[2], go(k3, 1.0), u, t, reaction)
-        return jax.tree.map(lambda a, *b: a + h / 6 * (b[0] + 2 * b[1] + 2 * b[2] + b[3]), x, k1, k2, k3, k4)
+    together = [jnp.broadcast_to(jnp.mean(a[0]), hidden.shape) for a in known]
+    memory, none = plant.initial_states(u[0]), jnp.zeros(hidden.size)
+    pull = lambda q: carried.balance(q, *together[1:], force[0, 0], times[0], memory, none).residual
+    relaxed = together[0] - small_solve(jax.jacfwd(pull)(together[0]), pull(together[0]))
+    # Within a clearance nothing pulls, and there is no such place.
+    nearer = jnp.all(jnp.abs(pull(relaxed)) <= jnp.abs(pull(together[0])))
+    relaxed = jnp.where(nearer, relaxed, together[0])
+    x0 = State(relaxed, together[1], memory)
+    flow = affine_flow(carried, x0, tuple(force[0]), times[0], h)
 
-    # Where forces are affine, a step is one matrix, worked out here once.
-    x0 = (start, together[1], memory)
-    matrix = affine(flow, ([first] * 3, x0, u[0], none), (times[0],))
-    go_on = flow if matrix is None else lambda at, x, u, reaction, t: matrix(at, x, u, reaction)
-
-    def step(at: list[Motion], x: tuple, u: Array, t: Array) -> tuple[tuple, Array]:
-        """The state a step later, and the reaction of dry friction over it: it sticks exactly."""
-        free = go_on(at, x, u, none, t)
-        middle = tuple(0.5 * (a + b) for a, b in zip(x[:2], free[:2], strict=True))
-        levels = balance(at[1], (*middle, none), x[2], u, t, none)
-        dry, stick = (a[jnp.asarray(hidden)] for a in (levels.dry, levels.stick))
-        own = h / jnp.diagonal(solved(at[1], x, u, t, none)[1])
-        reaction, stuck, _, part = own_reaction(own, free[1], x[1], dry, dry + stick)
-        q, v, memory = go_on(at, x, u, reaction, t)
-        v = jnp.where(stuck, 0.0, v)
-        return (q - overshot(x[1], v, part, h), v, memory), reaction
-
-    def advance(x: tuple, now: tuple) -> tuple[tuple, tuple]:
-        ends, u, t = now
-        for k in range(steps):
-            at = [_between(ends, (k + c) / steps, period) for c in (0.0, 0.5, 1.0)]
-            x, reaction = step(at, x, u, t)
+    def advance(x: State, now: tuple) -> tuple[State, tuple]:
+        values, t = tuple(now[0]), now[1]
+        bound = None if flow is None else lambda x, *reaction: flow(x, values, *reaction)
+        x, reaction = set_valued_step(carried, x, course(values), t, h, bound)
         return x, (x, reaction)
 
-    ends = tuple(tuple(a[k : len(a) - 1 + k] for a in known) for k in range(2))
-    _, (later, reactions) = jax.lax.scan(advance, x0, (ends, u[:-1], times[:-1]))
-    accelerations = jax.vmap(lambda *now: solved(*now)[0])(ends[1], later, u[:-1], times[1:], reactions)
-    at_start = (start, together[1], together[2])
-    found = (*later[:2], accelerations)
-    own = [jnp.concatenate([a[None], b]) for a, b in zip(at_start, found, strict=True)]
-    return tuple(jax.vmap(joined)(a, b) for a, b in zip(known, own, strict=True))
+    _, later = jax.lax.scan(advance, x0, (force, starts))
+    last = slice(steps - 1, None, steps)
+    x, reaction = jax.tree.map(lambda a: a[last], later)
+    solved = jax.vmap(lambda *now: acceleration(carried, *now))
+    found = (x.q, x.qd, solved(x, force[last, 2], times[1:], reaction))
+    own = [jnp.concatenate([a[None], b]) for a, b in zip((relaxed, *together[1:]), found, strict=True)]
+    return tuple(a.at[:, hidden].set(b) for a, b in zip((q, qd, qdd), own, strict=True))
 
 
-def _between(ends: tuple[Motion, Motion], s: float, period: Array) -> Motion:
-    """Motion at a fraction of a sample: cubics that have the velocities, and accelerations, of its ends."""
-    (q0, v0, a0), (q1, v1, a1) = ends
+def _between(known: Motion, s: Array, period: Array) -> Motion:
+    """Motion at a fraction of every sample: cubics with the velocities, and accelerations, of its ends."""
+    (q0, v0, a0), (q1, v1, a1) = ([a[k : len(a) - 1 + k] for a in known] for k in range(2))
 
     def hermite(x0: Array, x1: Array, d0: Array, d1: Array) -> Array:
         rise = x1 - x0

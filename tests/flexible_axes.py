@@ -5,6 +5,7 @@ availability", on the set-valued chain of `chain_stepper`: two masses, a spring 
 """
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 from chain_stepper import ChainMachine, simulate_chain
@@ -56,12 +57,13 @@ def trapezoids(
 
 def record(
     axis: ChainMachine | None = None, *, duration: float = 8.0, reference: np.ndarray | None = None,
-    pulses: bool = True, sensor: Sensor = SENSOR, seed: int = 0,
+    pulses: dict[str, float] | None = PULSES, law: dict[str, float] = LAW, sensor: Sensor = SENSOR,
+    seed: int = 0,
 ) -> dict[str, np.ndarray]:
-    """A log of the axis in its loop, with the truth behind it."""
+    """A log of the axis in its loop, as `simulate_chain` returns it."""
     axis = machine() if axis is None else axis
     reference = trapezoids(duration) if reference is None else reference
-    loop = Loop("cascade_pd", reference=reference, disturbance=PULSES if pulses else None, limit=10.0, **LAW)
+    loop = Loop("cascade_pd", reference=reference, disturbance=pulses, limit=10.0, **law)
     return simulate_chain(axis, [loop], sensor, rate=RATE, duration=duration, seed=seed)
 
 
@@ -75,9 +77,9 @@ def columns(log: dict[str, np.ndarray], noise: float = 0.01) -> dict[str, np.nda
     }
 
 
-def write(log: dict[str, np.ndarray], path) -> None:
+def write(log: dict[str, np.ndarray], path: Path, noise: float = 0.01) -> None:
     """Write those columns as CSV."""
-    table = columns(log)
+    table = columns(log, noise)
     np.savetxt(
         path, np.column_stack([*table.values()]), delimiter=",", header=",".join(table), comments="",
         fmt="%.12g",
@@ -85,30 +87,43 @@ def write(log: dict[str, np.ndarray], path) -> None:
 
 
 def text(
-    *, load: bool = True, known: dict[str, float] | None = None, pulses: bool = True,
-    sensor: Sensor = SENSOR, offset: bool = False, accelerometer: bool = False,
+    *, load: bool = True, known: dict[str, float] | None = None, guess: dict[str, float] = GUESS,
+    pulses: dict[str, float] | None = PULSES, law: dict[str, float] = LAW, sensor: Sensor = SENSOR,
+    offset: bool = False, accelerometer: bool = False, joints: tuple[int, ...] = (1, 2), effects: str = "",
 ) -> str:
-    """The case file: all of the axis unknown but what is given as known."""
+    """The case file: all of the axis unknown but what is given as known.
+
+    Args:
+        load, accelerometer: Whether the load's encoder, and its acceleration, are in the log.
+        known: Values that are given.
+        guess: Where the others start.
+        pulses, law: Of the loop, as in `record`.
+        sensor: As far as it is not exact.
+        offset: Whether the second encoder has an unknown one.
+        joints: With friction.
+        effects: More of them, as text.
+    """
     known = known or {}
 
     def entry(name: str) -> str:
-        return repr(known[name]) if name in known else f"{{ guess = {GUESS[name]}, true = {TRUTH[name]} }}"
+        return repr(known[name]) if name in known else f"{{ guess = {guess[name]}, true = {TRUTH[name]} }}"
 
     of_plant = ("motor_inertia", "load_inertia", "stiffness", "damping")
     lines = ["[plant]", 'kind = "flexible_axis"', "[plant.parameters]"]
     lines += [f"{name} = {entry(name)}" for name in of_plant]
     lines += ["zero_offset = { guess = 0.0 }"] if offset else []
     for kind, key in (("viscous_friction", "coefficient"), ("coulomb_friction", "level")):
-        both = ", ".join(entry(f"{kind}[{k}].{key}") for k in (1, 2))
-        lines += ["[[effects]]", f'kind = "{kind}"', f"{key} = [{both}]"]
-    lines += ["[actuator]", f"gain = {GAIN}", "[log]", 'time = "t"', 'position = "q"', 'force = "u"']
+        for k in joints:
+            value = entry(f"{kind}[{k}].{key}")
+            lines += ["[[effects]]", f'kind = "{kind}"', f"joint = {k}", f"{key} = {value}"]
+    lines += [effects, "[actuator]", f"gain = {GAIN}", "[log]", 'time = "t"', 'position = "q"', 'force = "u"']
     lines += ['reference = "ref"'] + (['load_position = "q_load"'] if load else [])
     lines += ['load_acceleration = "a_load"'] if accelerometer else []
-    lines += ["[controller]", 'kind = "cascade_pd"', *[f"{k} = {v}" for k, v in LAW.items()], "limit = 10.0"]
+    lines += ["[controller]", 'kind = "cascade_pd"', *[f"{k} = {v}" for k, v in law.items()], "limit = 10.0"]
     if pulses:
-        lines += ["disturbance = { " + ", ".join(f"{k} = {v}" for k, v in PULSES.items()) + " }"]
-    lines += ["[sensor]"]
-    lines += [f"{f.name} = {v}" for f in dataclasses.fields(sensor) if (v := getattr(sensor, f.name)) > 0]
+        lines += ["disturbance = { " + ", ".join(f"{k} = {v}" for k, v in pulses.items()) + " }"]
+    told = [f"{f.name} = {v}" for f in dataclasses.fields(sensor) if (v := getattr(sensor, f.name)) > 0]
+    lines += ["[sensor]", *told] if told else []
     return "\n".join(lines) + "\n"
 
 

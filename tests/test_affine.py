@@ -9,7 +9,7 @@ from jaxid.affine import affine
 from jaxid.effects import EFFECTS
 from jaxid.model import Action, Effect
 from jaxid.plants import Axis
-from jaxid.readings import State, affine_flow, line, set_valued_step, step
+from jaxid.readings import State, affine_flow, course, set_valued_step, step
 
 STEP = jnp.asarray(2e-3)
 LINEAR = {
@@ -66,11 +66,11 @@ def test_matrix_is_the_step(held):
     ends = (jnp.asarray([1.3]),) if held else (jnp.asarray([1.3]), jnp.asarray([-0.4]))
     reaction = jnp.asarray([0.6])
     flow = flow_of(plant, held)
-    stepped = step(plant, x, line(ends), jnp.asarray(5.0), STEP, reaction)
+    stepped = step(plant, x, course(ends), jnp.asarray(5.0), STEP, reaction)
     for a, b in zip(*map(jax.tree.leaves, (flow(x, ends, reaction), stepped)), strict=True):
         np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-13)
     # left out: zero
-    free = step(plant, x, line(ends), jnp.asarray(5.0), STEP, jnp.zeros(1))
+    free = step(plant, x, course(ends), jnp.asarray(5.0), STEP, jnp.zeros(1))
     np.testing.assert_allclose(np.asarray(flow(x, ends).qd), np.asarray(free.qd), rtol=1e-13)
 
 
@@ -80,8 +80,8 @@ def test_set_valued_step_is_the_same_either_way(v):
     x = State(jnp.asarray([0.1]), jnp.asarray([v]), plant.initial_states(jnp.asarray([4.5])))
     u = (jnp.asarray([4.5]),)
     flow = flow_of(plant)
-    fast = set_valued_step(plant, x, line(u), t, STEP, lambda x, *r: flow(x, u, *r))
-    slow = set_valued_step(plant, x, line(u), t, STEP)
+    fast = set_valued_step(plant, x, course(u), t, STEP, lambda x, *r: flow(x, u, *r))
+    slow = set_valued_step(plant, x, course(u), t, STEP)
     for a, b in zip(*map(jax.tree.leaves, (fast, slow)), strict=True):
         np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-12, atol=1e-15)
 

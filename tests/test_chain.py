@@ -26,7 +26,7 @@ from jaxid.io.log import Log
 from jaxid.io.results import identification_json
 from jaxid.machine import build_machine
 from jaxid.plants.chain import Chain
-from jaxid.readings import State, acceleration, line, set_valued_step
+from jaxid.readings import State, acceleration, course, set_valued_step
 from jaxid.session import open_session
 from jaxid.simulation import Drive, interval_forces, open_loop
 from jaxid.virtual import simulate
@@ -201,7 +201,7 @@ def test_diagonal_mass_gives_what_a_full_one_gives():
             p = p.with_effect(EFFECTS["coulomb_friction"](level=level, port=port))
         x = State(*motion, (None,) * 3)
         a = acceleration(p, x, u, jnp.zeros(()))
-        new = set_valued_step(p, x, line((u,)), jnp.zeros(()), jnp.asarray(1e-3))
+        new = set_valued_step(p, x, course((u,)), jnp.zeros(()), jnp.asarray(1e-3))[0]
         found.append((a, new.q, new.qd))
         assert float(new.qd[1]) == 0.0
         assert float(new.qd[0]) != 0.0

@@ -82,7 +82,7 @@ def test_break_away_holds_below_and_leaves_above():
     @jax.jit
     def step(u, v):
         x = eqx.tree_at(lambda s: s.qd, rest, v)
-        return set_valued_step(plant, x, lambda s: u, zero, h).qd
+        return set_valued_step(plant, x, lambda s: u, zero, h)[0].qd
 
     for u, leaves in ((69.9, False), (-69.9, False), (70.1, True), (-70.1, True)):
         assert (float(step(jnp.asarray([u]), jnp.zeros(1))[0]) != 0.0) == leaves

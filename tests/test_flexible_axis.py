@@ -3,19 +3,25 @@
 import dataclasses
 import json
 
+import equinox as eqx
 import flexible_axes as axes
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxid
 from jaxid.cli import main
 from jaxid.errors import InputError
+from jaxid.estimators import METHODS
+from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.steps import alone
 from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.io.results import derived_json
-from jaxid.machine import build_machine
+from jaxid.machine import build_machine, position_noise
 from jaxid.replay import make_replay
 from jaxid.session import open_session
+from jaxid.unmeasured import complete_motion
 
 # Of the paper's aims for the first model: motor inertia 1 %, load inertia 2 %, stiffness 2 %, Coulomb 5 %.
 WITHIN = {
@@ -41,22 +47,40 @@ def z_scores(result) -> np.ndarray:
     return (result.estimate.theta - truth) / result.estimate.std
 
 
-@pytest.mark.parametrize("gap", [0.0, 60e-6])
-def test_loop_is_that_of_the_independent_chain(tmp_path, gap):
-    """Also with clearance in the coupling."""
+def exact(folder, gap: float):
+    """A log without noise, and jaxid's machine at the truth; with clearance in the coupling."""
     sensor = dataclasses.replace(axes.SENSOR, position_noise=0.0, force_noise=0.0, position_resolution=0.0)
     machine = axes.machine() if gap == 0.0 else axes.machine().with_effect("backlash", 2, gap=gap)
     log = axes.record(machine, duration=2.0, sensor=sensor)
     spring = f'[[effects]]\nkind = "backlash"\nspring = 1\ngap = {gap}\n' if gap else ""
-    (tmp_path / "case.toml").write_text(axes.text(sensor=sensor).replace("[actuator]", spring + "[actuator]"))
-    case = load_case(tmp_path / "case.toml")
-    machine = build_machine(case, true=True, period=1 / axes.RATE)
+    (folder / "case.toml").write_text(axes.text(sensor=sensor).replace("[actuator]", spring + "[actuator]"))
+    return log, build_machine(load_case(folder / "case.toml"), true=True, period=1 / axes.RATE)
+
+
+@pytest.mark.parametrize("gap", [0.0, 60e-6])
+def test_loop_is_that_of_the_independent_chain(tmp_path, gap):
+    """Also with clearance in the coupling."""
+    log, machine = exact(tmp_path, gap)
     made = Log(time=log["t"], position=log["position"], force=log["force"], reference=log["reference"][:, :1])
     ours = np.asarray(make_replay(machine, made)(machine.plant).position)
     off = np.abs(ours - log["true_position"]).max()
     # The corner of the clearance is rounded over a hundredth of it.
     assert off < (2e-7 if gap else 1e-7)
     assert np.ptp(np.diff(log["true_position"], axis=1)) > max(1.5 * gap, 1e-5)
+
+
+@pytest.mark.parametrize(("gap", "steps", "within"), [(0.0, 1, 1e-7), (0.0, 3, 1e-8), (60e-6, 1, 5e-7)])
+def test_load_moves_as_the_motion_of_the_motor_has_it(tmp_path, gap, steps, within):
+    log, machine = exact(tmp_path, gap)
+    motion = [jnp.asarray(log[f"true_{name}"]) for name in ("position", "velocity", "acceleration")]
+    seen = [a.at[:, 1].set(jnp.nan) for a in motion]
+    u = jnp.asarray(machine.gain * log["force"])
+    whole = eqx.filter_jit(complete_motion)(machine.plant, *seen, u, log["t"], (True, False), steps)
+    for found, true in zip(whole, motion, strict=True):
+        np.testing.assert_array_equal(np.asarray(found)[:, 0], np.asarray(true)[:, 0])
+    assert np.abs(np.asarray(whole[0] - motion[0])).max() < within
+    # Friction's reaction is in it: without, it would be off by 10.4 N / 34.8 kg = 0.3.
+    assert np.std(np.asarray(whole[2] - motion[2])[:, 1]) < 0.01
 
 
 @pytest.mark.parametrize("method", ["inverse_dynamics", "output_error"])
@@ -76,12 +100,42 @@ def test_finds_table_2(folder, case, method):
     assert np.isnan(told.rms[1]) == (case == "motor")
 
 
+def test_fits_take_the_steps_that_turning_friction_asks_for(folder):
+    session = open_session(folder / "motor.toml", folder / "log.csv")
+    machine, log = build_machine(session.case, true=True, period=1 / axes.RATE), session.fit.log
+    chosen = choose_numerics(machine, log)
+
+    def position(steps: int) -> np.ndarray:
+        replay = make_replay(machine, log, dataclasses.replace(chosen, substeps=steps))
+        return np.asarray(eqx.filter_jit(lambda r, p: r(p).position)(replay, machine.plant))[:, 0]
+
+    noise, fine = position_noise(machine, log)[0], position(24)
+    assert np.abs(position(chosen.substeps) - fine).max() < 0.3 * noise
+    assert np.abs(position(1) - fine).max() > noise
+
+
 def test_didim_tells_the_split_from_forces_alone(folder):
     result = jaxid.identify(folder / "motor.toml", folder / "log.csv", method="didim")
     assert result.converged
     assert result.estimate.identifiable.all()
     assert np.abs(z_scores(result)).max() < 3.5
     assert np.all(result.estimate.std[-2:] < 1.0)  # N
+
+
+@pytest.mark.slow
+def test_coarse_readings_of_the_motor_alone_are_fitted_from_the_guesses_too(tmp_path):
+    """1000 counts a revolution: inverse dynamics ends at 2.6 N/mm, and a fit from there at 0.9."""
+    count = 100 * axes.COUNT
+    sensor = axes.Sensor(position_resolution=count, position_noise=0.5 * count, force_noise=0.1)
+    axes.write(axes.record(sensor=sensor, seed=2), tmp_path / "log.csv")
+    (tmp_path / "case.toml").write_text(axes.text(load=False, sensor=sensor))
+    session = open_session(tmp_path / "case.toml", tmp_path / "log.csv")
+    far = alone(METHODS["inverse_dynamics"](session))
+    assert far.told
+    assert far.value("stiffness") < 0.1 * axes.TRUTH["stiffness"]
+    found = alone(METHODS["output_error"](session))
+    assert found.converged
+    assert found.value("stiffness") == pytest.approx(axes.TRUTH["stiffness"], rel=0.025)
 
 
 @pytest.mark.parametrize("method", ["power", "algebraic"])

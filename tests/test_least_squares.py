@@ -101,6 +101,23 @@ def test_a_start_that_is_not_finite_is_told():
     assert not bool(minimum.converged)
 
 
+@pytest.mark.parametrize("keep", [True, False])
+def test_nothing_unknown_is_a_fit_of_one_step(keep):
+    """Only the residual is asked for; its Jacobian has no columns."""
+    none = Parameters(())
+    free, bounds = Transform.of(none), none.bounds
+    residual = lambda theta: DATA.reshape(-1, 2)
+    minimum = jax.jit(lambda: levenberg_marquardt(residual, none.guess, free, *bounds, keep=keep))()
+    assert minimum.theta.shape == (0,)
+    assert bool(minimum.converged)
+    assert int(minimum.steps) == 1
+    assert float(minimum.cost) == pytest.approx(0.5 * float(DATA @ DATA), rel=1e-14)
+    np.testing.assert_array_equal(minimum.residual, DATA if keep else [])
+    assert minimum.jacobian.shape == (DATA.size if keep else 0, 0)
+    lost = jax.jit(lambda: levenberg_marquardt(lambda t: DATA * jnp.nan, none.guess, free, *bounds))()
+    assert not bool(lost.converged)
+
+
 def unbounded(residual, start: list[float]):
     free, wide = Transform(jnp.zeros(len(start), bool)), jnp.full(len(start), jnp.inf)
     theta = jnp.asarray(start)

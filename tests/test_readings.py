@@ -1,10 +1,12 @@
 """What is read from the balance, against closed forms."""
 
 import equinox as eqx
+import flexible_axes as axes
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stepper import Sensor
 
 from jaxid.effects import EFFECTS
 from jaxid.estimators.algebraic import iterated_integral, weak_motion
@@ -87,7 +89,7 @@ def test_lag_far_shorter_than_the_step_is_exact_and_stable():
     plant = Axis(MASS, effects=(EFFECTS["actuator_lag"](time_constant=lag),))
     x = State(jnp.zeros(1), jnp.zeros(1), (jnp.asarray(-3.0),))
     force, zero = jnp.asarray([6.0]), jnp.zeros(())
-    for one in (step, set_valued_step):
+    for one in (step, lambda *now: set_valued_step(*now)[0]):
         new = jax.jit(lambda x, one=one: one(plant, x, lambda s: force, zero, jnp.asarray(h)))(x)
         assert float(new.own[0]) == pytest.approx(6.0 - 9.0 * np.exp(-h / lag), rel=1e-13)
 
@@ -234,6 +236,33 @@ def test_own_states_driven_along_a_motion_are_those_of_the_simulation():
     # of a force of 40 N; second order, 4 a halving, less at the corners of the hysteresis
     assert errors[1] < 0.05
     assert errors[0] > 2.5 * errors[1]
+
+
+def test_what_sits_behind_a_spring_is_driven_along_the_motion_of_the_joint():
+    """Own state of two entries: the motor of an independent axis is the rigid one with the effect."""
+    free_load = axes.machine(**{"viscous_friction[2].coefficient": 0.0, "coulomb_friction[2].level": 0.0})
+    log = axes.record(free_load, duration=2.0, sensor=Sensor())
+    q, v = log["true_position"][:, :1], log["true_velocity"][:, :1]
+    # Of command and acceleration, which jump at every tick, the mean of both sides.
+    a, u = np.gradient(v, 1 / axes.RATE, axis=0), axes.GAIN * log["force"]
+    u[1:] = 0.5 * (u[1:] + u[:-1])
+    moving = np.abs(v[:, 0]) > 1e-3
+    true = axes.TRUTH
+    inertia = true["motor_inertia"] + true["load_inertia"]
+    behind = {name: true[name] for name in ("stiffness", "damping", "load_inertia")}
+    friction = (
+        EFFECTS["viscous_friction"](true["viscous_friction[1].coefficient"]),
+        EFFECTS["coulomb_friction"](true["coulomb_friction[1].level"]),
+    )
+
+    def rms(*effects) -> float:
+        plant = Axis(inertia, effects=(*friction, *effects), sharpness=1e-6)
+        e = jax.jit(residual_along)(plant, *map(jnp.asarray, (q, v, a, u)), 1 / axes.RATE)
+        return float(np.sqrt(np.mean(np.square(np.asarray(e)[moving]))))
+
+    flexible, rigid = rms(EFFECTS["joint_flexibility"](**behind)), rms()
+    assert rigid > 0.1 * np.sqrt(np.mean(u[moving] ** 2))
+    assert flexible < 0.01 * rigid
 
 
 def test_iterated_integrals_are_exact_for_cubics():

@@ -238,6 +238,22 @@ def test_gap_of_several_joints_and_logs():
     assert "force, joint 2 validation: fast 0.600 N m" in words
 
 
+def test_logs_are_not_mixed_in_the_answer():
+    """Steps of a search hold one number for all joints, of the other log."""
+    gap = {"unit": "N", "before": [4.1, 3.5], "after": [1.0, 0.02], "noise_floor": [1.0, 0.016]}
+    data = _discovery(summary_lines=(), views=(), gap={**gap, "on": "validation"})
+    words = _words(render(data))
+    assert "joint 1 residual on the validation log falls from 4.10 N to 1.00 N" in words
+    assert "3 joints" not in words
+    assert "force, worst joint fit 21.0 N" in words
+
+
+def test_a_line_in_the_spectrum_has_no_region():
+    data = _discovery(views=())
+    assert "region" in _words(render(data))
+    assert "region" not in _words(render(replace(data, where={**data.where, "frequency_hz": 33.0})))
+
+
 def test_non_finite_data_neither_fail_nor_show():
     view = _view()
     diverged = view.position_measured.copy()

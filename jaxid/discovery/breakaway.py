@@ -184,8 +184,9 @@ def _unknown(machine: Machine, log: Log) -> str:
     """What of the moment of a start is not known; empty where all is."""
     if not any(e.kind == CoulombFriction.kind for e in machine.plant.effects):
         return "there is no sliding friction that it could stand above"
-    if any(e.adds_force and e.initial_state(jnp.zeros(())) is not None for e in machine.plant.effects):
-        return "the state of presliding friction at rest is not known"
+    for e in machine.plant.effects:
+        if e.adds_force and e.initial_state(jnp.zeros(())) is not None:
+            return f"the state of {e.kind} at rest is not known"
     if machine.controller is not None and machine.controller.period < 0.9 * log.period:
         return "the command between the log's samples is not known"
     if log.hold == "band_limited":

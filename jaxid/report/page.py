@@ -141,8 +141,7 @@ def _experiment(data: ReportData, view: ExperimentView) -> dict:
 def _where_figure(data: ReportData) -> dict | None:
     if data.where_plot is None or len(data.where_plot[2]) == 0:
         return None
-    region = (data.where or {}).get("region")
-    figure = plots.plot_where(data.where_plot, data.units, region)
+    figure = plots.plot_where(data.where_plot, data.units, tables.where_region(data))
     return image(figure, f"Mean force residual over {data.where_plot[0]}")
 
 

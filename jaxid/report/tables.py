@@ -70,9 +70,9 @@ def answer(data: ReportData) -> str:
         }
         lines = [openings.get(data.verdict, "The declared model was fitted to the log")]
         # One line for each quantity, of two joints at most one each: the table below has the other logs.
-        rows = {r.quantity: r for r in reversed(_gap_rows(data)) if is_number(r.after)}
+        rows = [r for r in _gap_rows(data) if is_number(r.after)]
         groups: dict[str, list[GapRow]] = {}
-        for row in reversed(rows.values()):
+        for row in (r for r in rows if r.log == rows[0].log):
             groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
         for quantity, own in groups.items():
             lines += [_gaps_words(quantity, own)] if len(own) > 2 else [_gap_words(row) for row in own]
@@ -155,7 +155,7 @@ def where_lines(data: ReportData) -> dict | None:
     variable = where.get("variable")
     unit = pretty_unit(_variable_unit(data, variable))
     facts = [("acts at", place_words(where)), ("stands out over", variable or "")]
-    region = where.get("region")
+    region = where_region(data)
     if region and len(region) == 2 and all(is_number(r) for r in region):
         text = f"{short(region[0], 3)} to {short(region[1], 3)} {unit}"
         facts.append(("region", text.strip()))
@@ -165,6 +165,12 @@ def where_lines(data: ReportData) -> dict | None:
         more = f" and {len(spans) - len(listed)} more" if len(spans) > len(listed) else ""
         facts.append(("when", f"{', '.join(listed)} {data.units.get('time', 's')}{more}"))
     return {"text": unbroken(where.get("text") or ""), "facts": [f for f in facts if f[1]]}
+
+
+def where_region(data: ReportData) -> Sequence[float] | None:
+    """Range of the variable in which the residual is largest; None of a line in its spectrum."""
+    where = data.where or {}
+    return None if is_number(where.get("frequency_hz")) else where.get("region")
 
 
 def step_lines(data: ReportData) -> list[dict]:
@@ -267,8 +273,9 @@ def _other_log(data: ReportData, log: str, force: Mapping) -> list[GapRow]:
     ends = [getattr(step, f"gap_{other}") for step in (data.steps[0], data.steps[-1])]
     if not all(is_number(end) for end in ends):
         return []
-    # The floor is only given for the log that was judged.
-    shared = {**force, "floor": None}
+    # The floor is only given for the log that was judged, and steps hold one number for all joints.
+    several = isinstance(data.gap.get("after"), (list, tuple))
+    shared = {**force, "floor": None, "quantity": "force, worst joint" if several else "force"}
     return _by_joint(log=other, before=ends[0], after=ends[1], **shared)
 
 
