@@ -362,7 +362,7 @@ def set_valued_step(
             slid = speed - jnp.sign(before) * own * dry
             rests = (before == 0.0) | (before * slid < 0.0)
             reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
-            ways = stuck, jnp.zeros_like(stuck), jnp.ones_like(speed)
+            ways = stuck, stuck & (before == 0.0), jnp.ones_like(speed)
         return spread(reaction, slides, ports), *ways
 
     zero = jnp.zeros_like(x.q)
@@ -376,9 +376,7 @@ def set_valued_step(
         reaction, *ways = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
     stuck, stands, part = ways
     end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
-    if alone:
-        end_of_step = _turned(x, end_of_step, stands, part, h, slides)
-    return end_of_step, reaction
+    return _turned(x, end_of_step, stands, part, h, slides), reaction
 
 
 def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
