@@ -12,9 +12,9 @@ from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS
 from jaxid.estimators.output_error import OUTPUTS, SHORT
 from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import alone
+from jaxid.estimators.steps import Steps, alone, together
 from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
-from jaxid.io.case import Case
+from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.replay import TooStiffError, exact_numerics, from_rest, make_replay, with_fitted_start
@@ -127,6 +127,34 @@ def identify(
         session, estimate, gaps(estimate.machine, session.runs),
         noise_floor(estimate.machine, session.fit.log, session.fit.data),
     )
+
+
+def identify_many(
+    case: Case | str | Path, logs: Sequence[Log | str | Path], *, method: str = "output_error",
+    lanes: int = 16,
+) -> list[Estimate | Exception]:
+    """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
+
+    Args:
+        case: The case, or its file.
+        logs: Logs, or their files.
+        method: One of `jaxid.estimators.METHODS`.
+        lanes: Logs in a compiled call.
+
+    Returns:
+        The estimate of each log, or what kept it from one: no log fails for another.
+
+    Raises:
+        InputError: If the case or the method is unsound.
+    """
+    if method not in METHODS:
+        raise InputError(f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}")
+    case = case if isinstance(case, Case) else load_case(case)
+
+    def steps(log: Log | str | Path) -> Steps[Estimate]:
+        return (yield from METHODS[method](open_session(case, log)))
+
+    return together([steps(log) for log in logs], lanes)
 
 
 def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:

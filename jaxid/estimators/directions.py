@@ -129,13 +129,13 @@ class Problem:
         return (self.replay, self.places, self.plant, self.measured, self.weight, self.prior, self.on)
 
     @property
-    def ladder(self) -> np.ndarray:
+    def ladder(self) -> list[np.ndarray]:
         """Sharpnesses at which to fit, one after the other."""
         n, m = self.replay.position.size, self.replay.drive.gain.size
         none, u = jnp.zeros(n), jnp.zeros(m)
         own = self.plant.initial_states(u)
         rises = self.plant.balance(none, none, none, u, jnp.zeros(()), own).rises
-        return np.array(_LADDER if rises else (float(self.plant.sharpness),))
+        return [np.asarray(s) for s in (_LADDER if rises else (self.plant.sharpness,))]
 
 
 def _residual_of(
@@ -233,11 +233,6 @@ def directions_steps(
         Precision: Bogdan and Abba, (12)-(27), with the residual's colour where they take white noise.
         (27) lacks the inverse of B: 100 (sigma^2 diag B^-1)^(1/2) / theta.
     """
-    if machine.controller is None:
-        raise InputError(
-            "a prior goes with a simulated loop", where=log.source,
-            mend="name the controller in [controller], or leave out prior in [output_error]",
-        )
     numerics = numerics or choose_numerics(machine, log)
     problem = _problem(machine, log, prior, on, numerics)
     found = yield from _rounds(problem, np.zeros(problem.prior.base.size))
@@ -269,7 +264,7 @@ def directions_steps(
         samples=int(counts.sum()),
         steps=found.evaluations,
         notes=(*notes_of(machine, numerics, log, on), *extra),
-        details={"directions": stated, "criterion": _criterion(found), **many},
+        details={"directions": stated, "criterion_percent": _criterion(found.problem, found.minimum), **many},
     )
 
 
@@ -308,7 +303,8 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[_Found
     ladder = problem.ladder[-1:] if last else problem.ladder
     minimum = yield Solve(_fit, (*problem.args, ladder[0], _NONE, whole, w, none))
     count, cost, settled = 0, np.inf, False
-    for sharpness in (*ladder, *[ladder[-1]] * _ROUNDS):
+    for rung in range(len(ladder) + _ROUNDS):
+        sharpness = ladder[min(rung, len(ladder) - 1)]
         problem = _weighed(problem, minimum)
         here = yield Solve(_fit, (*problem.args, sharpness, _NONE, whole, w, none))
         jacobian = np.asarray(here.jacobian)
@@ -321,15 +317,17 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[_Found
         before, count = count, int(np.sum(told > 1.0 / _TOLD_TWICE))
         if before > count:
             count = int(np.sum(told[:before] > 1.0 / _STAYS))
-        vectors, fitted = rows.T, np.arange(size) < count
+        # Eigenvectors come with either sign: the largest entry is taken positive.
+        largest = rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]
+        vectors, fitted = rows.T * np.sign(largest), np.arange(size) < count
         start = np.where(fitted, np.clip(vectors.T @ w, -_FAR, _FAR), 0.0)
-        pull = np.asarray(0.0 if sharpness == ladder[-1] else noise)
+        pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
         minimum = yield Solve(_fit, (*problem.args, sharpness, pull, vectors, start, fitted))
         spent += int(here.steps) + int(minimum.steps)
         w = vectors @ np.asarray(minimum.theta)
         moved = abs(float(minimum.cost) - cost)
         close = before == count and moved <= _SETTLED / len(problem.measured) * cost
-        settled, cost = close and sharpness == ladder[-1], float(minimum.cost)
+        settled, cost = close and sharpness is ladder[-1], float(minimum.cost)
         if settled or not np.isfinite(cost):
             break
     return _Found(problem, vectors, count, minimum, spent, settled)
@@ -361,8 +359,9 @@ def _many_starts(found: _Found, points: np.ndarray) -> Steps[tuple[_Found, dict[
         z = np.where(fitted, np.clip(points @ found.vectors, -_FAR, _FAR), 0.0)
         active = np.tile(fitted, (len(z), 1))
         noise = _noise(found.problem, found.minimum, found.count)
-        for sharpness in found.problem.ladder:
-            pull = np.asarray(0.0 if sharpness == found.problem.ladder[-1] else noise)
+        ladder = found.problem.ladder
+        for sharpness in ladder:
+            pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
             args = (*found.problem.args, sharpness, pull, found.vectors, z, active)
             z, costs, _, _ = (np.asarray(x) for x in (yield Solve(_fit_each, args)))
         costs = np.where(np.isfinite(costs), costs, np.inf)
@@ -386,6 +385,8 @@ def _assessed(
 ) -> tuple[Precision, list[dict[str, Any]]]:
     """Precision of the parameters, and of the directions."""
     problem, r = found.problem, found.count
+    if r == 0:
+        return _nothing_told(machine)
     names = [*machine.parameters.names, *_nuisances(problem)]
     shape, counts = problem.measured.shape, problem.weight > 0
     jacobian = np.asarray(found.minimum.jacobian).reshape(*shape, -1)[..., :r]
@@ -398,9 +399,14 @@ def _assessed(
     )
     z = np.asarray(found.minimum.theta)
     theta = np.asarray(problem.prior.outward(found.vectors @ z))
+    flat = jacobian.reshape(-1, r)
+    white = _noise(problem, found.minimum, r) * np.sqrt(np.diag(np.linalg.inv(flat.T @ flat)))
+    # A colour read off a hundred samples is itself uncertain: never less than white noise would leave.
+    larger = np.maximum(1.0, white / told.std)
+    of_seen = told.covariance * np.outer(larger, larger)
     seen, held = found.vectors[:, :r], found.vectors[:, r:]
     slope = problem.prior.slope(theta)
-    whole = seen @ told.covariance @ seen.T + held @ held.T
+    whole = seen @ of_seen @ seen.T + held @ held.T
     p = len(problem.places)
     left = np.sqrt(np.diag(whole))[:p]
     identifiable = left < _TOLD
@@ -409,7 +415,7 @@ def _assessed(
     stated = [
         {
             "combination": _named(names, found.vectors[:, k]), "value": float(z[k]),
-            "std": float(told.std[k]),
+            "std": float(np.sqrt(of_seen[k, k])), "std_white": float(white[k]),
         }
         for k in range(r)
     ]
@@ -417,8 +423,15 @@ def _assessed(
     return Precision(covariance, identifiable, blind, told.information), stated
 
 
+def _nothing_told(machine: Machine) -> tuple[Precision, list[dict[str, Any]]]:
+    """Of a log that tells no combination better than the guesses."""
+    names = machine.parameters.names
+    p = len(names)
+    blind = [{n: 1.0} for n in names]
+    return Precision(np.full((p, p), np.nan), np.zeros(p, bool), blind, np.zeros(0)), []
+
+
 def _named(names: Sequence[str], vector: np.ndarray) -> dict[str, float]:
-    vector = vector if vector[np.argmax(np.abs(vector))] > 0 else -vector
     return {n: float(v) for n, v in zip(names, vector, strict=True) if abs(v) > _NEGLIGIBLE}
 
 
@@ -448,8 +461,21 @@ def _profiles(found: _Found, stated: list[dict[str, Any]]) -> Steps[None]:
         }
 
 
-def _criterion(found: _Found) -> float:
+def _criterion(problem: Problem, minimum: Minimum) -> float:
     """(11) of Bogdan and Abba: squared residual over squared deviation from the mean, percent."""
-    weight, measured = found.problem.weight, found.problem.measured
+    weight, measured = problem.weight, problem.measured
     spread = np.sum((weight * (measured - measured.mean(axis=0))) ** 2)
-    return float(100 * 2 * float(found.minimum.cost) / spread)
+    return float(100 * 2 * float(minimum.cost) / spread)
+
+
+def criterion_steps(
+    machine: Machine, log: Log, theta: Float[np.ndarray, " p"], *, on: str = "position",
+    numerics: Numerics | None = None,
+) -> Steps[float]:
+    """Criterion of the same simulation at given unknowns, percent; nothing is fitted."""
+    problem = _problem(machine, log, 1.0, on, numerics or choose_numerics(machine, log))
+    size = problem.prior.base.size
+    w = problem.prior.inward(_padded(theta, problem))
+    nothing = (np.eye(size), w, np.zeros(size, bool))
+    found = yield Solve(_fit, (*problem.args, problem.ladder[-1], _NONE, *nothing))
+    return _criterion(problem, found)
