@@ -274,7 +274,6 @@ def full_hessian(
 
     def gradient(theta: Array) -> Array:
         e, push = jax.linearize(residual, theta)
-        basis = jnp.eye(theta.size)
-        return jnp.stack([jnp.vdot(push(b), e) for b in basis])
+        return jax.vmap(lambda b: jnp.vdot(push(b), e))(jnp.eye(theta.size))
 
     return jax.jacfwd(gradient)(theta)

@@ -1,0 +1,151 @@
+"""Output error in the directions that a log tells: a hundred samples, eleven unknowns."""
+
+import json
+
+import numpy as np
+import pytest
+import stages
+
+import jaxid
+from jaxid.cli import main
+from jaxid.estimators.directions import criterion_steps
+from jaxid.estimators.steps import alone
+from jaxid.identification import identify_many
+from jaxid.io.log import Log
+from jaxid.machine import build_machine
+from jaxid.session import open_session
+
+NOISE = 0.0135  # A
+STATED = '[output_error]\non = "force"\nprior = 0.5\n'
+REFERENCE = stages.move(0.5, **stages.MOVES[1])
+STAGE = stages.machine(1, rigid=True)
+
+
+def logged(seed: int, noise: float = NOISE) -> Log:
+    """A log of the exact stage whose encoder is fine: a coarse one is noise of another kind."""
+    log = stages.record(STAGE, REFERENCE, noise=noise, resolution=0.0, seed=seed)
+    return Log(
+        time=log["t"], position=log["q"][:, None], force=log["i"][:, None], reference=REFERENCE[:, None],
+        source=f"log {seed}",
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Guesses up to 50 % off, all of them."""
+    folder = tmp_path_factory.mktemp("stage")
+    (folder / "case.toml").write_text(stages.text(1, guess=stages.drawn(3), resolution=0.0, more=STATED))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(folder):
+    many = (folder / "case.toml").read_text() + "starts = 16\nprofile = true\nhessian = true\n"
+    (folder / "many.toml").write_text(many)
+    return jaxid.identify(folder / "many.toml", logged(0))
+
+
+def test_what_the_log_tells_is_found_and_the_rest_stays_at_its_guess(fitted):
+    estimate, guess = fitted.estimate, stages.drawn(3)
+    assert estimate.converged
+    told = {n: c["combination"] for n, c in enumerate(estimate.details["directions"])}
+    assert 2 <= len(told) <= 5
+    found = stages.combined({**guess, **dict(zip(estimate.names, estimate.theta, strict=True))})
+    truth, wrong = stages.combined(stages.TRUTH[1]), stages.combined(guess)
+    assert abs(found["dry"] / truth["dry"] - 1) < 0.05 < abs(wrong["dry"] / truth["dry"] - 1)
+    assert abs(found["inertia"] / truth["inertia"] - 1) < 0.15 < abs(wrong["inertia"] / truth["inertia"] - 1)
+    # Of friction at the motor and on the table one column is left: neither has a sigma of its own.
+    heaviest = max(told.values(), key=lambda c: abs(c.get("coulomb_friction[1].level", 0.0)))
+    assert heaviest["coulomb_friction[1].level"] * heaviest["coulomb_friction[2].level"] > 0
+    blind = [n for n, ok in zip(estimate.names, estimate.identifiable, strict=True) if not ok]
+    assert {"table_mass", "viscous_friction[2].coefficient", "cogging[2].amplitude"} <= set(blind)
+    assert np.all(np.isnan(estimate.std[[estimate.names.index(n) for n in blind]]))
+    assert estimate.value("table_mass") == pytest.approx(guess["table_mass"], rel=1e-2)
+
+
+def test_all_starts_end_alike_below_the_truth(fitted, folder):
+    details = fitted.estimate.details
+    assert details["starts"]["count"] == 16
+    assert details["starts"]["same_optimum"] >= 15
+    session = open_session(folder / "case.toml", logged(0))
+    truth = np.array([stages.TRUTH[1][n] for n in fitted.estimate.names])
+    at_truth, at_guess = (
+        alone(criterion_steps(session.machine, session.fit.log, theta, on="force"))
+        for theta in (truth, session.machine.parameters.guess)
+    )
+    assert details["criterion_percent"] < at_truth < 0.2 * at_guess
+
+
+def test_precision_and_profiles_agree(fitted):
+    """Two standard deviations off, the cost has risen by about four variances, in the best directions."""
+    best = fitted.estimate.details["directions"][0]
+    assert best["std"] >= best["std_white"] > 0
+    rise = dict(zip(best["profile"]["at_std"], best["profile"]["rise"], strict=True))
+    for at in (-2.0, 2.0):
+        wide = at * best["std"] / best["std_white"]
+        assert 0.4 * wide**2 < rise[at] < 2.5 * wide**2
+
+
+def test_results_hold_the_directions(fitted, tmp_path):
+    fitted.save(tmp_path / "out")
+    content = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert content["criterion_percent"] > 0
+    assert content["directions"][0].keys() >= {"combination", "value", "std"}
+    assert "directions of 11 unknowns fitted" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_many_logs_are_fitted_as_each_alone(folder, fitted):
+    """And one that cannot be fitted does not keep the others from it."""
+    still = logged(1)
+    still = Log(**{**vars(still), "position": np.zeros_like(still.position)})
+    found = identify_many(folder / "case.toml", [logged(1), still, logged(2)], lanes=2)
+    assert isinstance(found[1], jaxid.InputError)
+    alone_found = jaxid.identify(folder / "case.toml", logged(2)).estimate
+    np.testing.assert_allclose(found[2].theta, alone_found.theta, rtol=1e-6)
+    assert np.abs(found[0].theta / found[2].theta - 1).max() > 1e-4
+
+
+@pytest.mark.slow
+def test_intervals_cover_what_is_visible(folder, tmp_path):
+    """64 logs, guesses at the truth: so close that what is held is held rightly."""
+    (tmp_path / "case.toml").write_text(stages.text(1, resolution=0.0, more=STATED))
+    found = identify_many(tmp_path / "case.toml", [logged(k) for k in range(64)])
+    machine = build_machine(jaxid.load_case(tmp_path / "case.toml"), period=1 / stages.RATE)
+    assert np.all(machine.parameters.guess == [stages.TRUTH[1][n] for n in machine.parameters.names])
+    for k in range(3):
+        z = np.array([d[k]["value"] / d[k]["std"] for e in found if len(d := e.details["directions"]) > k])
+        assert len(z) > 50
+        assert np.mean(np.abs(z) < 1.96) > 0.85
+        assert np.mean(np.abs(z) < 3) > 0.95
+        assert np.abs(np.mean(z)) < 0.5
+        assert np.std(z) > 0.6
+
+
+def test_a_log_of_noise_tells_nothing(folder):
+    loud = logged(0, noise=1.0)
+    estimate = jaxid.identify(folder / "case.toml", loud).estimate
+    assert len(estimate.details["directions"]) <= 1
+    assert np.all(np.isnan(estimate.std[~estimate.identifiable]))
+
+
+def test_wrong_priors_are_refused(folder, tmp_path, capsys):
+    text = (folder / "case.toml").read_text()
+    stages.write(stages.record(STAGE, REFERENCE, noise=NOISE, resolution=0.0), tmp_path / "log.csv")
+    for wrong, said in (
+        (text.replace("prior = 0.5", "prior = -1"), "prior"),
+        (text.replace("prior = 0.5", "prior = 0.5\nstarts = 0"), "starts"),
+        (_without_guess(text), "cogging[2].phase has a guess of zero"),
+    ):
+        (tmp_path / "case.toml").write_text(wrong)
+        files = [str(tmp_path / name) for name in ("case.toml", "log.csv", "o")]
+        code = main(["identify", *files[:2], "-o", files[2]])
+        err = capsys.readouterr().err
+        assert code == 2
+        assert said in err
+        assert len(err.strip().splitlines()) == 1
+        assert not (tmp_path / "o").exists()
+
+
+def _without_guess(text: str) -> str:
+    head, tail = text.split("phase = { guess = ")
+    return head + "phase = { guess = 0.0" + tail[tail.index(","):]
