@@ -21,6 +21,9 @@ from jaxid.errors import InputError
 from jaxid.model import Balance, Plant, port_motion
 from jaxid.smooth import ramp, sharp_clip, sign
 
+# Traced once for all places of a step that read it: tracing is most of what a first answer waits for.
+_balance = eqx.filter_jit(lambda plant, *args: plant.balance(*args))
+
 # Coordinates, velocities, and own states in one array.
 Split = tuple[Array, Array, Array]
 
@@ -69,7 +72,7 @@ def acceleration(
     """
 
     def residual(qdd: Array) -> tuple[Array, Balance]:
-        balance = plant.balance(x.q, x.qd, qdd, u, t, x.own, reaction)
+        balance = _balance(plant, x.q, x.qd, qdd, u, t, x.own, reaction)
         return balance.residual, balance
 
     mass, rest = _mass(plant, residual, x.q)
@@ -118,8 +121,12 @@ def derivative(
 ) -> State:
     """Time derivative of the state: the right-hand side."""
     qdd = acceleration(plant, x, u, t, reaction)
-    rates = plant.balance(x.q, x.qd, qdd, u, t, x.own, reaction).rates
+    rates = _balance(plant, x.q, x.qd, qdd, u, t, x.own, reaction).rates
     return State(x.qd, qdd, rates)
+
+
+# Traced once for all stages of a step: tracing is most of what a first answer waits for.
+_derivative = eqx.filter_jit(derivative)
 
 
 def vector_field(t: Array, x: State, args: tuple[Plant, Callable[[Array], Array]]) -> State:
@@ -139,7 +146,7 @@ def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
     """
 
     def rates(own: tuple) -> tuple:
-        return plant.balance(x.q, x.qd, jnp.zeros_like(x.q), u, t, own).rates
+        return _balance(plant, x.q, x.qd, jnp.zeros_like(x.q), u, t, own).rates
 
     slopes = jax.jvp(rates, (x.own,), (jax.tree.map(jnp.ones_like, x.own),))[1]
     slopes = jax.tree.map(lambda s: s if s.ndim == 0 else jnp.zeros_like(s), slopes)
@@ -197,7 +204,7 @@ def step(
 
     def rest(y: Split, u: Array, t: Array) -> Split:
         q, v, z = y
-        rate = derivative(plant, State(q, v, back(z)), u, t, reaction)
+        rate = _derivative(plant, State(q, v, back(z)), u, t, reaction)
         return v, rate.qd - jnp.sum(push * z, axis=1), ravel_pytree(rate.own)[0] - decay * z
 
     half = 0.5 * h
@@ -330,7 +337,7 @@ def set_valued_step(
     end = u(jnp.asarray(1.0))
 
     def residual(qdd: Array, midway: Array) -> tuple[Array, Balance]:
-        levels = plant.balance(x.q, midway, qdd, end, t, x.own, jnp.zeros(ports))
+        levels = _balance(plant, x.q, midway, qdd, end, t, x.own, jnp.zeros(ports))
         return levels.residual, levels
 
     # The mass does not depend on the velocity: one balance gives it and the levels.
@@ -545,12 +552,12 @@ def drive_own_states(
 
         def rate(value: Array, i: int = i, own: tuple = own) -> Array:
             at = (*own[:i], jnp.broadcast_to(value, own[i].shape), *own[i + 1 :])
-            return jax.vmap(lambda *now: plant.balance(*now).rates[i])(*motion, at)
+            return jax.vmap(lambda *now: _balance(plant, *now).rates[i])(*motion, at)
 
         push = rate(jnp.zeros_like(z))
         if z.ndim:
             here = jax.tree.map(lambda a: a[0], (*motion, own))
-            slope = jax.jacfwd(lambda v, i=i, at=here: plant.balance(
+            slope = jax.jacfwd(lambda v, i=i, at=here: _balance(plant, 
                 *at[:5], (*at[5][:i], v, *at[5][i + 1 :])
             ).rates[i])(z)
             own = (*own[:i], _vector_recurrence(z, slope, push, period), *own[i + 1 :])
@@ -647,7 +654,7 @@ def residual_along(
     times = start + period * jnp.arange(q.shape[0])
 
     def at(q: Array, qd: Array, qdd: Array, u: Array, t: Array, own: tuple) -> tuple:
-        balance = plant.balance(q, qd, qdd, u, t, own)
+        balance = _balance(plant, q, qd, qdd, u, t, own)
         return balance.residual, balance.drive
 
     residual, drive = jax.vmap(at)(q, qd, qdd, u, times, own)

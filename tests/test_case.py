@@ -6,10 +6,9 @@ import pytest
 from case_faults import CASCADE, FAULTS, GOOD, message, more, swapped, write
 
 from jaxid.controllers import CONTROLLERS
-from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
-from jaxid.io.case_tables import PLANNED_CONTROLLERS, PLANNED_EFFECTS, PLANNED_PLANTS
+from jaxid.io.case_tables import PLANNED_CONTROLLERS, PLANNED_PLANTS
 from jaxid.io.case_values import Value
 from jaxid.plants import PLANTS
 
@@ -85,13 +84,6 @@ def test_planned_plants_are_told_from_unknown_ones(tmp_path, kind):
     told = message(tmp_path, swapped('"axis"', f'"{kind}"'))
     assert "not available in this version" in told
     assert "have: axis" in told
-
-
-@pytest.mark.parametrize("kind", [k for k in PLANNED_EFFECTS if k not in EFFECTS])
-def test_planned_effects_are_told_from_unknown_ones(tmp_path, kind):
-    told = message(tmp_path, swapped('"viscous_friction"', f'"{kind}"'))
-    assert "not available in this version" in told
-    assert "viscous_friction" in told
 
 
 @pytest.mark.parametrize("kind", [k for k in PLANNED_CONTROLLERS if k not in CONTROLLERS])
