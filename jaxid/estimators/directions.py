@@ -238,8 +238,10 @@ def directions_steps(
     found = yield from _rounds(problem, np.zeros(problem.prior.base.size))
     many: dict[str, Any] = {}
     if starts > 1 or len(others):
-        points = [*(problem.prior.inward(_padded(t, problem)) for t in others), *_drawn(problem, starts)]
-        found, many = yield from _many_starts(found, np.array(points))
+        given = [problem.prior.inward(_padded(t, problem)) for t in others]
+        points = np.array([*given, *_drawn(problem, starts)])
+        found = yield from _elsewhere(problem, found, points)
+        found, many = yield from _many_starts(found, points)
     p = len(machine.parameters.free)
     r, z = found.count, np.asarray(found.minimum.theta)
     full = None
@@ -351,6 +353,17 @@ def _noise(problem: Problem, minimum: Minimum, count: int) -> float:
     return float(np.sqrt(2 * float(minimum.cost) / max(samples - count, 1)))
 
 
+def _elsewhere(problem: Problem, found: _Found, points: np.ndarray) -> Steps[_Found]:
+    """The rounds from the best of some points too: a machine that sticks at the guesses shows nothing."""
+    size = problem.prior.base.size
+    still = (np.eye(size), points, np.zeros((len(points), size), bool))
+    _, costs, _, _ = yield Solve(_fit_each, (*problem.args, problem.ladder[0], _NONE, *still))
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    other = yield from _rounds(problem, points[best])
+    better = float(other.minimum.cost) < float(found.minimum.cost) * (1 - _SAME)
+    return replace(other if better else found, evaluations=found.evaluations + other.evaluations)
+
+
 def _many_starts(found: _Found, points: np.ndarray) -> Steps[tuple[_Found, dict[str, Any]]]:
     """The best of many starts, and how many end there."""
     spent = found.evaluations
@@ -414,7 +427,7 @@ def _assessed(
     covariance[~identifiable] = covariance[:, ~identifiable] = np.nan
     stated = [
         {
-            "combination": _named(names, found.vectors[:, k]), "value": float(z[k]),
+            "combination": dict(zip(names, found.vectors[:, k].tolist(), strict=True)), "value": float(z[k]),
             "std": float(np.sqrt(of_seen[k, k])), "std_white": float(white[k]),
         }
         for k in range(r)

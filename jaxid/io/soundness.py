@@ -32,6 +32,7 @@ def check_log(
     units: dict[str, str] | None = None,
     path: str | Path | None = None,
     driven: Sequence[int] | np.ndarray | None = None,
+    fewest_levels: int = _STILL_LEVELS + 1,
 ) -> list[Finding]:
     """Look for the faults of a readable log.
 
@@ -43,12 +44,13 @@ def check_log(
             position unit leaves out the checks that need metres or radians.
         path: Name of the log in messages; its source where absent.
         driven: Joints with a drive, 0-based, in the order of the drives; None: the first ones.
+        fewest_levels: A position of fewer values is no movement.
 
     Returns:
         What was found; empty for a sound log.
     """
     where = str(path or log.source)
-    findings = [*_movement(log, where), *_force(log, command_limit, where)]
+    findings = [*_movement(log, where, fewest_levels), *_force(log, command_limit, where)]
     still = any(finding.severity == "error" for finding in findings)
     if not still:
         findings += ratio_findings(log, motion, where, driven)
@@ -74,10 +76,10 @@ def raise_on_error(findings: Iterable[Finding]) -> None:
         raise InputError(first.what, where=first.where, mend=mend)
 
 
-def _movement(log: Log, path: str) -> list[Finding]:
+def _movement(log: Log, path: str, fewest: int) -> list[Finding]:
     """Joints that stand still, and positions that come in coarse steps."""
     seen = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
-    reasons = [_stillness(q) for _, q in seen]
+    reasons = [_stillness(q, fewest) for _, q in seen]
     if all(reasons):
         mend = "check that position names the right column and that the machine moved"
         return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, position", mend)]
@@ -95,12 +97,12 @@ def _movement(log: Log, path: str) -> list[Finding]:
     return findings
 
 
-def _stillness(q: np.ndarray) -> str:
+def _stillness(q: np.ndarray, fewest: int) -> str:
     """Why this position is no movement; empty where it is one."""
     if np.ptp(q) == 0:
         return f"the position is {q[0]:.6g} throughout"
     levels, step = _levels(q)
-    if levels <= _STILL_LEVELS:
+    if levels < fewest:
         return f"the position takes only {levels} values, {step:.3g} apart"
     centred = q - q.mean()
     lags = range(1, min(20, q.size // 4) + 1)

@@ -1,0 +1,119 @@
+"""Figures of the micropositioning stage, and the long log in which friction is to be found."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from jaxid.identification import Identification
+from jaxid.io.case import Case
+from jaxid.parameters import scatter
+from jaxid.sensors import Sensor
+from jaxid.simulation import closed_loop
+from jaxid.virtual import Scene
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+import stages
+
+
+def fit(path: Path, found: Identification, data: int) -> None:
+    """Figure 5: measured and simulated current, and their squared difference."""
+    log, gain = found.session.fit.log, float(found.session.machine.gain[0])
+    current, e = log.force[:, 0], found.estimate.residual[:, 0] / gain
+    figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
+    axes.plot(log.time, current, "r", label="measured")
+    axes.plot(log.time, current - e, "k", label="simulated")
+    axes.set(xlabel="time [s]", ylabel="current [A]", title=f"Data {data}")
+    right = axes.twinx()
+    right.plot(log.time, e**2, "b", lw=0.8, label="squared difference")
+    right.set(ylabel="squared difference [A²]", ylim=(0, 5 * np.max(e**2)))
+    figure.legend(loc="outside lower center", ncols=3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def needles(path: Path, case: Case) -> None:
+    """Cost along the inertia and the table's friction, with the encoder's rounding simulated and without."""
+    scene = Scene.of(case)
+    machine, unknown = scene.machine, scene.machine.parameters
+
+    @eqx.filter_jit
+    def current(theta: jax.Array, sensor: Sensor) -> jax.Array:
+        plant = scatter(unknown.places, machine.plant, theta)
+        rest = jnp.zeros(1)
+        none = jnp.zeros_like(scene.signal)
+        return closed_loop(
+            plant, scene.drive, machine.controller, scene.signal, none, rest, rest, sensor
+        ).command[:, 0]
+
+    figure, panes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for axes, name in zip(panes, ("motor_inertia", "coulomb_friction[2].level"), strict=True):
+        k, off = unknown.names.index(name), np.linspace(-0.1, 0.1, 401)
+        theta = np.tile(unknown.guess, (off.size, 1))
+        theta[:, k] *= 1 + off
+        for label, sensor in (("rounded", machine.sensor), ("not rounded", Sensor())):
+            runs = np.asarray(jax.vmap(lambda t, s=sensor: current(t, s))(jnp.asarray(theta)))
+            truth = runs[off.size // 2]
+            criterion = 100 * np.sum((runs - truth) ** 2, axis=1) / np.sum((truth - truth.mean()) ** 2)
+            axes.plot(100 * off, criterion, label=label, lw=1)
+        axes.set(xlabel=f"{name}, off [%]", ylabel="criterion without noise [%]")
+        axes.axhline(stages.CRITERION[1], color="0.6", ls="--", lw=0.8)
+    panes[0].legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def frictions(path: Path) -> None:
+    """Figures 3 and 6: friction at the motor while the table speeds up and slows down again."""
+    figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
+    turns = np.linspace(-0.5, 0.5, 400)
+    for data, colour in ((1, "r"), (2, "b")):
+        p = stages.TRUTH[data]
+        v = turns * stages.PITCH
+        side = np.sign(v)
+        smooth = p["viscous_friction[1].coefficient"] * turns * stages.TURN
+        smooth = smooth + stages.R * p["viscous_friction[2].coefficient"] * v
+        dry = p["coulomb_friction[1].level"] + stages.R * p["coulomb_friction[2].level"]
+        level = np.where(
+            v > 0, p["velocity_hysteresis[2].level"], p["velocity_hysteresis[2].level_negative"]
+        )
+        more = stages.R * level * np.exp(-((v / p["velocity_hysteresis[2].velocity"]) ** 2))
+        axes.plot(turns, 1e3 * (smooth + side * (dry + more)), colour, label=f"data {data}, speeding up")
+        axes.plot(turns, 1e3 * (smooth + side * dry), colour + "--", label=f"data {data}, slowing down")
+    axes.set(xlabel="velocity of the motor [rev/s]", ylabel="friction at the motor [mN m]")
+    axes.legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def long_case(folder: Path, seconds: float = 20.0) -> tuple[Path, Path]:
+    """A log that shows the friction: to and fro at many speeds, read finely; and a case without its physics.
+
+    The motor's viscous and Coulomb friction are declared, nothing on the table.
+    """
+    t = np.arange(round(seconds * stages.RATE)) / stages.RATE
+    tones = zip((0.3, 0.7, 1.3), (0.5, 0.25, 0.12), (0.0, 1.0, 2.0), strict=True)
+    turns = sum(a * (np.sin(2 * np.pi * f * t + p) - np.sin(p)) for f, a, p in tones)
+    fine = 2 * np.pi / 1e6
+    log = stages.record(
+        stages.machine(1, rigid=True), stages.TURN * turns, noise=1e-3, resolution=fine, seed=1
+    )
+    stages.write(log, folder / "hidden.csv")
+    whole = stages.text(1, resolution=fine)
+    lines = [
+        "[plant]", 'kind = "micropositioning_stage"', 'coupling = "rigid"', "[plant.parameters]",
+        f"pitch = {stages.PITCH}", "table_mass = 0.417", "motor_inertia = { guess = 1e-5 }",
+        "[[effects]]", 'kind = "coulomb_friction"', "joint = 1", "level = { guess = 5e-3 }",
+        "[[effects]]", 'kind = "viscous_friction"', "joint = 1", "coefficient = { guess = 1e-4 }",
+    ]
+    (folder / "hidden.toml").write_text("\n".join(lines) + "\n" + whole[whole.index("[actuator]") :])
+    return folder / "hidden.toml", folder / "hidden.csv"

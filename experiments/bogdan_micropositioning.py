@@ -1,0 +1,199 @@
+"""The micropositioning stage: what a hundred noisy samples of its current tell, and what they do not.
+
+Bogdan & Abba, "Identification of mechanical parameters at low velocities for a micropositioning stage using a
+velocity hysteresis model". Its Table 1, read in SI as `tests/stages.py` says, is the truth here, in an exact
+simulator that shares no code with jaxid (set-valued friction, 5 us).
+
+    python experiments/bogdan_micropositioning.py [-o results/bogdan_micropositioning] [--only NAME]
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from common import Table, parser_of
+
+import jaxid
+from jaxid.estimators.directions import Prior, criterion_steps
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import together
+from jaxid.identification import identify_many
+from jaxid.io.log import Log
+from jaxid.session import open_session
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+import bogdan_figures
+import stages
+
+ON_FORCE = '[output_error]\non = "force"\nprior = 0.5\n'
+# Of the published table: relative precision of data 1 and 2 [%].
+PUBLISHED = {
+    "motor_inertia": (2.02, 2.00), "viscous_friction[1].coefficient": (2.37, 6.43),
+    "coulomb_friction[1].level": (1.27, 1.08), "table_mass": (1.64, 2.63),
+    "viscous_friction[2].coefficient": (2.01, 2.13), "coulomb_friction[2].level": (1.90, 1.77),
+    "velocity_hysteresis[2].level": (3.51, 7.29), "velocity_hysteresis[2].level_negative": (1.75, 3.14),
+    "velocity_hysteresis[2].velocity": (3.12, 4.05), "cogging[2].amplitude": (1.58, 3.51),
+    "cogging[2].phase": (2.17, 2.98),
+}
+RUNS = 200
+
+
+def noise_of(data: int, resolution: float) -> float:
+    """Noise on the current [A] that, beside what rounding does, puts the criterion at the published one."""
+    reference = stages.move(0.5, **stages.MOVES[data])
+    stage = stages.machine(data, rigid=True)
+    fine = stages.record(stage, reference, resolution=0.0)["true_i"]
+    starts = np.random.default_rng(0).uniform(-0.5, 0.5, 20) * resolution
+    off = [stages.record(stage, reference, resolution=resolution, start=s)["true_i"] - fine for s in starts]
+    wanted = stages.CRITERION[data] / 100 * np.var(fine)
+    return float(np.sqrt(max(wanted - np.mean(np.square(off)), 0.1 * wanted)))
+
+
+def logs_of(data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT) -> list[Log]:
+    """Logs that differ in noise, and in where within its first count the motor stood."""
+    reference, noise = stages.move(0.5, **stages.MOVES[data]), noise_of(data, resolution)
+    stage, rng = stages.machine(data, rigid=rigid), np.random.default_rng(1)
+    out = []
+    for k in range(runs):
+        made = stages.record(
+            stage, reference, noise=noise, resolution=resolution, seed=k, step=5e-6 if rigid else 2e-6,
+            start=rng.uniform(-0.5, 0.5) * resolution,
+        )
+        out.append(
+            Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
+                reference=reference[:, None], source=f"run {k} of data {data}")
+        )
+    return out
+
+
+def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, more: str = ON_FORCE,
+            resolution: float = stages.COUNT) -> Path:
+    """A case file; guesses at the truth, or drawn up to 50 % around it."""
+    drawn = None if guess is None else stages.drawn(guess, data=data)
+    path = folder / f"{name}.toml"
+    path.write_text(stages.text(data, guess=drawn, more=more, resolution=resolution))
+    return path
+
+
+def published(folder: Path) -> None:
+    """(a) as published: one log of each, guesses up to 50 % off."""
+    for data in (1, 2):
+        start = time.perf_counter()
+        case = case_of(folder, f"data{data}", data, guess=data, more=ON_FORCE + "starts = 256\n")
+        log = logs_of(data, 1)[0]
+        try:
+            found = jaxid.identify(case, log)
+        except jaxid.InputError as error:
+            print(f"\ndata {data}: refused: {error}", flush=True)
+            continue
+        found.save(folder / f"data{data}", force=True)
+        estimate = found.estimate
+        truth = np.array([stages.TRUTH[data][n] for n in estimate.names])
+        table = Table(
+            f"Data {data}: criterion {estimate.details['criterion_percent']:.2f} % "
+            f"(published {stages.CRITERION[data]} %), {estimate.steps} evaluations, starts alike: "
+            "{same_optimum} of {count}".format(**estimate.details["starts"]),
+            ["parameter", "truth", "guess", "found", "sigma %", "published P %"],
+        )
+        guesses = stages.drawn(data, data=data)
+        for name, true, value, std in zip(estimate.names, truth, estimate.theta, estimate.std, strict=True):
+            told = f"{100 * std / abs(value):.1f}" if np.isfinite(std) else "not told"
+            table.row(name, f"{true:.3g}", f"{guesses[name]:.3g}", f"{value:.3g}", told,
+                      PUBLISHED[name][data - 1])
+        table.show(time.perf_counter() - start)
+        prior = Prior.of(open_session(case, log).machine, 0.5, np.zeros(0))
+        w = prior.inward(truth)
+        for d in estimate.details["directions"]:
+            at_truth = sum(d["combination"].get(n, 0.0) * v for n, v in zip(estimate.names, w, strict=True))
+            off = (d["value"] - at_truth) / d["std"]
+            parts = " ".join(f"{v:+.2f} {n}" for n, v in d["combination"].items() if abs(v) > 0.15)
+            print(f"  {0.5 * d['value']:+.3f} +- {0.5 * d['std']:.3f} ({off:+.1f} sigma): {parts}")
+        bogdan_figures.fit(folder / f"data{data}.png", found, data)
+
+
+def studied(
+    case: Path, logs: Sequence[Log], data: int
+) -> tuple[list[Estimate], np.ndarray, np.ndarray]:
+    """Estimates, criterion over that of the truth, and directions in sigma from the truth (runs, 5)."""
+    found = identify_many(case, logs)
+    kept = [(e, log) for e, log in zip(found, logs, strict=True) if isinstance(e, Estimate)]
+    machine = open_session(case, logs[0]).machine
+    truth = np.array([stages.TRUTH[data][n] for n in machine.parameters.names])
+    at = together([criterion_steps(machine, log, truth, on="force") for _, log in kept], 16)
+    ratio = np.array([e.details["criterion_percent"] / c for (e, _), c in zip(kept, at, strict=True)])
+    w = Prior.of(machine, 0.5, np.zeros(0)).inward(truth)
+    names, off = machine.parameters.names, np.full((len(kept), 5), np.nan)
+    for i, (e, _) in enumerate(kept):
+        for k, d in enumerate(e.details["directions"][:5]):
+            true = sum(d["combination"].get(n, 0.0) * v for n, v in zip(names, w, strict=True))
+            off[i, k] = (d["value"] - true) / d["std"]
+    return [e for e, _ in kept], ratio, off
+
+
+def scatter(folder: Path) -> None:
+    """Monte-Carlo runs: criterion against the truth's, coverage; by encoder and by screw."""
+    table = Table(
+        f"{RUNS} runs of data 1, guesses at the truth: what is fitted against its sigma",
+        ["encoder", "screw", "converged", "criterion %", "over truth's", "1 - r/n", "never above",
+         "in 1.96 sigma", "in 3 sigma"],
+    )
+    start = time.perf_counter()
+    for name, resolution, rigid in (
+        ("exact", 0.0, True), ("500 counts", stages.COUNT, True), ("500 counts", stages.COUNT, False),
+    ):
+        case = case_of(folder, "scatter", 1, resolution=resolution)
+        found, ratio, off = studied(case, logs_of(1, RUNS, rigid=rigid, resolution=resolution), 1)
+        fitted = np.mean([len(e.details["directions"]) for e in found])
+        inside = lambda bound, off=off: f"{100 * np.nanmean(np.abs(off[np.isfinite(off)]) < bound):.0f} %"
+        table.row(
+            name, "rigid" if rigid else "elastic", f"{np.mean([e.converged for e in found]):.0%}",
+            f"{np.mean([e.details['criterion_percent'] for e in found]):.2f}", f"{ratio.mean():.3f}",
+            f"{1 - fitted / 100:.3f}", f"{np.mean(ratio <= 1):.0%}", inside(1.96), inside(3.0),
+        )
+    table.show(time.perf_counter() - start)
+
+
+def needles(folder: Path) -> None:
+    """What simulating the encoder's rounding makes of the cost: a bed of needles."""
+    start = time.perf_counter()
+    case = case_of(folder, "needles", 1)
+    bogdan_figures.needles(folder / "needles.png", jaxid.load_case(case))
+    print(f"\nneedles.png: the cost with and without rounding ({time.perf_counter() - start:.1f} s)")
+
+
+def frictions(folder: Path) -> None:
+    """Figures 3 and 6 redrawn: friction against velocity of both data sets, and its hysteresis."""
+    bogdan_figures.frictions(folder / "frictions.png")
+    print("\nfrictions.png: friction torque against velocity, both data sets")
+
+
+def hidden(folder: Path) -> None:
+    """A fit with Coulomb and viscous friction only: what `discover` names on a log that shows it."""
+    start = time.perf_counter()
+    case, log = bogdan_figures.long_case(folder)
+    found = jaxid.discover(case, log)
+    found.save(folder / "hidden", force=True)
+    print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")
+
+
+STUDIES: dict[str, Callable[[Path], None]] = {
+    f.__name__: f for f in (published, scatter, needles, frictions, hidden)
+}
+
+
+def main() -> None:
+    parser = parser_of(__doc__, "results/bogdan_micropositioning")
+    parser.add_argument("--only", choices=STUDIES, help="one of the studies")
+    args = parser.parse_args()
+    args.o.mkdir(parents=True, exist_ok=True)
+    for name, study in STUDIES.items():
+        if args.only in (None, name):
+            study(args.o)
+
+
+if __name__ == "__main__":
+    main()
