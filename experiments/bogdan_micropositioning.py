@@ -39,7 +39,7 @@ PUBLISHED = {
     "velocity_hysteresis[2].velocity": (3.12, 4.05), "cogging[2].amplitude": (1.58, 3.51),
     "cogging[2].phase": (2.17, 2.98),
 }
-RUNS = 200
+RUNS = 48
 
 
 def noise_of(data: int, resolution: float) -> float:

@@ -1,7 +1,10 @@
 """Output error in the directions that a log tells: a hundred samples, eleven unknowns."""
 
+import dataclasses
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import stages
@@ -13,6 +16,8 @@ from jaxid.estimators.steps import alone
 from jaxid.identification import identify_many
 from jaxid.io.log import Log
 from jaxid.machine import build_machine
+from jaxid.parameters import scatter
+from jaxid.replay import Numerics, make_replay
 from jaxid.session import open_session
 
 NOISE = 0.0135  # A
@@ -40,7 +45,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(folder):
-    many = (folder / "case.toml").read_text() + "starts = 16\nprofile = true\nhessian = true\n"
+    many = (folder / "case.toml").read_text() + "starts = 16\nprofile = true\n"
     (folder / "many.toml").write_text(many)
     return jaxid.identify(folder / "many.toml", logged(0))
 
@@ -84,6 +89,45 @@ def test_precision_and_profiles_agree(fitted):
     for at in (-2.0, 2.0):
         wide = at * best["std"] / best["std_white"]
         assert 0.4 * wide**2 < rise[at] < 2.5 * wide**2
+
+
+def test_sensitivities_are_those_of_finite_differences(folder):
+    """Through sticking, breaking loose, and a velocity that stands."""
+    session = open_session(folder / "case.toml", logged(0))
+    replay = make_replay(session.machine, session.fit.log, Numerics(substeps=2))
+    plant = dataclasses.replace(session.machine.plant, sharpness=jnp.asarray(0.1))
+    unknown = session.machine.parameters
+
+    @jax.jit
+    def current(x):
+        return replay(scatter(unknown.places, plant, unknown.guess * (1 + x))).command[:, 0]
+
+    at = jnp.asarray([stages.TRUTH[1][n] for n in unknown.names]) / unknown.guess - 1
+    exact, step = jax.jacfwd(current)(at), 1e-6
+    for k in range(at.size):
+        off = step * jnp.eye(at.size)[k]
+        slope = (current(at + off) - current(at - off)) / (2 * step)
+        np.testing.assert_allclose(exact[:, k], slope, atol=2e-3 * float(jnp.abs(exact).max()))
+
+
+def test_rounding_widens_what_it_moves(tmp_path):
+    """A coarse encoder's rounding is in no residual of white noise; its sigma is simulated."""
+    log, sigma = logged(0), []
+    for count in (1e-5, stages.COUNT):
+        text = stages.text(1, resolution=count, more=STATED)
+        (tmp_path / "case.toml").write_text(text)
+        best = jaxid.identify(tmp_path / "case.toml", log).estimate.details["directions"][0]
+        sigma.append(best["std"] / best["std_white"])
+    assert sigma[0] < 1.5 < sigma[1]
+
+
+@pytest.mark.slow
+def test_the_full_hessian_is_near_gauss_newtons(folder, tmp_path):
+    (tmp_path / "case.toml").write_text((folder / "case.toml").read_text() + "hessian = true\n")
+    whole = jaxid.identify(tmp_path / "case.toml", logged(0)).estimate.details["directions"]
+    gauss = jaxid.identify(folder / "case.toml", logged(0)).estimate.details["directions"]
+    assert whole[0]["std"] == pytest.approx(gauss[0]["std"], rel=0.5)
+    assert whole[0]["std"] != gauss[0]["std"]
 
 
 def test_results_hold_the_directions(fitted, tmp_path):

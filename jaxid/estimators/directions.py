@@ -31,8 +31,9 @@ from jaxid.sensors import Sensor
 # A direction is fitted where its standard deviation is below this part of the prior's; one that was stays
 # up to the second.
 _TOLD_TWICE, _STAYS = 0.5, 0.6
-# Directions change with the point at which they are read: most rounds, and what ends them.
-_ROUNDS = 6
+# Directions change with the point at which they are read: most rounds, in how many of them they are read
+# anew, and what ends them.
+_ROUNDS, _READ = 6, 3
 # In parts of the variance of one sample.
 _SETTLED = 0.02
 # Farther from its guess than so many priors no unknown is taken.
@@ -47,6 +48,9 @@ _NEGLIGIBLE = 0.1
 # a machine is fitted with that rounded over these parts of it. At most so many evaluations at each.
 _LADDER = (1.0, 0.3, 0.1)
 _A_RUNG = 25
+# Draws of where a motor stands within its first count, and the least part of a residual that is noise.
+_DRAWS = 32
+_OWN = 0.1
 # A profile is taken at so many standard deviations of the quadratic picture.
 _NONE = np.zeros(())
 _PROFILED = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
@@ -247,7 +251,8 @@ def directions_steps(
     full = None
     if hessian:
         full = np.asarray((yield Solve(_hessian, (*found.problem.args, found.vectors, z))))[:r, :r]
-    precision, stated = _assessed(machine, found, full)
+    rounding = yield from _rounding(machine, found)
+    precision, stated = _assessed(machine, found, full, rounding)
     if profile:
         yield from _profiles(found, stated)
     theta = np.asarray(found.problem.prior.outward(found.vectors @ z))[:p]
@@ -306,26 +311,21 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[_Found
     minimum = yield Solve(_fit, (*problem.args, ladder[0], _NONE, whole, w, none))
     count, cost, settled = 0, np.inf, False
     for rung in range(len(ladder) + _ROUNDS):
-        sharpness = ladder[min(rung, len(ladder) - 1)]
-        problem = _weighed(problem, minimum)
-        here = yield Solve(_fit, (*problem.args, sharpness, _NONE, whole, w, none))
-        jacobian = np.asarray(here.jacobian)
-        if not np.all(np.isfinite(jacobian)):
-            return _Found(problem, whole, count, here, spent, False)
-        _, values, rows = np.linalg.svd(jacobian, full_matrices=True)
-        told = np.zeros(size)
-        noise = _noise(problem, here, count)
-        told[: values.size] = values / noise
-        before, count = count, int(np.sum(told > 1.0 / _TOLD_TWICE))
-        if before > count:
-            count = int(np.sum(told[:before] > 1.0 / _STAYS))
-        # Eigenvectors come with either sign: the largest entry is taken positive.
-        largest = rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]
-        vectors, fitted = rows.T * np.sign(largest), np.arange(size) < count
+        sharpness, before = ladder[min(rung, len(ladder) - 1)], count
+        # Directions that change places with one another for ever are taken as they are.
+        if rung < len(ladder) + _READ:
+            problem = _weighed(problem, minimum)
+            here = yield Solve(_fit, (*problem.args, sharpness, _NONE, whole, w, none))
+            spent += int(here.steps)
+            if not np.all(np.isfinite(here.jacobian)):
+                return _Found(problem, whole, count, here, spent, False)
+            noise = _noise(problem, here, count)
+            vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
+        fitted = np.arange(size) < count
         start = np.where(fitted, np.clip(vectors.T @ w, -_FAR, _FAR), 0.0)
         pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
         minimum = yield Solve(_fit, (*problem.args, sharpness, pull, vectors, start, fitted))
-        spent += int(here.steps) + int(minimum.steps)
+        spent += int(minimum.steps)
         w = vectors @ np.asarray(minimum.theta)
         moved = abs(float(minimum.cost) - cost)
         close = before == count and moved <= _SETTLED / len(problem.measured) * cost
@@ -333,6 +333,19 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[_Found
         if settled or not np.isfinite(cost):
             break
     return _Found(problem, vectors, count, minimum, spent, settled)
+
+
+def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
+    """Directions as columns, best told first, and how many are fitted; of a Jacobian over the noise."""
+    size = jacobian.shape[1]
+    _, values, rows = np.linalg.svd(jacobian, full_matrices=True)
+    told = np.zeros(size)
+    told[: values.size] = values
+    count = int(np.sum(told > 1.0 / _TOLD_TWICE))
+    if before > count:
+        count = int(np.sum(told[:before] > 1.0 / _STAYS))
+    # Eigenvectors come with either sign: the largest entry is taken positive.
+    return rows.T * np.sign(rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]), count
 
 
 def _weighed(problem: Problem, minimum: Minimum) -> Problem:
@@ -393,8 +406,38 @@ def _many_starts(found: _Found, points: np.ndarray) -> Steps[tuple[_Found, dict[
     return replace(found, evaluations=spent), {"starts": stated}
 
 
+@eqx.filter_jit
+def _each_start(*args: Any) -> Array:
+    *problem, sharpness, vectors, z, offsets = args
+    replay, places, plant, *rest = problem
+    plant = replace(plant, sharpness=sharpness)
+    # What the loop does of a motor that stands elsewhere within its first count.
+    moved = lambda offset: eqx.tree_at(lambda r: r.position, replay, replay.position + offset)
+    at = lambda offset: _residual_of(moved(offset), places, plant, *rest, vectors)(z)
+    return eqx.filter_vmap(at)(offsets)
+
+
+def _rounding(machine: Machine, found: _Found) -> Steps[np.ndarray | None]:
+    """What rounding of readings does to the residual, (draws, time, k); None where none was left out.
+
+    The loop of the estimate is simulated with it from many places within the first count, and without.
+    """
+    count, problem = machine.sensor.position_resolution, found.problem
+    if problem.on == "position" or count is None or problem.replay.controller is None:
+        return None
+    n = problem.replay.position.size
+    offsets = np.random.default_rng(0).uniform(-0.5, 0.5, (_DRAWS, n)) * np.asarray(count)
+    rounded = eqx.tree_at(
+        lambda r: r.sensor, problem.replay, machine.sensor, is_leaf=lambda x: isinstance(x, Sensor)
+    )
+    rest = (problem.ladder[-1], found.vectors, np.asarray(found.minimum.theta))
+    with_it = yield Solve(_each_start, (rounded, *problem.args[1:], *rest, offsets))
+    without = yield Solve(_each_start, (problem.replay, *problem.args[1:], *rest, 0.0 * offsets[:1]))
+    return np.asarray(with_it) - np.asarray(without)
+
+
 def _assessed(
-    machine: Machine, found: _Found, hessian: np.ndarray | None
+    machine: Machine, found: _Found, hessian: np.ndarray | None, rounding: np.ndarray | None
 ) -> tuple[Precision, list[dict[str, Any]]]:
     """Precision of the parameters, and of the directions."""
     problem, r = found.problem, found.count
@@ -417,6 +460,11 @@ def _assessed(
     # A colour read off a hundred samples is itself uncertain: never less than white noise would leave.
     larger = np.maximum(1.0, white / told.std)
     of_seen = told.covariance * np.outer(larger, larger)
+    if rounding is not None:
+        # To first order each draw of it moves the estimate so far; the residual has one draw in it.
+        moved = np.stack([np.linalg.lstsq(flat, d.ravel())[0] for d in rounding])
+        left = 1.0 - np.mean(rounding**2) * rounding[0].size / np.sum(e**2)
+        of_seen = moved.T @ moved / len(moved) + max(left, _OWN) * of_seen
     seen, held = found.vectors[:, :r], found.vectors[:, r:]
     slope = problem.prior.slope(theta)
     whole = seen @ of_seen @ seen.T + held @ held.T
