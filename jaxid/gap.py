@@ -110,9 +110,9 @@ def noise_density(
     """One-sided density of the force that the sensors' noise alone leaves [N^2/Hz], by joint.
 
     Position noise passes the plant's impedance -M w^2 + i C w + K (linearised at a typical
-    velocity) and both filters; force noise passes the parallel filter. The noise is the case's
-    `[sensor]`; where that is silent, position noise is read off the high band of the log and the
-    logged force counts as exact.
+    velocity), the response of each derivative and the parallel filter; force noise passes the
+    parallel filter. The noise is the case's `[sensor]`; where that is silent, position noise is read
+    off the high band of the log and the logged force counts as exact.
 
     Args:
         machine: The machine; its parameters enter through the impedance only.
@@ -128,8 +128,12 @@ def noise_density(
     sigma = position_noise(machine, log)
     mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
     w = 2 * np.pi * f[:, None, None]
-    impedance = _seen(-mass * w**2 + 1j * w * damping + stiffness, data.measured)
-    through = recipe.response(f, rate) * recipe.decimator.response(f, rate)
+    stiff, damped, heavy = (recipe.response(f, rate, k)[:, None, None] for k in range(3))
+    impedance = _seen(
+        -mass * w**2 * heavy + 1j * w * damping * damped + stiffness * stiff,
+        -mass * w**2 + 1j * w * damping + stiffness, data.measured,
+    )
+    through = recipe.decimator.response(f, rate)
     density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
     power = np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
     stated = machine.sensor.force_noise
@@ -141,13 +145,14 @@ def noise_density(
     return f, power
 
 
-def _seen(impedance: np.ndarray, measured: tuple[bool, ...]) -> np.ndarray:
-    """Of the joints that have an encoder, the others moving as they must; zero of those."""
+def _seen(impedance: np.ndarray, exact: np.ndarray, measured: tuple[bool, ...]) -> np.ndarray:
+    """Of the joints that have an encoder, the others moving as they must by the exact one; zero of those."""
     if all(measured):
         return impedance
     seen, hidden = np.flatnonzero(measured), np.flatnonzero(~np.array(measured))
     part = lambda i, j: impedance[:, i[:, None], j]
-    through = part(seen, hidden) @ np.linalg.solve(part(hidden, hidden), part(hidden, seen))
+    own = lambda i, j: exact[:, i[:, None], j]
+    through = part(seen, hidden) @ np.linalg.solve(own(hidden, hidden), own(hidden, seen))
     out = np.zeros_like(impedance)
     out[:, seen[:, None], seen] = part(seen, seen) - through
     return out

@@ -1,7 +1,8 @@
 """From a log to the motion and force that inverse dynamics compares, and the choice of how.
 
 A stated recipe is applied to the letter. Where none is stated, cut-off, decimation and rest
-velocity follow from the log's own noise, and are reported.
+velocity follow from the log's own noise, and are reported. A running median of the force is stated
+or there is none: it goes before all else, see `Recipe.cleaned`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ A_PERIOD = 0.4
 _ENOUGH = 100
 # Periods of the band's edge that are left out at each end.
 _ENDS = 3
+# The parallel filter's edge over the frequency at which a parabola has half of a velocity left, at
+# most: there nine tenths are left.
+_FLAT = 1 / 3
 
 
 @dataclass(frozen=True)
@@ -30,17 +34,21 @@ class Recipe:
     """How a log is filtered.
 
     Args:
-        cutoff_hz: Of the zero-phase low-pass on the position.
+        cutoff_hz: Of the zero-phase low-pass on the position; with "parabolic" derivatives, which
+            leave the position as it is, where half of the velocity is left.
         order: Of the Butterworth filter, which is run twice.
         decimation: One sample in so many is kept, after the parallel filter.
         trim: Samples left out at each end, after decimation.
         rest_velocity: Below it a sample counts as at rest [m/s or rad/s], by joint.
         align_hold: Whether the command is seen as it acts, half a sample late where it is held,
             instead of at the instants at which it was logged.
-        derivatives: "central" (differences) or "spectral" (exact in the band).
+        derivatives: "central" (differences), "spectral" (exact in the band) or "parabolic" (of the
+            parabola through the neighbours, with no low-pass before it).
         keeps_reversals: Whether a fit uses samples that only pass through zero.
         edge: Of the parallel filter over half the sampling rate (see `signals.Decimator`); None:
             its decimation's.
+        reach: Samples on each side of a parabola.
+        median: Samples of the running median of the force; None: as it was logged.
     """
 
     cutoff_hz: float
@@ -52,13 +60,42 @@ class Recipe:
     derivatives: str
     keeps_reversals: bool = False
     edge: float | None = None
+    reach: int = 2
+    median: int | None = None
+
+    def cleaned(self, log: Log) -> Log:
+        """A log as everything else sees it: its force behind the running median.
+
+        Raises:
+            InputError: If the log is shorter than the median or the parabola.
+        """
+        _require_length(log, self.median, self.reach if self.derivatives == "parabolic" else None)
+        if self.median is None:
+            return log
+        return replace(log, force=signals.running_median(log.force, self.median))
 
     def band_hz(self, rate_hz: float) -> float:
         """Edge of the band in which forces are compared."""
         return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
 
-    def response(self, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
-        """Gain of the zero-phase low-pass at each frequency [Hz], without the parallel filter."""
+    def motion_hz(self, rate_hz: float) -> float:
+        """Cut-off that the position has, or would have if it were filtered."""
+        if self.derivatives != "parabolic" or self.edge is None:
+            return self.cutoff_hz
+        return min(self.edge, 0.45) * rate_hz
+
+    def response(self, frequency: np.ndarray, rate_hz: float, order: int = 0) -> np.ndarray:
+        """Gain of a derivative over the exact one at each frequency [Hz], without the parallel filter.
+
+        Args:
+            frequency: [Hz].
+            rate_hz: Sampling rate of the log.
+            order: Of the derivative, 0 to 2; only a parabola treats them differently.
+        """
+        if self.derivatives == "parabolic":
+            if order == 0:
+                return np.ones_like(frequency)
+            return signals.parabolic_response(frequency / rate_hz, self.reach, order)
         if self.derivatives == "spectral":
             return signals.roll_off(frequency, self.cutoff_hz)
         sos = scipy.signal.butter(self.order, self.cutoff_hz, fs=rate_hz, output="sos")
@@ -179,12 +216,16 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     twice that, is flat where the parallel filter still passes anything. The rest velocity is five standard
     deviations of the velocity's noise in that band, at least half a percent of the RMS velocity.
 
+    Parabolic derivatives leave the position unfiltered, and the parallel filter ends where they are still
+    flat, or earlier; with a stated decimation it is that decimation's, to the letter.
+
     Args:
         log: The log.
         stated: The case's `[preprocess]`; its entries win.
 
     Raises:
-        InputError: If it states a cut-off that the log's sampling rate cannot have.
+        InputError: If it states a cut-off that the log's sampling rate cannot have, or a median or a
+            parabola that is longer than the log.
     """
     stated = dict(stated or {})
     rate = log.rate_hz
@@ -193,15 +234,25 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
             f"[preprocess] cutoff_hz = {stated['cutoff_hz']:g} is not below half the sampling rate of "
             f"{rate:.6g} Hz", where=log.source, mend="lower it, or leave it out: it is then chosen",
         )
-    literal = "cutoff_hz" in stated
+    parabolic, reach = stated.get("derivatives") == "parabolic", int(stated.get("reach", 2))
+    _require_length(log, stated.get("median"), reach if parabolic else None)
+    literal = "cutoff_hz" in stated or (parabolic and "decimation" in stated)
+    how = stated.get("derivatives", "central" if literal else "spectral")
     edge = None if literal else _noise_cutoff(log)
-    cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
+    if parabolic:
+        cutoff = signals.parabolic_cutoff(reach) * rate
+        edge = None if literal else min(edge, _FLAT * cutoff)
+    else:
+        cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
     band = cutoff if literal else edge
     decimation = int(stated.get("decimation", _decimation(log, band)))
-    q, qd, _ = differentiate(log.filled, log.period, cutoff, 4, "central" if literal else "spectral")
+    q, qd, _ = differentiate(log.filled, log.period, cutoff, 4, how, reach=reach)
     noise = signals.high_band_std(log.filled, rate)
     # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
     velocity_noise = noise * 2 * np.pi * np.sqrt(2 * cutoff**3 / (3 * rate))
+    if parabolic:
+        # Slope of a line through 2 k + 1 samples.
+        velocity_noise = noise * rate * np.sqrt(3 / (reach * (reach + 1) * (2 * reach + 1)))
     rest = np.maximum(5 * velocity_noise, 5e-3 * np.sqrt(np.mean(qd**2, axis=0)))
     if "rest_velocity" in stated:
         rest = np.full(q.shape[1], stated["rest_velocity"], float)
@@ -212,10 +263,22 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         trim=int(stated.get("trim", trimmed(log, band, decimation, literal=literal))),
         rest_velocity=tuple(float(r) for r in rest),
         align_hold=bool(stated.get("align_hold", not literal)),
-        derivatives="central" if literal else "spectral",
+        derivatives=how,
         keeps_reversals=literal,
         edge=None if literal else 2 * edge / rate,
+        reach=reach,
+        median=stated.get("median"),
     )
+
+
+def _require_length(log: Log, median: int | None, reach: int | None) -> None:
+    """Refuse a window that is as long as the log."""
+    for key, value, width in (("median", median, median), ("reach", reach, 2 * (reach or 0) + 1)):
+        if value is not None and width >= log.samples:
+            raise InputError(
+                f"[preprocess] {key} = {value} takes {width} samples, and the log has {log.samples}",
+                where=log.source, mend="lower it, or take a longer log",
+            )
 
 
 def _decimation(log: Log, band_hz: float) -> int:
@@ -265,9 +328,14 @@ def _noise_cutoff(log: Log) -> float:
 
 
 def differentiate(
-    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str, orders: int = 2
+    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str, orders: int = 2,
+    reach: int = 2,
 ) -> tuple[np.ndarray, ...]:
-    """Filtered signal and its derivatives up to an order, by "central" differences or "spectral"."""
+    """Signal and its derivatives up to an order; filtered unless `how` is "parabolic", see `Recipe`."""
+    if how == "parabolic":
+        if orders > 2:
+            raise ValueError(f"a parabola has no derivative of order {orders}.")
+        return (x, *signals.parabolic_derivatives(x, period, reach))[: orders + 1]
     if how == "spectral":
         return signals.spectral_derivatives(x, period, cutoff_hz, orders)
     out = [signals.butterworth_zero_phase(x, cutoff_hz, order, 1 / period)]
@@ -282,18 +350,18 @@ def prepare(
     """Filter a log and mark the samples that count.
 
     Args:
-        log: The log.
+        log: The log, as `Recipe.cleaned` gives it.
         gain: Declared force per unit of command, (m,).
         recipe: How to filter it.
         hold_period: For how long a held command is held [s]; absent: the log's sampling time.
     """
     q, qd, qdd = differentiate(
-        log.filled, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives
+        log.filled, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives, reach=recipe.reach
     )
     kept = recipe.decimator.kept(len(q))
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
     reach = recipe.decimator.reach
-    if recipe.derivatives == "spectral":
+    if not recipe.keeps_reversals:
         reach = affordable(at_rest, turning(qd), max(reach, recipe.decimation - 1))
         # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
         at_rest = at_rest | (turning(qd) & (reach > 0))

@@ -23,7 +23,7 @@ class Run:
 
     Args:
         name: In results.
-        log: The log.
+        log: The log, its force behind the recipe's running median where it has one.
         data: The same, prepared.
         disturbance: The controller's.
     """
@@ -95,14 +95,14 @@ def open_session(
         recipe = replace(recipe, align_hold=align_hold)
     disturbance = machine.disturbance
     needed = enough(case, machine)
-    opened = [Run("fit", fit, _prepare(fit, machine, recipe, needed), disturbance)]
+    opened = [_run("fit", fit, machine, recipe, needed, disturbance)]
     names = {"fit"}
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
         read = _read(case, source, columns=entry.columns)
         findings += _check(case, read, machine)
-        opened.append(Run(entry.name, read, _prepare(read, machine, recipe, needed), entry.disturbance))
+        opened.append(_run(entry.name, read, machine, recipe, needed, entry.disturbance))
         names.add(entry.name)
     for extra in validate:
         read = _read(case, extra, whole=True)
@@ -111,7 +111,7 @@ def open_session(
         while name in names:
             name += "'"
         names.add(name)
-        opened.append(Run(name, read, _prepare(read, machine, recipe, needed), disturbance))
+        opened.append(_run(name, read, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
 
@@ -131,9 +131,8 @@ def session_around(
         InputError: If the log is too short, or moves too little.
     """
     recipe = recipe or choose_recipe(log, case.preprocess)
-    data = _prepare(log, machine, recipe, enough(case, machine))
-    run = Run("fit", log, data, machine.disturbance)
-    return Session(case, _scaled(machine, data), run, (), recipe, ())
+    run = _run("fit", log, machine, recipe, enough(case, machine), machine.disturbance)
+    return Session(case, _scaled(machine, run.data), run, (), recipe, ())
 
 
 def _read(
@@ -180,6 +179,13 @@ def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
 def enough(case: Case, machine: Machine) -> int:
     """Samples of motion that a log must have; none where a prior holds what it does not tell."""
     return 0 if "prior" in case.output_error else 5 * max(len(machine.parameters.free), 4)
+
+
+def _run(
+    name: str, log: Log, machine: Machine, recipe: Recipe, needed: int, disturbance: dict | str | None
+) -> Run:
+    log = recipe.cleaned(log)
+    return Run(name, log, _prepare(log, machine, recipe, needed), disturbance)
 
 
 def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepared:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.fft
+import scipy.ndimage
+import scipy.optimize
 import scipy.signal
 from jaxtyping import Array, Float
 
@@ -42,6 +45,83 @@ def central_difference(
 ) -> Float[np.ndarray, "time k"]:
     """Second-order central difference, one-sided at the two ends."""
     return np.gradient(x, period, axis=0, edge_order=2)
+
+
+def running_median(x: Float[np.ndarray, "time k"], width: int) -> Float[np.ndarray, "time k"]:
+    """Median of each sample and its neighbours, `width` in all, which must be odd.
+
+    The windows that would reach beyond an end are replaced by Tukey's rule: the median of the
+    sample, of the first full window, and of the line through the first two full windows, as far
+    beyond the sample as that window lies before it. Reflected or repeated samples would bend a
+    ramp, and shrunken windows keep an outlier at the very end.
+
+    Raises:
+        ValueError: If the width is even, below 3, or not less than the samples.
+    """
+    if width < 3 or width % 2 == 0 or width >= len(x):
+        raise ValueError(f"width = {width} must be odd, at least 3 and less than the {len(x)} samples.")
+    half = width // 2
+    out = scipy.ndimage.median_filter(x, size=(width, 1), mode="nearest")
+    ahead = 2.0 * np.arange(half, 0, -1)[:, None]
+    for y, raw in ((out, x), (out[::-1], x[::-1])):
+        beyond = y[half] - ahead * (y[half + 1] - y[half])
+        inner = np.broadcast_to(y[half], beyond.shape)
+        y[:half] = np.median([raw[:half], inner, beyond], axis=0)
+    return out
+
+
+@cache
+def median_noise(width: int) -> float:
+    """What `high_band_std` sees of white noise of standard deviation one behind a running median.
+
+    Of noise that is larger than the signal's rise from sample to sample; found on Gaussian noise.
+    """
+    white = np.random.default_rng(0).standard_normal((1 << 18, 1))
+    return float(high_band_std(running_median(white, width), 1.0)[0])
+
+
+def parabolic_derivatives(
+    x: Float[np.ndarray, "time k"], period: float, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """First and second derivative of the parabola through 2 reach + 1 samples about each one.
+
+    The parabola is fitted by least squares (Savitzky and Golay); it is not causal and has no phase.
+    At the ends the first and the last one are read off the middle.
+
+    Args:
+        x: Columns.
+        period: Sampling time [s].
+        reach: Samples on each side.
+    """
+    fit = lambda order: scipy.signal.savgol_filter(
+        x, 2 * reach + 1, 2, deriv=order, delta=period, axis=0, mode="interp"
+    )
+    return fit(1), fit(2)
+
+
+def parabolic_response(f: np.ndarray, reach: int, order: int) -> np.ndarray:
+    """Gain of the parabola's derivative of order 1 or 2 over the exact one.
+
+    Args:
+        f: Frequencies [cycles a sample].
+        reach: Samples on each side.
+        order: Of the derivative.
+    """
+    steps = np.arange(-reach, reach + 1)
+    weights = scipy.signal.savgol_coeffs(2 * reach + 1, 2, deriv=order, use="dot")
+    w = 2 * np.pi * np.asarray(f, dtype=float)
+    slow = w < 1e-4  # Round-off grows with w^-2; the gain differs from one by w^2.
+    exact = np.where(slow, 1.0, w) ** order
+    # Odd weights see the sine, even ones the cosine, whose second derivative is negative.
+    seen = np.sin(np.outer(w, steps)) if order == 1 else -np.cos(np.outer(w, steps))
+    return np.where(slow, 1.0, seen @ weights / exact)
+
+
+@cache
+def parabolic_cutoff(reach: int) -> float:
+    """Where half of the parabola's velocity is left [cycles a sample]."""
+    left = lambda f: float(parabolic_response(np.array([f]), reach, 1)[0]) - 0.5
+    return float(scipy.optimize.brentq(left, 1e-3 / reach, 1 / (2 * reach + 1)))
 
 
 def spectral_derivatives(

@@ -206,6 +206,18 @@ FAULTS = {
     "cutoff": (more("[preprocess]\ncutoff_hz = -1"), ["[preprocess]", "cutoff_hz", "> 0"]),
     "decimation": (more("[preprocess]\ndecimation = 2.5"), ["decimation = 2.5", "whole number"]),
     "order": (more("[preprocess]\norder = 0"), ["order = 0", "at least 1"]),
+    "median even": (more("[preprocess]\nmedian = 4"), ["median = 4", "is even", "median = 5"]),
+    "median of one": (more("[preprocess]\nmedian = 1"), ["median = 1", "at least 3"]),
+    "derivatives": (
+        more('[preprocess]\nderivatives = "parabola"'), ["derivatives", "did you mean 'parabolic'"]
+    ),
+    "reach of none": (
+        more('[preprocess]\nderivatives = "parabolic"\nreach = 0'), ["reach = 0", "at least 1"]
+    ),
+    "reach alone": (more("[preprocess]\nreach = 3"), ["reach", 'derivatives = "parabolic"']),
+    "parabola of a low-pass": (
+        more('[preprocess]\nderivatives = "parabolic"\ncutoff_hz = 60.0'), ["cutoff_hz", "leave out one"]
+    ),
     "align_hold": (more("[preprocess]\nalign_hold = 1"), ["align_hold", "true or false"]),
     # controller
     "gain of another": (more("kd = 3.0"), ["[controller]", "'kd'", "there is: kind, kp, kv"]),

@@ -128,6 +128,9 @@ def test_faults_of_the_log(tmp_path, sound, capsys, fault):
     [
         ("rest_velocity = 1.0", "only 0 samples move faster than the rest velocity 1; take a log"),
         ("decimation = 200", "too short: 2000 samples leave"),
+        ("median = 2001", "median = 2001 takes 2001 samples, and the log has 2000"),
+        ('derivatives = "parabolic"\nreach = 1000', "reach = 1000 takes 2001 samples"),
+        ("median = 4", "median = 4 is even; it must be odd"),
     ],
 )
 def test_a_log_with_too_little_left(tmp_path, sound, capsys, line, told):

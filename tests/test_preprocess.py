@@ -1,13 +1,23 @@
 """From a log to prepared signals: stated recipes to the letter, chosen ones from the noise."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from cli_setup import TRUTH, text
+from search_setup import log_of as stepper_log
+from search_setup import write_case
+from stepper_machines import emps_like
 
+import jaxid
 from jaxid.errors import InputError
+from jaxid.gap import noise_floor
 from jaxid.io.log import Log
+from jaxid.io.results import recipe_json
 from jaxid.preprocess import choose_recipe, differentiate, prepare
+from jaxid.session import open_session
+from jaxid.signals import parabolic_cutoff
 
 RATE = 1000.0
 TIME = np.arange(8000) / RATE
@@ -149,3 +159,119 @@ def test_a_cutoff_beyond_half_the_rate_is_refused():
     log = log_of(tour())
     with pytest.raises(InputError, match="cutoff_hz = .* is not below half the sampling rate"):
         choose_recipe(log, {"cutoff_hz": 0.5 * log.rate_hz})
+
+
+@pytest.mark.parametrize("how", ["central", "spectral", "parabolic"])
+def test_stated_derivatives_win(how):
+    log = log_of(multisine())
+    recipe = choose_recipe(log, {"derivatives": how})
+    assert recipe.derivatives == how
+    # all else stays chosen
+    assert recipe.align_hold
+    assert not recipe.keeps_reversals
+    assert recipe.edge is not None
+    if how != "parabolic":
+        assert choose_recipe(log, {**STATED, "derivatives": how}).derivatives == how
+
+
+def test_parabolic_leaves_the_position_as_it_is():
+    log = log_of(multisine())
+    recipe = choose_recipe(log, {"derivatives": "parabolic", "reach": 4, "decimation": 1})
+    assert not recipe.decimator.filters
+    data = prepare(log, np.ones(1), recipe)
+    np.testing.assert_array_equal(data.q, log.position)
+    columns = np.arange(-4.0, 5.0)[:, None] ** np.arange(3)
+    rows = np.stack([log.position[k : k + len(TIME) - 8, 0] for k in range(9)])
+    fitted = np.linalg.pinv(columns) @ rows
+    np.testing.assert_allclose(data.qd[4:-4, 0], fitted[1] * RATE, atol=1e-9)
+    np.testing.assert_allclose(data.qdd[4:-4, 0], 2 * fitted[2] * RATE**2, atol=1e-6)
+    # the parallel filter ends where the parabola is still flat
+    wide = choose_recipe(log, {"derivatives": "parabolic", "reach": 40})
+    assert 0.5 * RATE * wide.edge < 0.34 * wide.cutoff_hz
+
+
+def test_rest_velocity_of_a_parabola_is_five_deviations_of_its_noise():
+    recipe = choose_recipe(log_of(multisine(), noise=1e-3), {"derivatives": "parabolic", "reach": 3})
+    white = 1e-3 * np.random.default_rng(4).standard_normal((8000, 1))
+    velocity = differentiate(white, 1 / RATE, recipe.cutoff_hz, 4, "parabolic", reach=3)[1]
+    assert recipe.rest_velocity[0] == pytest.approx(5 * velocity.std(), rel=0.1)
+
+
+SPIKY = 0.2  # V, of white noise on the logged force
+
+
+@pytest.fixture(scope="module")
+def axis():
+    """The stepper's axis with a noisy force, without and with spikes against it."""
+    clean = stepper_log(emps_like(0, duration=8.0))
+    random = np.random.default_rng(5)
+    noisy = clean.force + SPIKY * random.standard_normal(clean.force.shape)
+    at = np.arange(70, len(noisy) - 70, 140)
+    at = at + random.integers(-60, 60, len(at))
+    at = np.concatenate([at, at[::4] + 1])
+    spiky = noisy.copy()
+    spiky[at] = -9.0 * np.sign(clean.force[at])
+    return [dataclasses.replace(clean, force=force) for force in (noisy, spiky)]
+
+
+def case_of(folder, *lines: str):
+    case = text().replace("force_noise = 0.002", f"force_noise = {SPIKY}")
+    return write_case(folder, "\n".join([case, "[preprocess]", *lines, ""]))
+
+
+def test_median_takes_the_spikes_of_a_force_out(tmp_path, axis):
+    """Bias over standard deviation and over truth, with spikes in 1 % of the samples."""
+
+    def off(*lines: str) -> tuple[np.ndarray, np.ndarray]:
+        result = jaxid.identify(case_of(tmp_path, *lines), axis[1], method="inverse_dynamics")
+        estimate, truth = result.estimate, np.array(list(TRUTH.values()))
+        assert estimate.machine.parameters.names == list(TRUTH)
+        return (estimate.theta - truth) / estimate.precision.std, estimate.theta / truth - 1
+
+    sigmas, _ = off("median = 5")
+    assert np.abs(sigmas).max() < 3.0
+    _, biased = off()
+    assert np.all(biased < -0.03)
+
+
+def test_median_touches_the_force_and_nothing_else(tmp_path, axis):
+    session = open_session(case_of(tmp_path, "median = 5"), axis[1])
+    log = session.fit.log
+    np.testing.assert_array_equal(log.position, axis[1].position)
+    np.testing.assert_array_equal(log.reference, axis[1].reference)
+    assert np.abs(axis[1].force - axis[0].force).max() > 8.0
+    assert np.abs(log.force - axis[0].force).max() < 2.0
+    np.testing.assert_array_equal(session.fit.data.force, log.force * session.machine.gain)
+
+
+@pytest.mark.parametrize("reach", [2, 6])
+def test_noise_floor_of_a_parabola_is_what_its_noise_makes_of_the_balance(tmp_path, axis, reach):
+    lines = ('derivatives = "parabolic"', f"reach = {reach}", "decimation = 1")
+    session = open_session(case_of(tmp_path, *lines), axis[0])
+    # the encoder's noise alone
+    machine = dataclasses.replace(
+        session.machine, sensor=dataclasses.replace(session.machine.sensor, force_noise=None)
+    )
+    floor = noise_floor(machine, session.fit.log, session.fit.data)
+    sensor = emps_like(0).sensor
+    sigma = np.hypot(sensor.position_noise, sensor.position_resolution / np.sqrt(12))
+    white = sigma * np.random.default_rng(6).standard_normal((50_000, 1))
+    _, v, a = differentiate(white, 1e-3, 1.0, 4, "parabolic", reach=reach)
+    values = dict(zip(machine.parameters.names, machine.parameters.guess, strict=True))
+    left = values["inertia"] * a + values["viscous_friction.coefficient"] * v
+    assert floor[0] == pytest.approx(left.std(), rel=0.05)
+
+
+def test_minimal_models_refuse_a_parabola(tmp_path, axis):
+    case = case_of(tmp_path, 'derivatives = "parabolic"')
+    with pytest.raises(InputError, match="needs one filter for all of its columns") as caught:
+        jaxid.identify(case, axis[0], method="minimal_model")
+    assert "\n" not in str(caught.value)
+
+
+def test_results_tell_the_median_and_the_parabola(tmp_path, axis):
+    case = case_of(tmp_path, "median = 5", 'derivatives = "parabolic"', "reach = 4")
+    told = recipe_json(open_session(case, axis[0]))
+    assert (told["median"], told["derivatives"], told["reach"]) == (5, "parabolic", 4)
+    assert told["cutoff_hz"] == pytest.approx(RATE * parabolic_cutoff(4))
+    assert not {"median", "reach"} & set(recipe_json(open_session(case_of(tmp_path), axis[0])))

@@ -124,6 +124,73 @@ def test_central_difference_is_exact_for_parabolas_to_the_ends():
     np.testing.assert_allclose(signals.central_difference(x, PERIOD), expected, atol=1e-10)
 
 
+def test_median_leaves_a_ramp_and_takes_single_and_double_outliers_out():
+    ramp = np.stack([0.5 * np.arange(60.0), 7.0 - 2.0 * np.arange(60.0)], axis=1)
+    np.testing.assert_array_equal(signals.running_median(ramp, 5), ramp)
+    spoilt = ramp.copy()
+    spoilt[[0, 12, 30, 31, 59], 0] = [1e3, 1e3, -1e3, -1e3, 1e3]
+    spoilt[[20, 21, 58, 59], 1] = [1e3, -1e3, -1e3, -1e3]
+    off = np.abs(signals.running_median(spoilt, 5) - ramp)
+    # of four neighbours that are right, two samples of the ramp away at most
+    assert off[2:-2].max() <= 2 * 2.0
+    # at an end as far again
+    assert off.max() <= 4 * 2.0
+    far = np.ones(60, bool)
+    far[[*range(4), *range(10, 15), *range(28, 34), *range(56, 60)]] = False
+    np.testing.assert_array_equal(off[far, 0], 0.0)
+    # three in a row are the signal
+    spoilt[40:43, 0] = 1e3
+    assert np.abs(signals.running_median(spoilt, 5) - ramp)[41, 0] > 900.0
+
+
+@pytest.mark.parametrize("width", [1, 4, 61, 60])
+def test_median_of_an_impossible_width_is_refused(width):
+    with pytest.raises(ValueError, match="must be odd"):
+        signals.running_median(np.zeros((60, 1)), width)
+
+
+@pytest.mark.parametrize("width", [3, 5, 9])
+def test_noise_behind_a_median_is_read_back(width):
+    white = 0.3 * np.random.default_rng(8).standard_normal((50_000, 1))
+    seen = signals.high_band_std(signals.running_median(white, width), 1000.0)
+    assert seen[0] < 0.5 * 0.3
+    np.testing.assert_allclose(seen / signals.median_noise(width), 0.3, rtol=0.05)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 5])
+def test_parabolic_derivatives_are_exact_for_parabolas_to_the_ends(reach):
+    x = np.stack([1.0 + 3.0 * TIME - 2.0 * TIME**2, 5.0 * TIME**2], axis=1)
+    first, second = signals.parabolic_derivatives(x, PERIOD, reach)
+    np.testing.assert_allclose(first, np.stack([3.0 - 4.0 * TIME, 10.0 * TIME], axis=1), atol=1e-8)
+    np.testing.assert_allclose(second, np.broadcast_to([-4.0, 10.0], x.shape), atol=1e-5)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 5])
+def test_noise_of_the_parabolas_derivatives(reach):
+    """Slope of a line over an odd number of samples, and the fit's curvature by its normal equations."""
+    white = np.random.default_rng(2).standard_normal((40_000, 1))
+    first, second = signals.parabolic_derivatives(white, PERIOD, reach)
+    expected = np.sqrt(3 / (reach * (reach + 1) * (2 * reach + 1))) / PERIOD
+    assert first.std() == pytest.approx(expected, rel=0.02)
+    columns = np.arange(-reach, reach + 1)[:, None] ** np.arange(3.0)
+    curvature = 2 * np.sqrt(np.linalg.inv(columns.T @ columns)[2, 2]) / PERIOD**2
+    assert second.std() == pytest.approx(curvature, rel=0.02)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 5])
+@pytest.mark.parametrize("f", [5.0, 40.0])
+def test_response_of_the_parabola_is_what_it_leaves_of_a_tone(reach, f):
+    w, inside = 2 * np.pi * f, slice(20, -20)
+    x = np.sin(w * TIME)[:, None]
+    first, second = signals.parabolic_derivatives(x, PERIOD, reach)
+    gain = [signals.parabolic_response(np.array([0.0, f * PERIOD]), reach, k) for k in (1, 2)]
+    assert gain[0][0] == gain[1][0] == 1.0
+    np.testing.assert_allclose(first[inside, 0], gain[0][1] * w * np.cos(w * TIME)[inside], atol=1e-8 * w)
+    np.testing.assert_allclose(second[inside], -gain[1][1] * w**2 * x[inside], atol=1e-7 * w**2)
+    cutoff = np.array([signals.parabolic_cutoff(reach)])
+    assert signals.parabolic_response(cutoff, reach, 1)[0] == pytest.approx(0.5)
+
+
 def test_butterworth_has_no_phase_and_six_decibels_at_the_cut_off():
     x = np.sin(2 * np.pi * 20.0 * TIME)[:, None]
     y = signals.butterworth_zero_phase(x, 20.0, 4, 1000.0)

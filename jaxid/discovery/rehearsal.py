@@ -88,7 +88,8 @@ class Stage:
         command = np.asarray(run.command)
         command = command + self.floor * rng.standard_normal(command.shape)
         times = self.bench.period * np.arange(len(command))
-        return Log(times, np.asarray(run.reading), command, hold=self.machine.hold, source="rehearsal")
+        log = Log(times, np.asarray(run.reading), command, hold=self.machine.hold, source="rehearsal")
+        return self.recipe.cleaned(log)
 
     def _outcome(self, union: cand.Union, pair: Pair, log: Log) -> Outcome:
         if not np.all(np.isfinite(log.position)):

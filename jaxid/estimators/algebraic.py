@@ -171,7 +171,8 @@ def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
 def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimate]:
     """`algebraic`, as what is to be solved."""
     plant, arrays = sharpened(machine.plant, data), ForceData.of(data)
-    length = int(min(_WINDOW_PERIODS / (data.recipe.cutoff_hz * log.period), log.samples / 8))
+    cutoff = data.recipe.motion_hz(log.rate_hz)
+    length = int(min(_WINDOW_PERIODS / (cutoff * log.period), log.samples / 8))
     starts = np.arange(0, log.samples - length + 1, length // 2)
     slow = np.abs(data.qd) < np.asarray(data.recipe.rest_velocity)
     rests = np.stack([slow[k : k + length].mean(axis=0) for k in starts])

@@ -78,7 +78,9 @@ def minimal_model_steps(
     now = natural_frequencies(machine.plant, parameters.places, theta).hz
     for k in range(_PASSES):
         natural = now
-        spectrum = spectrum_of(log, machine, model.structure, coefficients, model.known, natural)
+        spectrum = spectrum_of(
+            log, machine, model.structure, coefficients, model.known, natural, stated.get("median")
+        )
         recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
         balance = _linear_balance(machine.plant, parameters.places, theta)
         data = regression_of(log, machine, model.structure, model.basis, model.known, recipe, balance)
@@ -113,14 +115,23 @@ def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Rec
     form = _form(session, printed)
     model = _model(machine.plant, machine.parameters, form, session, str(session.case.path))
     natural = natural_frequencies(machine.plant, machine.parameters.places, machine.parameters.guess).hz
-    spectrum = spectrum_of(log, machine, model.structure, model.guess, model.known, natural)
-    return spectrum, *choose_filtering(log, session.case.preprocess, model.structure, spectrum)
+    stated = session.case.preprocess
+    spectrum = spectrum_of(
+        log, machine, model.structure, model.guess, model.known, natural, stated.get("median")
+    )
+    return spectrum, *choose_filtering(log, stated, model.structure, spectrum)
 
 
 def _form(session: Session, printed: bool) -> Form:
     """The model that the log allows; the plant suits it."""
     plant, log, where = session.machine.plant, session.fit.log, str(session.case.path)
     require_linear(plant, where)
+    if session.case.preprocess.get("derivatives") == "parabolic":
+        raise InputError(
+            "[preprocess] derivatives = 'parabolic' filters each derivative differently, and a minimal model "
+            "needs one filter for all of its columns", where=where,
+            mend="leave it out, or use inverse_dynamics",
+        )
     unknown = {f.path[1] for f in session.machine.parameters.free if f.path[0] == "effects"}
     if any(delays_command(e) and k in unknown for k, e in enumerate(plant.effects)):
         raise InputError(

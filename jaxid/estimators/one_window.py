@@ -88,6 +88,9 @@ class Stretch:
         recipe = data.recipe
         position = (data.q if recipe.keeps_reversals else log.position)[inside]
         velocity = np.diff(data.q[inside], axis=0, prepend=data.q[inside][:1]) / log.period
+        if recipe.derivatives == "parabolic":
+            # Its position is not filtered: differences would have twice the noise or more.
+            velocity = data.qd[inside]
         fast = np.abs(velocity).max(axis=0)
         still = InputError(
             f"nothing moves between {start:g} and {end:g} s", where=log.source,

@@ -82,10 +82,13 @@ class Rerun:
         largest = _RUNAWAY * np.max(np.abs(self.log.filled))
         if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > largest:
             return None
-        force = np.asarray(command) if own_command and self.looped else self.log.force
+        own = own_command and self.looped
+        force = np.asarray(command) if own else self.log.force
         # What has no encoder has none here: its motion is found as that of the log is.
         position = np.where(self.log.measured, position, np.nan)
         run = replace(self.log, position=position, force=force)
+        # The log's own force has passed its median before.
+        run = self.data.recipe.cleaned(run) if own else run
         return replace(
             prepare(run, self.machine.gain, self.data.recipe), hold=self.data.hold, steps=self.data.steps
         )

@@ -165,7 +165,7 @@ def load_case(path: str | Path) -> Case:
         gain=actuator.get("gain", 1.0),
         transmission=actuator.get("transmission"),
         log=_log(tables, plant, file),
-        preprocess=read("preprocess", preprocess_keys(joints)),
+        preprocess=_checked_preprocess(read("preprocess", preprocess_keys(joints)), file),
         algebraic=read("algebraic", ALGEBRAIC),
         output_error=read("output_error", OUTPUT_ERROR),
         controller=_controller(tables, drives, file),
@@ -238,6 +238,19 @@ def _checked_transmission(actuator: dict[str, Any], joints: int, file: str) -> d
         mend = f"give {joints} rows of {joints} numbers, none a sum of others"
         raise spot.fault("is not an invertible square matrix", mend)
     return actuator
+
+
+def _checked_preprocess(stated: dict[str, Any], file: str) -> dict[str, Any]:
+    """Keys of a low-pass and of a parabola do not stand together."""
+    parabolic, spot = stated.get("derivatives") == "parabolic", Spot(file, "[preprocess]")
+    if "reach" in stated and not parabolic:
+        mend = 'add derivatives = "parabolic", or leave it out'
+        raise spot.at("reach").fault("is that of a parabola", mend)
+    for key in ("cutoff_hz", "order"):
+        if key in stated and parabolic:
+            what = 'is of a low-pass, which derivatives = "parabolic" does without'
+            raise spot.at(key).fault(what, "leave out one of them")
+    return stated
 
 
 def _log(tables: Mapping[str, Any], plant: PlantEntry, file: str) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from jaxid.io.schema import (
     flag,
     inline,
     number,
+    odd,
     rows,
     several,
     span,
@@ -42,6 +43,7 @@ METHODS = (
     "output_error",
     "didim",
 )
+DERIVATIVES = ("central", "spectral", "parabolic")
 # Tables at the top of a case, in the order in which they are checked; [[ ]] where it may recur.
 TOP = {
     "plant": False,
@@ -147,6 +149,9 @@ def preprocess_keys(joints: int) -> Keys:
         "trim": Key(whole(0)),
         "rest_velocity": Key(by_joint(number("nonnegative"), joints)),
         "align_hold": Key(flag),
+        "median": Key(odd(3), "samples of the running median of the force"),
+        "derivatives": Key(choice(DERIVATIVES)),
+        "reach": Key(whole(1), "samples on each side of a parabola"),
     }
 
 

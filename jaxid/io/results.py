@@ -148,10 +148,13 @@ def identification_json(result: Identification) -> dict[str, Any]:
 def recipe_json(session: Session) -> dict[str, Any]:
     """How the logs were filtered, chosen or stated."""
     r = session.recipe
+    stated = {"median": r.median} if r.median else {}
+    if r.derivatives == "parabolic":
+        stated["reach"] = r.reach
     return {
         "cutoff_hz": r.cutoff_hz, "order": r.order, "decimation": r.decimation, "trim": r.trim,
         "rest_velocity": list(r.rest_velocity), "align_hold": r.align_hold,
-        "derivatives": r.derivatives,
+        "derivatives": r.derivatives, **stated,
     }
 
 

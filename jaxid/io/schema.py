@@ -172,6 +172,19 @@ def whole(minimum: int) -> Reader:
     return read
 
 
+def odd(minimum: int) -> Reader:
+    """An odd whole number of at least `minimum`, which is odd."""
+    read_whole = whole(minimum)
+
+    def read(value: Any, spot: Spot) -> int:
+        value = read_whole(value, spot)
+        if value % 2 == 0:
+            raise spot.refuse(value, "is even", f"it must be odd, e.g. {spot.key} = {value + 1}")
+        return value
+
+    return read
+
+
 def flag(value: Any, spot: Spot) -> bool:
     """True or false."""
     if not isinstance(value, bool):

@@ -127,8 +127,13 @@ def check_table(result: Any) -> str:
         f"{_number(one(log['peak_force']))} {unit('force')}; {100 * log['moving']:.0f} % moving"
     )
     recipe = content["preprocess"]
+    what = f"{recipe['cutoff_hz']:.4g} Hz"
+    if "reach" in recipe:
+        what = f"parabola through {2 * recipe['reach'] + 1} samples, half the velocity at {what}"
+    if "median" in recipe:
+        what = f"median of {recipe['median']} samples of the force, {what}"
     how = (
-        f"filter: {recipe['cutoff_hz']:.4g} Hz, one sample in {recipe['decimation']} kept; noise "
+        f"filter: {what}, one sample in {recipe['decimation']} kept; noise "
         f"floor {_number(one(content['noise_floor']))} {unit('force')}"
     )
     rows = [["unknown", "guess", "std at best", "unit"]]

@@ -51,7 +51,7 @@ class Spectrum:
 
 def spectrum_of(
     log: Log, machine: Machine, structure: Structure, coefficients: np.ndarray, known: np.ndarray,
-    natural: np.ndarray,
+    natural: np.ndarray, median: int | None = None,
 ) -> Spectrum:
     """Force and noise over frequency, the noise as a row of the model amplifies it.
 
@@ -62,12 +62,14 @@ def spectrum_of(
         coefficients: Its unknown coefficients at some plant.
         known: Its known ones.
         natural: Natural frequencies of that plant [Hz].
+        median: Samples of the running median that the force has passed.
     """
     rate = log.rate_hz
     length = int(min(log.samples, max(256, 2 * rate)))
     force = log.force * machine.gain
     f, density = scipy.signal.welch(force, rate, nperseg=length, detrend="linear", axis=0)
-    floor = 2 * signals.high_band_std(force, rate) ** 2 / rate
+    white = signals.high_band_std(force, rate) / (signals.median_noise(median) if median else 1.0)
+    floor = 2 * white**2 / rate
     own = 2 * position_noise(machine, log) ** 2 / rate
     row, lead = next((k[1].row, k[1]) for k in structure.leading if k is not None)
     s = 2j * np.pi * f
