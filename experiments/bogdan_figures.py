@@ -24,6 +24,18 @@ from jaxid.virtual import Scene
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import stages
 
+# The move of data 1, for a simulation by jaxid itself.
+SIMULATED = f"""[reference]
+kind = "trapezoid"
+targets = [{stages.MOVES[1]["distance"] / stages.R}]
+speed = {stages.MOVES[1]["speed"] / stages.R}
+acceleration = {stages.MOVES[1]["speed"] / stages.R / stages.RAMP}
+repeat = false
+[simulation]
+duration = 0.5
+sample_rate = {stages.RATE}
+"""
+
 
 def fit(path: Path, found: Identification, data: int) -> None:
     """Figure 5: measured and simulated current, and their squared difference."""

@@ -160,7 +160,7 @@ def scatter(folder: Path) -> None:
 def needles(folder: Path) -> None:
     """What simulating the encoder's rounding makes of the cost: a bed of needles."""
     start = time.perf_counter()
-    case = case_of(folder, "needles", 1)
+    case = case_of(folder, "needles", 1, more=bogdan_figures.SIMULATED)
     bogdan_figures.needles(folder / "needles.png", jaxid.load_case(case))
     print(f"\nneedles.png: the cost with and without rounding ({time.perf_counter() - start:.1f} s)")
 

