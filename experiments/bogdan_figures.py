@@ -15,7 +15,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxid.identification import Identification
-from jaxid.io.case import Case
+from jaxid.io.case import Case, load_case
+from jaxid.machine import build_machine
+from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.sensors import Sensor
 from jaxid.simulation import closed_loop
@@ -85,22 +87,25 @@ def needles(path: Path, case: Case) -> None:
 
 
 def frictions(path: Path) -> None:
-    """Figures 3 and 6: friction at the motor while the table speeds up and slows down again."""
+    """Figures 3 and 6: friction at the motor, by the plant's balance, while it speeds up and slows down."""
     figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
     turns = np.linspace(-0.5, 0.5, 400)
     for data, colour in ((1, "r"), (2, "b")):
-        p = stages.TRUTH[data]
-        v = turns * stages.PITCH
-        side = np.sign(v)
-        smooth = p["viscous_friction[1].coefficient"] * turns * stages.TURN
-        smooth = smooth + stages.R * p["viscous_friction[2].coefficient"] * v
-        dry = p["coulomb_friction[1].level"] + stages.R * p["coulomb_friction[2].level"]
-        level = np.where(
-            v > 0, p["velocity_hysteresis[2].level"], p["velocity_hysteresis[2].level_negative"]
-        )
-        more = stages.R * level * np.exp(-((v / p["velocity_hysteresis[2].velocity"]) ** 2))
-        axes.plot(turns, 1e3 * (smooth + side * (dry + more)), colour, label=f"data {data}, speeding up")
-        axes.plot(turns, 1e3 * (smooth + side * dry), colour + "--", label=f"data {data}, slowing down")
+        case = path.with_name(f"friction{data}.toml")
+        case.write_text(stages.text(data, resolution=0.0))
+        plant = build_machine(load_case(case), period=1 / stages.RATE).plant
+        # A quarter turn from where the ripple of position is at its largest.
+        q = jnp.asarray([0.5 * np.pi - stages.TRUTH[data]["cogging[2].phase"]])
+
+        def friction(velocity: jax.Array, way: float, plant: Plant = plant, q: jax.Array = q) -> jax.Array:
+            u = jnp.zeros(1)
+            a = 1e-9 * way * jnp.sign(velocity)
+            own = plant.initial_states(u)
+            return plant.balance(q, velocity[None], a[None], u, jnp.zeros(()), own).residual[0]
+
+        for way, line, name in ((1.0, "-", "speeding up"), (-1.0, "--", "slowing down")):
+            torque = jax.vmap(lambda v, way=way, f=friction: f(v, way))(stages.TURN * jnp.asarray(turns))
+            axes.plot(turns, 1e3 * np.asarray(torque), colour + line, label=f"data {data}, {name}")
     axes.set(xlabel="velocity of the motor [rev/s]", ylabel="friction at the motor [mN m]")
     axes.legend()
     figure.savefig(path, dpi=110)
