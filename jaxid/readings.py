@@ -125,7 +125,7 @@ def derivative(
     return State(x.qd, qdd, rates)
 
 
-# Traced once for all stages of a step: tracing is most of what a first answer waits for.
+# Likewise, for all stages of a step.
 _derivative = eqx.filter_jit(derivative)
 
 

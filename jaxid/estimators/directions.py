@@ -51,8 +51,9 @@ _A_RUNG = 25
 # Draws of where a motor stands within its first count, and the least part of a residual that is noise.
 _DRAWS = 32
 _OWN = 0.1
-# A profile is taken at so many standard deviations of the quadratic picture.
+# No pull towards the guesses.
 _NONE = np.zeros(())
+# A profile is taken at so many standard deviations of the quadratic picture.
 _PROFILED = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 
 
