@@ -1,7 +1,7 @@
 """What is read from a plant's one balance: accelerations, steps, residuals, regressors.
 
-The smoothed reading serves gradients and the regressor; the set-valued step serves replay, where
-the axis must stick exactly.
+The smoothed reading serves gradients and the regressor; the step in which dry friction sticks
+exactly is in `jaxid.sticking`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxid.affine import Affine, affine, depends
+from jaxid.affine import Affine, affine
 from jaxid.errors import InputError
-from jaxid.model import Balance, Plant, port_motion
-from jaxid.smooth import ramp, sharp_clip, sign
+from jaxid.model import Balance, Plant
+from jaxid.smooth import ramp, sign
 
 # Traced once for all places of a step that read it: tracing is most of what a first answer waits for.
-_balance = eqx.filter_jit(lambda plant, *args: plant.balance(*args))
+balance_of = eqx.filter_jit(lambda plant, *args: plant.balance(*args))
 
 # Coordinates, velocities, and own states in one array.
 Split = tuple[Array, Array, Array]
@@ -72,15 +72,15 @@ def acceleration(
     """
 
     def residual(qdd: Array) -> tuple[Array, Balance]:
-        balance = _balance(plant, x.q, x.qd, qdd, u, t, x.own, reaction)
+        balance = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction)
         return balance.residual, balance
 
-    mass, rest = _mass(plant, residual, x.q)
+    mass, rest = mass_of(plant, residual, x.q)
     if reaction is not None or not rest.rises:
-        return _solved(mass, -rest.residual)
+        return solved(mass, -rest.residual)
     # At rest in acceleration the balance has nothing of what acts while speed grows: that resists what
     # is left of the force, as far as it goes.
-    each = _need_apart(plant, mass, rest.rises)
+    each = need_apart(plant, mass, rest.rises)
     way = sign(x.qd, plant.port_width(x.q)[: x.q.size])
     forth, back = (spread(picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
     left = -rest.residual
@@ -89,7 +89,7 @@ def acceleration(
     return (left - more) / each
 
 
-def _need_apart(plant: Plant, mass: Array, rises: tuple[int, ...]) -> Array:
+def need_apart(plant: Plant, mass: Array, rises: tuple[int, ...]) -> Array:
     """Mass of each joint, where none pushes another.
 
     Raises:
@@ -104,7 +104,7 @@ def _need_apart(plant: Plant, mass: Array, rises: tuple[int, ...]) -> Array:
     )
 
 
-def _mass(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple[Array, Any]:
+def mass_of(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple[Array, Any]:
     """Derivative of a residual in the accelerations, (n, n), or (n,) where it is diagonal; and its aux."""
     zero = jnp.zeros_like(q)
     if plant.diagonal:
@@ -112,7 +112,8 @@ def _mass(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple[A
     return jax.jacfwd(residual, has_aux=True)(zero)
 
 
-def _solved(mass: Array, force: Float[Array, " n"]) -> Float[Array, " n"]:
+def solved(mass: Array, force: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Accelerations that forces give a mass, which is a matrix or its diagonal."""
     return force / mass if mass.ndim == 1 else small_solve(mass, force)
 
 
@@ -121,7 +122,7 @@ def derivative(
 ) -> State:
     """Time derivative of the state: the right-hand side."""
     qdd = acceleration(plant, x, u, t, reaction)
-    rates = _balance(plant, x.q, x.qd, qdd, u, t, x.own, reaction).rates
+    rates = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction).rates
     return State(x.qd, qdd, rates)
 
 
@@ -146,7 +147,7 @@ def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
     """
 
     def rates(own: tuple) -> tuple:
-        return _balance(plant, x.q, x.qd, jnp.zeros_like(x.q), u, t, own).rates
+        return balance_of(plant, x.q, x.qd, jnp.zeros_like(x.q), u, t, own).rates
 
     slopes = jax.jvp(rates, (x.own,), (jax.tree.map(jnp.ones_like, x.own),))[1]
     slopes = jax.tree.map(lambda s: s if s.ndim == 0 else jnp.zeros_like(s), slopes)
@@ -154,7 +155,7 @@ def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
     return State(zero, zero, slopes)
 
 
-def _phi(x: Array) -> list[Array]:
+def phi(x: Array) -> list[Array]:
     """e^x, (e^x - 1)/x and the next three of that family; series near zero, where they cancel."""
     small = jnp.abs(x) < 0.3
     safe = jnp.where(small, 1.0, x)
@@ -208,9 +209,9 @@ def step(
         return v, rate.qd - jnp.sum(push * z, axis=1), ravel_pytree(rate.own)[0] - decay * z
 
     half = 0.5 * h
-    e, p1, p2, *_ = _phi(decay * half)
+    e, p1, p2, *_ = phi(decay * half)
     over, add = (1.0, e, half * p1), (half, half * p1, half**2 * p2)
-    e, p1, p2, p3, p4 = _phi(decay * h)
+    e, p1, p2, p3, p4 = phi(decay * h)
     y0 = (x.q, x.qd, z)
     n0 = rest(y0, start, t)
     a = _sum(linear(y0, *over), linear(n0, *add))
@@ -301,106 +302,6 @@ def course(values: tuple[Array, ...]) -> Callable[[Array], Array]:
     return lambda s: start if len(values) == 1 else start + s * (end - start)
 
 
-def set_valued_step(
-    plant: Plant,
-    x: State,
-    u: Callable[[Array], Array],
-    t: Array,
-    h: Array,
-    flow: Callable[..., State] | None = None,
-) -> tuple[State, Array]:
-    """One step under set-valued friction: flow without it, then the reaction that stops or drags.
-
-    A port slides under the level of dry friction halfway. Where it comes to rest within the step it
-    stays if the break-away level holds it, and else goes back for the rest of the step: the reaction
-    is then the mean of both parts, and the position that of two parabolas, of second order in the
-    step. Ports that are coupled through the mass matrix share their reactions by projected
-    Gauss-Seidel sweeps, each the force that brings its port to rest at the step's end, clipped.
-
-    Args:
-        plant: The plant.
-        x: State at t.
-        u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
-        t: Time [s].
-        h: Step [s].
-        flow: `step` as a function of state and reaction (left out: zero), where there is a
-            cheaper one.
-
-    Returns:
-        The state a step later, and the reaction of every port over the step.
-    """
-    ports = plant.ports(x.q).size
-    if flow is None:
-        none = jnp.zeros(ports)
-        flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
-    free = flow(x)
-    end = u(jnp.asarray(1.0))
-
-    def residual(qdd: Array, midway: Array) -> tuple[Array, Balance]:
-        levels = _balance(plant, x.q, midway, qdd, end, t, x.own, jnp.zeros(ports))
-        return levels.residual, levels
-
-    # The mass does not depend on the velocity: one balance gives it and the levels.
-    midway = 0.5 * (x.qd + free.qd)
-    mass, levels = _mass(plant, lambda qdd: residual(qdd, midway), x.q)
-    slides = levels.slides
-    if not slides:
-        return free, jnp.zeros(ports)
-    speed, before = (_port_speed(plant, at, slides) for at in (free, x))
-    mobility = h * _mobility(plant, mass, x.q, slides)
-
-    own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
-    alone = mobility.ndim == 1 or own.size == 1
-    if levels.rises:
-        _need_apart(plant, mass, levels.rises)
-        own = own * picked(_yielding(plant, x, end, t, h), slides)
-
-    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, ...]:
-        dry = picked(levels.dry, slides)
-        held = picked(at_rest.dry, slides) + picked(at_rest.stick, slides)
-        if alone:
-            more = [
-                jnp.stack([picked(r, slides) for r in b.rising]) if b.rises else None
-                for b in (levels, at_rest)
-            ]
-            reaction, *ways = _own_reaction(own, speed, before, dry, held, *more, plant.sharpness)
-        else:
-            # The level at rest acts until a port slides, and again where it would pass through rest.
-            slid = speed - jnp.sign(before) * own * dry
-            rests = (before == 0.0) | (before * slid < 0.0)
-            reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
-            ways = stuck, stuck & (before == 0.0), jnp.ones_like(speed)
-        return spread(reaction, slides, ports), *ways
-
-    zero = jnp.zeros_like(x.q)
-    named = ("dry", "stick", "rising")
-    moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in named], (midway,))
-    at_rest = residual(zero, zero)[1] if moves else levels
-    reaction, *ways = answered(levels, at_rest)
-    if moves:
-        # Without friction motion begins too fast, and friction that falls with speed is too small.
-        slowed = free.qd + h * _solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
-        reaction, *ways = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
-    stuck, stands, part = ways
-    end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
-    return _turned(x, end_of_step, stands, part, h, slides), reaction
-
-
-def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
-    """By how much less a force changes a velocity over a step than its impulse would, for damping.
-
-    A velocity that stands does so exactly or jumps: nothing may be lost between the two.
-    """
-    none = jnp.zeros_like(plant.ports(x.q))
-    slope = jax.jacfwd(lambda v: acceleration(plant, State(x.q, v, x.own), u, t, none))(x.qd)
-    return _phi(h * jnp.diagonal(slope))[1]
-
-
-def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
-    """Velocities of some ports."""
-    return picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
-
-
 def picked(x: Array, ports: tuple[int, ...]) -> Array:
     """Values of some ports."""
     return x if len(ports) == x.size else jnp.stack([x[i] for i in ports])
@@ -412,114 +313,6 @@ def spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
         return x
     zero = jnp.zeros((), x.dtype)
     return jnp.stack([x[ports.index(i)] if i in ports else zero for i in range(size)])
-
-
-def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> Array:
-    """Acceleration of some ports per unit force on each; the diagonal where that is all there is."""
-    if mass.ndim == 1 and max(slides) < q.size:
-        return picked(1.0 / mass, slides)
-    jacobian = jax.jacfwd(lambda q: picked(plant.ports(q), slides))(q)
-    columns = [_solved(mass, row) for row in jacobian]
-    return jnp.stack([jacobian @ c for c in columns], axis=1)
-
-
-def _own_reaction(
-    own: Array, speed: Array, before: Array, dry: Array, hold: Array, rising: Array | None = None,
-    rising_at_rest: Array | None = None, corner: Array | float = 0.0,
-) -> tuple[Array, Array, Array, Array]:
-    """Mean reaction over a step of ports that do not push each other.
-
-    Args:
-        own: Change of velocity over the step per unit reaction.
-        speed: At the step's end without reaction.
-        before: At its start.
-        dry, hold: Levels, sliding and at rest.
-        rising, rising_at_rest: What comes on top while speed grows, forwards and backwards, (2, ports). It
-            takes up what would speed a port up, as far as it goes: where it is not all used, the
-            velocity stands.
-        corner: Over what part of that its two corners are rounded.
-
-    Returns:
-        The reaction, which ports rest at the step's end, which do not change their velocity at all, and
-        the part of the step before a port comes to rest; one where it does not.
-    """
-    starts = before == 0.0
-    drag = jnp.sign(jnp.where(starts, speed, before)) * dry
-    slid = speed - own * drag
-    turns = before * slid < 0.0
-    part = jnp.where(turns, before / jnp.where(turns, before - slid, 1.0), 1.0)
-    if rising is not None:
-        hold = hold + jnp.where(speed > before, rising_at_rest[0], rising_at_rest[1])
-    stuck = (starts | turns) & (jnp.abs(speed - before) <= own * hold)
-    stands, reaction = starts & stuck, (1.0 - 2.0 * part) * drag
-    if rising is not None:
-        # After a turn a port speeds up for the rest of the step, the other way.
-        way = jnp.where(turns, -1.0, 1.0) * jnp.sign(jnp.where(starts, speed, before))
-        left = way * (speed - before) / own - dry
-        most = jnp.where(way > 0, rising[0], rising[1])
-        more = ramp(left, most, corner * most)
-        reaction = reaction - way * jnp.where(turns, 1.0 - part, 1.0) * more
-        # Twenty widths from a corner nothing is left of its rounding.
-        edge = 20.0 * corner * most
-        stands = stands | (~turns & (left > edge) & (left < most - edge))
-    return jnp.where(stuck, -speed / own, reaction), stuck, stands, part
-
-
-def _turned(
-    x: State, end: State, stands: Array, part: Array, h: Array, slides: tuple[int, ...]
-) -> State:
-    """The end of a step with the motion of joints that came to rest within it, or kept their velocity."""
-    joints = [k for k, i in enumerate(slides) if i < x.qd.size]
-    if not joints:
-        return end
-    size = max(*slides, x.qd.size - 1) + 1
-    own = spread(part - 1.0, slides, size)[: x.qd.size] + 1.0
-    # The reaction balances the mean force; damping within the step leaves a trace that would add up.
-    keeps = spread(stands, slides, size).astype(bool)[: x.qd.size]
-    q = jnp.where(keeps, x.q + h * x.qd, end.q - _overshot(x.qd, end.qd, own, h))
-    return State(q, jnp.where(keeps, x.qd, end.qd), end.own)
-
-
-def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
-    """By how much one line of velocity over a step misses the stroke of a joint that came to rest in it.
-
-    Until then, and from then on, velocity runs in lines; one line over the whole step is off by half
-    a step times the velocity of either end in the other part.
-    """
-    return jnp.where(part < 1.0, 0.5 * h * ((1.0 - part) * before + part * after), 0.0)
-
-
-def _box_reaction(
-    mobility: Array, speed: Array, dry: Array, hold: Array
-) -> tuple[Array, Array]:
-    """Reaction that leaves `speed + mobility @ reaction` complementary, and which ports it stops.
-
-    A port is held up to `hold`, the level at rest; one that breaks loose is dragged by `dry`.
-    """
-    n = speed.size
-    inverse = 1.0 / jnp.diagonal(mobility)
-
-    def answer(wanted: Array, dry: Array, hold: Array) -> Array:
-        return jnp.where(jnp.abs(wanted) < hold, wanted, sharp_clip(wanted, dry))
-
-    reaction = wanted = jnp.zeros(n)
-    for _ in range(20):
-        for i in range(n):
-            slip = speed[i] + jnp.sum(mobility[i] * reaction)
-            wanted = wanted.at[i].set(reaction[i] - slip * inverse[i])
-            reaction = reaction.at[i].set(answer(wanted[i], dry[i], hold[i]))
-    return reaction, jnp.abs(wanted) < hold
-
-
-def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:
-    """Take the rounding off the velocity of joints that stick."""
-    joints = [k for k, i in enumerate(slides) if i < x.qd.size]
-    if len(joints) == x.qd.size:
-        stuck = picked(stuck, tuple(joints))
-    else:
-        held = {slides[k]: stuck[k] for k in joints}
-        stuck = jnp.stack([held.get(i, jnp.zeros((), bool)) for i in range(x.qd.size)])
-    return State(x.q, jnp.where(stuck, 0.0, x.qd), x.own)
 
 
 def drive_own_states(
@@ -552,12 +345,12 @@ def drive_own_states(
 
         def rate(value: Array, i: int = i, own: tuple = own) -> Array:
             at = (*own[:i], jnp.broadcast_to(value, own[i].shape), *own[i + 1 :])
-            return jax.vmap(lambda *now: _balance(plant, *now).rates[i])(*motion, at)
+            return jax.vmap(lambda *now: balance_of(plant, *now).rates[i])(*motion, at)
 
         push = rate(jnp.zeros_like(z))
         if z.ndim:
             here = jax.tree.map(lambda a: a[0], (*motion, own))
-            slope = jax.jacfwd(lambda v, i=i, at=here: _balance(plant, 
+            slope = jax.jacfwd(lambda v, i=i, at=here: balance_of(plant, 
                 *at[:5], (*at[5][:i], v, *at[5][i + 1 :])
             ).rates[i])(z)
             own = (*own[:i], _vector_recurrence(z, slope, push, period), *own[i + 1 :])
@@ -578,7 +371,7 @@ def _recurrence(start: Array, decay: Array, push: Array, h: Array) -> Array:
     """
     here, line, bend, turn = _cubics(push)
     mean = 0.5 * (decay[:-1] + decay[1:])
-    e, p1, p2, p3, p4 = _phi(h * mean)
+    e, p1, p2, p3, p4 = phi(h * mean)
     add = h * (here * p1 + line * p2 + 2 * bend * p3 + 6 * turn * p4)
     # What the decay differs from its mean acts as a push that is a line, in proportion to z at both
     # ends: a friction that slips stays at its level however fast the speed changes.
@@ -620,7 +413,7 @@ def _cubics(x: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _matrix_phi(x: Float[Array, "k k"]) -> list[Array]:
-    """`_phi` of a matrix: the first row of blocks of the exponential of a shifted block matrix.
+    """`phi` of a matrix: the first row of blocks of the exponential of a shifted block matrix.
 
     By Taylor's series, halved and squared: LAPACK inside a batch of a study may wait for ever.
     """
@@ -654,7 +447,7 @@ def residual_along(
     times = start + period * jnp.arange(q.shape[0])
 
     def at(q: Array, qd: Array, qdd: Array, u: Array, t: Array, own: tuple) -> tuple:
-        balance = _balance(plant, q, qd, qdd, u, t, own)
+        balance = balance_of(plant, q, qd, qdd, u, t, own)
         return balance.residual, balance.drive
 
     residual, drive = jax.vmap(at)(q, qd, qdd, u, times, own)

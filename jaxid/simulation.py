@@ -24,12 +24,12 @@ from jaxid.readings import (
     acceleration,
     affine_flow,
     course,
-    set_valued_step,
     step,
     vector_field,
 )
 from jaxid.sensors import Sensor
 from jaxid.solvers import RELATIVE, Adaptive
+from jaxid.sticking import set_valued_step
 
 if TYPE_CHECKING:
     import diffrax

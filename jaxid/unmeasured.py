@@ -22,10 +22,10 @@ from jaxid.readings import (
     affine_flow,
     course,
     picked,
-    set_valued_step,
     small_solve,
     spread,
 )
+from jaxid.sticking import set_valued_step
 
 Motion = tuple[Array, Array, Array]
 

@@ -9,7 +9,8 @@ from jaxid.affine import affine
 from jaxid.effects import EFFECTS
 from jaxid.model import Action, Effect
 from jaxid.plants import Axis
-from jaxid.readings import State, affine_flow, course, set_valued_step, step
+from jaxid.readings import State, affine_flow, course, step
+from jaxid.sticking import set_valued_step
 
 STEP = jnp.asarray(2e-3)
 LINEAR = {

@@ -26,9 +26,10 @@ from jaxid.io.log import Log
 from jaxid.io.results import identification_json
 from jaxid.machine import build_machine
 from jaxid.plants.chain import Chain
-from jaxid.readings import State, acceleration, course, set_valued_step
+from jaxid.readings import State, acceleration, course
 from jaxid.session import open_session
 from jaxid.simulation import Drive, interval_forces, open_loop
+from jaxid.sticking import set_valued_step
 from jaxid.virtual import simulate
 
 MASS, DAMPING = np.array([2.0, 1.4, 2.6]), np.array([8.0, 7.0, 9.0])

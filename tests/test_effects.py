@@ -11,8 +11,9 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
-from jaxid.readings import State, residual_along, set_valued_step
+from jaxid.readings import State, residual_along
 from jaxid.signals import Decimator
+from jaxid.sticking import set_valued_step
 
 each_row = pytest.mark.parametrize("row", ROWS.values(), ids=[*ROWS])
 

@@ -12,8 +12,9 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.algebraic import iterated_integral, weak_motion
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
-from jaxid.readings import State, _recurrence, residual_along, set_valued_step, small_solve, step
+from jaxid.readings import State, _recurrence, residual_along, small_solve, step
 from jaxid.simulation import Drive, open_loop
+from jaxid.sticking import set_valued_step
 
 MASS, DAMPING, STIFFNESS = 2.0, 3.0, 800.0
 OSCILLATOR = (

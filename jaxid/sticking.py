@@ -1,0 +1,241 @@
+"""The step under set-valued friction: a joint sticks exactly, and turns where friction does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxid.affine import depends
+from jaxid.model import Balance, Plant, port_motion
+from jaxid.readings import (
+    State,
+    acceleration,
+    balance_of,
+    mass_of,
+    need_apart,
+    phi,
+    picked,
+    solved,
+    spread,
+    step,
+)
+from jaxid.smooth import ramp, sharp_clip
+
+
+def set_valued_step(
+    plant: Plant,
+    x: State,
+    u: Callable[[Array], Array],
+    t: Array,
+    h: Array,
+    flow: Callable[..., State] | None = None,
+) -> tuple[State, Array]:
+    """One step under set-valued friction: flow without it, then the reaction that stops or drags.
+
+    A port slides under the level of dry friction halfway. Where it comes to rest within the step it
+    stays if the break-away level holds it, and else goes back for the rest of the step: the reaction
+    is then the mean of both parts, and the position that of two parabolas, of second order in the
+    step. Ports that are coupled through the mass matrix share their reactions by projected
+    Gauss-Seidel sweeps, each the force that brings its port to rest at the step's end, clipped.
+
+    Args:
+        plant: The plant.
+        x: State at t.
+        u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
+        t: Time [s].
+        h: Step [s].
+        flow: `step` as a function of state and reaction (left out: zero), where there is a
+            cheaper one.
+
+    Returns:
+        The state a step later, and the reaction of every port over the step.
+    """
+    ports = plant.ports(x.q).size
+    if flow is None:
+        none = jnp.zeros(ports)
+        flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
+    free = flow(x)
+    end = u(jnp.asarray(1.0))
+
+    def residual(qdd: Array, midway: Array) -> tuple[Array, Balance]:
+        levels = balance_of(plant, x.q, midway, qdd, end, t, x.own, jnp.zeros(ports))
+        return levels.residual, levels
+
+    # The mass does not depend on the velocity: one balance gives it and the levels.
+    midway = 0.5 * (x.qd + free.qd)
+    mass, levels = mass_of(plant, lambda qdd: residual(qdd, midway), x.q)
+    slides = levels.slides
+    if not slides:
+        return free, jnp.zeros(ports)
+    speed, before = (_port_speed(plant, at, slides) for at in (free, x))
+    mobility = h * _mobility(plant, mass, x.q, slides)
+
+    own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
+    alone = mobility.ndim == 1 or own.size == 1
+    if levels.rises:
+        need_apart(plant, mass, levels.rises)
+        own = own * picked(_yielding(plant, x, end, t, h), slides)
+
+    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, ...]:
+        dry = picked(levels.dry, slides)
+        held = picked(at_rest.dry, slides) + picked(at_rest.stick, slides)
+        if alone:
+            more = [
+                jnp.stack([picked(r, slides) for r in b.rising]) if b.rises else None
+                for b in (levels, at_rest)
+            ]
+            reaction, *ways = _own_reaction(own, speed, before, dry, held, *more, plant.sharpness)
+        else:
+            # The level at rest acts until a port slides, and again where it would pass through rest.
+            slid = speed - jnp.sign(before) * own * dry
+            rests = (before == 0.0) | (before * slid < 0.0)
+            reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
+            ways = stuck, stuck & (before == 0.0), jnp.ones_like(speed)
+        return spread(reaction, slides, ports), *ways
+
+    zero = jnp.zeros_like(x.q)
+    named = ("dry", "stick", "rising")
+    moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in named], (midway,))
+    at_rest = residual(zero, zero)[1] if moves else levels
+    reaction, *ways = answered(levels, at_rest)
+    if moves:
+        # Without friction motion begins too fast, and friction that falls with speed is too small.
+        slowed = free.qd + h * solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
+        reaction, *ways = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
+    stuck, stands, part = ways
+    end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
+    return _turned(x, end_of_step, stands, part, h, slides), reaction
+
+
+
+def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
+    """By how much less a force changes a velocity over a step than its impulse would, for damping.
+
+    A velocity that stands does so exactly or jumps: nothing may be lost between the two.
+    """
+    none = jnp.zeros_like(plant.ports(x.q))
+    slope = jax.jacfwd(lambda v: acceleration(plant, State(x.q, v, x.own), u, t, none))(x.qd)
+    return phi(h * jnp.diagonal(slope))[1]
+
+
+
+def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
+    """Velocities of some ports."""
+    return picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
+
+
+
+def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> Array:
+    """Acceleration of some ports per unit force on each; the diagonal where that is all there is."""
+    if mass.ndim == 1 and max(slides) < q.size:
+        return picked(1.0 / mass, slides)
+    jacobian = jax.jacfwd(lambda q: picked(plant.ports(q), slides))(q)
+    columns = [solved(mass, row) for row in jacobian]
+    return jnp.stack([jacobian @ c for c in columns], axis=1)
+
+
+
+def _own_reaction(
+    own: Array, speed: Array, before: Array, dry: Array, hold: Array, rising: Array | None = None,
+    rising_at_rest: Array | None = None, corner: Array | float = 0.0,
+) -> tuple[Array, Array, Array, Array]:
+    """Mean reaction over a step of ports that do not push each other.
+
+    Args:
+        own: Change of velocity over the step per unit reaction.
+        speed: At the step's end without reaction.
+        before: At its start.
+        dry, hold: Levels, sliding and at rest.
+        rising, rising_at_rest: What comes on top while speed grows, forwards and backwards, (2, ports). It
+            takes up what would speed a port up, as far as it goes: where it is not all used, the
+            velocity stands.
+        corner: Over what part of that its two corners are rounded.
+
+    Returns:
+        The reaction, which ports rest at the step's end, which do not change their velocity at all, and
+        the part of the step before a port comes to rest; one where it does not.
+    """
+    starts = before == 0.0
+    drag = jnp.sign(jnp.where(starts, speed, before)) * dry
+    slid = speed - own * drag
+    turns = before * slid < 0.0
+    part = jnp.where(turns, before / jnp.where(turns, before - slid, 1.0), 1.0)
+    if rising is not None:
+        hold = hold + jnp.where(speed > before, rising_at_rest[0], rising_at_rest[1])
+    stuck = (starts | turns) & (jnp.abs(speed - before) <= own * hold)
+    stands, reaction = starts & stuck, (1.0 - 2.0 * part) * drag
+    if rising is not None:
+        # After a turn a port speeds up for the rest of the step, the other way.
+        way = jnp.where(turns, -1.0, 1.0) * jnp.sign(jnp.where(starts, speed, before))
+        left = way * (speed - before) / own - dry
+        most = jnp.where(way > 0, rising[0], rising[1])
+        more = ramp(left, most, corner * most)
+        reaction = reaction - way * jnp.where(turns, 1.0 - part, 1.0) * more
+        # Twenty widths from a corner nothing is left of its rounding.
+        edge = 20.0 * corner * most
+        stands = stands | (~turns & (left > edge) & (left < most - edge))
+    return jnp.where(stuck, -speed / own, reaction), stuck, stands, part
+
+
+
+def _turned(
+    x: State, end: State, stands: Array, part: Array, h: Array, slides: tuple[int, ...]
+) -> State:
+    """The end of a step with the motion of joints that came to rest within it, or kept their velocity."""
+    joints = [k for k, i in enumerate(slides) if i < x.qd.size]
+    if not joints:
+        return end
+    size = max(*slides, x.qd.size - 1) + 1
+    own = spread(part - 1.0, slides, size)[: x.qd.size] + 1.0
+    # The reaction balances the mean force; damping within the step leaves a trace that would add up.
+    keeps = spread(stands, slides, size).astype(bool)[: x.qd.size]
+    q = jnp.where(keeps, x.q + h * x.qd, end.q - _overshot(x.qd, end.qd, own, h))
+    return State(q, jnp.where(keeps, x.qd, end.qd), end.own)
+
+
+
+def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
+    """By how much one line of velocity over a step misses the stroke of a joint that came to rest in it.
+
+    Until then, and from then on, velocity runs in lines; one line over the whole step is off by half
+    a step times the velocity of either end in the other part.
+    """
+    return jnp.where(part < 1.0, 0.5 * h * ((1.0 - part) * before + part * after), 0.0)
+
+
+
+def _box_reaction(
+    mobility: Array, speed: Array, dry: Array, hold: Array
+) -> tuple[Array, Array]:
+    """Reaction that leaves `speed + mobility @ reaction` complementary, and which ports it stops.
+
+    A port is held up to `hold`, the level at rest; one that breaks loose is dragged by `dry`.
+    """
+    n = speed.size
+    inverse = 1.0 / jnp.diagonal(mobility)
+
+    def answer(wanted: Array, dry: Array, hold: Array) -> Array:
+        return jnp.where(jnp.abs(wanted) < hold, wanted, sharp_clip(wanted, dry))
+
+    reaction = wanted = jnp.zeros(n)
+    for _ in range(20):
+        for i in range(n):
+            slip = speed[i] + jnp.sum(mobility[i] * reaction)
+            wanted = wanted.at[i].set(reaction[i] - slip * inverse[i])
+            reaction = reaction.at[i].set(answer(wanted[i], dry[i], hold[i]))
+    return reaction, jnp.abs(wanted) < hold
+
+
+
+def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:
+    """Take the rounding off the velocity of joints that stick."""
+    joints = [k for k, i in enumerate(slides) if i < x.qd.size]
+    if len(joints) == x.qd.size:
+        stuck = picked(stuck, tuple(joints))
+    else:
+        held = {slides[k]: stuck[k] for k in joints}
+        stuck = jnp.stack([held.get(i, jnp.zeros((), bool)) for i in range(x.qd.size)])
+    return State(x.q, jnp.where(stuck, 0.0, x.qd), x.own)
