@@ -134,6 +134,7 @@ def test_results_hold_the_directions(fitted, tmp_path):
     fitted.save(tmp_path / "out")
     content = json.loads((tmp_path / "out" / "result.json").read_text())
     assert content["criterion_percent"] > 0
+    assert str(fitted).count("told together: ") == len(content["directions"])
     assert content["directions"][0].keys() >= {"combination", "value", "std"}
     assert "directions of 11 unknowns fitted" in (tmp_path / "out" / "report.html").read_text()
 

@@ -63,7 +63,21 @@ def identification_table(result: Identification) -> str:
     told = parameter_lines(estimate, results.derived(result.session, result.estimate))
     notes = _notes(results.notes(result.session, estimate))
     own = _minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []
-    return "\n".join([head, "", told, *_blind(estimate), *own, "", aligned(rows), *notes])
+    together = _told_together(estimate.details.get("directions", []))
+    return "\n".join([head, "", told, *together, *_blind(estimate), *own, "", aligned(rows), *notes])
+
+
+# Weights below this are left out of a combination's line.
+_SLIGHT = 0.1
+
+
+def _told_together(directions: Sequence[dict[str, Any]]) -> list[str]:
+    """Combinations that a fit within a prior tells, from the guesses on in units of it."""
+    return [
+        f"told together: {d['value']:+.3f} ± {d['std']:.3f} priors of "
+        + ", ".join(f"{w:+.2f} {n}" for n, w in d["combination"].items() if abs(w) > _SLIGHT)
+        for d in directions
+    ]
 
 
 def _minimal(content: dict[str, Any]) -> list[str]:
