@@ -205,6 +205,9 @@ class Effect(eqx.Module):
     # Whether only a plant with springs of its own (True), or only one without (False), can have it.
     with_springs: ClassVar[bool | None] = None
 
+    # Whether a search looks for it on stages only: elsewhere what differs by direction is taken for it.
+    of_stages: ClassVar[bool] = False
+
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         """Values from which a search starts, one dictionary a start.
@@ -354,7 +357,7 @@ class Plant(eqx.Module):
     def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
         """Whether a search may name such an effect on a port."""
         springs = self.springs(self.joints) > 0
-        if effect.with_springs not in (None, springs):
+        if effect.with_springs not in (None, springs) or (effect.of_stages and not self.couplings):
             return False
         if springs and effect.of_spring != (port >= self.parts(self.joints)):
             return False

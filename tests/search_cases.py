@@ -64,7 +64,6 @@ def _rows() -> dict[str, SearchCase]:
         SearchCase("coulomb_friction", {"level": 20.39}, declared=(VISCOUS,)),
         SearchCase("static_friction", {"level": 8.0}),
         SearchCase("stribeck_friction", {"level": 10.0, "velocity": 0.02}),
-        SearchCase("velocity_hysteresis", {"level": 10.0, "velocity": 0.02}),
         SearchCase("asymmetric_viscous", {"coefficient": 60.0}),
         SearchCase("quadratic_drag", {"coefficient": 800.0}),
         SearchCase("cubic_friction", {"coefficient": 6000.0}),

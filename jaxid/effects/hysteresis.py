@@ -56,6 +56,8 @@ class VelocityHysteresis(Effect):
         term drives the table when it moves backwards.
     """
 
+    of_stages = True
+
     level: Array = parameter("force", "nonnegative", "C, above sliding friction at low velocity")
     velocity: Array = parameter("position/time", "positive", "v_s, where it fades")
     level_negative: Array | None = parameter(

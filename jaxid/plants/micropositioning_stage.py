@@ -179,3 +179,4 @@ class RigidMicropositioningStage(Plant):
 
 # By the coupling that a case states.
 MicropositioningStage.couplings = {"elastic": MicropositioningStage, "rigid": RigidMicropositioningStage}
+RigidMicropositioningStage.couplings = MicropositioningStage.couplings
