@@ -18,7 +18,7 @@ import numpy as np
 from common import Table, parser_of
 
 import jaxid
-from jaxid.estimators.directions import Prior, criterion_steps
+from jaxid.estimators.directions_problem import Prior, criterion_steps
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import together
 from jaxid.identification import identify_many

@@ -166,6 +166,11 @@ def from_rest(replay: Replay) -> Replay:
     return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
 
 
+def with_sensor(replay: Replay, sensor: Sensor) -> Replay:
+    """The same run, its controller reading by another sensor."""
+    return eqx.tree_at(lambda r: r.sensor, replay, sensor, is_leaf=lambda x: isinstance(x, Sensor))
+
+
 def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100) -> Replay:
     """An open-loop run whose initial position and velocity fit the first samples of its log.
 

@@ -11,7 +11,7 @@ import stages
 
 import jaxid
 from jaxid.cli import main
-from jaxid.estimators.directions import criterion_steps
+from jaxid.estimators.directions_problem import criterion_steps
 from jaxid.estimators.steps import alone
 from jaxid.identification import identify_many
 from jaxid.io.log import Log

@@ -1,0 +1,144 @@
+"""How well a fit within a prior tells each combination of unknowns, and each unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+
+from jaxid.estimators.directions_problem import NO_PULL, Found, fit_each, residual_of
+from jaxid.estimators.steps import Solve, Steps
+from jaxid.machine import Machine
+from jaxid.precision import Precision, assess, full_hessian
+from jaxid.replay import with_sensor
+
+# A parameter is told where what is left of its prior is less than this.
+_TOLD = 0.5
+# Entries of a combination below this are left out when it is named.
+_NEGLIGIBLE = 0.1
+# Draws of where a motor stands within its first count, and the least part of a residual that is noise.
+_DRAWS = 32
+_OWN = 0.1
+# A profile is taken at so many standard deviations of the quadratic picture.
+_PROFILED = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+
+
+@eqx.filter_jit
+def hessian_of(*args: Any) -> Array:
+    """Of the cost, in the directions' coordinates."""
+    *problem, vectors, z = args
+    return full_hessian(residual_of(*problem, vectors), z)
+
+
+@eqx.filter_jit
+def _each_start(*args: Any) -> Array:
+    *problem, sharpness, vectors, z, offsets = args
+    replay, places, plant, *rest = problem
+    plant = replace(plant, sharpness=sharpness)
+    # What the loop does of a motor that stands elsewhere within its first count.
+    moved = lambda offset: eqx.tree_at(lambda r: r.position, replay, replay.position + offset)
+    at = lambda offset: residual_of(moved(offset), places, plant, *rest, vectors)(z)
+    return eqx.filter_vmap(at)(offsets)
+
+
+def rounding_of(machine: Machine, found: Found) -> Steps[np.ndarray | None]:
+    """What rounding of readings does to the residual, (draws, time, k); None where none was left out.
+
+    The loop of the estimate is simulated with it from many places within the first count, and without.
+    """
+    count, problem = machine.sensor.position_resolution, found.problem
+    if problem.on == "position" or count is None or problem.replay.controller is None:
+        return None
+    n = problem.replay.position.size
+    offsets = np.random.default_rng(0).uniform(-0.5, 0.5, (_DRAWS, n)) * np.asarray(count)
+    rounded = with_sensor(problem.replay, machine.sensor)
+    rest = (problem.ladder[-1], found.vectors, np.asarray(found.minimum.theta))
+    with_it = yield Solve(_each_start, (rounded, *problem.args[1:], *rest, offsets))
+    without = yield Solve(_each_start, (problem.replay, *problem.args[1:], *rest, 0.0 * offsets[:1]))
+    return np.asarray(with_it) - np.asarray(without)
+
+
+def assessed(
+    machine: Machine, found: Found, hessian: np.ndarray | None, rounding: np.ndarray | None
+) -> tuple[Precision, list[dict[str, Any]]]:
+    """Precision of the parameters, and of the directions."""
+    problem, r = found.problem, found.count
+    if r == 0:
+        return _nothing_told(machine)
+    names = [*machine.parameters.names, *problem.nuisances]
+    shape, counts = problem.measured.shape, problem.weight > 0
+    jacobian = np.asarray(found.minimum.jacobian).reshape(*shape, -1)[..., :r]
+    e = np.asarray(found.minimum.residual).reshape(shape)
+    deviation = problem.weight * (problem.measured - problem.measured.mean(axis=0))
+    signal = float(np.linalg.norm(deviation))
+    told = assess(
+        [f"direction {k + 1}" for k in range(r)], jacobian, e, counts,
+        signal, np.ones(r), hessian, crossed=problem.on == "both",
+    )
+    z = np.asarray(found.minimum.theta)
+    theta = np.asarray(problem.prior.outward(found.vectors @ z))
+    flat = jacobian.reshape(-1, r)
+    white = problem.noise(found.minimum, r) * np.sqrt(np.diag(np.linalg.inv(flat.T @ flat)))
+    # A colour read off a hundred samples is itself uncertain: never less than white noise would leave.
+    larger = np.maximum(1.0, white / told.std)
+    of_seen = told.covariance * np.outer(larger, larger)
+    if rounding is not None:
+        # To first order each draw of it moves the estimate so far; the residual has one draw in it.
+        moved = np.stack([np.linalg.lstsq(flat, d.ravel())[0] for d in rounding])
+        left = 1.0 - np.mean(rounding**2) * rounding[0].size / np.sum(e**2)
+        of_seen = moved.T @ moved / len(moved) + max(left, _OWN) * of_seen
+    seen, held = found.vectors[:, :r], found.vectors[:, r:]
+    slope = problem.prior.slope(theta)
+    whole = seen @ of_seen @ seen.T + held @ held.T
+    p = len(problem.places)
+    left = np.sqrt(np.diag(whole))[:p]
+    identifiable = left < _TOLD
+    covariance = (whole * np.outer(slope, slope))[:p, :p]
+    covariance[~identifiable] = covariance[:, ~identifiable] = np.nan
+    stated = [
+        {
+            "combination": dict(zip(names, found.vectors[:, k].tolist(), strict=True)), "value": float(z[k]),
+            "std": float(np.sqrt(of_seen[k, k])), "std_white": float(white[k]),
+        }
+        for k in range(r)
+    ]
+    blind = [c for c in (_named(names, v) for v in held.T) if any(n in c for n in names[:p])]
+    return Precision(covariance, identifiable, blind, told.information), stated
+
+
+def _nothing_told(machine: Machine) -> tuple[Precision, list[dict[str, Any]]]:
+    """Of a log that tells no combination better than the guesses."""
+    names = machine.parameters.names
+    p = len(names)
+    blind = [{n: 1.0} for n in names]
+    return Precision(np.full((p, p), np.nan), np.zeros(p, bool), blind, np.zeros(0)), []
+
+
+def _named(names: Sequence[str], vector: np.ndarray) -> dict[str, float]:
+    return {n: float(v) for n, v in zip(names, vector, strict=True) if abs(v) > _NEGLIGIBLE}
+
+
+def add_profiles(found: Found, stated: list[dict[str, Any]]) -> Steps[None]:
+    """Add to each direction its profile: where the cost has risen as 1 and 4 standard deviations say."""
+    r, size = found.count, found.vectors.shape[0]
+    if not r:
+        return
+    best = np.asarray(found.minimum.theta)
+    z = np.tile(best, (r, _PROFILED.size, 1))
+    active = np.tile(np.arange(size) < r, (r, _PROFILED.size, 1))
+    for k in range(r):
+        z[k, :, k] += _PROFILED * stated[k]["std"]
+        active[k, :, k] = False
+    flat = (z.reshape(-1, size), active.reshape(-1, size))
+    args = (*found.problem.args, found.problem.ladder[-1], NO_PULL, found.vectors, *flat)
+    _, costs, _, _ = yield Solve(fit_each, args)
+    rise = 2 * (np.asarray(costs).reshape(r, -1) - float(found.minimum.cost))
+    noise = found.problem.noise(found.minimum, r) ** 2
+    for k in range(r):
+        stated[k]["profile"] = {
+            "at_std": _PROFILED.tolist(), "rise": (rise[k] / noise).tolist(),
+        }

@@ -1,0 +1,237 @@
+"""What a fit within a prior compares: a residual in units of the prior, and the way down its cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxid.errors import InputError
+from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.output_error import choose_numerics, measured_output, output_residual
+from jaxid.estimators.steps import Solve, Steps
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.model import Plant
+from jaxid.replay import Numerics, Replay, from_rest, make_replay, with_sensor
+from jaxid.sensors import Sensor
+
+# In parts of the variance of one sample.
+SETTLED = 0.02
+# Farther from its guess than so many priors no unknown is taken.
+FAR = 8.0
+# No pull towards the guesses.
+NO_PULL = np.zeros(())
+# Friction that rises with speeding up lets a velocity stand, and costs have a kink wherever it does: such
+# a machine is fitted with that rounded over these parts of it. At most so many evaluations at each.
+_LADDER = (1.0, 0.3, 0.1)
+_A_RUNG = 25
+
+
+class Prior(eqx.Module):
+    """Guesses and how far from them the unknowns may be: physical values, and in units of that.
+
+    What must be positive is log-normal about its guess, the rest normal.
+    """
+
+    base: Float[Array, " p"]
+    scale: Float[Array, " p"]
+    log: Bool[Array, " p"]
+    lower: Float[Array, " p"]
+    upper: Float[Array, " p"]
+
+    def outward(self, w: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Physical values, within their bounds."""
+        moved = jnp.where(self.log, self.base * jnp.exp(self.scale * w), self.base + self.scale * w)
+        return jnp.clip(moved, self.lower, self.upper)
+
+    def inward(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """In units of the prior."""
+        ratio = np.where(self.log, np.maximum(theta, 1e-300) / np.where(self.log, self.base, 1.0), 1.0)
+        return np.where(self.log, np.log(ratio), theta - self.base) / self.scale
+
+    def slope(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Physical change for a change of one prior."""
+        return np.where(self.log, theta, 1.0) * self.scale
+
+    @classmethod
+    def of(cls, machine: Machine, width: float, nuisance: Float[np.ndarray, " k"]) -> Prior:
+        """Of a machine's guesses, a relative width around each, and of nuisances about zero.
+
+        Raises:
+            InputError: If a guess is zero, of which nothing can be a part.
+        """
+        free = machine.parameters.free
+        for f in free:
+            if f.guess == 0.0:
+                raise InputError(
+                    f"{f.name} has a guess of zero, which a relative prior says nothing of",
+                    where="[output_error] prior", mend="give it a guess of its natural size",
+                )
+        guess, (lower, upper) = machine.parameters.guess, machine.parameters.bounds
+        log = Transform.of(machine.parameters).log
+        none = np.zeros(nuisance.size)
+        return cls(
+            np.concatenate([guess, none]),
+            np.concatenate([np.where(log, width, width * np.abs(guess)), nuisance]),
+            np.concatenate([log, none.astype(bool)]),
+            np.concatenate([lower, none - np.inf]), np.concatenate([upper, none + np.inf]),
+        )
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is compared, as arrays.
+
+    Args:
+        replay: The loop, or the input.
+        places, plant: Of the unknowns.
+        measured, weight: (time, k).
+        prior: Of the unknowns, nuisances behind them.
+        on: What of the simulation is compared.
+    """
+
+    replay: Replay
+    places: tuple
+    plant: Plant
+    measured: np.ndarray
+    weight: np.ndarray
+    prior: Prior
+    on: str
+
+    @property
+    def args(self) -> tuple:
+        """For the compiled functions."""
+        return (self.replay, self.places, self.plant, self.measured, self.weight, self.prior, self.on)
+
+    @property
+    def ladder(self) -> list[np.ndarray]:
+        """Sharpnesses at which to fit, one after the other."""
+        n, m = self.replay.position.size, self.replay.drive.gain.size
+        none, u = jnp.zeros(n), jnp.zeros(m)
+        own = self.plant.initial_states(u)
+        rises = self.plant.balance(none, none, none, u, jnp.zeros(()), own).rises
+        return [np.asarray(s) for s in (_LADDER if rises else (self.plant.sharpness,))]
+
+    @classmethod
+    def of(cls, machine: Machine, log: Log, prior: float, on: str, numerics: Numerics) -> Problem:
+        """Of a machine and its log, from rest; see `jaxid.estimators.directions.directions_steps`.
+
+        Raises:
+            InputError: If a guess is zero, or the loop cannot be simulated.
+        """
+        replay = from_rest(make_replay(machine, log, numerics))
+        if on != "position":
+            replay = with_sensor(replay, Sensor())
+        measured, counts = measured_output(machine, log, on)
+        std = machine.sensor.position_std
+        n = log.position.shape[1]
+        start = np.zeros(0) if std is None else np.broadcast_to(np.asarray(std), n)
+        whole = Prior.of(machine, prior, start)
+        weight = np.tile(counts.astype(float), (len(measured), 1))
+        return cls(replay, machine.parameters.places, machine.plant, measured, weight, whole, on)
+
+    @property
+    def nuisances(self) -> list[str]:
+        """Names of what is unknown behind the machine's own unknowns."""
+        return [f"start position {k + 1}" for k in range(self.prior.base.size - len(self.places))]
+
+    def padded(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " q"]:
+        """Unknowns with all nuisances at zero."""
+        return np.concatenate([theta, np.zeros(self.prior.base.size - len(theta))])
+
+    def weighed(self, minimum: Minimum) -> Problem:
+        """Columns of the residual by their own spread, where there are several."""
+        counts = self.weight[0] > 0
+        if counts.sum() == 1:
+            return self
+        e = np.asarray(minimum.residual).reshape(self.measured.shape)[:, counts] / self.weight[0, counts]
+        least = 1e-12 * np.std(self.measured[:, counts], axis=0)
+        row = np.zeros(len(counts))
+        row[counts] = 1.0 / np.maximum(np.std(e, axis=0), least)
+        return replace(self, weight=np.tile(row, (len(self.measured), 1)))
+
+    def noise(self, minimum: Minimum, count: int) -> float:
+        """Standard deviation of a weighted residual of which so many directions are fitted."""
+        samples = int(np.sum(self.weight > 0))
+        return float(np.sqrt(2 * float(minimum.cost) / max(samples - count, 1)))
+
+    def criterion(self, minimum: Minimum) -> float:
+        """(11) of Bogdan and Abba: squared residual over squared deviation from the mean, percent."""
+        spread = np.sum((self.weight * (self.measured - self.measured.mean(axis=0))) ** 2)
+        return float(100 * 2 * float(minimum.cost) / spread)
+
+
+def residual_of(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, prior: Prior, on: str,
+    vectors: Array,
+) -> Any:
+    """Residual as a function of the directions' coordinates."""
+    physical = output_residual(replay, places, plant, measured, weight, on)
+    # Behind the unknowns stand positions at the start; velocities there are known to be those of the log.
+    still = jnp.zeros(prior.base.size - len(places))
+    return lambda z: physical(jnp.concatenate([prior.outward(vectors @ z), still]))
+
+
+def _descent(*args: Any) -> Minimum:
+    """Down the cost; `pull`, the noise that a prior is held against, keeps the way near the guesses."""
+    replay, places, plant, *rest, sharpness, pull, vectors, z, active = args
+    bound = jnp.full(z.shape, FAR)
+    linear = Transform(np.zeros(z.shape, bool))
+    compared = residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors)
+    residual = lambda z: jnp.concatenate([compared(z).ravel(), pull * z])
+    tolerance = 0.1 * SETTLED / rest[0].shape[0]
+    found = levenberg_marquardt(
+        residual, z, linear, -bound, bound, active, max_steps=_A_RUNG, tolerance=tolerance
+    )
+    e = found.residual[: -z.size]
+    return replace(
+        found, residual=e, jacobian=found.jacobian[: -z.size], cost=0.5 * jnp.sum(e * e),
+    )
+
+
+@eqx.filter_jit
+def fit(*args: Any) -> Minimum:
+    """From one start: `Problem.args`, sharpness, pull, directions, coordinates, and which are fitted."""
+    return _descent(*args)
+
+
+@eqx.filter_jit
+def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
+    """From many starts, or with many things held: coordinates, cost, convergence and steps of each."""
+    *problem, vectors, z, active = args
+
+    def one(z: Array, active: Array) -> tuple:
+        found = _descent(*problem, vectors, z, active)
+        return found.theta, found.cost, found.converged, found.steps
+
+    return eqx.filter_vmap(one)(z, active)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum."""
+
+    problem: Problem
+    vectors: np.ndarray
+    count: int
+    minimum: Minimum
+    evaluations: int
+    settled: bool
+
+
+def criterion_steps(
+    machine: Machine, log: Log, theta: Float[np.ndarray, " p"], *, on: str = "position",
+    numerics: Numerics | None = None,
+) -> Steps[float]:
+    """Criterion of the same simulation at given unknowns, percent; nothing is fitted."""
+    problem = Problem.of(machine, log, 1.0, on, numerics or choose_numerics(machine, log))
+    size = problem.prior.base.size
+    w = problem.prior.inward(problem.padded(theta))
+    nothing = (np.eye(size), w, np.zeros(size, bool))
+    found = yield Solve(fit, (*problem.args, problem.ladder[-1], NO_PULL, *nothing))
+    return problem.criterion(found)
