@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import METHODS
+from jaxid.estimators import METHODS, steps_of
 from jaxid.estimators.output_error import OUTPUTS, SHORT
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Steps, alone, together
@@ -121,7 +121,7 @@ def identify(
             mend="give at least one parameter as { guess = ... }",
         )
     progress(f"fitting by {method}")
-    estimate = alone(METHODS[method](session, **options))
+    estimate = alone(steps_of(method, session, **options))
     progress("simulating")
     return Identification(
         session, estimate, gaps(estimate.machine, session.runs),
@@ -152,7 +152,7 @@ def identify_many(
     case = case if isinstance(case, Case) else load_case(case)
 
     def steps(log: Log | str | Path) -> Steps[Estimate]:
-        return (yield from METHODS[method](open_session(case, log)))
+        return (yield from steps_of(method, open_session(case, log)))
 
     return together([steps(log) for log in logs], lanes)
 

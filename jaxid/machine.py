@@ -14,10 +14,13 @@ from jaxid.controllers import CONTROLLERS, Controller
 from jaxid.errors import InputError
 from jaxid.io.case import Case
 from jaxid.io.case_entries import EffectEntry
+from jaxid.io.case_reference import info_of
 from jaxid.io.case_values import Value
 from jaxid.io.log import Log
 from jaxid.model import ParameterInfo, Plant, as_array, parameters_of
-from jaxid.parameters import Free, Parameters, effect_name, label
+from jaxid.parameters import REFERENCE, Free, Parameters, effect_name, label
+from jaxid.references import REFERENCES
+from jaxid.references.course import Course
 from jaxid.sensors import Sensor
 from jaxid.tables import read_columns
 from jaxid.units import Units
@@ -42,6 +45,7 @@ class Machine:
             start [s], or the name of a column of the log; None: none.
         sensor: What is known of the measurement.
         hold: How the command runs between samples.
+        course: The reference of the loop, where it has unknowns; None: that of the log.
     """
 
     plant: Plant
@@ -52,6 +56,7 @@ class Machine:
     disturbance: Mapping[str, float] | str | None = None
     sensor: Sensor = Sensor()
     hold: str = "zero_order"
+    course: Course | None = None
 
     @property
     def hold_period(self) -> float | None:
@@ -67,7 +72,8 @@ class Machine:
         theta = np.asarray(theta, dtype=np.float64)
         parameters = self.parameters.with_guess(theta)
         plant = self.parameters.insert(self.plant, theta)
-        return replace(self, plant=plant, parameters=parameters)
+        course = None if self.course is None else self.course.with_unknowns(self.parameters.places, theta)
+        return replace(self, plant=plant, parameters=parameters, course=course)
 
 
 def build_machine(case: Case, *, true: bool = False, period: float | None = None) -> Machine:
@@ -91,16 +97,18 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
         what = "transmission is not available in this version"
         raise InputError(what, where=f"{case.path}, [actuator]", mend=mend)
     plant, free = _plant(case, true)
+    course, more = _course(case, true, plant)
     gain = np.broadcast_to(np.asarray(case.gain, dtype=np.float64), (case.plant.drives,)).copy()
     return Machine(
         plant=plant,
-        parameters=Parameters(tuple(free)),
+        parameters=Parameters((*free, *more)),
         gain=gain,
         units=case.plant.units,
         controller=_controller(case, period, gain),
         disturbance=(case.controller or {}).get("disturbance"),
         sensor=Sensor(**{name: as_array(value) for name, value in case.sensor.items()}),
         hold=case.log.get("hold", "zero_order"),
+        course=course,
     )
 
 
@@ -183,6 +191,19 @@ def _free(
     unit = case.plant.units.label(info.dimension, motion)
     guess, bounds = value.start(true), (value.lower, value.upper)
     return [Free(name, path, unit, info.sign, guess, *bounds, index=index, true=value.true)]
+
+
+def _course(case: Case, true: bool, plant: Plant) -> tuple[Course | None, list[Free]]:
+    """The reference that has unknowns, and these."""
+    if not case.unknown_reference:
+        return None, []
+    values = {name: v.start(true) for name, v in case.unknown_reference.items()}
+    course, free = Course.of(case.reference, values), []
+    motion, keys = plant.motion(plant.driven(plant.joints)[0]), REFERENCES[course.kind].keys
+    for name, value in case.unknown_reference.items():
+        path, info = (REFERENCE, name), info_of(keys[name])
+        free += _free(value, f"{REFERENCE}.{name}", path, info, motion, case, true)
+    return course, free
 
 
 def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controller | None:

@@ -16,6 +16,8 @@ from jaxid.units import Units
 # Lower bound of what must be positive, relative to its guess: keeps a solver off zero, far below
 # anything that a log can tell.
 _POSITIVE_FLOOR = 1e-9
+# First step of the path of what is unknown of a reference, and of no plant.
+REFERENCE = "reference"
 
 
 @dataclass(frozen=True)
@@ -105,10 +107,15 @@ def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
 
 
 def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
-    """The plant with theta[k] at places[k], each a path and, where the leaf is a list, an index."""
+    """The plant with theta[k] at places[k], each a path and, where the leaf is a list, an index.
+
+    What is unknown of a reference stands in no plant, and is passed over.
+    """
     leaves, structure = jax.tree.flatten(plant)
     numbers = jax.tree.unflatten(structure, range(len(leaves)))
     for k, (path, index) in enumerate(places):
+        if path[0] == REFERENCE:
+            continue
         at, value = leaf(numbers, path), theta[k]
         if isinstance(theta, np.ndarray):
             # Each array that JAX makes outside compiled code takes longer than all else here.

@@ -19,6 +19,7 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine, disturbance_at
 from jaxid.model import Plant
 from jaxid.readings import State, acceleration, derivative
+from jaxid.references.course import Course
 from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
 from jaxid.solvers import Adaptive
@@ -63,7 +64,7 @@ class Replay(eqx.Module):
         drive: How the command acts.
         controller: The law; None: open loop.
         sensor: What the controller reads.
-        reference, disturbance: By drive, at every tick (closed loop).
+        reference, disturbance: By drive, at every tick (closed loop); a `Course` where it has unknowns.
         command: Logged command (open loop), refined where it is band-limited.
         position, velocity: At the start.
         restart: Flags, positions and velocities of segments (open loop).
@@ -73,7 +74,7 @@ class Replay(eqx.Module):
     drive: Drive
     controller: Controller | None
     sensor: Sensor
-    reference: Array | None
+    reference: Array | Course | None
     disturbance: Array | None
     command: Array | None
     position: Float[Array, " n"]
@@ -92,13 +93,20 @@ class Replay(eqx.Module):
         if nudge is not None:
             q, v = q + nudge[: q.size], v + nudge[q.size :]
         if self.controller is not None:
+            reference = self.reference() if isinstance(self.reference, Course) else self.reference
             run = closed_loop(
-                plant, self.drive, self.controller, self.reference, self.disturbance, q, v,
+                plant, self.drive, self.controller, reference, self.disturbance, q, v,
                 self.sensor,
             )
         else:
             run = open_loop(plant, self.drive, self.command, q, v, None, self.restart)
         return jax.tree.map(lambda a: a[:: self.every], run)
+
+    def following(self, places: tuple, theta: Float[Array, " p"]) -> Replay:
+        """The same run with what is unknown of its reference at theta."""
+        if not isinstance(self.reference, Course):
+            return self
+        return replace(self, reference=self.reference.with_unknowns(places, theta))
 
 
 def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) -> Replay:
@@ -143,6 +151,8 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         # ten ticks apart is off by a hundredth of a millimetre at 0.8 m/s^2, and bends an inertia by 10 %.
         curve = scipy.interpolate.Akima1DInterpolator(log.time, log.reference, axis=0)
         reference, times = curve(np.minimum(ticks, log.time[-1])), ticks
+    if machine.course is not None:
+        reference = machine.course.at(ticks - log.time[0])
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"), machine.controller,

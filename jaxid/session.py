@@ -14,6 +14,7 @@ from jaxid.io.log import Log, read_log, with_load
 from jaxid.io.soundness import Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine, build_machine
 from jaxid.preprocess import Prepared, Recipe, choose_recipe, prepare
+from jaxid.references import make_reference
 from jaxid.replay import needed_steps
 
 
@@ -144,8 +145,8 @@ def _read(
         columns = case.columns if columns is None else columns
         kept = {k: v for k, v in columns.items() if not (whole and k == "rows")}
         own = joints if load is None else None
-        return with_load(read_log(log, kept, joints=own, drives=drives), load, joints)
-    log = with_load(log, load, joints)
+        return _followed(case, with_load(read_log(log, kept, joints=own, drives=drives), load, joints))
+    log = _followed(case, with_load(log, load, joints))
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):
         values = getattr(log, name)
         if values is not None and values.shape[1] != width:
@@ -155,6 +156,15 @@ def _read(
                 mend=f"give one column a {what}, in the order of the {what}s",
             )
     return log
+
+
+def _followed(case: Case, log: Log) -> Log:
+    """The log with the reference that the case states, where the log has none."""
+    if log.reference is not None or case.controller is None or case.reference is None:
+        return log
+    rate = 1 / log.period
+    reference = make_reference(case.reference, rate, log.samples / rate, case.folder)
+    return replace(log, reference=np.broadcast_to(reference, (log.samples, case.plant.drives)))
 
 
 def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:

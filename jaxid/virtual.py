@@ -140,7 +140,7 @@ class Scene:
         if not case.reference:
             raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
         period = machine.controller.period
-        reference = _by_drive(make_reference(case.reference, 1 / period, duration, case.folder), machine)
+        reference = _by_drive(make_reference(case.true_reference, 1 / period, duration, case.folder), machine)
         machine = _scaled(machine, reference, period)
         drive = _drive(case, machine, period, longer_delays)
         _refuse_coarse(case, machine, drive, reference)
@@ -165,12 +165,13 @@ class Scene:
         looped = machine.controller is not None
         if looped:
             extra = disturbance_at(machine.disturbance, times)
-            args = (machine.plant, self.drive, machine.controller, self.signal, extra, *start, *sensor)
+            signal = self.signal if machine.course is None else np.asarray(machine.course.at(times)())
+            args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
             run = yield Solve(_closed_run, args)
         else:
             run = yield Solve(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
         pick = slice(None, None, self.every)
-        reference = self.signal[pick] if looped else None
+        reference = signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
         log = _log(self.case, machine, times[pick], reading, command, rng, reference)
         return Virtual(log, run, _columns(self.case, reference=looped))

@@ -19,6 +19,7 @@ from jaxid.discovery.separate import proposals
 from jaxid.discovery.union import build_union
 from jaxid.discovery.where import Where, locate
 from jaxid.effects.friction import StaticFriction
+from jaxid.estimators import need_known_reference
 from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
 from jaxid.estimators.output_error import output_error
 from jaxid.estimators.result import Estimate
@@ -64,6 +65,7 @@ def discover(
         InputError: If case or log are unsound.
     """
     session = open_session(case, log, validate, align_hold=True)
+    need_known_reference(session, "what it is would be taken for an effect")
     return explore(session, max_effects=max_effects, refit=refit, progress=progress)
 
 

@@ -8,12 +8,14 @@ stands in its keywords.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Steps
+from jaxid.parameters import REFERENCE
 
 if TYPE_CHECKING:
     from jaxid.replay import Numerics
@@ -39,9 +41,10 @@ def _output_error(
 
         stated = {k: v for k, v in session.case.output_error.items() if k != "on"}
         return (yield from directions_steps(session.machine, log, on=on, numerics=numerics, **stated))
-    # Inverse dynamics gives the start where it tells all unknowns.
+    # Inverse dynamics gives the start where it tells all unknowns of the plant.
     first = yield from inverse_dynamics_steps(session.machine, session.fit.data)
-    start = first.theta if first.told else None
+    elsewhere = [path[0] == REFERENCE for path, _ in session.machine.parameters.places]
+    start = first.theta if first.converged and np.all(first.identifiable | elsewhere) else None
     if solver is not None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, log, solver=solver)
@@ -129,3 +132,32 @@ METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "minimal_model": _minimal_model,
     "minimal_model_printed": _minimal_model_printed,
 }
+
+
+def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
+    """Fit by one of `METHODS`, one solve at a time.
+
+    Args:
+        method: Its name.
+        session: Case and logs.
+        options: Of the method.
+
+    Raises:
+        InputError: If the reference has unknowns, and the method does not simulate the loop for them.
+    """
+    if method != "output_error":
+        need_known_reference(session, f"{method} takes them as they are")
+    return METHODS[method](session, **options)
+
+
+def need_known_reference(session: Session, why: str) -> None:
+    """Refuse a case whose reference has unknowns.
+
+    Raises:
+        InputError: If it has any.
+    """
+    if session.machine.course is not None:
+        raise InputError(
+            f"the reference has unknowns, and {why}", where=f"{session.case.path}, [reference]",
+            mend="fit them by output_error, and give the numbers found",
+        )

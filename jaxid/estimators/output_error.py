@@ -22,7 +22,7 @@ from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.io.log import Log
 from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
-from jaxid.parameters import scatter
+from jaxid.parameters import REFERENCE, scatter
 from jaxid.precision import assess, full_hessian
 from jaxid.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
 from jaxid.simulation import Drive, needed_substeps
@@ -60,7 +60,7 @@ def output_residual(
     def residual(theta: Array) -> Array:
         extra = theta[len(places) :]
         nudge = extra if extra.size else None
-        run = replay(scatter(places, plant, theta), nudge)
+        run = replay.following(places, theta)(scatter(places, plant, theta), nudge)
         outputs = {"position": (run.position,), "force": (replay.drive.gain * run.command,)}
         outputs["both"] = outputs["position"] + outputs["force"]
         return weight * (measured - jnp.concatenate(outputs[on], axis=1))
@@ -173,6 +173,10 @@ def output_error_steps(
     p = len(machine.parameters.free)
     active = np.arange(p + nuisance) < p
     problem = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
+    if machine.course is not None:
+        # A machine bent to follow another reference ends nowhere: first what is unknown of that alone.
+        minimum = yield Solve(_fit, (*problem, _of_course(machine, active)))
+        problem = (*problem[:5], minimum.theta, *problem[6:])
     minimum = yield Solve(_fit, (*problem, active))
     if on == "both":
         problem = _problem(machine.with_estimate(np.asarray(minimum.theta)[:p]), replay, log, nuisance, on)
@@ -215,6 +219,13 @@ def output_error_steps(
         steps=int(minimum.steps),
         notes=notes_of(machine, numerics, log, on),
     )
+
+
+def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
+    """Which unknowns are those of the reference."""
+    own = np.zeros_like(active)
+    own[: len(machine.parameters.free)] = [path[0] == REFERENCE for path, _ in machine.parameters.places]
+    return own
 
 
 def _with_start(

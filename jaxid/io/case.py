@@ -23,6 +23,7 @@ from jaxid.io.case_entries import (
     read_kind,
     read_plant,
 )
+from jaxid.io.case_reference import read_signal, read_unknown_reference
 from jaxid.io.case_tables import (
     ALGEBRAIC,
     OUTPUT_ERROR,
@@ -38,10 +39,10 @@ from jaxid.io.case_tables import (
     simulation_keys,
     validation_keys,
 )
+from jaxid.io.case_values import Value
 from jaxid.io.log import LOG_KEYS
 from jaxid.io.schema import Key, Keys, Spot, read_table
 from jaxid.model import Effect
-from jaxid.references import REFERENCES
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,8 @@ class Case:
         limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
         candidates: User's own effects that a search may name, from [discover].
-        reference: [reference], for `jaxid.references.make_reference`.
+        reference: [reference], for `jaxid.references.make_reference`, at its guesses.
+        unknown_reference: What of it is unknown.
         input: [input], likewise.
         simulation: [simulation].
         study: [study].
@@ -101,6 +103,7 @@ class Case:
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
     reference: dict[str, Any] | None = None
+    unknown_reference: dict[str, Value] = field(default_factory=dict)
     input: dict[str, Any] | None = None
     simulation: dict[str, Any] = field(default_factory=dict)
     study: dict[str, Any] = field(default_factory=dict)
@@ -109,6 +112,13 @@ class Case:
     def folder(self) -> Path:
         """Where relative file names of the case start from."""
         return self.path.parent
+
+    @property
+    def true_reference(self) -> dict[str, Any] | None:
+        """[reference] for a simulation: at true values where its unknowns have any."""
+        if self.reference is None:
+            return None
+        return self.reference | {k: v.start(True) for k, v in self.unknown_reference.items()}
 
     @property
     def own_effects(self) -> tuple[type[Effect], ...]:
@@ -157,6 +167,7 @@ def load_case(path: str | Path) -> Case:
     def read(name: str, keys: Keys) -> dict[str, Any]:
         return read_table(tables.get(name, {}), keys, Spot(file, f"[{name}]"))
 
+    followed, unknown = read_unknown_reference(tables, drives, file)
     actuator = _checked_transmission(read("actuator", actuator_keys(drives)), drives, file)
     case = Case(
         path=path,
@@ -173,8 +184,9 @@ def load_case(path: str | Path) -> Case:
         limits=read("limits", limits_keys(joints, drives)),
         validations=_validations(tables, plant, path),
         candidates=read_candidates(tables.get("discover", {}), path),
-        reference=_signal("reference", tables, drives, file),
-        input=_signal("input", tables, drives, file),
+        reference=read_signal("reference", tables | followed, drives, file),
+        unknown_reference=unknown,
+        input=read_signal("input", tables, drives, file),
         simulation=read("simulation", simulation_keys(joints)),
         study=read("study", STUDY),
     )
@@ -308,23 +320,6 @@ def _merged(base: dict[str, Any], columns: dict[str, Any], *, same_file: bool) -
     dropped |= {"time"} if "sample_rate" in columns else set()
     dropped |= {"sample_rate"} if "time" in columns else set()
     return {**{key: value for key, value in base.items() if key not in dropped}, **columns}
-
-
-def _signal(
-    name: str, tables: Mapping[str, Any], drives: int, file: str
-) -> dict[str, Any] | None:
-    """[reference] or [input], checked by the family that it names; None where it says nothing."""
-    if not tables.get(name):
-        return None
-    table, spot = tables[name], Spot(file, f"[{name}]")
-    kind = read_kind(table, REFERENCES, (), spot)
-    try:
-        read = REFERENCES[kind].read(table, name)
-    except InputError as error:
-        raise InputError(f"{file}, {error}") from error
-    if len(read) not in (1, drives):
-        raise spot.fault(f"has values for {len(read)} joints", f"the plant drives {drives}")
-    return dict(table)
 
 
 def _check_loop(case: Case) -> None:

@@ -81,12 +81,16 @@ class Family:
         doc: One line for the user.
         keys: Every parameter allowed, by name.
         sample: From the values of one joint to its positions at the grid's instants.
+        unknown: Parameters that may be unknown, and are then fitted by `output_error`.
+        follow: As `sample`, from values and instants [s] as JAX's arrays; where any may be unknown.
     """
 
     kind: str
     doc: str
     keys: Mapping[str, Key]
     sample: Callable[[dict[str, Any], Grid], np.ndarray]
+    unknown: tuple[str, ...] = ()
+    follow: Callable[[Mapping[str, Any], Any], Any] | None = None
 
     def read(self, table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         """Check a table and spread it over the joints.

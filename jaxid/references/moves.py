@@ -1,6 +1,7 @@
 """Moves from rest to rest, strung together: trapezoids of velocity and S-curves."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, Key
+
+_NO_TIME = 1e-300
 
 
 @dataclass(frozen=True)
@@ -17,6 +20,8 @@ class Move:
     Seven phases that mirror at half time: the jerk rises for `jerk_time`, acceleration holds
     until `ramp_time - jerk_time`, then the jerk falls; after `ramp_time` the speed holds for
     `cruise_time`. Without a limit of jerk its phases have no length: a trapezoid.
+
+    Times and distance may be JAX's, for positions that can be differentiated in them.
 
     Attributes:
         distance: Way, with its sign [position].
@@ -37,26 +42,27 @@ class Move:
 
     def position(self, time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
         """Way covered [position] at instants from the start of the move [s]; rest outside."""
-        if self.duration == 0.0:
-            return np.where(time > 0, self.distance, 0.0)
-        peak = self.distance / (self.ramp_time + self.cruise_time)
-        clipped = np.clip(time, 0.0, self.duration)
+        xp = time.__array_namespace__()
+        # A move nowhere takes no time.
+        peak = self.distance / xp.maximum(self.ramp_time + self.cruise_time, _NO_TIME)
+        clipped = xp.clip(time, 0.0, self.duration)
         # Later than half time the move is itself, reversed in time and direction.
-        early = np.minimum(clipped, self.duration - clipped)
-        covered = self._ramp(np.minimum(early, self.ramp_time), peak)
-        covered += peak * np.maximum(early - self.ramp_time, 0.0)
-        return np.where(clipped <= self.duration / 2.0, covered, self.distance - covered)
+        early = xp.minimum(clipped, self.duration - clipped)
+        covered = self._ramp(xp.minimum(early, self.ramp_time), peak)
+        covered = covered + peak * xp.maximum(early - self.ramp_time, 0.0)
+        return xp.where(clipped <= self.duration / 2.0, covered, self.distance - covered)
 
     def _ramp(self, t: np.ndarray, peak: float) -> np.ndarray:
         jerk_time, ramp_time = self.jerk_time, self.ramp_time
-        acceleration = peak / (ramp_time - jerk_time)
+        xp = t.__array_namespace__()
+        acceleration = peak / xp.maximum(ramp_time - jerk_time, _NO_TIME)
         held = acceleration * (t**2 / 2.0 - t * jerk_time / 2.0 + jerk_time**2 / 6.0)
-        if jerk_time == 0.0:
+        if isinstance(jerk_time, float) and jerk_time == 0.0:
             return held
         jerk = acceleration / jerk_time
         left = ramp_time - t
         falling = peak * ramp_time / 2.0 - peak * left + jerk * left**3 / 6.0
-        return np.where(t < jerk_time, jerk * t**3 / 6.0, np.where(left < jerk_time, falling, held))
+        return xp.where(t < jerk_time, jerk * t**3 / 6.0, xp.where(left < jerk_time, falling, held))
 
 
 def plan_move(distance: float, speed: float, acceleration: float, jerk: float = math.inf) -> Move:
@@ -78,6 +84,8 @@ def plan_move(distance: float, speed: float, acceleration: float, jerk: float = 
     way = abs(distance)
     if way == 0.0:
         return Move(0.0, 0.0, 0.0, 0.0)
+    if math.isinf(jerk):
+        return plan_trapezoid(distance, speed, acceleration)
     jerk_time = acceleration / jerk
     if speed * jerk < acceleration**2:
         jerk_time = math.sqrt(speed / jerk)
@@ -95,6 +103,13 @@ def plan_move(distance: float, speed: float, acceleration: float, jerk: float = 
     return Move(distance, jerk_time, ramp_time, cruise_time)
 
 
+def plan_trapezoid(distance: float, speed: Any, acceleration: Any, xp: Any = np) -> Move:
+    """`plan_move` without a limit of jerk; limits may be JAX's, and `xp` is jax.numpy then."""
+    way = abs(distance)
+    ramp_time = xp.minimum(speed / acceleration, xp.sqrt(way / acceleration))
+    return Move(distance, 0.0, ramp_time, xp.maximum(way / speed - ramp_time, 0.0))
+
+
 def string_moves(
     start: float, targets: list[float], limits: dict[str, float], values: dict[str, Any], grid: Grid
 ) -> Float[np.ndarray, " samples"]:
@@ -104,8 +119,8 @@ def string_moves(
         start: Where the axis stands at time zero [position].
         targets: Where it goes, in turn [position].
         limits: Speed, acceleration and perhaps jerk, for `plan_move`.
-        values: Holds `dwell` [s] at each target and `repeat`: whether the targets are
-            visited anew until the grid ends, or the last one is held.
+        values: Holds `onset` [s] of the first move, `dwell` [s] at each target and `repeat`: whether the
+            targets are visited anew until the grid ends, or the last one is held.
         grid: The instants wanted.
 
     Returns:
@@ -115,7 +130,7 @@ def string_moves(
         InputError: If the moves are too short for the sampling rate to show.
     """
     time, position = grid.time, np.full(grid.samples, start)
-    now, here, turn, round_start = 0.0, start, 0, 0.0
+    now, here, turn, round_start = values["onset"], start, 0, values["onset"]
     while now < time[-1] and (values["repeat"] or turn < len(targets)):
         target = targets[turn % len(targets)]
         move = plan_move(target - here, **limits)
@@ -139,6 +154,19 @@ def _trapezoid(values: dict[str, Any], grid: Grid) -> np.ndarray:
     return string_moves(values["start"], list(values["targets"]), limits, values, grid)
 
 
+def _followed(values: Mapping[str, Any], time: Any) -> Any:
+    """As `_trapezoid` with its targets visited once: a sum of moves, differentiable in its times."""
+    xp, now, here = time.__array_namespace__(), values["onset"], values["start"]
+    position = xp.full(time.shape, here)
+    for target in values["targets"]:
+        if target != here:
+            move = plan_trapezoid(target - here, values["speed"], values["acceleration"], xp)
+            position = position + move.position(time - now)
+            now, here = now + move.duration, target
+        now = now + values["dwell"]
+    return position
+
+
 def _point_to_point(values: dict[str, Any], grid: Grid) -> np.ndarray:
     start, end = values["start"], values["end"]
     if start == end:
@@ -150,6 +178,7 @@ def _point_to_point(values: dict[str, Any], grid: Grid) -> np.ndarray:
 _START = Key("where it stands at time zero", "position", default=0.0)
 _SPEED = Key("limit of speed", "position/s", positive=True)
 _ACCELERATION = Key("limit of acceleration", "position/s^2", positive=True)
+_ONSET = Key("rest before the first move", "s", default=0.0)
 _DWELL = Key("rest at each target", "s", default=0.0, minimum=0.0)
 
 TRAPEZOID = Family(
@@ -160,10 +189,13 @@ TRAPEZOID = Family(
         "targets": Key("positions to visit in turn", "position", shape="list"),
         "speed": _SPEED,
         "acceleration": _ACCELERATION,
+        "onset": _ONSET,
         "dwell": _DWELL,
         "repeat": Key("visit the targets anew until the end", shape="flag", default=True),
     },
     sample=_trapezoid,
+    unknown=("onset", "speed", "acceleration"),
+    follow=_followed,
 )
 POINT_TO_POINT = Family(
     kind="point_to_point",
@@ -174,6 +206,7 @@ POINT_TO_POINT = Family(
         "speed": _SPEED,
         "acceleration": _ACCELERATION,
         "jerk": Key("limit of jerk", "position/s^3", positive=True),
+        "onset": _ONSET,
         "dwell": _DWELL,
         "repeat": Key("go to and fro until the end", shape="flag", default=True),
     },

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.estimators import METHODS, SIMULATING
+from jaxid.estimators import SIMULATING, steps_of
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.result import Estimate
@@ -96,7 +96,7 @@ class Runner:
                     whole = session_around(at.model, machine, virtual.log, aligned)
                     rows.append(_found(plan, whole))
                     continue
-                rows.append(_row((yield from METHODS[method](session, **options))))
+                rows.append(_row((yield from steps_of(method, session, **options))))
             except Exception as error:
                 rows.append(_failed(plan, _words(error)))
         return _stacked(rows)
