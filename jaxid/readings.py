@@ -350,7 +350,7 @@ def drive_own_states(
         push = rate(jnp.zeros_like(z))
         if z.ndim:
             here = jax.tree.map(lambda a: a[0], (*motion, own))
-            slope = jax.jacfwd(lambda v, i=i, at=here: balance_of(plant, 
+            slope = jax.jacfwd(lambda v, i=i, at=here: balance_of(plant,
                 *at[:5], (*at[5][:i], v, *at[5][i + 1 :])
             ).rates[i])(z)
             own = (*own[:i], _vector_recurrence(z, slope, push, period), *own[i + 1 :])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,73 +44,113 @@ def set_valued_step(
     Gauss-Seidel sweeps, each the force that brings its port to rest at the step's end, clipped.
 
     Args:
-        plant: The plant.
-        x: State at t.
-        u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
-        t: Time [s].
-        h: Step [s].
-        flow: `step` as a function of state and reaction (left out: zero), where there is a
-            cheaper one.
+        plant, x, u, t, h: As of `jaxid.readings.step`.
+        flow: That as a function of state and reaction (left out: zero), where there is a cheaper one.
 
     Returns:
         The state a step later, and the reaction of every port over the step.
-    """
-    ports = plant.ports(x.q).size
-    if flow is None:
-        none = jnp.zeros(ports)
-        flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
-    free = flow(x)
-    end = u(jnp.asarray(1.0))
 
-    def residual(qdd: Array, midway: Array) -> tuple[Array, Balance]:
-        levels = balance_of(plant, x.q, midway, qdd, end, t, x.own, jnp.zeros(ports))
+    Raises:
+        InputError: If friction that depends on the acceleration is on ports that push one another.
+    """
+    none, standing = jnp.zeros(plant.ports(x.q).size), jnp.zeros_like(x.q)
+    if flow is None:
+        flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
+    free, end = flow(x), u(jnp.asarray(1.0))
+
+    def at(qd: Array, qdd: Array = standing) -> Balance:
+        return balance_of(plant, x.q, qd, qdd, end, t, x.own, none)
+
+    def residual(qdd: Array) -> tuple[Array, Balance]:
+        levels = at(midway, qdd)
         return levels.residual, levels
 
     # The mass does not depend on the velocity: one balance gives it and the levels.
     midway = 0.5 * (x.qd + free.qd)
-    mass, levels = mass_of(plant, lambda qdd: residual(qdd, midway), x.q)
-    slides = levels.slides
-    if not slides:
-        return free, jnp.zeros(ports)
-    speed, before = (_port_speed(plant, at, slides) for at in (free, x))
-    mobility = h * _mobility(plant, mass, x.q, slides)
+    mass, levels = mass_of(plant, residual, x.q)
+    if not levels.slides:
+        return free, none
+    sliding = _sliding(plant, x, free, mass, levels, end, t, h)
+    moves = depends(lambda qd: [getattr(at(qd), n) for n in ("dry", "stick", "rising")], (midway,))
+    at_rest = at(standing) if moves else levels
+    found = sliding.answer(levels, at_rest)
+    reaction = spread(found.reaction, levels.slides, none.size)
+    if moves:
+        # Without friction motion begins too fast, and friction that falls with speed is too small.
+        slowed = free.qd + h * solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
+        found = sliding.answer(at(0.5 * (x.qd + slowed)), at_rest)
+        reaction = spread(found.reaction, levels.slides, none.size)
+    end_of_step = _rest_exactly(flow(x, reaction), found.stuck, levels.slides)
+    return _turned(x, end_of_step, found, h, levels.slides), reaction
 
+
+class _Answer(NamedTuple):
+    """What dry friction does over a step, an entry for each sliding port.
+
+    Args:
+        reaction: Its mean [N or N m].
+        stuck: Which ports rest at the step's end.
+        stands: Which do not change their velocity at all.
+        part: Part of the step before a port comes to rest; one where it does not.
+    """
+
+    reaction: Array
+    stuck: Array
+    stands: Array
+    part: Array
+
+
+@dataclass(frozen=True)
+class _Sliding:
+    """The ports on which friction slides, and their motion over a step without it.
+
+    Args:
+        ports: Which of all.
+        before: Velocity at the step's start, (ports,).
+        speed: At its end.
+        mobility: Change of that per unit reaction, (ports, ports), where ports push each other.
+        own: The same by a port's own reaction, (ports,).
+        corner: Over what part of itself the corners of friction that rises are rounded.
+    """
+
+    ports: tuple[int, ...]
+    before: Array
+    speed: Array
+    mobility: Array | None
+    own: Array
+    corner: Array
+
+    def answer(self, levels: Balance, at_rest: Balance) -> _Answer:
+        """Of friction at given levels, and at those at rest."""
+        dry = picked(levels.dry, self.ports)
+        held = picked(at_rest.dry, self.ports) + picked(at_rest.stick, self.ports)
+        if self.mobility is None:
+            rising = [
+                jnp.stack([picked(r, self.ports) for r in b.rising]) if b.rises else None
+                for b in (levels, at_rest)
+            ]
+            return _own_reaction(self.own, self.speed, self.before, dry, held, *rising, self.corner)
+        # The level at rest acts until a port slides, and again where it would pass through rest.
+        slid = self.speed - jnp.sign(self.before) * self.own * dry
+        rests = (self.before == 0.0) | (self.before * slid < 0.0)
+        held = jnp.where(rests, held, dry)
+        reaction, stuck = _box_reaction(self.mobility, self.speed, dry, held)
+        return _Answer(reaction, stuck, stuck & (self.before == 0.0), jnp.ones_like(self.speed))
+
+
+def _sliding(
+    plant: Plant, x: State, free: State, mass: Array, levels: Balance, u: Array, t: Array, h: Array
+) -> _Sliding:
+    """The ports that slide over a step h from x to `free`, under the force u."""
+    ports = levels.slides
+    speed, before = (_port_speed(plant, at, ports) for at in (free, x))
+    mobility = h * _mobility(plant, mass, x.q, ports)
     own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
     alone = mobility.ndim == 1 or own.size == 1
     if levels.rises:
         need_apart(plant, mass, levels.rises)
-        own = own * picked(_yielding(plant, x, end, t, h), slides)
-
-    def answered(levels: Balance, at_rest: Balance) -> tuple[Array, ...]:
-        dry = picked(levels.dry, slides)
-        held = picked(at_rest.dry, slides) + picked(at_rest.stick, slides)
-        if alone:
-            more = [
-                jnp.stack([picked(r, slides) for r in b.rising]) if b.rises else None
-                for b in (levels, at_rest)
-            ]
-            reaction, *ways = _own_reaction(own, speed, before, dry, held, *more, plant.sharpness)
-        else:
-            # The level at rest acts until a port slides, and again where it would pass through rest.
-            slid = speed - jnp.sign(before) * own * dry
-            rests = (before == 0.0) | (before * slid < 0.0)
-            reaction, stuck = _box_reaction(mobility, speed, dry, jnp.where(rests, held, dry))
-            ways = stuck, stuck & (before == 0.0), jnp.ones_like(speed)
-        return spread(reaction, slides, ports), *ways
-
-    zero = jnp.zeros_like(x.q)
-    named = ("dry", "stick", "rising")
-    moves = depends(lambda v: [getattr(residual(zero, v)[1], n) for n in named], (midway,))
-    at_rest = residual(zero, zero)[1] if moves else levels
-    reaction, *ways = answered(levels, at_rest)
-    if moves:
-        # Without friction motion begins too fast, and friction that falls with speed is too small.
-        slowed = free.qd + h * solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
-        reaction, *ways = answered(residual(zero, 0.5 * (x.qd + slowed))[1], at_rest)
-    stuck, stands, part = ways
-    end_of_step = _rest_exactly(flow(x, reaction), stuck, slides)
-    return _turned(x, end_of_step, stands, part, h, slides), reaction
-
+        own = own * picked(_yielding(plant, x, u, t, h), ports)
+    return _Sliding(ports, before, speed, None if alone else mobility, own, plant.sharpness)
 
 
 def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
@@ -121,11 +163,9 @@ def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:
     return phi(h * jnp.diagonal(slope))[1]
 
 
-
 def _port_speed(plant: Plant, x: State, slides: tuple[int, ...]) -> Array:
     """Velocities of some ports."""
     return picked(port_motion(plant, x.q, x.qd, jnp.zeros_like(x.q))[1], slides)
-
 
 
 def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> Array:
@@ -137,11 +177,10 @@ def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> A
     return jnp.stack([jacobian @ c for c in columns], axis=1)
 
 
-
 def _own_reaction(
     own: Array, speed: Array, before: Array, dry: Array, hold: Array, rising: Array | None = None,
     rising_at_rest: Array | None = None, corner: Array | float = 0.0,
-) -> tuple[Array, Array, Array, Array]:
+) -> _Answer:
     """Mean reaction over a step of ports that do not push each other.
 
     Args:
@@ -153,10 +192,6 @@ def _own_reaction(
             takes up what would speed a port up, as far as it goes: where it is not all used, the
             velocity stands.
         corner: Over what part of that its two corners are rounded.
-
-    Returns:
-        The reaction, which ports rest at the step's end, which do not change their velocity at all, and
-        the part of the step before a port comes to rest; one where it does not.
     """
     starts = before == 0.0
     drag = jnp.sign(jnp.where(starts, speed, before)) * dry
@@ -177,24 +212,20 @@ def _own_reaction(
         # Twenty widths from a corner nothing is left of its rounding.
         edge = 20.0 * corner * most
         stands = stands | (~turns & (left > edge) & (left < most - edge))
-    return jnp.where(stuck, -speed / own, reaction), stuck, stands, part
+    return _Answer(jnp.where(stuck, -speed / own, reaction), stuck, stands, part)
 
 
-
-def _turned(
-    x: State, end: State, stands: Array, part: Array, h: Array, slides: tuple[int, ...]
-) -> State:
+def _turned(x: State, end: State, found: _Answer, h: Array, slides: tuple[int, ...]) -> State:
     """The end of a step with the motion of joints that came to rest within it, or kept their velocity."""
     joints = [k for k, i in enumerate(slides) if i < x.qd.size]
     if not joints:
         return end
     size = max(*slides, x.qd.size - 1) + 1
-    own = spread(part - 1.0, slides, size)[: x.qd.size] + 1.0
+    own = spread(found.part - 1.0, slides, size)[: x.qd.size] + 1.0
     # The reaction balances the mean force; damping within the step leaves a trace that would add up.
-    keeps = spread(stands, slides, size).astype(bool)[: x.qd.size]
+    keeps = spread(found.stands, slides, size).astype(bool)[: x.qd.size]
     q = jnp.where(keeps, x.q + h * x.qd, end.q - _overshot(x.qd, end.qd, own, h))
     return State(q, jnp.where(keeps, x.qd, end.qd), end.own)
-
 
 
 def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
@@ -204,7 +235,6 @@ def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
     a step times the velocity of either end in the other part.
     """
     return jnp.where(part < 1.0, 0.5 * h * ((1.0 - part) * before + part * after), 0.0)
-
 
 
 def _box_reaction(
@@ -227,7 +257,6 @@ def _box_reaction(
             wanted = wanted.at[i].set(reaction[i] - slip * inverse[i])
             reaction = reaction.at[i].set(answer(wanted[i], dry[i], hold[i]))
     return reaction, jnp.abs(wanted) < hold
-
 
 
 def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:
