@@ -89,18 +89,20 @@ def acceleration(
     return (left - more) / each
 
 
-def need_apart(plant: Plant, mass: Array, rises: tuple[int, ...]) -> Array:
-    """Mass of each joint, where none pushes another.
+def need_apart(plant: Plant, mass: Array, ports: tuple[int, ...]) -> Array:
+    """Mass of each joint, where none pushes another and all of some ports are joints.
 
     Raises:
-        InputError: If friction that depends on the acceleration is on anything else.
+        InputError: Elsewhere: friction that depends on the acceleration has no answer there.
     """
     apart = mass.ndim == 1 or mass.shape == (1, 1)
-    if apart and max(rises) < mass.shape[0]:
+    if apart and max(ports) < mass.shape[0]:
         return mass if mass.ndim == 1 else mass[0]
     raise InputError(
-        f"friction that grows with speeding up cannot be simulated on kind = {plant.kind!r}",
-        mend="put velocity_hysteresis on a joint of a machine whose joints do not push each other",
+        f"velocity_hysteresis cannot be simulated here: on kind = {plant.kind!r} "
+        + ("it, or other dry friction beside it, acts in a spring" if apart else "joints push each other"),
+        mend="put it on a joint of a machine whose joints do not push each other, "
+        "and leave dry friction out of the springs",
     )
 
 

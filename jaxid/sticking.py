@@ -51,7 +51,7 @@ def set_valued_step(
         The state a step later, and the reaction of every port over the step.
 
     Raises:
-        InputError: If friction that depends on the acceleration is on ports that push one another.
+        InputError: If there is friction that depends on the acceleration, and ports push one another.
     """
     none, standing = jnp.zeros(plant.ports(x.q).size), jnp.zeros_like(x.q)
     if flow is None:
@@ -148,7 +148,7 @@ def _sliding(
     own = mobility if mobility.ndim == 1 else jnp.diagonal(mobility)
     alone = mobility.ndim == 1 or own.size == 1
     if levels.rises:
-        need_apart(plant, mass, levels.rises)
+        need_apart(plant, mass, ports)
         own = own * picked(_yielding(plant, x, u, t, h), ports)
     return _Sliding(ports, before, speed, None if alone else mobility, own, plant.sharpness)
 

@@ -6,7 +6,8 @@ import pytest
 import stepper
 
 from jaxid.effects import EFFECTS
-from jaxid.plants import Axis
+from jaxid.errors import InputError
+from jaxid.plants import Axis, Chain
 from jaxid.simulation import Drive, open_loop
 
 MASS, RATE, SECONDS = 2.5, 500.0, 0.6
@@ -49,3 +50,19 @@ def test_friction_that_falls_with_speed_is_taken_halfway():
     # Taken once they are 1.1e-2 and 2.6e-3.
     assert coarse < 5e-4
     assert fine < 0.2 * coarse
+
+
+def test_friction_while_speed_grows_beside_friction_in_a_spring_is_refused():
+    """Their shares are found together, of which the first knows nothing: it was left out without a word."""
+    rising = EFFECTS["velocity_hysteresis"](level=5.0, velocity=0.5, port=0)
+    in_spring = EFFECTS["coulomb_friction"](level=1.0, port=3)
+
+    def moved(*effects) -> float:
+        plant = Chain([1.0, 2.0], [2.0, 1.0], [100.0, 200.0, 150.0], effects=effects)
+        drive = Drive(jnp.ones(2), 1 / RATE, set_valued=True)
+        run = open_loop(plant, drive, jnp.full((3, 2), 10.0), jnp.zeros(2), jnp.zeros(2))
+        return float(run.position[-1, 0])
+
+    assert moved(rising) < moved(in_spring)
+    with pytest.raises(InputError, match="velocity_hysteresis.*kind = 'chain'.*in a spring"):
+        moved(rising, in_spring)
