@@ -28,7 +28,7 @@ def _table(registry: dict[str, type], what: str) -> str:
         rows.append([kind, "", "", "", "", (cls.__doc__ or "").strip().splitlines()[0]])
         for name, info in parameters_of(cls).items():
             shown = f"{name}?" if info.optional else name
-            units = [linear.label(info.dimension), rotary.label(info.dimension)]
+            units = [either.label(info.dimension, info.motion) for either in (linear, rotary)]
             rows.append(["", shown, _SIGNS[info.sign], *units, info.doc])
-    note = "\n? : one of these" if any(r[1].endswith("?") for r in rows) else ""
+    note = "\n? : may be left out; what stands in place of another, where that is given" if any(r[1].endswith("?") for r in rows) else ""
     return aligned(rows) + note

@@ -204,7 +204,6 @@ class Effect(eqx.Module):
     of_spring: ClassVar[bool] = False
     # Whether only a plant with springs of its own (True), or only one without (False), can have it.
     with_springs: ClassVar[bool | None] = None
-
     # Whether a search looks for it on stages only: elsewhere what differs by direction is taken for it.
     of_stages: ClassVar[bool] = False
 
@@ -281,6 +280,8 @@ class Plant(eqx.Module):
     diagonal: ClassVar[bool] = False
     # Joint behind an elastic coupling, which may go without an encoder; None where there is none.
     load: ClassVar[int | None] = None
+    # Whether it is a stage (see `Effect.of_stages`).
+    stage: ClassVar[bool] = False
     # Classes by the coupling that a case may state; none where there is no choice.
     couplings: ClassVar[Mapping[str, type[Plant]]] = {}
     # Joints that are driven, 0-based, in the order of their drives; None: the first ones, all of them.
@@ -357,7 +358,7 @@ class Plant(eqx.Module):
     def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
         """Whether a search may name such an effect on a port."""
         springs = self.springs(self.joints) > 0
-        if effect.with_springs not in (None, springs) or (effect.of_stages and not self.couplings):
+        if effect.with_springs not in (None, springs) or (effect.of_stages and not self.stage):
             return False
         if springs and effect.of_spring != (port >= self.parts(self.joints)):
             return False

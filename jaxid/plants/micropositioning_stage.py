@@ -32,6 +32,7 @@ class Stage(Plant):
 
     kind = "micropositioning_stage"
     diagonal = True
+    stage = True
 
     motor_inertia: Array = parameter("inertia", "positive", "of the motor", motion="rotary")
     table_mass: Array = parameter("inertia", "positive", "of the table", motion="linear")
