@@ -30,5 +30,5 @@ def _table(registry: dict[str, type], what: str) -> str:
             shown = f"{name}?" if info.optional else name
             units = [either.label(info.dimension, info.motion) for either in (linear, rotary)]
             rows.append(["", shown, _SIGNS[info.sign], *units, info.doc])
-    note = "\n? : may be left out; what stands in place of another, where that is given" if any(r[1].endswith("?") for r in rows) else ""
-    return aligned(rows) + note
+    note = "\n? : may be left out; what stands in place of another, where that is given"
+    return aligned(rows) + (note if any(r[1].endswith("?") for r in rows) else "")

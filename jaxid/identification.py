@@ -114,7 +114,7 @@ def identify(
         options["solver"] = _checked("solver", solver, SOLVERS, method)
     if on is not None:
         options["on"] = _checked("on", on, OUTPUTS, method)
-    session = open_session(case, log, validate)
+    session = open_session(case, log, validate, method=method)
     if not session.machine.parameters.free:
         raise InputError(
             "nothing is unknown", where=str(session.case.path),
@@ -152,7 +152,7 @@ def identify_many(
     case = case if isinstance(case, Case) else load_case(case)
 
     def steps(log: Log | str | Path) -> Steps[Estimate]:
-        return (yield from steps_of(method, open_session(case, log)))
+        return (yield from steps_of(method, open_session(case, log, method=method)))
 
     return together([steps(log) for log in logs], lanes)
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log, read_log, with_load
-from jaxid.io.soundness import Finding, check_log, plausible_inertia, raise_on_error
+from jaxid.io.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine, build_machine
 from jaxid.preprocess import Prepared, Recipe, choose_recipe, prepare
 from jaxid.references import make_reference
@@ -75,6 +75,7 @@ def open_session(
     validate: Sequence[Log | str | Path] = (),
     *,
     align_hold: bool | None = None,
+    method: str = "output_error",
 ) -> Session:
     """Open a case and its logs, check them and prepare them.
 
@@ -83,6 +84,7 @@ def open_session(
         log: The log to fit, or its file.
         validate: More logs to validate on, beside the case's own.
         align_hold: See `jaxid.preprocess.Recipe`; absent: what the case's recipe implies.
+        method: That is to fit the log: only `output_error` can do with a short one, within a prior.
 
     Raises:
         InputError: If anything in case or logs is unsound.
@@ -90,24 +92,25 @@ def open_session(
     case = case if isinstance(case, Case) else load_case(case)
     fit = _read(case, log)
     machine = build_machine(case, period=fit.period)
-    findings = _check(case, fit, machine)
+    held = method == "output_error" and "prior" in case.output_error
+    findings = _check(case, fit, machine, held)
     recipe = choose_recipe(fit, case.preprocess)
     if align_hold is not None:
         recipe = replace(recipe, align_hold=align_hold)
     disturbance = machine.disturbance
-    needed = enough(case, machine)
+    needed = 0 if held else enough(machine)
     opened = [_run("fit", fit, machine, recipe, needed, disturbance)]
     names = {"fit"}
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
         read = _read(case, source, columns=entry.columns)
-        findings += _check(case, read, machine)
+        findings += _check(case, read, machine, held)
         opened.append(_run(entry.name, read, machine, recipe, needed, entry.disturbance))
         names.add(entry.name)
     for extra in validate:
         read = _read(case, extra, whole=True)
-        findings += _check(case, read, machine)
+        findings += _check(case, read, machine, held)
         name = Path(read.source).stem
         while name in names:
             name += "'"
@@ -132,7 +135,8 @@ def session_around(
         InputError: If the log is too short, or moves too little.
     """
     recipe = recipe or choose_recipe(log, case.preprocess)
-    run = _run("fit", log, machine, recipe, enough(case, machine), machine.disturbance)
+    needed = 0 if "prior" in case.output_error else enough(machine)
+    run = _run("fit", log, machine, recipe, needed, machine.disturbance)
     return Session(case, _scaled(machine, run.data), run, (), recipe, ())
 
 
@@ -167,14 +171,16 @@ def _followed(case: Case, log: Log) -> Log:
     return replace(log, reference=np.broadcast_to(reference, (log.samples, case.plant.drives)))
 
 
-def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
+def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
+    """Findings on a log; held: by a prior, for which two positions are a movement."""
     limit = (case.controller or {}).get("limit")
     units, plant = machine.units, machine.plant
     driven = plant.at_drives(np.arange(plant.joints))
+    stated = machine.sensor.position_resolution is not None
     findings = check_log(
         log, command_limit=limit, motion=units.motion,
         units={"position": units.position} if units.position else None, driven=driven,
-        **({"fewest_levels": 2} if "prior" in case.output_error else {}),
+        fewest_levels=2 if held else FEWEST_LEVELS, resolution_stated=stated,
     )
     inertia = plant.own_inertia()
     if inertia is not None:
@@ -186,9 +192,9 @@ def _check(case: Case, log: Log, machine: Machine) -> list[Finding]:
     return findings
 
 
-def enough(case: Case, machine: Machine) -> int:
-    """Samples of motion that a log must have; none where a prior holds what it does not tell."""
-    return 0 if "prior" in case.output_error else 5 * max(len(machine.parameters.free), 4)
+def enough(machine: Machine) -> int:
+    """Samples of motion that a log must have, where no prior holds what it does not tell."""
+    return 5 * max(len(machine.parameters.free), 4)
 
 
 def _run(

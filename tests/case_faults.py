@@ -214,6 +214,7 @@ FAULTS = {
     "reach of none": (
         more('[preprocess]\nderivatives = "parabolic"\nreach = 0'), ["reach = 0", "at least 1"]
     ),
+    "starts without a prior": (more("[output_error]\nstarts = 4"), ["starts goes with prior only"]),
     "reach alone": (more("[preprocess]\nreach = 3"), ["reach", 'derivatives = "parabolic"']),
     "parabola of a low-pass": (
         more('[preprocess]\nderivatives = "parabolic"\ncutoff_hz = 60.0'), ["cutoff_hz", "leave out one"]

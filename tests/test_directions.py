@@ -176,14 +176,20 @@ def test_a_log_of_noise_tells_nothing(folder):
 def test_wrong_priors_are_refused(folder, tmp_path, capsys):
     text = (folder / "case.toml").read_text()
     stages.write(stages.record(STAGE, REFERENCE, noise=NOISE, resolution=0.0), tmp_path / "log.csv")
-    for wrong, said in (
+    start, end = text.index("[controller]"), text.index(STATED.splitlines()[0])
+    for wrong, said, *options in (
         (text.replace("prior = 0.5", "prior = -1"), "prior"),
         (text.replace("prior = 0.5", "prior = 0.5\nstarts = 0"), "starts"),
+        (text.replace("prior = 0.5", "profile = true"), "profile goes with prior only"),
         (_without_guess(text), "cogging[2].phase has a guess of zero"),
+        (text[:start] + text[end:], "[output_error] prior needs a loop"),
+        (text, "solver 'tsit5' does not go with [output_error] prior", "--solver", "tsit5"),
+        # A prior is no help to a method that knows of none.
+        (text + "[preprocess]\ntrim = 40\n", "log.csv: too short", "--method", "inverse_dynamics"),
     ):
         (tmp_path / "case.toml").write_text(wrong)
         files = [str(tmp_path / name) for name in ("case.toml", "log.csv", "o")]
-        code = main(["identify", *files[:2], "-o", files[2]])
+        code = main(["identify", *files[:2], "-o", files[2], *options])
         err = capsys.readouterr().err
         assert code == 2
         assert said in err

@@ -64,7 +64,7 @@ def discover(
     Raises:
         InputError: If case or log are unsound.
     """
-    session = open_session(case, log, validate, align_hold=True)
+    session = open_session(case, log, validate, align_hold=True, method="discover")
     need_known_reference(session, "what it is would be taken for an effect")
     return explore(session, max_effects=max_effects, refit=refit, progress=progress)
 

@@ -33,12 +33,18 @@ def _output_error(
     numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
-    from jaxid.estimators.output_error import choose_numerics, output_error_steps
+    from jaxid.estimators.output_error import choose_numerics, need_loop, output_error_steps
 
     log, on = session.fit.log, on or session.case.output_error.get("on", "position")
     if "prior" in session.case.output_error:
         from jaxid.estimators.directions import directions_steps
 
+        if solver is not None:
+            raise InputError(
+                f"solver {solver!r} does not go with [output_error] prior", where=str(session.case.path),
+                mend="leave one of them out: a fit within a prior takes fixed steps",
+            )
+        need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
         stated = {k: v for k, v in session.case.output_error.items() if k != "on"}
         return (yield from directions_steps(session.machine, log, on=on, numerics=numerics, **stated))
     # Inverse dynamics gives the start where it tells all unknowns of the plant.

@@ -68,6 +68,25 @@ def output_residual(
     return residual
 
 
+def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
+    """Refuse an open loop, whose force is the log's own: it would meet itself.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        what: Needs the loop.
+        other: Way out, behind that of naming it.
+
+    Raises:
+        InputError: If there is no controller.
+    """
+    if machine.controller is None:
+        raise InputError(
+            f"{what} needs a loop whose simulation makes a force", where=log.source,
+            mend=f"name the controller in [controller] and the reference's column in [log], {other}",
+        )
+
+
 def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
     """What a log holds of an output, (time, k), and which columns count; see `output_residual`."""
     force = log.force * machine.gain
@@ -158,11 +177,8 @@ def output_error_steps(
     hessian: bool = False, on: str = "position",
 ) -> Steps[Estimate]:
     """`output_error`, one solve at a time."""
-    if on != "position" and machine.controller is None:
-        raise InputError(
-            f"output_error on {on} needs a loop whose simulation makes a force", where=log.source,
-            mend="name the controller in [controller] and the reference's column in [log], or fit position",
-        )
+    if on != "position":
+        need_loop(machine, log, f"output_error on {on}", "or fit position")
     machine = machine if start is None else machine.with_estimate(start)
     numerics = numerics or choose_numerics(machine, log)
     replay = make_replay(machine, log, numerics)

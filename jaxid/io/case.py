@@ -178,7 +178,7 @@ def load_case(path: str | Path) -> Case:
         log=_log(tables, plant, file),
         preprocess=_checked_preprocess(read("preprocess", preprocess_keys(joints)), file),
         algebraic=read("algebraic", ALGEBRAIC),
-        output_error=read("output_error", OUTPUT_ERROR),
+        output_error=_checked_output_error(read("output_error", OUTPUT_ERROR), file),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
         limits=read("limits", limits_keys(joints, drives)),
@@ -250,6 +250,15 @@ def _checked_transmission(actuator: dict[str, Any], joints: int, file: str) -> d
         mend = f"give {joints} rows of {joints} numbers, none a sum of others"
         raise spot.fault("is not an invertible square matrix", mend)
     return actuator
+
+
+def _checked_output_error(given: dict[str, Any], file: str) -> dict[str, Any]:
+    """Refuse what only a fit within a prior does where there is none."""
+    lost = [key for key in given if key not in ("on", "prior")]
+    if lost and "prior" not in given:
+        mend = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
+        raise Spot(file, "[output_error]", lost[0]).fault("goes with prior only", mend)
+    return given
 
 
 def _checked_preprocess(stated: dict[str, Any], file: str) -> dict[str, Any]:

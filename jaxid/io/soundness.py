@@ -18,7 +18,8 @@ __all__ = ["Finding", "check_log", "plausible_inertia", "raise_on_error"]
 
 # Chosen: with fewer levels than this over the whole stroke, an acceleration is made of steps.
 _COARSE_LEVELS = 500
-_STILL_LEVELS = 4
+# A position of fewer values is no movement.
+FEWEST_LEVELS = 5
 # Of all rows; a command that is longer at its limit than not says little about the force.
 _SATURATED = 0.5
 _OFTEN_SATURATED = 0.05
@@ -32,7 +33,8 @@ def check_log(
     units: dict[str, str] | None = None,
     path: str | Path | None = None,
     driven: Sequence[int] | np.ndarray | None = None,
-    fewest_levels: int = _STILL_LEVELS + 1,
+    fewest_levels: int = FEWEST_LEVELS,
+    resolution_stated: bool = False,
 ) -> list[Finding]:
     """Look for the faults of a readable log.
 
@@ -45,12 +47,13 @@ def check_log(
         path: Name of the log in messages; its source where absent.
         driven: Joints with a drive, 0-based, in the order of the drives; None: the first ones.
         fewest_levels: A position of fewer values is no movement.
+        resolution_stated: Whether the case says in what steps the position comes.
 
     Returns:
         What was found; empty for a sound log.
     """
     where = str(path or log.source)
-    findings = [*_movement(log, where, fewest_levels), *_force(log, command_limit, where)]
+    findings = [*_movement(log, where, fewest_levels, resolution_stated), *_force(log, command_limit, where)]
     still = any(finding.severity == "error" for finding in findings)
     if not still:
         findings += ratio_findings(log, motion, where, driven)
@@ -76,7 +79,7 @@ def raise_on_error(findings: Iterable[Finding]) -> None:
         raise InputError(first.what, where=first.where, mend=mend)
 
 
-def _movement(log: Log, path: str, fewest: int) -> list[Finding]:
+def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
     """Joints that stand still, and positions that come in coarse steps."""
     seen = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
     reasons = [_stillness(q, fewest) for _, q in seen]
@@ -92,7 +95,8 @@ def _movement(log: Log, path: str, fewest: int) -> list[Finding]:
             findings.append(Finding("warning", f"the joint does not move: {reason}", where, mend))
         elif step and levels < _COARSE_LEVELS:
             what = f"the position is quantised in steps of {step:.3g}: {levels} levels in all"
-            mend = "log a longer stroke or more digits, and give sensor.position_resolution"
+            mend = "log a longer stroke or more digits"
+            mend += "" if stated else ", and give sensor.position_resolution"
             findings.append(Finding("warning", what, where, mend))
     return findings
 
