@@ -136,7 +136,19 @@ def test_results_hold_the_directions(fitted, tmp_path):
     assert content["criterion_percent"] > 0
     assert str(fitted).count("told together: ") == len(content["directions"])
     assert content["directions"][0].keys() >= {"combination", "value", "std"}
-    assert "directions of 11 unknowns fitted" in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "directions of 11 unknowns fitted" in page
+    told = page[page.index('<section id="directions">'):].partition("</section>")[0]
+    assert told.count("<tr>") == 1 + len(content["directions"])
+    assert "rise at −2 σ" in told
+    for words in (f"tarts: {content['starts']['same_optimum']} of 16", "riterion: "):
+        assert words in told
+        assert words in str(fitted)
+    # Of what was held it is not said that it changes nothing.
+    assert "Held at the guesses: " in page
+    assert "held at the guesses: " in str(fitted)
+    assert "leaves everything that was measured as it is" not in page
+    assert "<figcaption>Force of the drive</figcaption>" in page
 
 
 def test_many_logs_are_fitted_as_each_alone(folder, fitted):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.io import results
 from jaxid.minimal.report import minimal_rows
 from jaxid.report.numbers import with_std
-from jaxid.report.tables import place_words
+from jaxid.report.tables import SLIGHT, place_words, within_prior_words
 
 if TYPE_CHECKING:
     from jaxid.discovery.result import Discovery
@@ -64,18 +64,15 @@ def identification_table(result: Identification) -> str:
     notes = _notes(results.notes(result.session, estimate))
     own = _minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []
     together = _told_together(estimate.details.get("directions", []))
-    return "\n".join([head, "", told, *together, *_blind(estimate), *own, "", aligned(rows), *notes])
-
-
-# Weights below this are left out of a combination's line.
-_SLIGHT = 0.1
+    below = [*_blind(estimate), *within_prior_words(estimate.details), *own]
+    return "\n".join([head, "", told, *together, *below, "", aligned(rows), *notes])
 
 
 def _told_together(directions: Sequence[dict[str, Any]]) -> list[str]:
     """Combinations that a fit within a prior tells, from the guesses on in units of it."""
     return [
         f"told together: {d['value']:+.3f} ± {d['std']:.3f} priors of "
-        + ", ".join(f"{w:+.2f} {n}" for n, w in d["combination"].items() if abs(w) > _SLIGHT)
+        + ", ".join(f"{w:+.2f} {n}" for n, w in d["combination"].items() if abs(w) > SLIGHT)
         for d in directions
     ]
 
@@ -119,8 +116,10 @@ def discovery_table(result: Discovery) -> str:
 
 
 def _blind(estimate: Estimate) -> list[str]:
+    """Combinations that the log does not tell; a fit within a prior holds them."""
+    said = "held at the guesses" if "directions" in estimate.details else "cannot be told apart"
     return [
-        "cannot be told apart: " + ", ".join(f"{w:+.2f} {n}" for n, w in c.items())
+        f"{said}: " + ", ".join(f"{w:+.2f} {n}" for n, w in c.items())
         for c in estimate.precision.unidentifiable
     ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,8 +45,9 @@ def identification_report(result: Identification) -> str:
             summary_lines=(),
             gap=content["gap"],
             unidentifiable=tuple(content["unidentifiable"]),
-            views=_views(session, None, result.gaps),
+            views=_views(session, None, result.gaps, drives="directions" in content),
             converged=result.converged,
+            within_prior=content if "directions" in content else None,
             coefficients=tuple(rows),
             statistics=tuple(below),
             **_common(session, result.estimate, content["notes"]),
@@ -126,15 +128,27 @@ def _derived(session: Session, estimate: Estimate) -> tuple[ParameterRow, ...]:
 
 
 def _views(
-    session: Session, before: Sequence[Gap] | None, after: Sequence[Gap]
+    session: Session, before: Sequence[Gap] | None, after: Sequence[Gap], drives: bool = False
 ) -> tuple[LogView, ...]:
+    """The logs, by joint; `drives`: with what their loops command."""
     earlier = before or [None] * len(after)
     joints = np.flatnonzero(session.fit.log.measured).tolist()
+    driven = _driven if drives else lambda *of: {}
     return tuple(
-        _view(run, old, new, joint, len(joints))
+        replace(_view(run, old, new, joint, len(joints)), **driven(session, run, new, joint))
         for run, old, new in zip(session.runs, earlier, after, strict=True)
         for joint in joints
     )
+
+
+def _driven(session: Session, run: Run, gap: Gap, joint: int) -> dict[str, np.ndarray]:
+    """Declared force of a joint's drive, logged and simulated; nothing where either is not there."""
+    gain = session.machine.gain
+    drive = session.machine.plant.drive_of(joint, gain.size)
+    if drive is None or gap.simulation is None or gap.simulation.command is None:
+        return {}
+    both = {"drive_measured": run.log.force, "drive_simulated": gap.simulation.command}
+    return {name: (command * gain)[:, drive] for name, command in both.items()}
 
 
 def _view(run: Run, before: Gap | None, after: Gap, joint: int, joints: int) -> LogView:

@@ -29,6 +29,8 @@ class LogView:
         residual_before: Force measured minus force of the declared model, (K,) or None.
         residual_after: The same with the final model, (K,) or None.
         joint: Which joint, 0-based.
+        drive_measured: Declared force of its drive as it was logged, (N,), where that is to be compared.
+        drive_simulated: The same as the simulated loop commands it, (N,).
     """
 
     name: str
@@ -43,6 +45,8 @@ class LogView:
     residual_before: np.ndarray | None = None
     residual_after: np.ndarray | None = None
     joint: int = 0
+    drive_measured: np.ndarray | None = None
+    drive_simulated: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,8 @@ class ReportData:
         derived: What follows from the parameters.
         coefficients: Rows of a minimal model's table, its head first; empty without one.
         statistics: Lines below it.
+        within_prior: `directions`, `criterion_percent` and `starts` of the JSON result of a fit within a
+            prior; None of any other.
     """
 
     title: str
@@ -191,3 +197,4 @@ class ReportData:
     derived: tuple[ParameterRow, ...] = ()
     coefficients: tuple[Sequence[str], ...] = ()
     statistics: tuple[str, ...] = ()
+    within_prior: Mapping | None = None

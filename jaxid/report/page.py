@@ -60,6 +60,8 @@ def render(data: ReportData) -> str:
         parameters=tables.parameter_lines((*data.parameters, *data.derived)),
         effects=tables.effect_entries(data.effects),
         unidentifiable=tables.unidentifiable_lines(data.unidentifiable),
+        directions=tables.direction_lines(data.within_prior["directions"]) if data.within_prior else [],
+        within_prior_words=tables.within_prior_words(data.within_prior or {}),
         untold=[row.name for row in data.parameters if not row.identifiable],
         steps=tables.step_lines(data),
         force_unit=pretty_unit(str(data.units["force"])),
@@ -96,9 +98,13 @@ def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
         "anchor": f"log-{number}",
         "simulated": simulated,
         "fit": _picture(words, plots.plot_fit, view, units),
+        "drive": None,
         "force": None,
         "against": [],
     }
+    if view.drive_simulated is not None:
+        words = f"{view.name}: force of the drive over time, measured and simulated"
+        entry["drive"] = _picture(words, plots.plot_drive, view, units)
     if len(view.band_time):
         words = f"{view.name}: measured force and force residual over time"
         draw = plots.plot_residual_over_time

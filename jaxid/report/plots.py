@@ -24,6 +24,7 @@ _IDLE = "#b4bcc4"
 # Darker shades for the means, which stand on a cloud of their own colour.
 _DARK = {BEFORE: "#7a3600", AFTER: "#00344f"}
 _MOST_POINTS = 4000
+_FEW = 200
 _JOINTS = (AFTER, "#009e73", "#cc79a7", "#56b4e9")
 
 
@@ -40,21 +41,44 @@ def plot_fit(
     Returns:
         The figure.
     """
-    simulated = _simulated(view)
+    return _compared(view, drawable(view.position_measured), _simulated(view), "position", units, size)
+
+
+def plot_drive(
+    view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
+) -> Figure:
+    """Declared force of the drive over time, as logged and as the simulated loop commands it.
+
+    Args:
+        view: The log; it must have both.
+        units: Labels of "force" and "time".
+        size: Width and height [inch].
+
+    Returns:
+        The figure, with what parts them below.
+    """
+    simulated = [("simulated", AFTER, drawable(view.drive_simulated))]
+    return _compared(view, drawable(view.drive_measured), simulated, "force", units, size)
+
+
+def _compared(
+    view: LogView, measured: np.ndarray, simulated: Sequence[tuple[str, str, np.ndarray]], what: str,
+    units: Mapping[str, str], size: tuple[float, float],
+) -> Figure:
+    """A measured quantity and lines beside it over time, with what parts them below."""
     figure, top, below = time_axes(size, 2 if simulated else 1, ratios=(3, 2))
     many = bucket_count(size)
-    measured = drawable(view.position_measured)
-    factor, unit = scaled_unit(units["position"], [measured])
+    factor, unit = scaled_unit(units[what], [measured])
     top.plot(*envelope(view.time, measured / factor, many), color=MEASURED, lw=3.0)
     names = ["measured"]
-    small, small_unit = scaled_unit(units["position"], [measured - s[2] for s in simulated])
+    small, small_unit = scaled_unit(units[what], [measured - s[2] for s in simulated])
     for label, color, line in simulated:
         top.plot(*envelope(view.time, line / factor, many), color=color, lw=1.1)
         gap = (measured - line) / small
         below.plot(*envelope(view.time, gap, many), color=color, lw=1.1)
         names.append(label)
     span(top, view)
-    dress(top, "" if simulated else time_label(units), f"position [{unit}]")
+    dress(top, "" if simulated else time_label(units), f"{what} [{unit}]")
     if simulated:
         below.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
         dress(below, time_label(units), f"measured −\nsimulated [{small_unit}]")
@@ -295,7 +319,9 @@ def _groups(variable: str, x: np.ndarray) -> np.ndarray | None:
 
 def _cloud(ax: Axes, x: np.ndarray, y: np.ndarray, color: str, groups: np.ndarray | None) -> None:
     some = thinned(len(x), _MOST_POINTS)
-    # As an image: thousands of dots would be megabytes of SVG.
-    ax.plot(x[some], y[some], ".", color=color, ms=2.8, alpha=0.4, mew=0, rasterized=True)
+    # As an image: thousands of dots would be megabytes of SVG. A handful is drawn to be seen one by one.
+    few = len(x) <= _FEW
+    look = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.4}
+    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, **look)
     ax.axhline(0.0, color=TEXT, lw=0.6)
     ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8)

@@ -20,6 +20,8 @@ from jaxid.report.numbers import (
 )
 
 _MOST_INTERVALS = 12
+# Weights up to this are left out of a combination that is told.
+SLIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -140,10 +142,41 @@ def unidentifiable_lines(entries: Sequence[Mapping]) -> list[dict]:
     """Explain each combination that the log cannot tell, largest weight first."""
     lines = []
     for entry in entries:
-        weights = {k: w for k, w in entry["combination"].items() if is_number(w) and w != 0}
-        ranked = sorted(weights.items(), key=lambda item: -abs(item[1]))
-        terms = [{"name": n, "weight": ("+" if w > 0 else "") + plain(w, 2)} for n, w in ranked]
+        terms = _terms(entry["combination"])
         lines.append({"terms": terms, "single": len(terms) == 1})
+    return lines
+
+
+def _terms(combination: Mapping[str, float], least: float = 0.0) -> list[dict]:
+    """Names and weights of a combination, largest first, without those up to a size."""
+    weights = {k: w for k, w in combination.items() if is_number(w) and abs(w) > least}
+    ranked = sorted(weights.items(), key=lambda item: -abs(item[1]))
+    return [{"name": n, "weight": ("+" if w > 0 else "") + plain(w, 2)} for n, w in ranked]
+
+
+def direction_lines(directions: Sequence[Mapping]) -> list[dict]:
+    """Format the combinations that a fit within a prior tells."""
+    lines = []
+    for entry in directions:
+        value, std = with_std(entry["value"], entry["std"])
+        profile = entry.get("profile")
+        rise = dict(zip(profile["at_std"], profile["rise"], strict=True)) if profile else {}
+        lines.append({
+            "terms": _terms(entry["combination"], SLIGHT), "value": value, "std": std,
+            "white": with_std(entry["value"], entry["std_white"])[1],
+            "profile": [short(rise[at], 2) for at in (-2.0, 2.0)] if rise else None,
+        })
+    return lines
+
+
+def within_prior_words(content: Mapping) -> list[str]:
+    """What a fit within a prior says beside its directions; nothing of any other."""
+    if "criterion_percent" not in content:
+        return []
+    lines = [f"criterion: {short(content['criterion_percent'], 3)} % of the squared deviation from the mean"]
+    starts = content.get("starts")
+    if starts:
+        lines.append(f"starts: {starts['same_optimum']} of {starts['count']} end at the lowest cost")
     return lines
 
 
