@@ -8,7 +8,9 @@ import stepper
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.plants import Axis, Chain
+from jaxid.readings import State, course
 from jaxid.simulation import Drive, open_loop
+from jaxid.sticking import set_valued_step
 
 MASS, RATE, SECONDS = 2.5, 500.0, 0.6
 COULOMB = {"coulomb_friction": {"level": 11.8}}
@@ -66,3 +68,43 @@ def test_friction_while_speed_grows_beside_friction_in_a_spring_is_refused():
     assert moved(rising) < moved(in_spring)
     with pytest.raises(InputError, match="velocity_hysteresis.*kind = 'chain'.*in a spring"):
         moved(rising, in_spring)
+
+
+def stepped(plant, speed: float, force: float) -> tuple[float, float]:
+    """Position and velocity after one step from zero under a held force."""
+    x = State(jnp.zeros(1), jnp.asarray([speed]), (None,) * len(plant.effects))
+    y, _ = set_valued_step(plant, x, course((jnp.asarray([force]),)), jnp.zeros(()), jnp.asarray(1 / RATE))
+    return float(y.q[0]), float(y.qd[0])
+
+
+def test_a_stop_and_a_turn_within_a_step_are_two_parabolas():
+    """Exact where friction is Coulomb's: one parabola over the step would go nearly twice as far."""
+    level, speed, h = 11.8, 5e-3, 1 / RATE
+    plant = Axis(MASS, effects=(EFFECTS["coulomb_friction"](level=level),))
+    way, end = stepped(plant, speed, 0.0)
+    assert end == 0.0
+    assert way == pytest.approx(0.5 * MASS * speed**2 / level, rel=1e-9)
+    force = -20.0
+    slowing, back = (force - level) / MASS, (force + level) / MASS
+    rest = h + speed / slowing
+    way, end = stepped(plant, speed, force)
+    assert end == pytest.approx(back * rest, rel=1e-9)
+    assert way == pytest.approx(-0.5 * speed**2 / slowing + 0.5 * back * rest**2, rel=1e-9)
+
+
+def test_a_velocity_stands_just_where_the_force_lies_between_both_frictions():
+    """However much damping takes of an impulse within the step: here a fifth."""
+    dry, rising, damping, speed = 10.0, 4.0, 0.5 * MASS * RATE, 0.2
+    effects = (
+        EFFECTS["coulomb_friction"](level=dry), EFFECTS["viscous_friction"](coefficient=damping),
+        EFFECTS["velocity_hysteresis"](level=rising, velocity=1e3),
+    )
+    plant = Axis(MASS, effects=effects, sharpness=1e-6)
+    for left in (0.01, 2.0, 3.99):
+        way, end = stepped(plant, speed, dry + damping * speed + left)
+        assert (way, end) == (speed / RATE, speed)
+    # Beyond either end what is left speeds it up or slows it down, as if nothing stood in between.
+    taken = -np.expm1(-damping / MASS / RATE) / damping
+    for left, over in ((-0.1, -0.1), (4.1, 0.1)):
+        _, end = stepped(plant, speed, dry + damping * speed + left)
+        assert end - speed == pytest.approx(over * taken, rel=1e-3)
