@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,8 @@ import stages
 
 import jaxid
 from jaxid.cli import main
-from jaxid.estimators.directions_problem import criterion_steps
+from jaxid.estimators.directions_precision import add_profiles
+from jaxid.estimators.directions_problem import Found, Prior, criterion_steps
 from jaxid.estimators.steps import alone
 from jaxid.identification import identify_many
 from jaxid.io.log import Log
@@ -89,6 +91,60 @@ def test_precision_and_profiles_agree(fitted):
     for at in (-2.0, 2.0):
         wide = at * best["std"] / best["std_white"]
         assert 0.4 * wide**2 < rise[at] < 2.5 * wide**2
+
+
+def test_a_prior_is_normal_in_the_logarithm_of_what_is_positive():
+    guess, logarithmic = np.array([2e-5, -0.06]), np.array([True, False])
+    prior = Prior(guess, np.array([0.5, 0.03]), logarithmic, np.array([0.0, -np.inf]), np.full(2, np.inf))
+    w = np.array([1.7, -1.2])
+    theta = np.asarray(prior.outward(w))
+    np.testing.assert_allclose(theta, [2e-5 * np.exp(0.85), -0.06 - 0.036], rtol=1e-12)
+    np.testing.assert_allclose(prior.inward(theta), w, rtol=1e-12)
+    np.testing.assert_allclose(prior.slope(theta), np.diag(jax.jacfwd(prior.outward)(w)), rtol=1e-12)
+
+
+def test_a_profile_holds_one_direction_and_fits_the_others():
+    """Of three directions two are fitted; costs here are quadratic, and rise by the square of the place."""
+    best, noise = np.array([0.3, -0.5, 0.0]), 0.2
+    problem = SimpleNamespace(args=(), ladder=[0.1], noise=lambda minimum, count: noise)
+    minimum = SimpleNamespace(theta=best, cost=4.0)
+    stated = [{"std": 0.1}, {"std": 0.7}]
+    steps = add_profiles(Found(problem, np.eye(3), 2, minimum, 0, True), stated)
+    *_, z, active = next(steps).args
+    places = (z - best).reshape(2, 6, 3)
+    np.testing.assert_allclose(places[0, :, 0], 0.1 * np.array([-3, -2, -1, 1, 2, 3]))
+    np.testing.assert_allclose(places[1, :, 1], 0.7 * np.array([-3, -2, -1, 1, 2, 3]))
+    assert np.all(np.count_nonzero(places, axis=2) == 1)
+    free = active.reshape(2, 6, 3)
+    assert np.all(free[0] == [False, True, False])
+    assert np.all(free[1] == [True, False, False])
+    costs = 4.0 + 0.5 * noise**2 * np.sum(np.square(places / [0.1, 0.7, 1.0]), axis=2).ravel()
+    with pytest.raises(StopIteration):
+        steps.send((None, costs, None, None))
+    for direction in stated:
+        np.testing.assert_allclose(direction["profile"]["rise"], [9, 4, 1, 1, 4, 9])
+
+
+def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
+    """The move of data 2: half as much friction again, and nothing moves, nor do most of the starts."""
+    truth, reference = stages.TRUTH[2], stages.move(0.5, **stages.MOVES[2])
+    names = ("coulomb_friction[1].level", "coulomb_friction[2].level")
+    guess = {n: 1.5 * truth[n] for n in names}
+    log = stages.record(stages.machine(2, rigid=True), reference, noise=0.002, resolution=0.0)
+    log = Log(
+        time=log["t"], position=log["q"][:, None], force=log["i"][:, None], reference=reference[:, None]
+    )
+    found = {}
+    for starts in (1, 16):
+        text = stages.text(2, guess=guess, resolution=0.0, more=f"{STATED}starts = {starts}\n")
+        (tmp_path / "case.toml").write_text(text)
+        found[starts] = jaxid.identify(tmp_path / "case.toml", log).estimate
+    few, many = found[1].details, found[16].details
+    assert not few["directions"]
+    assert many["directions"]
+    assert many["criterion_percent"] < 0.5 * few["criterion_percent"]
+    assert many["starts"]["count"] == 16
+    assert 1 <= many["starts"]["same_optimum"] < 16
 
 
 def test_sensitivities_are_those_of_finite_differences(folder):

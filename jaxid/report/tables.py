@@ -176,7 +176,7 @@ def within_prior_words(content: Mapping) -> list[str]:
     lines = [f"criterion: {short(content['criterion_percent'], 3)} % of the squared deviation from the mean"]
     starts = content.get("starts")
     if starts:
-        lines.append(f"starts: {starts['same_optimum']} of {starts['count']} end at the lowest cost")
+        lines.append(f"starts: {starts['same_optimum']} of {starts['count']} end at the same cost")
     return lines
 
 
