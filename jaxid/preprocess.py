@@ -211,10 +211,11 @@ class Prepared:
 def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     """Complete a stated recipe from the log, or choose all of it.
 
-    The parallel filter ends at the highest frequency at which the position still stands four times
-    above its noise floor in power, at most 0.3 of the sampling rate; the position's own filter, at
-    twice that, is flat where the parallel filter still passes anything. The rest velocity is five standard
-    deviations of the velocity's noise in that band, at least half a percent of the RMS velocity.
+    The parallel filter ends where the position first stands less than four times above its noise floor
+    in power (a gap between the lines of a multisine is enough), at most at 0.3 of the sampling rate; the
+    position's own filter, at twice that, is flat where the parallel filter still passes anything. The
+    rest velocity is five standard deviations of the velocity's noise in that band, at least half a
+    percent of the RMS velocity.
 
     Parabolic derivatives leave the position unfiltered, and the parallel filter ends where they are still
     flat, or earlier; with a stated decimation it is that decimation's, to the letter.
@@ -310,7 +311,7 @@ def trimmed(log: Log, band_hz: float, decimation: int, *, literal: bool, periods
 
 
 def _noise_cutoff(log: Log) -> float:
-    """Highest frequency at which every joint's position stands above its noise [Hz]."""
+    """Frequency up to which every joint's position stands above its noise without a gap [Hz]."""
     rate = log.rate_hz
     # Two seconds a segment: friction's corners recur over seconds, noise everywhere.
     position = log.position[:, list(log.measured)]
