@@ -2,7 +2,7 @@
 
 A plant states `M(q) qdd + h(q, qd)` and carries effects; `Plant.balance` puts them together. All
 else (right-hand side, regressor, iterated integrals, set-valued step) reads that one statement and
-lives in `jaxid.readings`.
+lives in `jaxid.readings`, `jaxid.residuals` and `jaxid.sticking`.
 """
 
 from __future__ import annotations

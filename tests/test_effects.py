@@ -11,7 +11,8 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
-from jaxid.readings import State, residual_along
+from jaxid.readings import State
+from jaxid.residuals import residual_along
 from jaxid.signals import Decimator
 from jaxid.sticking import set_valued_step
 

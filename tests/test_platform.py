@@ -118,6 +118,7 @@ ABOVE_PHYSICS = (
     "estimators", "discovery", "io", "report", "cli", "identify", "session", "machine", "replay",
     "gap", "precision", "preprocess", "studies", "check", "virtual",
 )  # fmt: skip
+READINGS = ("readings", "residuals", "sticking")
 BESIDE = ("effects", "plants", "controllers", "sensors", "simulation")
 
 
@@ -125,9 +126,9 @@ BESIDE = ("effects", "plants", "controllers", "sensors", "simulation")
     ("places", "forbidden"),
     [
         (("smooth.py", "units.py", "_platform.py", "errors.py"), ("",)),  # nothing of jaxid
-        (("model.py",), ("readings", *BESIDE, *ABOVE_PHYSICS)),
-        (("readings.py",), (*BESIDE, *ABOVE_PHYSICS)),
-        (("effects",), ("plants", "controllers", "simulation", "readings", *ABOVE_PHYSICS)),
+        (("model.py",), (*READINGS, *BESIDE, *ABOVE_PHYSICS)),
+        (("readings.py", "residuals.py", "sticking.py"), (*BESIDE, *ABOVE_PHYSICS)),
+        (("effects",), ("plants", "controllers", "simulation", *READINGS, *ABOVE_PHYSICS)),
         (("plants", "controllers", "sensors.py"), ("effects", "simulation", *ABOVE_PHYSICS)),
         (("simulation.py", "signals.py", "parameters.py"), ABOVE_PHYSICS),
         (("references",), ABOVE_PHYSICS),

@@ -12,7 +12,7 @@ from jaxid.effects import EFFECTS
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
 from jaxid.precision import NoiseModel, assess, full_hessian, sandwich
-from jaxid.readings import residual_along
+from jaxid.residuals import residual_along
 
 AR2 = np.array([1.4, -0.6])
 

@@ -12,7 +12,8 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.algebraic import iterated_integral, weak_motion
 from jaxid.parameters import scatter
 from jaxid.plants import Axis
-from jaxid.readings import State, _recurrence, residual_along, small_solve, step
+from jaxid.readings import State, small_solve, step
+from jaxid.residuals import _recurrence, residual_along
 from jaxid.simulation import Drive, open_loop
 from jaxid.sticking import set_valued_step
 

@@ -18,7 +18,7 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine, disturbance_at
 from jaxid.model import Plant
 from jaxid.preprocess import Prepared
-from jaxid.readings import drive_own_states
+from jaxid.residuals import drive_own_states
 from jaxid.session import Run
 
 # Readings that agree within this range, in standard deviations of their noise, are a rest: noise

@@ -30,7 +30,7 @@ from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess
 from jaxid.preprocess import Prepared
-from jaxid.readings import drive_own_states, drive_ratio
+from jaxid.residuals import drive_own_states, drive_ratio
 
 # Windows: so many periods of the band edge each, half overlapping. Shorter ones hold too little
 # motion to tell inertia from friction, longer ones too much of the noise's drift.

@@ -21,7 +21,7 @@ from jaxid.model import Effect, ParameterInfo, Plant, carries_force, parameters_
 from jaxid.parameters import Free, scatter, seeds
 from jaxid.precision import Precision, assess
 from jaxid.preprocess import Prepared
-from jaxid.readings import residual_along
+from jaxid.residuals import residual_along
 from jaxid.unmeasured import complete_motion
 
 # Of the solver where the balance is linear in all unknowns: the first step is then the last.

@@ -36,7 +36,7 @@ from jaxid.model import Balance, Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess
 from jaxid.preprocess import Prepared, lasting
-from jaxid.readings import drive_own_states, drive_ratio
+from jaxid.residuals import drive_own_states, drive_ratio
 
 # A hill of speed stands out by this part of the RMS speed.
 _HILL = 0.5
