@@ -120,6 +120,14 @@ def test_coarse_encoder_is_told_with_its_resolution():
     assert check_log(axis_log(position=fine)) == []
 
 
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_resolution_that_the_case_states_is_not_asked_for(stated):
+    log = axis_log()
+    coarse = dataclasses.replace(log, position=1e-3 * np.round(log.position / 1e-3))
+    told = found(coarse, "warning", "quantised", resolution_stated=stated)
+    assert ("give sensor.position_resolution" in told.mend) == (not stated)
+
+
 # Units
 
 
