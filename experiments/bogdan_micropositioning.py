@@ -53,21 +53,35 @@ def noise_of(data: int, resolution: float) -> float:
     return float(np.sqrt(max(wanted - np.mean(np.square(off)), 0.1 * wanted)))
 
 
-def logs_of(data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT) -> list[Log]:
-    """Logs that differ in noise, and in where within its first count the motor stood."""
+def logs_of(
+    data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT
+) -> tuple[list[Log], np.ndarray]:
+    """Logs that differ in noise, and in where within its first count the motor stood: that too [rad]."""
     reference, noise = stages.move(0.5, **stages.MOVES[data]), noise_of(data, resolution)
     stage, rng = stages.machine(data, rigid=rigid), np.random.default_rng(1)
-    out = []
+    out, starts = [], rng.uniform(-0.5, 0.5, runs) * resolution
     for k in range(runs):
         made = stages.record(
             stage, reference, noise=noise, resolution=resolution, seed=k, step=5e-6 if rigid else 2e-6,
-            start=rng.uniform(-0.5, 0.5) * resolution,
+            start=starts[k],
         )
         out.append(
             Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
                 reference=reference[:, None], source=f"run {k} of data {data}")
         )
-    return out
+    return out, starts
+
+
+def off_in_sigma(estimate: Estimate, case: Path, log: Log, start: float, data: int) -> np.ndarray:
+    """By how many of its standard deviations each direction is off the truth, the motor's start included."""
+    machine = open_session(case, log).machine
+    w = Prior.of(machine, 0.5, np.zeros(0)).inward(np.array([stages.TRUTH[data][n] for n in estimate.names]))
+    truth = dict(zip(estimate.names, w, strict=True))
+    if start:
+        truth["start position 1"] = start / float(np.max(machine.sensor.position_std))
+    directions = estimate.details["directions"]
+    at = [sum(v * truth.get(n, 0.0) for n, v in d["combination"].items()) for d in directions]
+    return np.array([(d["value"] - t) / d["std"] for d, t in zip(directions, at, strict=True)])
 
 
 def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, more: str = ON_FORCE,
@@ -84,7 +98,7 @@ def published(folder: Path) -> None:
     for data in (1, 2):
         start = time.perf_counter()
         case = case_of(folder, f"data{data}", data, guess=data, more=ON_FORCE + "starts = 256\n")
-        log = logs_of(data, 1)[0]
+        (log,), (begin,) = logs_of(data, 1)
         try:
             found = jaxid.identify(case, log)
         except jaxid.InputError as error:
@@ -105,33 +119,25 @@ def published(folder: Path) -> None:
             table.row(name, f"{true:.3g}", f"{guesses[name]:.3g}", f"{value:.3g}", told,
                       PUBLISHED[name][data - 1])
         table.show(time.perf_counter() - start)
-        prior = Prior.of(open_session(case, log).machine, 0.5, np.zeros(0))
-        w = prior.inward(truth)
-        for d in estimate.details["directions"]:
-            at_truth = sum(d["combination"].get(n, 0.0) * v for n, v in zip(estimate.names, w, strict=True))
-            off = (d["value"] - at_truth) / d["std"]
+        sigmas = off_in_sigma(estimate, case, log, begin, data)
+        for d, off in zip(estimate.details["directions"], sigmas, strict=True):
             parts = " ".join(f"{v:+.2f} {n}" for n, v in d["combination"].items() if abs(v) > 0.15)
             print(f"  {0.5 * d['value']:+.3f} +- {0.5 * d['std']:.3f} ({off:+.1f} sigma): {parts}")
         bogdan_figures.fit(folder / f"data{data}.png", found, data)
 
 
 def studied(
-    case: Path, logs: Sequence[Log], data: int
-) -> tuple[list[Estimate], np.ndarray, np.ndarray]:
-    """Estimates, criterion over that of the truth, and directions in sigma from the truth (runs, 5)."""
+    case: Path, logs: Sequence[Log], starts: np.ndarray, data: int
+) -> tuple[list[Estimate], np.ndarray, list[np.ndarray]]:
+    """Estimates, criterion over that of the truth, and directions in sigma from the truth."""
     found = identify_many(case, logs)
-    kept = [(e, log) for e, log in zip(found, logs, strict=True) if isinstance(e, Estimate)]
+    kept = [(e, *of) for e, *of in zip(found, logs, starts, strict=True) if isinstance(e, Estimate)]
     machine = open_session(case, logs[0]).machine
     truth = np.array([stages.TRUTH[data][n] for n in machine.parameters.names])
-    at = together([criterion_steps(machine, log, truth, on="force") for _, log in kept], 16)
-    ratio = np.array([e.details["criterion_percent"] / c for (e, _), c in zip(kept, at, strict=True)])
-    w = Prior.of(machine, 0.5, np.zeros(0)).inward(truth)
-    names, off = machine.parameters.names, np.full((len(kept), 5), np.nan)
-    for i, (e, _) in enumerate(kept):
-        for k, d in enumerate(e.details["directions"][:5]):
-            true = sum(d["combination"].get(n, 0.0) * v for n, v in zip(names, w, strict=True))
-            off[i, k] = (d["value"] - true) / d["std"]
-    return [e for e, _ in kept], ratio, off
+    at = together([criterion_steps(machine, log, truth, on="force") for _, log, _ in kept], 16)
+    ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])
+    off = [off_in_sigma(e, case, log, start, data) for e, log, start in kept]
+    return [e for e, *_ in kept], ratio, off
 
 
 def scatter(folder: Path) -> None:
@@ -146,9 +152,10 @@ def scatter(folder: Path) -> None:
         ("exact", 0.0, True), ("500 counts", stages.COUNT, True), ("500 counts", stages.COUNT, False),
     ):
         case = case_of(folder, "scatter", 1, resolution=resolution)
-        found, ratio, off = studied(case, logs_of(1, RUNS, rigid=rigid, resolution=resolution), 1)
-        fitted = np.mean([len(e.details["directions"]) for e in found])
-        inside = lambda bound, off=off: f"{100 * np.nanmean(np.abs(off[np.isfinite(off)]) < bound):.0f} %"
+        logs, starts = logs_of(1, RUNS, rigid=rigid, resolution=resolution)
+        found, ratio, off = studied(case, logs, starts, 1)
+        fitted = np.mean([len(o) for o in off])
+        inside = lambda bound, off=off: f"{100 * np.mean(np.abs(np.concatenate(off)) < bound):.1f} %"
         table.row(
             name, "rigid" if rigid else "elastic", f"{np.mean([e.converged for e in found]):.0%}",
             f"{np.mean([e.details['criterion_percent'] for e in found]):.2f}", f"{ratio.mean():.3f}",

@@ -47,7 +47,7 @@ def directions_steps(
             readings: which count a simulated reading falls on is a coin toss for a coarse encoder, and
             a cost with it a bed of needles.
         starts: Starts drawn within `prior` of the guesses, to see that all end alike.
-        others: More starts.
+        others: More starts: values of the unknowns.
         hessian: Take the curvature from the full Hessian in place of Gauss-Newton's.
         profile: Also take profile likelihoods of the fitted directions.
         numerics: How to integrate.
@@ -57,7 +57,7 @@ def directions_steps(
         `details["directions"]` has the combinations with their own.
 
     Raises:
-        InputError: If there is no loop, or a guess is zero.
+        InputError: If the loop cannot be simulated, or a guess is zero.
 
     Source:
         Precision: Bogdan and Abba, (12)-(27), with the residual's colour where they take white noise.
@@ -74,29 +74,36 @@ def directions_steps(
         found, many = yield from _many_starts(found, points)
     p = len(machine.parameters.free)
     r, z = found.count, np.asarray(found.minimum.theta)
-    full = None
+    full, remarks = None, []
     if hessian:
-        full = np.asarray((yield Solve(hessian_of, (*found.problem.args, found.vectors, z))))[:r, :r]
+        args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
+        full = np.asarray((yield Solve(hessian_of, args)))[:r, :r]
+        if r and not np.linalg.eigvalsh(full)[0] > 0.0:
+            full = None
+            remarks.append("the cost does not curve upwards everywhere: Gauss-Newton's curvature was taken")
     rounding = yield from rounding_of(machine, found)
     precision, stated = assessed(machine, found, full, rounding)
     if profile:
-        yield from add_profiles(found, stated)
+        remarks += yield from add_profiles(found, stated)
     theta = np.asarray(found.problem.prior.outward(found.vectors @ z))[:p]
     e = np.asarray(found.minimum.residual).reshape(found.problem.measured.shape)
     counts = found.problem.weight > 0
     converged = bool(found.minimum.converged) and found.settled
-    extra = (f"{r} directions of {p} unknowns fitted, the rest held at the guesses",)
+    message = "the directions that the log tells did not settle"
+    if not np.isfinite(float(found.minimum.cost)) or not np.all(np.isfinite(found.minimum.jacobian)):
+        message = "the simulation is not finite where the fit ended"
+    remarks.insert(0, f"{r} directions of {p} unknowns fitted, the rest held at the guesses")
     return Estimate(
         method="output_error",
         machine=machine.with_estimate(theta),
         theta=theta,
         precision=precision,
         converged=converged,
-        message="converged" if converged else "the directions that the log tells did not settle",
+        message="converged" if converged else message,
         residual=np.where(counts, e / np.where(counts, found.problem.weight, 1.0), np.nan),
         samples=int(counts.sum()),
         steps=found.evaluations,
-        notes=(*notes_of(machine, numerics, log, on), *extra),
+        notes=(*notes_of(machine, numerics, log, on), *remarks),
         details={"directions": stated, "criterion_percent": found.problem.criterion(found.minimum), **many},
     )
 
@@ -127,7 +134,7 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]
             here = yield Solve(fit, (*problem.args, sharpness, NO_PULL, whole, w, none))
             spent += int(here.steps)
             if not np.all(np.isfinite(here.jacobian)):
-                return Found(problem, whole, count, here, spent, False)
+                return Found(problem, whole, 0, here, spent, False)
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
         fitted = np.arange(size) < count
@@ -192,6 +199,7 @@ def _many_starts(found: Found, points: np.ndarray) -> Steps[tuple[Found, dict[st
             break
         found = other
     cost = float(found.minimum.cost)
-    same = np.append(costs, cost) <= cost * (1 + _SAME)
+    # A start that ended lower, where other directions are told and the fit was worse, is not alike.
+    same = np.abs(np.append(costs, cost) - cost) <= cost * _SAME
     stated = {"count": len(same), "same_optimum": int(same.sum())}
     return replace(found, evaluations=spent), {"starts": stated}

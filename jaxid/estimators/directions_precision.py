@@ -25,13 +25,15 @@ _DRAWS = 32
 _OWN = 0.1
 # A profile is taken at so many standard deviations of the quadratic picture.
 _PROFILED = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+# Variances by which one may end below the fit for numerics alone.
+_BELOW = 0.1
 
 
 @eqx.filter_jit
 def hessian_of(*args: Any) -> Array:
-    """Of the cost, in the directions' coordinates."""
-    *problem, vectors, z = args
-    return full_hessian(residual_of(*problem, vectors), z)
+    """Of the cost, in the directions' coordinates, at a sharpness."""
+    replay, places, plant, *rest, sharpness, vectors, z = args
+    return full_hessian(residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors), z)
 
 
 @eqx.filter_jit
@@ -89,8 +91,8 @@ def assessed(
     if rounding is not None:
         # To first order each draw of it moves the estimate so far; the residual has one draw in it.
         moved = np.stack([np.linalg.lstsq(flat, d.ravel())[0] for d in rounding])
-        left = 1.0 - np.mean(rounding**2) * rounding[0].size / np.sum(e**2)
-        of_seen = moved.T @ moved / len(moved) + max(left, _OWN) * of_seen
+        own = 1.0 - np.mean(rounding**2) * rounding[0].size / np.sum(e**2)
+        of_seen = moved.T @ moved / len(moved) + max(own, _OWN) * of_seen
     seen, held = found.vectors[:, :r], found.vectors[:, r:]
     slope = problem.prior.slope(theta)
     whole = seen @ of_seen @ seen.T + held @ held.T
@@ -122,11 +124,15 @@ def _named(names: Sequence[str], vector: np.ndarray) -> dict[str, float]:
     return {n: float(v) for n, v in zip(names, vector, strict=True) if abs(v) > _NEGLIGIBLE}
 
 
-def add_profiles(found: Found, stated: list[dict[str, Any]]) -> Steps[None]:
-    """Add to each direction its profile: where the cost has risen as 1 and 4 standard deviations say."""
+def add_profiles(found: Found, stated: list[dict[str, Any]]) -> Steps[list[str]]:
+    """Add to each direction its profile: by how many variances the cost rises when it is held elsewhere.
+
+    Returns:
+        What to remark: profiles that fall below the fit.
+    """
     r, size = found.count, found.vectors.shape[0]
     if not r:
-        return
+        return []
     best = np.asarray(found.minimum.theta)
     z = np.tile(best, (r, _PROFILED.size, 1))
     active = np.tile(np.arange(size) < r, (r, _PROFILED.size, 1))
@@ -142,3 +148,6 @@ def add_profiles(found: Found, stated: list[dict[str, Any]]) -> Steps[None]:
         stated[k]["profile"] = {
             "at_std": _PROFILED.tolist(), "rise": (rise[k] / noise).tolist(),
         }
+    below = [k + 1 for k in range(r) if np.nanmin(rise[k]) < -_BELOW * noise]
+    words = "the profile of direction {} falls below the fit: there is a better optimum beside it"
+    return [words.format(k) for k in below]
