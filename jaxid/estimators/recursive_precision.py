@@ -57,7 +57,10 @@ def precision_of(
     covariance = told.covariance[-1] * np.outer(inflation, inflation)
     if whole:
         covariance = found.covariance + np.outer(told.pull[-1], told.pull[-1])
-    sure = told.told[-1] & (found.identifiable if whole else True)
+        ratio = found.std / np.sqrt(np.diag(told.covariance[-1]))
+        # All columns together say more than each alone.
+        inflation = np.where(np.isfinite(ratio), ratio, inflation)
+    sure = told.told[-1] & (found.identifiable if whole else np.isfinite(inflation))
     covariance[~sure], covariance[:, ~sure] = np.nan, np.nan
     named = found.unidentifiable if whole else []
     lost = [{n: 1.0} for k, n in enumerate(names) if not sure[k] and not any(n in c for c in named)]
