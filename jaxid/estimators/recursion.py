@@ -172,7 +172,7 @@ class Recursion(eqx.Module):
         theta = memory.theta
         if self.instrument:
             scale = jnp.sqrt(jnp.abs(jnp.diagonal(memory.normal)))
-            both = jnp.concatenate([memory.moment[:, None], jnp.diag(scale)], axis=1) / scale[:, None]
+            both = jnp.concatenate([memory.moment[:, None], jnp.eye(scale.size)], axis=1) / scale[:, None]
             both = eliminated(memory.normal / jnp.outer(scale, scale), both) / scale[:, None]
             theta, inverse = both[:, 0], both[:, 1:]
         pull = inverse @ (self.information * (theta - self.start))

@@ -57,7 +57,7 @@ def precision_of(
     covariance = told.covariance[-1] * np.outer(inflation, inflation)
     if whole:
         covariance = found.covariance + np.outer(told.pull[-1], told.pull[-1])
-        ratio = found.std / np.sqrt(np.diag(told.covariance[-1]))
+        ratio = np.sqrt(np.diag(covariance) / np.diag(told.covariance[-1]))
         # All columns together say more than each alone.
         inflation = np.where(np.isfinite(ratio), ratio, inflation)
     sure = told.told[-1] & (found.identifiable if whole else np.isfinite(inflation))
