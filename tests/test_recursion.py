@@ -59,7 +59,7 @@ def test_it_is_weighted_least_squares(beta, summed):
 
 def test_standard_deviations_are_the_scatter():
     """Of 400 runs with white noise, forgetting included: to 3.5 %, here four times that."""
-    recursion = Recursion(START, np.full(4, 1e-4), np.asarray(0.98))
+    recursion = Recursion(START, np.full(4, 1e-4), np.asarray(0.95))
     y, _, counts = regression(600)
     noise = 0.3 * np.random.default_rng(1).standard_normal((400, *counts.shape))
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -10,11 +11,15 @@ from chain_stepper import ChainMachine, simulate_chain
 from search_setup import case_text, log_of, write_case
 from stepper import Loop, Sensor
 from stepper_machines import emps_like, moves, servo
+from test_recursion import gain_regression
 
 from jaxid import RealTime
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
+from jaxid.estimators.recursion import Recursion, run
 from jaxid.estimators.recursive import recursive_steps, start_of
+from jaxid.estimators.recursive_precision import precision_of
+from jaxid.estimators.recursive_rows import Rows
 from jaxid.estimators.steps import alone
 from jaxid.identification import identify, identify_many
 from jaxid.io.case import load_case
@@ -105,8 +110,8 @@ def test_the_gate_leaves_out_what_sticks(tmp_path):
     declared = [*setup.machine.effects.items(), ("constant_force", {"level": 0.0})]
     text, log = case_text(setup, declared, off=2.0, motion="rotary"), log_of(setup)
     text += "\n[preprocess]\ncutoff_hz = 80.0\ndecimation = 1\nalign_hold = true\n[recursive]\n"
-    gates = ("gate_velocity = 0.0\n", "gate_velocity = 0.05\ngate_acceleration = 50.0\n", "gate_velocity = 0.05\n")
-    every, both, fast = (estimate(write_case(tmp_path, text + g), log) for g in gates)
+    gates = ("0.0\n", "0.05\ngate_acceleration = 50.0\n", "0.05\n")
+    every, both, fast = (estimate(write_case(tmp_path, f"{text}gate_velocity = {g}"), log) for g in gates)
     kept = open_session(write_case(tmp_path, text), log).fit.data.kept
     stuck = np.abs(setup.run()["true_velocity"][kept]) < 1e-9
     assert 0.3 < stuck.mean() < 0.45
@@ -164,8 +169,34 @@ def test_rows_of_a_chain_summed_and_full(tmp_path):
     assert np.all(summed.std > full.std)
 
 
+def test_a_sum_is_over_the_rows_that_count():
+    y, counts = np.arange(12.0).reshape(2, 2, 3), np.array([[True, False], [True, True]])
+    one = Rows(y, y[..., 0], counts, y[..., 1]).summed
+    np.testing.assert_array_equal(one.rows[:, 0], [y[0, 0], y[1, 0] + y[1, 1]])
+    np.testing.assert_array_equal(one.target[:, 0], [0.0, 15.0])
+    np.testing.assert_array_equal(one.force[:, 0], [1.0, 17.0])
+    assert one.counts.tolist() == [[True], [True]]
+
+
+@pytest.mark.parametrize("instrument", [False, True])
+def test_precision_of_forgotten_rows_under_white_noise(instrument):
+    """What the recursion says of white noise, and what the weighted rows do with a model of its colour."""
+    y, r, _ = gain_regression(4000, 3.0, 5)
+    counts, start = np.ones_like(r, bool), np.array([0.0, 0.0, 1.0])
+    recursion = Recursion(start, np.full(3, 1e-6), np.asarray(0.995), False, (2,), instrument)
+    _, told, z = run(recursion, recursion.memory(), y, r, counts, 100)
+    told = jax.tree.map(np.asarray, told)
+    guess = SimpleNamespace(names=["a", "b", "c"], guess=np.ones(3))
+    rows = Rows(y, r, counts, y[..., 2])
+    z = np.asarray(z) if instrument else y
+    machine = SimpleNamespace(parameters=guess)
+    precision, inflation = precision_of(machine, rows, z, recursion, told, 100, True)
+    np.testing.assert_allclose(precision.std, told.std[-1], rtol=0.1)
+    np.testing.assert_allclose(inflation, 1.0, rtol=0.1)
+
+
 def test_an_instrument_where_torque_noise_biases_the_gain(tmp_path):
-    """A force noise of 0.3 V on 0.9 V RMS, and a band that lets it through; a fine encoder."""
+    """A force noise of 0.3 V, a band that lets it through, and an encoder so fine that it adds none."""
     setup = slide(10.0, actuator_gain=GAIN[1])
     fine = Sensor(position_resolution=5e-8, position_noise=1.2e-8, force_noise=0.3)
     setup = dataclasses.replace(setup, sensor=fine)

@@ -90,7 +90,7 @@ def recursive_steps(
     memory, told, z = yield Solve(run, (recursion, memory, full.rows, full.target, full.counts, every))
     told, z = jax.tree.map(np.asarray, told), used.rows if z is None else np.asarray(z)
     theta, times = told.theta[-1], data.times[instants(len(full.rows), every)]
-    precision, inflation = precision_of(machine, used, z, recursion, told, saved is None)
+    precision, inflation = precision_of(machine, used, z, recursion, told, every, saved is None)
     converged = bool(np.all(np.isfinite(theta)))
     return Estimate(
         method="recursive", machine=machine.with_estimate(theta), theta=theta, precision=precision,

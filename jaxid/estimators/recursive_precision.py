@@ -23,7 +23,7 @@ def weights(rows: Rows, forgetting: float) -> Float[np.ndarray, " kept"]:
 
 def precision_of(
     machine: Machine, rows: Rows, z: Float[np.ndarray, "kept m p"], recursion: Recursion, told: Told,
-    whole: bool,
+    every: int, whole: bool,
 ) -> tuple[Precision, Float[np.ndarray, " p"]]:
     """Precision at the end, and by how much the residual's colour widens what white noise would leave.
 
@@ -33,6 +33,7 @@ def precision_of(
         z: Their instruments; the rows themselves without.
         recursion: The estimator.
         told: What it told, by instant.
+        every: After so many samples.
         whole: Whether these rows are all that the estimate has seen; else what the memory held counts as
             of this log's noise.
 
@@ -43,10 +44,7 @@ def precision_of(
     names = machine.parameters.names
     w, counts = weights(rows, float(recursion.forgetting))[:, None], rows.counts
     root = np.where(counts, np.sqrt(w), 0.0)
-    e = np.where(counts, rows.rows @ told.theta[-1] - rows.target, 0.0)
-    # Of the noise that the samples of most weight show, as if it were that of all.
-    level = root * np.sqrt(counts.sum(axis=0) / np.maximum(np.sum(root**2, axis=0), 1e-300))
-    e = level * e
+    e = _residual(rows, root, recursion, told, every)
     seen = root[..., None] * (rows.rows if not recursion.instrument else _seen(rows.rows, z, root))
     flat = seen.reshape(-1, len(names))
     jacobian = root[..., None] * seen
@@ -67,6 +65,24 @@ def precision_of(
     return replace(
         found, covariance=covariance, identifiable=sure, unidentifiable=[*named, *lost]
     ), inflation
+
+
+def _residual(
+    rows: Rows, root: np.ndarray, recursion: Recursion, told: Told, every: int
+) -> Float[np.ndarray, "kept m"]:
+    """Residual whose colour and size are those of the noise that the estimate has.
+
+    Its size is that of the weighted samples. Its colour is that of the whole log, at what was told at the
+    time: few samples of large weight tell no colour, and a drift is none.
+    """
+    last = np.where(rows.counts, rows.rows @ told.theta[-1] - rows.target, 0.0)
+    if recursion.forgetting == 1.0:
+        return last
+    block = np.arange(len(last)) // every
+    then = np.where(told.told.all(axis=1)[block, None], told.theta[block], told.theta[-1])
+    e = np.where(rows.counts, np.einsum("tmp,tp->tm", rows.rows, then) - rows.target, 0.0)
+    mean = lambda x, weight: np.sum(weight * x**2, axis=0) / np.maximum(np.sum(weight, axis=0), 1e-300)
+    return e * np.sqrt(mean(last, root**2) / np.maximum(mean(e, rows.counts), 1e-300))
 
 
 def _seen(rows: np.ndarray, z: np.ndarray, root: np.ndarray) -> np.ndarray:
