@@ -64,7 +64,8 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
     Else at the guesses (None). Inverse dynamics keeps the bounds, and may end at one; what does not keep
     them may end where there is nothing to simulate.
     """
-    method, parameters = session.case.output_error.get("start", "inverse_dynamics"), session.machine.parameters
+    parameters = session.machine.parameters
+    method = session.case.output_error.get("start", "inverse_dynamics")
     if method == "guess":
         return None
     first = yield from METHODS[method](session)
