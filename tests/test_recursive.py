@@ -8,54 +8,26 @@ import jax
 import numpy as np
 import pytest
 from chain_stepper import ChainMachine, simulate_chain
+from recursive_axis import COULOMB, GAIN, TRUTH, VISCOUS, estimate, slide, with_table, written_axis
 from search_setup import case_text, log_of, write_case
 from stepper import Loop, Sensor
-from stepper_machines import emps_like, moves, servo
+from stepper_machines import moves, servo
 from test_recursion import gain_regression
 
-from jaxid import RealTime
-from jaxid.errors import InputError
-from jaxid.estimators import METHODS
 from jaxid.estimators.recursion import Recursion, run
-from jaxid.estimators.recursive import recursive_steps, start_of
+from jaxid.estimators.recursive import start_of
 from jaxid.estimators.recursive_precision import precision_of
 from jaxid.estimators.recursive_rows import Rows
-from jaxid.estimators.steps import alone
 from jaxid.identification import identify, identify_many
-from jaxid.io.case import load_case
 from jaxid.io.log import Log
-from jaxid.machine import build_machine
 from jaxid.report.build import history_of, identification_report
 from jaxid.report.history_plots import plot_history
 from jaxid.session import open_session
 
-VISCOUS = ("viscous_friction", {"coefficient": 203.5})
-COULOMB = ("coulomb_friction", {"level": 20.39})
-GAIN = ("actuator_gain", {"gain": 0.85})
-TRUTH = np.array([95.1, 203.5, 20.39])
-NOISY = Sensor(position_resolution=1e-7, position_noise=1e-6, force_noise=0.05)
-
-
-def slide(duration=8.0, seed=0, **effects):
-    setup = dataclasses.replace(emps_like(0, duration=duration), sensor=NOISY, seed=seed)
-    for kind, values in effects.items():
-        setup = setup.with_effect(kind, **values)
-    return setup
-
-
-def estimate(path, log, method="recursive"):
-    return alone(METHODS[method](open_session(path, log)))
-
 
 @pytest.fixture(scope="module")
 def axis(tmp_path_factory):
-    setup = slide()
-    folder = tmp_path_factory.mktemp("axis")
-    return write_case(folder, case_text(setup, [VISCOUS, COULOMB], off=3.0)), log_of(setup)
-
-
-def with_table(folder, axis, text):
-    return write_case(folder, axis[0].read_text() + text)
+    return written_axis(tmp_path_factory.mktemp("axis"))
 
 
 def test_an_axis_from_a_start_far_off(axis):
@@ -261,60 +233,6 @@ def test_output_error_starts_from_it(axis, tmp_path):
     assert found.steps < guess.steps
 
 
-@pytest.fixture(scope="module")
-def live(axis):
-    """A machine's rows in real time, on true motion: no filter stands between the two."""
-    machine = open_session(*axis).machine
-    truth = slide(4.0).run()
-    motion = [truth[f"true_{x}"][:, None] for x in ("position", "velocity", "acceleration", "command")]
-    options = {"noise": 0.1, "spread": [50.0, 200.0, 20.0], "gate_velocity": 1e-3}
-    return RealTime.of(machine, 1e-3, **options), motion, machine
-
-
-def test_a_sample_at_a_time(live):
-    """Against ridge regression on columns written by hand. The command has no noise: 1e-9."""
-    estimator, (q, v, a, u), _ = live
-    memory = estimator.memory()
-    memory = jax.lax.scan(lambda m, now: (estimator.update(m, *now), None), memory, (q, v, a, u))[0]
-    moving = np.abs(v[:, 0]) > 1e-3
-    columns = np.stack([a, v, np.tanh(v / (1e-3 / 3))], axis=-1)[moving, 0]
-    normal = columns.T @ columns + np.diag(np.square(0.1 / np.array([50.0, 200.0, 20.0])))
-    start = np.array([TRUTH[0] / 3, 0.0, 0.0])
-    pulled = np.square(0.1 / np.array([50.0, 200.0, 20.0])) * start
-    expected = np.linalg.solve(normal, columns.T @ (35.15065 * u[moving, 0]) + pulled)
-    told = estimator.told(memory)
-    assert int(memory.samples) == moving.sum() < len(moving)
-    np.testing.assert_allclose(told.theta, expected, rtol=1e-6)
-    np.testing.assert_allclose(told.theta, TRUTH, rtol=2e-3)
-
-
-def test_real_time_goes_on_from_a_memory(live):
-    estimator, motion, _ = live
-    memory = estimator.memory()
-    for k in range(600):
-        memory = estimator.update(memory, *(x[k] for x in motion))
-        if k == 299:
-            kept = jax.tree.map(np.asarray, memory)
-    assert float(memory.weight) > 0
-    for k in range(300, 600):
-        kept = estimator.update(kept, *(x[k] for x in motion))
-    for one, other in zip(jax.tree.leaves(memory), jax.tree.leaves(kept), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_real_time_refuses(live):
-    machine = live[2]
-    good = {"noise": 0.1, "spread": [1.0, 1.0, 1.0], "gate_velocity": 1e-3}
-    for change, message in (
-        ({"half_life": 0.0}, "half_life = 0.0 is not positive"),
-        ({"noise": -1.0}, "noise = -1.0 is not positive"),
-        ({"spread": [1.0]}, "give one of each of inertia"),
-        ({"gate_velocity": 0.0}, "gate_velocity = 0.0 is not positive"),
-    ):
-        with pytest.raises(InputError, match=message):
-            RealTime.of(machine, 1e-3, **(good | change))
-
-
 def test_the_report_shows_how_it_went(axis):
     result = identify(*axis, method="recursive")
     view = history_of(result.estimate)
@@ -327,87 +245,3 @@ def test_the_report_shows_how_it_went(axis):
     np.testing.assert_allclose(view.std[-1], result.estimate.std, rtol=1e-9)
     assert "How the estimate went" in identification_report(result)
     assert history_of(estimate(*axis, "inverse_dynamics")) is None
-
-
-REFUSED = {
-    "an unknown key": ("half_live = 3.0", "unknown key 'half_live'; did you mean 'half_life'"),
-    "a half-life of nothing": ("half_life = 0.0", "half_life = 0.0 is not positive"),
-    "a start that does not count": ("regularization = 0", "regularization = 0 is not positive"),
-    "a negative gate": ("gate_velocity = -1.0", "gate_velocity = -1.0 is negative"),
-    "rows of a third kind": ('rows = "half"', "rows = \"half\" is unknown"),
-    "an instrument without a gain": ('instrument = "model"', "for gains of drives, and none is unknown"),
-    "nothing passes": ("gate_velocity = 1e3", "0 samples pass the gate, for 3 unknowns; lower"),
-    "no memory": ('restart = "none.json"', "none.json: no such file"),
-    "another memory": ('restart = "case.toml"', "holds no memory of the method recursive"),
-    "a restart with a start": ('restart = "a"\nstart = "guess"', "start does not go with restart"),
-}
-
-
-@pytest.mark.parametrize("fault", REFUSED)
-def test_refuses_in_one_line(fault, axis, tmp_path):
-    line, message = REFUSED[fault]
-    path = with_table(tmp_path, axis, f"\n[recursive]\n{line}\n")
-    with pytest.raises(InputError) as caught:
-        estimate(path, axis[1])
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-NOT_IN_PROPORTION = {
-    "a velocity": (
-        ("stribeck_friction", {"level": 5.0, "velocity": 0.01}),
-        "not in proportion to stribeck_friction.level and stribeck_friction.velocity; declare one",
-    ),
-    "a rate and its level": (
-        ("friction_drift", {"rate": 0.01}),
-        "not in proportion to coulomb_friction.level and friction_drift.rate; declare one",
-    ),
-    "a gain with nothing known": (GAIN, "actuator_gain.gain has nothing known in its balance"),
-}
-
-
-@pytest.mark.parametrize("fault", NOT_IN_PROPORTION)
-def test_refuses_what_is_not_in_proportion(fault, axis, tmp_path):
-    effect, message = NOT_IN_PROPORTION[fault]
-    text = case_text(slide(), [VISCOUS, COULOMB, effect], off=2.0)
-    with pytest.raises(InputError) as caught:
-        estimate(write_case(tmp_path, text), axis[1])
-    assert message in str(caught.value)
-
-
-STAGE = """
-[plant]
-kind = "micropositioning_stage"
-[plant.parameters]
-motor_inertia = { guess = 1e-5 }
-table_mass = 0.4
-pitch = 2e-3
-stiffness = 1e6
-[log]
-sample_rate = 1000.0
-position = ["q1", "q2"]
-force = "u"
-"""
-
-
-def test_forces_and_torques_have_no_sum(tmp_path):
-    machine = build_machine(load_case(write_case(tmp_path, STAGE)))
-    with pytest.raises(InputError, match="would add forces to torques; take rows"):
-        next(recursive_steps(machine, None, {"rows": "summed"}))
-
-
-def test_a_restart_about_other_unknowns(axis, tmp_path):
-    identify(*axis, method="recursive").save(tmp_path / "first")
-    text = case_text(slide(), [VISCOUS, COULOMB], off=2.0, inertia_known=True)
-    path = write_case(tmp_path, text + '\n[recursive]\nrestart = "first/result.json"\n')
-    with pytest.raises(InputError, match="is about inertia, .* let both be the same"):
-        estimate(path, axis[1])
-    path = with_table(tmp_path, axis, '\n[recursive]\nrestart = "first/result.json"\nrows = "summed"\n')
-    with pytest.raises(InputError, match="restart is of a run with other rows"):
-        estimate(path, axis[1])
-
-
-def test_a_prior_has_its_own_start(axis, tmp_path):
-    path = with_table(tmp_path, axis, '\n[output_error]\nprior = 0.5\nstart = "recursive"\n')
-    with pytest.raises(InputError, match="start does not go with prior"):
-        estimate(path, axis[1])
