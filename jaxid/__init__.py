@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from jaxid.effects import EFFECTS as EFFECTS
     from jaxid.effects import register as register_effect  # noqa: F401
     from jaxid.errors import InputError as InputError
-    from jaxid.identification import identify as identify
+    from jaxid.estimators.real_time import RealTime as RealTime
     from jaxid.io.case import load_case as load_case
     from jaxid.io.log import Log as Log
     from jaxid.io.log import read_log as read_log
@@ -34,6 +34,7 @@ _HOMES = {
     "Log": ("jaxid.io.log", "Log"),
     "Live": ("jaxid.live", "Live"),
     "follow": ("jaxid.live", "follow"),
+    "RealTime": ("jaxid.estimators.real_time", "RealTime"),
     "open_session": ("jaxid.session", "open_session"),
     "InputError": ("jaxid.errors", "InputError"),
     "EFFECTS": ("jaxid.effects", "EFFECTS"),

@@ -15,6 +15,7 @@ from jaxid.errors import InputError, suggest
 
 METHODS = (
     "output_error", "inverse_dynamics", "algebraic", "instrumental_variable", "didim", "power",
+    "recursive",
     "algebraic_single_time", "algebraic_ratio", "algebraic_sign_changed", "algebraic_sign_unchanged",
     "minimal_model", "minimal_model_printed",
 )

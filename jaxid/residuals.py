@@ -126,10 +126,10 @@ def _matrix_phi(x: Float[Array, "k k"]) -> list[Array]:
     return [total[:k, i * k : (i + 1) * k] for i in range(5)]
 
 
-def residual_along(
+def balance_along(
     plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
-) -> Float[Array, "time n"]:
-    """Residual of the balance at every sample of a motion [N or N m, declared units].
+) -> tuple[Float[Array, "time n"], Float[Array, "time m"]]:
+    """Residual of the balance along a motion, and force of the drives, both at the load [N or N m].
 
     Args:
         plant: The plant; its effects' own states are driven along the motion.
@@ -137,9 +137,6 @@ def residual_along(
         u: Declared force at the samples, delay applied, (time, m).
         period: Sampling time [s].
         start: Time of the first sample [s].
-
-    Returns:
-        Inverse dynamics minus declared force, over `drive_ratio`.
     """
     own = drive_own_states(plant, q, qd, qdd, u, period, start)
     times = start + period * jnp.arange(q.shape[0])
@@ -148,7 +145,17 @@ def residual_along(
         balance = balance_of(plant, q, qd, qdd, u, t, own)
         return balance.residual, balance.drive
 
-    residual, drive = jax.vmap(at)(q, qd, qdd, u, times, own)
+    return jax.vmap(at)(q, qd, qdd, u, times, own)
+
+
+def residual_along(
+    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
+) -> Float[Array, "time n"]:
+    """Inverse dynamics minus declared force, over `drive_ratio` [N or N m, declared units].
+
+    Arguments are those of `balance_along`.
+    """
+    residual, drive = balance_along(plant, q, qd, qdd, u, period, start)
     return residual / drive_ratio(plant, drive, u, q.shape[1])
 
 

@@ -142,7 +142,7 @@ def test_weight_acts_along_a_vertical_chain():
     np.testing.assert_allclose(acceleration(hangs, x, jnp.zeros(3), jnp.zeros(())), -9.7)
 
 
-@pytest.mark.parametrize("method", ["inverse_dynamics", "output_error", "algebraic"])
+@pytest.mark.parametrize("method", ["inverse_dynamics", "output_error", "algebraic", "recursive"])
 def test_parameters_and_a_spring_are_recovered(tmp_path, method):
     found = identify(write(tmp_path, unknown(effect=SPRING)), recorded((0, 1, 2)), method=method)
     assert found.converged

@@ -10,7 +10,7 @@ from jaxid.effects import EFFECTS
 UNITS = {
     "inertia": "kg", "viscous_friction.coefficient": "N s/m", "coulomb_friction.level": "N",
 }
-METHODS = ("inverse_dynamics", "output_error", "algebraic")
+METHODS = ("inverse_dynamics", "output_error", "algebraic", "recursive")
 ADDED_MASS = ("added_mass", {"mass": 1.0})
 
 

@@ -391,7 +391,7 @@ FAULTS = {
     "no sensor": ("[sensor]\nposition_noise = 3e-5", "", "no noise to multiply"),
     "nothing unknown": ("{ guess = 1.4, true = 2.0 }", "1.4", None),
     "no simulation": ("duration = 2.0\n", "", "no duration"),
-    "an estimator that is not there": ('"algebraic"', '"recursive"', "'recursive' is not available"),
+    "an estimator that is not there": ('"algebraic"', '"recursion"', "did you mean 'recursive'?"),
 }
 
 

@@ -32,7 +32,6 @@ def _output_error(
     session: Session, *, solver: str | None = None, on: str | None = None,
     numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
-    from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.output_error import choose_numerics, need_loop, output_error_steps
 
     log, on = session.fit.log, on or session.case.output_error.get("on", "position")
@@ -47,10 +46,7 @@ def _output_error(
         need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
         stated = {k: v for k, v in session.case.output_error.items() if k != "on"}
         return (yield from directions_steps(session.machine, log, on=on, numerics=numerics, **stated))
-    # Inverse dynamics gives the start where it tells all unknowns of the plant.
-    first = yield from inverse_dynamics_steps(session.machine, session.fit.data)
-    elsewhere = [path[0] == REFERENCE for path, _ in session.machine.parameters.places]
-    start = first.theta if first.converged and np.all(first.identifiable | elsewhere) else None
+    start = yield from _start(session)
     if solver is not None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, log, solver=solver)
@@ -60,6 +56,36 @@ def _output_error(
     # Without an encoder on every joint inverse dynamics may end far off, of coarse readings above all.
     other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on)
     return min((found, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
+
+
+def _start(session: Session) -> Steps[np.ndarray | None]:
+    """Where output error starts: at what another method found where that tells all unknowns of the plant.
+
+    Else at the guesses (None). Inverse dynamics keeps the bounds, and may end at one; what does not keep
+    them may end where there is nothing to simulate.
+    """
+    parameters = session.machine.parameters
+    method = session.case.output_error.get("start", "inverse_dynamics")
+    if method == "guess":
+        return None
+    first = yield from METHODS[method](session)
+    elsewhere = [path[0] == REFERENCE for path, _ in parameters.places]
+    told = first.converged and np.all(first.identifiable | elsewhere)
+    lower, upper = parameters.bounds
+    inside = np.all((first.theta >= lower) & (first.theta <= upper))
+    return first.theta if told and inside else None
+
+
+def _recursive(session: Session) -> Steps[Estimate]:
+    from jaxid.estimators.recursive import recursive_steps
+    from jaxid.io.memory import read_memory
+
+    case, run = session.case, session.fit
+    run.log.need_every_encoder("recursive")
+    saved = None
+    if "restart" in case.recursive:
+        saved = read_memory(case.folder / case.recursive["restart"], session.machine.parameters.names)
+    return recursive_steps(session.machine, run.data, case.recursive, saved)
 
 
 def _instrumental_variable(
@@ -134,6 +160,7 @@ METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "instrumental_variable": _instrumental_variable,
     "didim": _didim,
     "power": _power,
+    "recursive": _recursive,
     **{f"algebraic_{name}": _form(f"algebraic_{name}") for name in _FORMS},
     "minimal_model": _minimal_model,
     "minimal_model_printed": _minimal_model_printed,

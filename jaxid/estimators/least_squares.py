@@ -206,11 +206,11 @@ def _step(
     # A trace of damping keeps directions that the data cannot tell where they are.
     matrix = normal + jnp.diag(jnp.where(free, damping + 1e-13, 1.0))
     gradient = jnp.where(free, gradient / scale, 0.0)
-    return -_solved(matrix, gradient) / scale
+    return -eliminated(matrix, gradient[:, None])[:, 0] / scale
 
 
-def _solved(matrix: Float[Array, "p p"], b: Float[Array, " p"]) -> Float[Array, " p"]:
-    """Solve with a positive definite matrix by Gauss and Jordan's elimination, without pivoting.
+def eliminated(matrix: Float[Array, "p p"], b: Float[Array, "p k"]) -> Float[Array, "p k"]:
+    """Solve by Gauss and Jordan's elimination, without pivoting: the symmetric part is positive definite.
 
     Not LAPACK's: a batch of its factorisations waits for threads of the pool on which it runs, and two
     batches at once, as studies have them, then wait for each other for ever (jaxlib 0.10.2).
@@ -221,5 +221,5 @@ def _solved(matrix: Float[Array, "p p"], b: Float[Array, " p"]) -> Float[Array, 
         rows = rows - rows[:, k, None] * pivot
         return rows.at[k].set(pivot)
 
-    rows = jnp.concatenate([matrix, b[:, None]], axis=1)
-    return jax.lax.fori_loop(0, b.size, eliminate, rows)[:, -1]
+    rows = jnp.concatenate([matrix, b], axis=1)
+    return jax.lax.fori_loop(0, len(b), eliminate, rows)[:, len(b) :]

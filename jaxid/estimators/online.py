@@ -304,11 +304,13 @@ def _enters(plant: Plant, parameters: Parameters, joints: int, drives: int) -> B
     random = np.random.default_rng(0)
     motion, u = random.uniform(0.5, 1.5, (3, joints)), random.uniform(0.5, 1.5, drives)
     guess = np.where(parameters.guess == 0, 1.0, parameters.guess)
-    return np.asarray(_slopes(plant, parameters.places, guess, motion, u)) != 0
+    return np.asarray(slopes(plant, parameters.places, guess, motion, u)) != 0
 
 
 @eqx.filter_jit
-def _slopes(plant: Plant, places: tuple, theta: Array, motion: Array, u: Array) -> Float[Array, "n p"]:
+def slopes(plant: Plant, places: tuple, theta: Array, motion: Array, u: Array) -> Float[Array, "n p"]:
+    """Derivative of the balance in the unknowns at one instant of a motion, (3, n)."""
+
     def residual(theta: Array) -> Array:
         moved = scatter(places, plant, theta)
         return moved.balance(*motion, u, jnp.zeros(()), moved.initial_states(u)).residual
@@ -324,6 +326,21 @@ def check_linear(machine: Machine) -> None:
             proportion.
     """
     where = "algebraic, over one window"
+    check_instant(machine, where)
+    odd = [machine.parameters.names[k] for k in np.flatnonzero(~linear_unknowns(machine))]
+    if odd:
+        raise InputError(
+            f"{odd[0]} does not enter the balance in proportion", where=where,
+            mend="declare it known, friction by its level, or use inverse_dynamics",
+        )
+
+
+def check_instant(machine: Machine, where: str) -> None:
+    """Refuse a balance that one sample does not hold.
+
+    Raises:
+        InputError: If an effect remembers, delays or changes with time.
+    """
     for e in machine.plant.effects:
         if e.initial_state(jnp.zeros(())) is not None or not isinstance(e.command_delay(), float):
             mend = "leave it out, or use inverse_dynamics"
@@ -332,12 +349,6 @@ def check_linear(machine: Machine) -> None:
         raise InputError(
             "the balance changes with time", where=where,
             mend="leave out what does (friction_drift), or use inverse_dynamics",
-        )
-    odd = [machine.parameters.names[k] for k in np.flatnonzero(~linear_unknowns(machine))]
-    if odd:
-        raise InputError(
-            f"{odd[0]} does not enter the balance in proportion", where=where,
-            mend="declare it known, friction by its level, or use inverse_dynamics",
         )
 
 

@@ -35,6 +35,7 @@ from jaxid.io.case_tables import (
     limits_keys,
     log_keys,
     preprocess_keys,
+    recursive_keys,
     sensor_keys,
     simulation_keys,
     validation_keys,
@@ -76,6 +77,7 @@ class Case:
         preprocess: [preprocess], for `jaxid.preprocess.choose_recipe`.
         algebraic: [algebraic], for the estimators of that name.
         output_error: [output_error], likewise.
+        recursive: [recursive], likewise.
         controller: [controller].
         sensor: [sensor].
         limits: [limits], for `jaxid.discovery.limits`.
@@ -97,6 +99,7 @@ class Case:
     preprocess: dict[str, Any] = field(default_factory=dict)
     algebraic: dict[str, Any] = field(default_factory=dict)
     output_error: dict[str, Any] = field(default_factory=dict)
+    recursive: dict[str, Any] = field(default_factory=dict)
     controller: dict[str, Any] | None = None
     sensor: dict[str, Any] = field(default_factory=dict)
     limits: dict[str, Any] = field(default_factory=dict)
@@ -179,6 +182,9 @@ def load_case(path: str | Path) -> Case:
         preprocess=_checked_preprocess(read("preprocess", preprocess_keys(joints)), file),
         algebraic=read("algebraic", ALGEBRAIC),
         output_error=_checked_output_error(read("output_error", OUTPUT_ERROR), file),
+        recursive=_apart(
+            read("recursive", recursive_keys(joints)), "restart", ("start", "regularization"),
+            Spot(file, "[recursive]")),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
         limits=read("limits", limits_keys(joints, drives)),
@@ -253,12 +259,12 @@ def _checked_transmission(actuator: dict[str, Any], joints: int, file: str) -> d
 
 
 def _checked_output_error(given: dict[str, Any], file: str) -> dict[str, Any]:
-    """Refuse what only a fit within a prior does where there is none."""
-    lost = [key for key in given if key not in ("on", "prior")]
+    """Refuse what only a fit within a prior does where there is none, and a start beside a prior."""
+    lost = [key for key in given if key not in ("on", "prior", "start")]
     if lost and "prior" not in given:
         mend = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
         raise Spot(file, "[output_error]", lost[0]).fault("goes with prior only", mend)
-    return given
+    return _apart(given, "prior", ("start",), Spot(file, "[output_error]"))
 
 
 def _checked_preprocess(stated: dict[str, Any], file: str) -> dict[str, Any]:
@@ -271,6 +277,14 @@ def _checked_preprocess(stated: dict[str, Any], file: str) -> dict[str, Any]:
         if key in stated and parabolic:
             what = 'is of a low-pass, which derivatives = "parabolic" does without'
             raise spot.at(key).fault(what, "leave out one of them")
+    return stated
+
+
+def _apart(stated: dict[str, Any], key: str, others: tuple[str, ...], spot: Spot) -> dict[str, Any]:
+    """A table in which one key stands without some others: what they say, it says otherwise."""
+    for other in others:
+        if key in stated and other in stated:
+            raise spot.at(other).fault(f"does not go with {key}", "leave out one of them")
     return stated
 
 

@@ -53,6 +53,7 @@ TOP = {
     "preprocess": False,
     "algebraic": False,
     "output_error": False,
+    "recursive": False,
     "controller": False,
     "sensor": False,
     "limits": False,
@@ -88,6 +89,7 @@ PLANT: Keys = {
 ALGEBRAIC: Keys = {"window": Key(span(), "from and to [s]; absent: many windows over the log")}
 OUTPUT_ERROR: Keys = {
     "on": Key(choice(("position", "force", "both"))),
+    "start": Key(choice(("inverse_dynamics", "recursive", "guess"))),
     "prior": Key(number("positive"), "relative standard deviation of the guesses; fits what the log tells"),
     "starts": Key(whole(1), "how many, drawn within the prior"),
     "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),
@@ -152,6 +154,20 @@ def preprocess_keys(joints: int) -> Keys:
         "median": Key(odd(3), "samples of the running median of the force"),
         "derivatives": Key(choice(DERIVATIVES)),
         "reach": Key(whole(1), "samples on each side of a parabola"),
+    }
+
+
+def recursive_keys(joints: int) -> Keys:
+    """Keys of [recursive]."""
+    return {
+        "half_life": Key(number("positive"), "s of motion after which a sample counts half"),
+        "regularization": Key(number("positive"), "how many samples the start counts as"),
+        "gate_velocity": Key(by_joint(number("nonnegative"), joints)),
+        "gate_acceleration": Key(by_joint(number("nonnegative"), joints)),
+        "rows": Key(choice(("full", "summed"))),
+        "start": Key(choice(("neutral", "guess"))),
+        "instrument": Key(choice(("none", "model"))),
+        "restart": Key(text, "result.json of an earlier run, relative to the case"),
     }
 
 

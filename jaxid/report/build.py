@@ -16,6 +16,7 @@ from jaxid.minimal.report import minimal_rows
 from jaxid.report.data import (
     CandidateScore,
     ExperimentView,
+    HistoryView,
     LogView,
     ParameterRow,
     ReportData,
@@ -50,6 +51,7 @@ def identification_report(result: Identification) -> str:
             within_prior=content if "directions" in content else None,
             coefficients=tuple(rows),
             statistics=tuple(below),
+            history=history_of(result.estimate),
             **_common(session, result.estimate, content["notes"]),
         )
     )
@@ -85,6 +87,18 @@ def views(result: Identification | Discovery) -> tuple[LogView, ...]:
     if hasattr(result, "gaps"):
         return _views(result.session, None, result.gaps)
     return _views(result.session, result.gaps_before, result.gaps_after)
+
+
+def history_of(estimate: Estimate) -> HistoryView | None:
+    """How a recursive estimate went, for the report and for notebooks; None for any other."""
+    history = estimate.details.get("recursive", {}).get("history")
+    if history is None:
+        return None
+    free = estimate.machine.parameters.free
+    value, std = (np.stack([history[k][f.name] for f in free], axis=1) for k in ("value", "std"))
+    return HistoryView(
+        history["time"], [f.name for f in free], [f.unit for f in free], value, std, history["residual"]
+    )
 
 
 def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:

@@ -117,6 +117,26 @@ class WherePlot(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class HistoryView:
+    """A recursive estimate over time.
+
+    Args:
+        time: Instants [s], (K,).
+        names, units: Of the parameters.
+        value: Estimate so far, (K, p).
+        std: Its standard deviation, (K, p); NaN where nothing but the start told it.
+        residual: Root mean square of the force residual so far, (K,).
+    """
+
+    time: np.ndarray
+    names: Sequence[str]
+    units: Sequence[str]
+    value: np.ndarray
+    std: np.ndarray
+    residual: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class ExperimentView:
     """A proposed experiment, as it is drawn.
 
@@ -173,6 +193,7 @@ class ReportData:
         statistics: Lines below it.
         within_prior: `directions`, `criterion_percent` and `starts` of the JSON result of a fit within a
             prior; None of any other.
+        history: Of a recursive estimate, or None.
     """
 
     title: str
@@ -198,3 +219,4 @@ class ReportData:
     coefficients: tuple[Sequence[str], ...] = ()
     statistics: tuple[str, ...] = ()
     within_prior: Mapping | None = None
+    history: HistoryView | None = None

@@ -16,8 +16,11 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from jaxid.report import plots, tables
-from jaxid.report.data import ExperimentView, LogView, ReportData
+from jaxid.report.data import ExperimentView, HistoryView, LogView, ReportData
+from jaxid.report.history_plots import plot_history
 from jaxid.report.numbers import is_number, nats, pretty_unit, short
+
+View = LogView | ExperimentView | HistoryView
 
 _NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
 _RASTER_DPI = 130  # chosen: sharp on a phone, and ten clouds stay below a megabyte
@@ -69,6 +72,7 @@ def render(data: ReportData) -> str:
         where=tables.where_lines(data),
         notes=[tables.unbroken(note) for note in data.notes],
         where_figure=_where_figure(data),
+        history=_history(data),
         experiments=[_experiment(data, view) for view in data.experiments],
         views=[_view_entry(data, view, i) for i, view in enumerate(data.views)],
     )
@@ -144,6 +148,12 @@ def _experiment(data: ReportData, view: ExperimentView) -> dict:
     return entry
 
 
+def _history(data: ReportData) -> dict | None:
+    if data.history is None:
+        return None
+    return _picture("Estimates and running residual over time", plot_history, data.history, data.units)
+
+
 def _where_figure(data: ReportData) -> dict | None:
     if data.where_plot is None or len(data.where_plot[2]) == 0:
         return None
@@ -151,7 +161,7 @@ def _where_figure(data: ReportData) -> dict | None:
     return image(figure, f"Mean force residual over {data.where_plot[0]}")
 
 
-def _picture(words: str, draw, view: LogView | ExperimentView, units: Mapping, **options: object) -> dict:
+def _picture(words: str, draw, view: View, units: Mapping, **options: object) -> dict:
     """Draw a plot over time twice: wide, and again for narrow screens."""
     wide = image(draw(view, units, **options), words)
     wide["narrow"] = image(draw(view, units, size=_NARROW, **options), words)["source"]

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.estimators import METHODS
 from jaxid.io.case import Case
 from jaxid.machine import Machine
 from jaxid.studies.levels import Level, levels_of
@@ -71,7 +70,7 @@ class Plan:
 
         Raises:
             InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has
-                nothing to act on, or an estimator is not there.
+                nothing to act on.
         """
         setting, where = case.study, str(case.path)
         if not 0 <= seed < 2**31:
@@ -84,12 +83,6 @@ class Plan:
                 "nothing is unknown", where=where, mend="give at least one parameter as { guess = ... }"
             )
         estimators = tuple(setting.get("estimators", ("output_error",)))
-        for name in estimators:
-            if name not in (*METHODS, DISCOVER):
-                raise InputError(
-                    f"estimator {name!r} is not available in this version", where=f"{where}, [study]",
-                    mend=f"choose from {', '.join((*METHODS, DISCOVER))}",
-                )
         runs = int(setting.get("runs", _RUNS) if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, mend="give one or more")
