@@ -4,7 +4,7 @@ Bogdan & Abba, "Identification of mechanical parameters at low velocities for a 
 velocity hysteresis model". Its Table 1, read in SI as `tests/stages.py` says, is the truth here, in an exact
 simulator that shares no code with jaxid (set-valued friction, 5 us).
 
-    python experiments/bogdan_micropositioning.py [-o results/bogdan_micropositioning] [--only NAME]
+    python experiments/bogdan_micropositioning.py [-o FOLDER] [--only NAME] [--runs N]
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, mor
     return path
 
 
-def published(folder: Path) -> None:
+def published(folder: Path, runs: int) -> None:
     """(a) as published: one log of each, guesses up to 50 % off."""
     for data in (1, 2):
         start = time.perf_counter()
@@ -127,23 +127,23 @@ def published(folder: Path) -> None:
 
 
 def studied(
-    case: Path, logs: Sequence[Log], starts: np.ndarray, data: int
+    case: Path, logs: Sequence[Log], starts: np.ndarray, data: int, on: str = "force"
 ) -> tuple[list[Estimate], np.ndarray, list[np.ndarray]]:
     """Estimates, criterion over that of the truth, and directions in sigma from the truth."""
     found = identify_many(case, logs)
     kept = [(e, *of) for e, *of in zip(found, logs, starts, strict=True) if isinstance(e, Estimate)]
     machine = open_session(case, logs[0]).machine
     truth = np.array([stages.TRUTH[data][n] for n in machine.parameters.names])
-    at = together([criterion_steps(machine, log, truth, on="force") for _, log, _ in kept], 16)
+    at = together([criterion_steps(machine, log, truth, on=on) for _, log, _ in kept], 16)
     ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])
     off = [off_in_sigma(e, case, log, start, data) for e, log, start in kept]
     return [e for e, *_ in kept], ratio, off
 
 
-def scatter(folder: Path) -> None:
+def scatter(folder: Path, runs: int) -> None:
     """Monte-Carlo runs: criterion against the truth's, coverage; by encoder and by screw."""
     table = Table(
-        f"{RUNS} runs of data 1, guesses at the truth: what is fitted against its sigma",
+        f"{runs} runs of data 1, guesses at the truth: what is fitted against its sigma",
         ["encoder", "screw", "converged", "criterion %", "over truth's", "1 - r/n", "never above",
          "in 1.96 sigma", "in 3 sigma"],
     )
@@ -152,7 +152,7 @@ def scatter(folder: Path) -> None:
         ("exact", 0.0, True), ("500 counts", stages.COUNT, True), ("500 counts", stages.COUNT, False),
     ):
         case = case_of(folder, "scatter", 1, resolution=resolution)
-        logs, starts = logs_of(1, RUNS, rigid=rigid, resolution=resolution)
+        logs, starts = logs_of(1, runs, rigid=rigid, resolution=resolution)
         found, ratio, off = studied(case, logs, starts, 1)
         fitted = np.mean([len(o) for o in off])
         inside = lambda bound, off=off: f"{100 * np.mean(np.abs(np.concatenate(off)) < bound):.1f} %"
@@ -161,10 +161,40 @@ def scatter(folder: Path) -> None:
             f"{np.mean([e.details['criterion_percent'] for e in found]):.2f}", f"{ratio.mean():.3f}",
             f"{1 - fitted / 100:.3f}", f"{np.mean(ratio <= 1):.0%}", inside(1.96), inside(3.0),
         )
+        print(f"  {name}, {'rigid' if rigid else 'elastic'}: {time.perf_counter() - start:.0f} s", flush=True)
     table.show(time.perf_counter() - start)
 
 
-def needles(folder: Path) -> None:
+def position(folder: Path, runs: int) -> None:
+    """The position in place of the current, which the paper says goes wrong: whether and why."""
+    table = Table(
+        f"Output error on current and on position: {runs // 2} runs of data 1, and 64 starts 50 % off",
+        ["fitted", "encoder", "directions", "off, of 1st and 2nd", "their sigma", "in 1.96 sigma",
+         "over truth's", "starts alike"],
+    )
+    start = time.perf_counter()
+    for on in ("force", "position"):
+        for name, resolution in (("exact", 0.0), ("500 counts", stages.COUNT)):
+            stated = ON_FORCE.replace('"force"', f'"{on}"')
+            case = case_of(folder, "position", 1, resolution=resolution, more=stated)
+            logs, starts = logs_of(1, runs // 2, resolution=resolution)
+            found, ratio, off = studied(case, logs, starts, 1, on)
+            std = np.array([[d["std"] for d in e.details["directions"][:2]] for e in found])
+            stated += "starts = 64\n"
+            far = case_of(folder, "position", 1, guess=1, resolution=resolution, more=stated)
+            alike = jaxid.identify(far, logs[0]).estimate.details["starts"]
+            wrong = np.sqrt(np.mean((std * np.array([o[:2] for o in off])) ** 2, axis=0))
+            share = lambda x: ", ".join(f"{50 * v:.2g} %" for v in x)
+            table.row(
+                "current" if on == "force" else on, name, f"{np.mean([len(o) for o in off]):.1f}",
+                share(wrong), share(np.median(std, axis=0)),
+                f"{np.mean(np.abs(np.concatenate(off)) < 1.96):.0%}", f"{ratio.mean():.3f}",
+                f"{alike['same_optimum']} of {alike['count']}",
+            )
+    table.show(time.perf_counter() - start)
+
+
+def needles(folder: Path, runs: int) -> None:
     """What simulating the encoder's rounding makes of the cost: a bed of needles."""
     start = time.perf_counter()
     case = case_of(folder, "needles", 1, more=bogdan_figures.SIMULATED)
@@ -172,13 +202,13 @@ def needles(folder: Path) -> None:
     print(f"\nneedles.png: the cost with and without rounding ({time.perf_counter() - start:.1f} s)")
 
 
-def frictions(folder: Path) -> None:
+def frictions(folder: Path, runs: int) -> None:
     """Figures 3 and 6 redrawn: friction against velocity of both data sets, and its hysteresis."""
     bogdan_figures.frictions(folder / "frictions.png")
     print("\nfrictions.png: friction torque against velocity, both data sets")
 
 
-def hidden(folder: Path) -> None:
+def hidden(folder: Path, runs: int) -> None:
     """A fit with Coulomb and viscous friction only: what `discover` names on a log that shows it."""
     start = time.perf_counter()
     case, log = bogdan_figures.long_case(folder)
@@ -187,19 +217,20 @@ def hidden(folder: Path) -> None:
     print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")
 
 
-STUDIES: dict[str, Callable[[Path], None]] = {
-    f.__name__: f for f in (published, scatter, needles, frictions, hidden)
+STUDIES: dict[str, Callable[[Path, int], None]] = {
+    f.__name__: f for f in (published, scatter, position, needles, frictions, hidden)
 }
 
 
 def main() -> None:
     parser = parser_of(__doc__, "results/bogdan_micropositioning")
     parser.add_argument("--only", choices=STUDIES, help="one of the studies")
+    parser.add_argument("--runs", type=int, default=RUNS, help="of Monte-Carlo, a row (default: %(default)s)")
     args = parser.parse_args()
     args.o.mkdir(parents=True, exist_ok=True)
     for name, study in STUDIES.items():
         if args.only in (None, name):
-            study(args.o)
+            study(args.o, args.runs)
 
 
 if __name__ == "__main__":

@@ -268,3 +268,33 @@ def test_wrong_priors_are_refused(folder, tmp_path, capsys):
 def _without_guess(text: str) -> str:
     head, tail = text.split("phase = { guess = ")
     return head + "phase = { guess = 0.0" + tail[tail.index(","):]
+
+
+@pytest.mark.slow
+def test_intervals_hold_under_a_coarse_encoder(tmp_path):
+    """500 counts a turn, the motor anywhere within its first: 24 logs, white noise alone would cover 65 %."""
+    (tmp_path / "case.toml").write_text(stages.text(1, guess=stages.drawn(1), more=STATED))
+    case = jaxid.load_case(tmp_path / "case.toml")
+    starts = np.random.default_rng(5).uniform(-0.5, 0.5, 24) * stages.COUNT
+    logs = []
+    for k, start in enumerate(starts):
+        made = stages.record(STAGE, REFERENCE, noise=0.009, seed=k, start=start)
+        columns = {"position": made["q"], "force": made["i"], "reference": REFERENCE}
+        columns = {name: x[:, None] for name, x in columns.items()}
+        logs.append(Log(time=made["t"], **columns, source=f"log {k}"))
+    machine = build_machine(case, period=1 / stages.RATE)
+    prior = Prior.of(machine, 0.5, np.zeros(0))
+    truth = prior.inward(np.array([stages.TRUTH[1][n] for n in machine.parameters.names]))
+    z, white = [], []
+    for estimate in identify_many(case, logs):
+        directions = estimate.details["directions"]
+        assert 1 <= len(directions) <= 4
+        for d in directions:
+            at = [d["combination"][n] * w for n, w in zip(estimate.names, truth, strict=True)]
+            z.append((d["value"] - sum(at)) / d["std"])
+            white.append(d["std_white"] / d["std"])
+    assert np.mean(np.abs(z) < 1.96) > 0.9
+    assert np.mean(np.abs(z) < 3) > 0.97
+    assert np.std(z) > 0.4
+    # The test is one only where the plain sigma fails it.
+    assert np.mean(np.abs(np.array(z) / np.array(white)) < 1.96) < 0.8

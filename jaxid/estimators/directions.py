@@ -13,8 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.estimators.directions_precision import add_profiles, assessed, hessian_of, rounding_of
+from jaxid.estimators.directions_precision import (
+    Told,
+    add_profiles,
+    assessed,
+    hessian_of,
+    told_of,
+)
 from jaxid.estimators.directions_problem import FAR, NO_PULL, SETTLED, Found, Problem, fit, fit_each
+from jaxid.estimators.directions_rounding import covariance_with_rounding, rounds
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -72,17 +79,20 @@ def directions_steps(
         points = np.array([*given, *_drawn(problem, starts)])
         found = yield from _elsewhere(problem, found, points)
         found, many = yield from _many_starts(found, points)
+    found, told = yield from _sifted(machine, found)
     p = len(machine.parameters.free)
     r, z = found.count, np.asarray(found.minimum.theta)
-    full, remarks = None, []
-    if hessian:
+    remarks: list[str] = []
+    if hessian and told is not None:
         args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
         full = np.asarray((yield Solve(hessian_of, args)))[:r, :r]
-        if r and not np.linalg.eigvalsh(full)[0] > 0.0:
-            full = None
+        if rounds(machine, found):
+            remarks.append("rounding was simulated: the Hessian says nothing beside it")
+        elif np.linalg.eigvalsh(full)[0] > 0.0:
+            told = told_of(found, full)
+        else:
             remarks.append("the cost does not curve upwards everywhere: Gauss-Newton's curvature was taken")
-    rounding = yield from rounding_of(machine, found)
-    precision, stated = assessed(machine, found, full, rounding)
+    precision, stated = assessed(machine, found, told)
     if profile:
         remarks += yield from add_profiles(found, stated)
     theta = np.asarray(found.problem.prior.outward(found.vectors @ z))[:p]
@@ -149,6 +159,32 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]
         if settled or not np.isfinite(cost):
             break
     return Found(problem, vectors, count, minimum, spent, settled)
+
+
+def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
+    """Let go of directions that are told only as long as noise counts as white, and fit the rest again.
+
+    A residual's colour, and above all what rounding of the readings does in the loop, moves an estimate
+    farther along them than its prior would let it.
+    """
+    while found.count and np.all(np.isfinite(found.minimum.jacobian)):
+        told = told_of(found)
+        if rounds(machine, found):
+            covariance = yield from covariance_with_rounding(machine, found, told.std)
+            told = replace(told, covariance=covariance)
+        stays = told.std <= _STAYS
+        if np.all(stays):
+            return found, told
+        rest = np.arange(found.count, len(found.vectors))
+        order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
+        vectors, count = found.vectors[:, order], int(stays.sum())
+        fitted = np.arange(len(vectors)) < count
+        z = np.where(fitted, np.asarray(found.minimum.theta)[order], 0.0)
+        args = (*found.problem.args, found.problem.ladder[-1], NO_PULL, vectors, z, fitted)
+        minimum = yield Solve(fit, args)
+        spent = found.evaluations + int(minimum.steps)
+        found = replace(found, vectors=vectors, count=count, minimum=minimum, evaluations=spent)
+    return found, None
 
 
 def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -14,15 +14,11 @@ from jaxid.estimators.directions_problem import NO_PULL, Found, fit_each, residu
 from jaxid.estimators.steps import Solve, Steps
 from jaxid.machine import Machine
 from jaxid.precision import Precision, assess, full_hessian
-from jaxid.replay import with_sensor
 
 # A parameter is told where what is left of its prior is less than this.
 _TOLD = 0.5
 # Entries of a combination below this are left out when it is named.
 _NEGLIGIBLE = 0.1
-# Draws of where a motor stands within its first count, and the least part of a residual that is noise.
-_DRAWS = 32
-_OWN = 0.1
 # A profile is taken at so many standard deviations of the quadratic picture.
 _PROFILED = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 # Variances by which one may end below the fit for numerics alone.
@@ -36,42 +32,29 @@ def hessian_of(*args: Any) -> Array:
     return full_hessian(residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors), z)
 
 
-@eqx.filter_jit
-def _each_start(*args: Any) -> Array:
-    *problem, sharpness, vectors, z, offsets = args
-    replay, places, plant, *rest = problem
-    plant = replace(plant, sharpness=sharpness)
-    # What the loop does of a motor that stands elsewhere within its first count.
-    moved = lambda offset: eqx.tree_at(lambda r: r.position, replay, replay.position + offset)
-    at = lambda offset: residual_of(moved(offset), places, plant, *rest, vectors)(z)
-    return eqx.filter_vmap(at)(offsets)
+@dataclass(frozen=True)
+class Told:
+    """How well the fitted directions are told.
 
-
-def rounding_of(machine: Machine, found: Found) -> Steps[np.ndarray | None]:
-    """What rounding of readings does to the residual, (draws, time, k); None where none was left out.
-
-    The loop of the estimate is simulated with it from many places within the first count, and without.
+    Args:
+        covariance: Of their coordinates, (r, r).
+        white: Standard deviations as if noise were white, (r,).
+        information: See `Precision`.
     """
-    count, problem = machine.sensor.position_resolution, found.problem
-    if problem.on == "position" or count is None or problem.replay.controller is None:
-        return None
-    n = problem.replay.position.size
-    offsets = np.random.default_rng(0).uniform(-0.5, 0.5, (_DRAWS, n)) * np.asarray(count)
-    rounded = with_sensor(problem.replay, machine.sensor)
-    rest = (problem.ladder[-1], found.vectors, np.asarray(found.minimum.theta))
-    with_it = yield Solve(_each_start, (rounded, *problem.args[1:], *rest, offsets))
-    without = yield Solve(_each_start, (problem.replay, *problem.args[1:], *rest, 0.0 * offsets[:1]))
-    return np.asarray(with_it) - np.asarray(without)
+
+    covariance: np.ndarray
+    white: np.ndarray
+    information: np.ndarray
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviations of the directions' coordinates, (r,)."""
+        return np.sqrt(np.diag(self.covariance))
 
 
-def assessed(
-    machine: Machine, found: Found, hessian: np.ndarray | None, rounding: np.ndarray | None
-) -> tuple[Precision, list[dict[str, Any]]]:
-    """Precision of the parameters, and of the directions."""
+def told_of(found: Found, hessian: np.ndarray | None = None) -> Told:
+    """Precision of the fitted directions, one at least, from the residual's own colour; see `hessian_of`."""
     problem, r = found.problem, found.count
-    if r == 0:
-        return _nothing_told(machine)
-    names = [*machine.parameters.names, *problem.nuisances]
     shape, counts = problem.measured.shape, problem.weight > 0
     jacobian = np.asarray(found.minimum.jacobian).reshape(*shape, -1)[..., :r]
     e = np.asarray(found.minimum.residual).reshape(shape)
@@ -81,21 +64,26 @@ def assessed(
         [f"direction {k + 1}" for k in range(r)], jacobian, e, counts,
         signal, np.ones(r), hessian, crossed=problem.on == "both",
     )
-    z = np.asarray(found.minimum.theta)
-    theta = np.asarray(problem.prior.outward(found.vectors @ z))
     flat = jacobian.reshape(-1, r)
     white = problem.noise(found.minimum, r) * np.sqrt(np.diag(np.linalg.inv(flat.T @ flat)))
     # A colour read off a hundred samples is itself uncertain: never less than white noise would leave.
     larger = np.maximum(1.0, white / told.std)
     of_seen = told.covariance * np.outer(larger, larger)
-    if rounding is not None:
-        # To first order each draw of it moves the estimate so far; the residual has one draw in it.
-        moved = np.stack([np.linalg.lstsq(flat, d.ravel())[0] for d in rounding])
-        own = 1.0 - np.mean(rounding**2) * rounding[0].size / np.sum(e**2)
-        of_seen = moved.T @ moved / len(moved) + max(own, _OWN) * of_seen
+    return Told(of_seen, white, told.information)
+
+
+def assessed(
+    machine: Machine, found: Found, told: Told | None
+) -> tuple[Precision, list[dict[str, Any]]]:
+    """Precision of the parameters, and of the directions; None where no direction is told."""
+    problem, r = found.problem, found.count
+    if told is None:
+        return _nothing_told(machine)
+    names = [*machine.parameters.names, *problem.nuisances]
+    z = np.asarray(found.minimum.theta)
     seen, held = found.vectors[:, :r], found.vectors[:, r:]
-    slope = problem.prior.slope(theta)
-    whole = seen @ of_seen @ seen.T + held @ held.T
+    slope = problem.prior.slope(np.asarray(problem.prior.outward(found.vectors @ z)))
+    whole = seen @ told.covariance @ seen.T + held @ held.T
     p = len(problem.places)
     left = np.sqrt(np.diag(whole))[:p]
     identifiable = left < _TOLD
@@ -104,7 +92,7 @@ def assessed(
     stated = [
         {
             "combination": dict(zip(names, found.vectors[:, k].tolist(), strict=True)), "value": float(z[k]),
-            "std": float(np.sqrt(of_seen[k, k])), "std_white": float(white[k]),
+            "std": float(told.std[k]), "std_white": float(told.white[k]),
         }
         for k in range(r)
     ]

@@ -1,0 +1,113 @@
+"""What rounding of readings does to a fit that simulates its loop without: found by simulating it.
+
+In a loop with a coarse encoder the instant at which a reading steps is chaotic, and what it does to the
+force is neither small nor white, nor the same elsewhere within the prior. So data are drawn over all of that
+and a line is laid through what the fit makes of those like the log's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.estimators.directions_problem import Found, residual_of
+from jaxid.estimators.steps import Solve, Steps
+from jaxid.machine import Machine
+from jaxid.replay import with_sensor
+
+_DRAWS = 512
+# Data are drawn so many deviations around the estimate, but over this part of the prior at least, and this
+# at most; the nearest of them count.
+_REACH, _LEAST, _MOST = 8.0, 0.8, 2.0
+_NEAREST = 0.3
+# Least part of a residual that is noise.
+_OWN = 0.1
+
+
+@eqx.filter_jit
+def _each(*args: Any) -> Array:
+    *problem, sharpness, vectors, z, starts = args
+    replay, places, plant, *rest = problem
+    plant = replace(plant, sharpness=sharpness)
+    moved = lambda start: eqx.tree_at(lambda r: r.position, replay, replay.position + start)
+    at = lambda z, start: residual_of(moved(start), places, plant, *rest, vectors)(z)
+    return eqx.filter_vmap(at)(z, starts)
+
+
+def rounds(machine: Machine, found: Found) -> bool:
+    """Whether the loop reads by counts that its simulation left out."""
+    problem = found.problem
+    coarse = machine.sensor.position_resolution is not None and problem.on != "position"
+    return coarse and problem.replay.controller is not None
+
+
+def covariance_with_rounding(
+    machine: Machine, found: Found, std: Float[np.ndarray, " r"]
+) -> Steps[Float[np.ndarray, "r r"]]:
+    """Mean square of the truth's distance from the estimate, by simulation.
+
+    Args:
+        machine: Its sensor rounds.
+        found: The fit, of one direction at least.
+        std: Standard deviations of the directions' coordinates without rounding.
+
+    Returns:
+        About the estimate, what is off on average included.
+
+    Source:
+        Beaumont, Zhang and Balding (2002), "Approximate Bayesian computation in population genetics":
+        local linear regression on a summary, here the estimate of one Gauss-Newton step.
+    """
+    problem, r, rng = found.problem, found.count, np.random.default_rng(0)
+    best, n = np.asarray(found.minimum.theta), problem.replay.position.size
+    count = np.asarray(machine.sensor.position_resolution)
+    starts = rng.uniform(-0.5, 0.5, (_DRAWS, n)) * count
+    off = rng.uniform(-1.0, 1.0, (_DRAWS, r)) * np.clip(_REACH * std, _LEAST, _MOST)
+    z = np.tile(best, (_DRAWS, 1))
+    z[:, :r] += off
+    args = (with_sensor(problem.replay, machine.sensor), *problem.args[1:], problem.ladder[-1])
+    e = np.asarray((yield Solve(_each, (*args, found.vectors, z, starts))))
+    # Of data drawn, less what the estimate says: what a fit of them would begin with.
+    shape = problem.measured.shape
+    apart = (np.asarray(found.minimum.residual).reshape(shape) - e).reshape(_DRAWS, -1)
+    jacobian = np.asarray(found.minimum.jacobian)[:, :r]
+    inverse = np.linalg.pinv(jacobian)
+    prior = np.exp(-0.5 * np.sum((best[:r] + off) ** 2, axis=1))
+    weight = prior * _near(-apart @ inverse.T)
+    left = (apart - apart @ inverse.T @ jacobian.T).reshape(_DRAWS, *shape)
+    own = _own_noise(np.asarray(found.minimum.residual).reshape(shape), left, weight)
+    apart = apart + (rng.standard_normal((_DRAWS, *shape)) * own).reshape(_DRAWS, -1)
+    ended = -apart @ inverse.T
+    return _about_zero(ended, off, prior * _near(ended))
+
+
+def _near(ended: Float[np.ndarray, "draws r"]) -> Float[np.ndarray, " draws"]:
+    """Weights of data whose fits end near the log's own."""
+    scale = np.maximum(np.median(np.abs(ended), axis=0), 1e-300)
+    distance = np.sum((ended / scale) ** 2, axis=1)
+    return np.maximum(1.0 - distance / np.quantile(distance, _NEAREST), 0.0)
+
+
+def _own_noise(
+    residual: Float[np.ndarray, "time k"], left: Float[np.ndarray, "draws time k"],
+    weight: Float[np.ndarray, " draws"],
+) -> Float[np.ndarray, " k"]:
+    """Standard deviation of what rounding does not explain of a residual, by column."""
+    power = np.mean(residual**2, axis=0)
+    explained = np.average(np.mean(left**2, axis=1), axis=0, weights=weight)
+    return np.sqrt(np.maximum(power - explained, _OWN * power))
+
+
+def _about_zero(
+    x: Float[np.ndarray, "draws r"], y: Float[np.ndarray, "draws r"], weight: Float[np.ndarray, " draws"]
+) -> Float[np.ndarray, "r r"]:
+    """Mean square of y where x is zero: a weighted line's value there, and what is left around it."""
+    rows = np.concatenate([np.ones((len(x), 1)), x], axis=1)
+    root = np.sqrt(weight)[:, None]
+    line = np.linalg.lstsq(rows * root, y * root)[0]
+    left = y - rows @ line
+    return (left * weight[:, None]).T @ left / weight.sum() + np.outer(line[0], line[0])
