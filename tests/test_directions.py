@@ -12,6 +12,7 @@ import stages
 
 import jaxid
 from jaxid.cli import main
+from jaxid.estimators import _beside_the_guesses, steps_of
 from jaxid.estimators.directions_precision import add_profiles
 from jaxid.estimators.directions_problem import Found, Prior, criterion_steps
 from jaxid.estimators.steps import alone
@@ -81,6 +82,19 @@ def test_all_starts_end_alike_below_the_truth(fitted, folder):
         for theta in (truth, session.machine.parameters.guess)
     )
     assert details["criterion_percent"] < at_truth < 0.2 * at_guess
+
+
+@pytest.mark.parametrize("method", ["inverse_dynamics", "recursive"])
+def test_what_another_method_finds_is_a_start_too(fitted, folder, tmp_path, method):
+    """On a hundred samples neither tells the unknowns: far off as it is, the fit ends where it did."""
+    text = (folder / "case.toml").read_text() + f'start = "{method}"\n'
+    (tmp_path / "case.toml").write_text(text)
+    session = open_session(tmp_path / "case.toml", logged(0))
+    (other,) = alone(_beside_the_guesses(session))
+    assert np.max(other / session.machine.parameters.guess) > 1.3
+    found = alone(steps_of("output_error", session))
+    assert found.details["starts"] == {"count": 2, "same_optimum": 2}
+    np.testing.assert_allclose(found.theta, fitted.estimate.theta, rtol=0.02)
 
 
 def test_precision_and_profiles_agree(fitted):

@@ -96,7 +96,3 @@ def test_a_restart_about_other_unknowns(axis, tmp_path):
         estimate(path, axis[1])
 
 
-def test_a_prior_has_its_own_start(axis, tmp_path):
-    path = with_table(tmp_path, axis, '\n[output_error]\nprior = 0.5\nstart = "recursive"\n')
-    with pytest.raises(InputError, match="start does not go with prior"):
-        estimate(path, axis[1])

@@ -8,6 +8,7 @@ stands in its keywords.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,8 +45,12 @@ def _output_error(
                 mend="leave one of them out: a fit within a prior takes fixed steps",
             )
         need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
-        stated = {k: v for k, v in session.case.output_error.items() if k != "on"}
-        return (yield from directions_steps(session.machine, log, on=on, numerics=numerics, **stated))
+        stated = {k: v for k, v in session.case.output_error.items() if k not in ("on", "start")}
+        others = yield from _beside_the_guesses(session)
+        asked = directions_steps(
+            session.machine, log, on=on, numerics=numerics, others=others, **stated
+        )
+        return (yield from asked)
     start = yield from _start(session)
     if solver is not None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
@@ -56,6 +61,24 @@ def _output_error(
     # Without an encoder on every joint inverse dynamics may end far off, of coarse readings above all.
     other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on)
     return min((found, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
+
+
+def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
+    """Another start of a fit within a prior: what a method finds of the unknowns, the rest at the guesses.
+
+    Of sums that it cannot tell apart both parts move; what does not enter in proportion stays.
+    """
+    method, unknown = session.case.output_error.get("start", "guess"), session.machine.parameters
+    if method == "guess":
+        return []
+    from jaxid.estimators.recursive_rows import in_proportion_steps
+
+    machine = yield from in_proportion_steps(session.machine, session.fit.data)
+    case = replace(session.case, recursive=session.case.recursive | {"start": "guess"})
+    first = yield from METHODS[method](replace(session, machine=machine, case=case))
+    found = dict(zip(first.names, first.theta, strict=True))
+    theta = np.array([found.get(f.name, f.guess) for f in unknown.free])
+    return [np.clip(np.where(np.isfinite(theta), theta, unknown.guess), *unknown.bounds)]
 
 
 def _start(session: Session) -> Steps[np.ndarray | None]:

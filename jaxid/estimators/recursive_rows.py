@@ -21,7 +21,7 @@ from jaxid.estimators.inverse_dynamics import ForceData, measured_force, sharpen
 from jaxid.estimators.steps import Solve, Steps
 from jaxid.machine import Machine
 from jaxid.model import Plant
-from jaxid.parameters import scatter
+from jaxid.parameters import Parameters, scatter
 from jaxid.preprocess import Prepared, smeared
 from jaxid.residuals import balance_along
 
@@ -112,14 +112,34 @@ def check_proportion(names: list[str], columns: np.ndarray, there: np.ndarray) -
     Raises:
         InputError: If there are any.
     """
-    rows = tuple(range(columns.ndim - 1))
-    odd = np.abs(there - columns).max(axis=rows) > _LINEAR * np.abs(columns).max(axis=rows)
+    odd = _out_of_proportion(columns, there)
     if odd.any():
         several = " and ".join(n for n, o in zip(names, odd, strict=True) if o)
         raise InputError(
             f"the balance is not in proportion to {several}", where="recursive",
             mend=f"declare {'one of them' if odd.sum() > 1 else 'it'} known, or use inverse_dynamics",
         )
+
+
+def _out_of_proportion(columns: np.ndarray, there: np.ndarray) -> Bool[np.ndarray, " p"]:
+    rows = tuple(range(columns.ndim - 1))
+    return np.abs(there - columns).max(axis=rows) > _LINEAR * np.abs(columns).max(axis=rows)
+
+
+def in_proportion_steps(machine: Machine, data: Prepared) -> Steps[Machine]:
+    """The machine with only those unknowns that enter the balance in proportion; the rest at their guesses.
+
+    Args:
+        machine: The machine.
+        data: The log, prepared.
+    """
+    free, guess = machine.parameters.free, machine.parameters.guess
+    args = (sharpened(machine.plant, data), machine.parameters.places, ForceData.of(data, data.fitted))
+    _, columns = yield Solve(load_columns, (*args, guess))
+    _, there = yield Solve(load_columns, (*args, elsewhere(guess)))
+    odd = _out_of_proportion(np.asarray(columns), np.asarray(there))
+    kept = tuple(f for f, o in zip(free, odd, strict=True) if not o)
+    return machine.with_plant(machine.plant, Parameters(kept))
 
 
 _measured_force = eqx.filter_jit(measured_force)

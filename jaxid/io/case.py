@@ -259,12 +259,12 @@ def _checked_transmission(actuator: dict[str, Any], joints: int, file: str) -> d
 
 
 def _checked_output_error(given: dict[str, Any], file: str) -> dict[str, Any]:
-    """Refuse what only a fit within a prior does where there is none, and a start beside a prior."""
+    """Refuse what only a fit within a prior does where there is none."""
     lost = [key for key in given if key not in ("on", "prior", "start")]
     if lost and "prior" not in given:
         mend = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
         raise Spot(file, "[output_error]", lost[0]).fault("goes with prior only", mend)
-    return _apart(given, "prior", ("start",), Spot(file, "[output_error]"))
+    return given
 
 
 def _checked_preprocess(stated: dict[str, Any], file: str) -> dict[str, Any]:
