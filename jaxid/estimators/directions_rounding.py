@@ -24,6 +24,10 @@ _DRAWS = 512
 # at most; the nearest of them count.
 _REACH, _LEAST, _MOST = 8.0, 0.8, 2.0
 _NEAREST = 0.3
+# Then anew within so many of the deviations found, as long as that is less than half as far.
+_AGAIN, _PASSES = 4.0, 4
+# With fewer that did not run away nothing is told.
+_FEWEST = 100
 # Least part of a residual that is noise.
 _OWN = 0.1
 
@@ -56,17 +60,31 @@ def covariance_with_rounding(
         std: Standard deviations of the directions' coordinates without rounding.
 
     Returns:
-        About the estimate, what is off on average included.
+        About the estimate, what is off on average included; the prior's where too many data ran away.
 
     Source:
         Beaumont, Zhang and Balding (2002), "Approximate Bayesian computation in population genetics":
         local linear regression on a summary, here the estimate of one Gauss-Newton step.
     """
+    reach = np.clip(_REACH * std, _LEAST, _MOST)
+    for _ in range(_PASSES):
+        covariance = yield from _within(machine, found, reach)
+        closer = np.minimum(_AGAIN * np.sqrt(np.diag(covariance)), reach)
+        if np.all(closer > 0.5 * reach):
+            break
+        reach = closer
+    return covariance
+
+
+def _within(
+    machine: Machine, found: Found, reach: Float[np.ndarray, " r"]
+) -> Steps[Float[np.ndarray, "r r"]]:
+    """The same from data drawn so far around the estimate."""
     problem, r, rng = found.problem, found.count, np.random.default_rng(0)
     best, n = np.asarray(found.minimum.theta), problem.replay.position.size
     count = np.asarray(machine.sensor.position_resolution)
     starts = rng.uniform(-0.5, 0.5, (_DRAWS, n)) * count
-    off = rng.uniform(-1.0, 1.0, (_DRAWS, r)) * np.clip(_REACH * std, _LEAST, _MOST)
+    off = rng.uniform(-1.0, 1.0, (_DRAWS, r)) * reach
     z = np.tile(best, (_DRAWS, 1))
     z[:, :r] += off
     args = (with_sensor(problem.replay, machine.sensor), *problem.args[1:], problem.ladder[-1])
@@ -74,13 +92,18 @@ def covariance_with_rounding(
     # Of data drawn, less what the estimate says: what a fit of them would begin with.
     shape = problem.measured.shape
     apart = (np.asarray(found.minimum.residual).reshape(shape) - e).reshape(_DRAWS, -1)
+    # Far from the estimate a loop may run away.
+    sound = np.all(np.isfinite(apart), axis=1)
+    if sound.sum() < _FEWEST:
+        return np.eye(r)
+    apart, off = apart[sound], off[sound]
     jacobian = np.asarray(found.minimum.jacobian)[:, :r]
     inverse = np.linalg.pinv(jacobian)
     prior = np.exp(-0.5 * np.sum((best[:r] + off) ** 2, axis=1))
     weight = prior * _near(-apart @ inverse.T)
-    left = (apart - apart @ inverse.T @ jacobian.T).reshape(_DRAWS, *shape)
+    left = (apart - apart @ inverse.T @ jacobian.T).reshape(-1, *shape)
     own = _own_noise(np.asarray(found.minimum.residual).reshape(shape), left, weight)
-    apart = apart + (rng.standard_normal((_DRAWS, *shape)) * own).reshape(_DRAWS, -1)
+    apart = apart + (rng.standard_normal((len(apart), *shape)) * own).reshape(len(apart), -1)
     ended = -apart @ inverse.T
     return _about_zero(ended, off, prior * _near(ended))
 
