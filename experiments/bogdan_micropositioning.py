@@ -194,6 +194,58 @@ def position(folder: Path, runs: int) -> None:
     table.show(time.perf_counter() - start)
 
 
+DESIGN = """
+[limits]
+stroke = [0.0, 6.3]
+speed = 6.3
+[simulation]
+duration = 10.0
+sample_rate = 200.0
+"""
+
+
+def designed(folder: Path, runs: int) -> None:
+    """(b) A log of 2000 samples out and back, found by its information; both screws, 32 starts."""
+    start = time.perf_counter()
+    text = stages.text(1, reference="", more=ON_FORCE + DESIGN)
+    noise = noise_of(1, stages.COUNT)
+    (folder / "design.toml").write_text(text.replace("[sensor]\n", f"[sensor]\nforce_noise = {noise!r}\n"))
+    plan = jaxid.design(folder / "design.toml")
+    plan.save(folder / "design.csv")
+    print(f"\n{plan}\n({time.perf_counter() - start:.0f} s)", flush=True)
+    guesses, reference = stages.drawn(1), plan.values[:, 0]
+    case = case_of(folder, "designed", 1, guess=1, more=ON_FORCE + "starts = 32\n")
+    table = Table(
+        "What the designed log tells, over the truth, with its relative standard deviation",
+        ["parameter", "guess", "rigid screw", "elastic screw"],
+    )
+    columns = []
+    for rigid in (True, False):
+        begin = 0.3 * stages.COUNT
+        made = stages.record(
+            stages.machine(1, rigid=rigid), reference, noise=noise, step=5e-6 if rigid else 2e-6, start=begin
+        )
+        log = Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
+                  reference=reference[:, None], source="the designed log")
+        found = jaxid.identify(case, log)
+        found.save(folder / f"designed_{'rigid' if rigid else 'elastic'}", force=True)
+        estimate = found.estimate
+        off = off_in_sigma(estimate, case, log, begin, 1)
+        alike = "{same_optimum} of {count} starts alike".format(**estimate.details["starts"])
+        most = f"{len(off)} combinations, at most {np.max(np.abs(off), initial=0.0):.1f} sigma off"
+        print(f"  {'rigid' if rigid else 'elastic'}: {most}; {alike}", flush=True)
+        columns.append(dict(zip(estimate.names, zip(estimate.theta, estimate.std, strict=True), strict=True)))
+    for name, guess in guesses.items():
+        if name in columns[0]:
+            true = stages.TRUTH[1][name]
+            cells = (
+                f"{v / true:.3f} +- {s / abs(true):.3f}" if np.isfinite(s) else "not told"
+                for v, s in (c[name] for c in columns)
+            )
+            table.row(name, f"{guess / true:.2f}", *cells)
+    table.show(time.perf_counter() - start)
+
+
 def needles(folder: Path, runs: int) -> None:
     """What simulating the encoder's rounding makes of the cost: a bed of needles."""
     start = time.perf_counter()
@@ -218,7 +270,7 @@ def hidden(folder: Path, runs: int) -> None:
 
 
 STUDIES: dict[str, Callable[[Path, int], None]] = {
-    f.__name__: f for f in (published, scatter, position, needles, frictions, hidden)
+    f.__name__: f for f in (published, scatter, position, designed, needles, frictions, hidden)
 }
 
 

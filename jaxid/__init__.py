@@ -7,6 +7,7 @@ from jaxid import _platform
 _platform.configure()
 
 if TYPE_CHECKING:
+    from jaxid.design import design as design
     from jaxid.discovery.discover import discover as discover
     from jaxid.effects import EFFECTS as EFFECTS
     from jaxid.effects import register as register_effect  # noqa: F401
@@ -28,6 +29,7 @@ _HOMES = {
     "identify": ("jaxid.identification", "identify"),
     "simulate": ("jaxid.virtual", "simulate"),
     "check": ("jaxid.checks", "check"),
+    "design": ("jaxid.design", "design"),
     "study": ("jaxid.studies.study", "study"),
     "load_case": ("jaxid.io.case", "load_case"),
     "read_log": ("jaxid.io.log", "read_log"),

@@ -76,6 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     ):
         commands.add_parser(name, help=what, description=what).set_defaults(run=run)
     _simulate(commands)
+    _design(commands)
     _check(commands)
     _identify(commands)
     _discover(commands)
@@ -104,6 +105,13 @@ def _simulate(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("case", metavar="CASE.toml")
     parser.add_argument("-o", metavar="LOG.csv", required=True)
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the sensors' noise")
+
+
+def _design(commands: argparse._SubParsersAction) -> None:
+    what = "the reference, or input, within [limits] whose log would tell the unknowns best"
+    parser = _add(commands, "design", what, _run_design)
+    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("-o", metavar="SIGNAL.csv", required=True)
 
 
 def _logs(parser: argparse.ArgumentParser) -> None:
@@ -217,6 +225,19 @@ def _run_simulate(args: argparse.Namespace) -> int:
         virtual = simulate(args.case, seed=args.seed)
     virtual.save(path)
     print(f"{virtual.log.samples} samples at {virtual.log.rate_hz:g} Hz in {path}")
+    return 0
+
+
+def _run_design(args: argparse.Namespace) -> int:
+    from jaxid.io.output import ready_file
+
+    path = ready_file(Path(args.o), force=args.force)
+    with _progress(args, 4) as tell:
+        from jaxid.design import design
+
+        found = design(args.case, progress=tell)
+    found.save(path)
+    print(f"{found}\n{len(found.time)} ticks of the {found.signal} in {path}")
     return 0
 
 

@@ -269,11 +269,11 @@ def _optimised(
     known = {p.tobytes(): both(p) for p in looked_at}
     ranked = sorted(looked_at, key=lambda p: known[p.tobytes()][0])[:_OPTIMISED]
     each = min((affordable - len(looked_at)) // len(ranked), _EVALUATIONS)
-    found = [_improved(both, p, known[p.tobytes()], each) for p in ranked]
+    found = [improved(both, p, known[p.tobytes()], each) for p in ranked]
     return [p for _, p in sorted(found, key=lambda f: f[0])]
 
 
-def _improved(
+def improved(
     both: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray,
     first: tuple[float, np.ndarray], evaluations: int,
 ) -> tuple[float, np.ndarray]:

@@ -1,0 +1,359 @@
+"""The experiment that tells a case's unknowns best, by the information that its log would hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.discovery.limits import Limits, Peaks
+from jaxid.discovery.rivals import Bounds
+from jaxid.discovery.separate import improved
+from jaxid.discovery.shapes import Shapes, basis
+from jaxid.errors import InputError
+from jaxid.estimators.directions_problem import Prior, residual_of, with_sensor
+from jaxid.io.case import Case, load_case
+from jaxid.io.output import write_whole
+from jaxid.machine import Machine, build_machine
+from jaxid.model import Plant
+from jaxid.parameters import scatter
+from jaxid.replay import Replay
+from jaxid.sensors import Sensor
+from jaxid.simulation import Drive, needed_substeps
+
+# Relative width of the guesses where the case states none.
+_PRIOR = 0.5
+# A tour reaches its speed within this part of the stroke; sines go up to this part of the rate.
+_RUN_UP, _FASTEST = 0.02, 0.1
+# Starts that are improved, of those that tell most, and evaluations for each.
+_IMPROVED, _EVALUATIONS = 2, 25
+# Amplitudes tried until the machine keeps within its limits.
+_AMPLITUDES = (1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.15)
+# Of the controller's own limit: what saturates is no longer in the loop.
+_UNSATURATED = 0.95
+_BEYOND = 1e6
+# Weight of what goes beyond a limit beside the information.
+_STERN = 100.0
+# Steps between two ticks: what a design costs grows with them, what it gains does not.
+_STEPS = 8
+# Sharpness at which an experiment is designed: friction that sticks exactly has no slope in the reference.
+_SHARPNESS = 0.1
+
+
+@dataclass(frozen=True)
+class Design:
+    """An experiment, and what is expected of it.
+
+    Args:
+        machine: The machine at the guesses.
+        signal: "reference" or "input".
+        time: Ticks [s].
+        values: Of the signal, (ticks, m).
+        std: Standard deviations that are expected, in parts of the guess (of what may be zero: physical over
+            the guess), (p,); what the guesses say included.
+        plain: The same of a tour from end to end at several speeds.
+        nats: Information gained over the guesses, of the design and of the tour.
+        limits: What it keeps to.
+        peaks: How far the machine goes.
+    """
+
+    machine: Machine
+    signal: str
+    time: Float[np.ndarray, " ticks"]
+    values: Float[np.ndarray, "ticks m"]
+    std: Float[np.ndarray, " p"]
+    plain: Float[np.ndarray, " p"]
+    nats: tuple[float, float]
+    limits: Limits
+    peaks: Peaks
+
+    def csv(self) -> str:
+        """Time and signal as `[reference] kind = "csv"` (or `[input]`) takes them, every digit kept."""
+        m = self.values.shape[1]
+        names = [self.signal] if m == 1 else [f"{self.signal}_{k + 1}" for k in range(m)]
+        rows = np.column_stack([self.time, self.values])
+        lines = [",".join(repr(float(v)) for v in row) for row in rows]
+        return "\n".join([",".join(["t", *names]), *lines]) + "\n"
+
+    def save(self, path: str | Path) -> Path:
+        """Write the signal as CSV, whole or not at all."""
+        write_whole(Path(path), self.csv())
+        return Path(path)
+
+    def __str__(self) -> str:
+        names = self.machine.parameters.names
+        width = max(len("parameter"), *map(len, names))
+        lines = [f"{'parameter':<{width}}  expected  tour      (relative standard deviation)"]
+        for name, std, plain in zip(names, self.std, self.plain, strict=True):
+            lines.append(f"{name:<{width}}  {std:<8.2%}  {plain:<8.2%}")
+        lines.append(
+            f"{self.nats[0]:.1f} nats over the guesses, the tour {self.nats[1]:.1f}; "
+            f"{self.time[-1]:.3g} s, speed up to {_shown(self.peaks.speed)}, "
+            f"command up to {_shown(self.peaks.force)}"
+        )
+        return "\n".join(lines)
+
+
+def _shown(values: np.ndarray) -> str:
+    return ", ".join(f"{v:.3g}" for v in np.ravel(values))
+
+
+def design(case: Case | str | Path, *, progress: Callable[[str], None] = lambda text: None) -> Design:
+    """Find the reference (in a loop) or the input that tells a case's unknowns best, at its guesses.
+
+    The logarithm of the information's determinant is raised through the simulation by gradients (D-optimal;
+    Bayesian: each guess is a prior of the relative width `[output_error] prior`, 0.5 where absent), over sums
+    of sines and a tour from end to end, within [limits].
+
+    Args:
+        case: The case, or its file; it needs [simulation] duration and sample_rate, [limits] stroke and
+            speed (in open loop force), and in [sensor] the noise of what `[output_error] on` compares.
+        progress: Called with a line at every stage.
+
+    Raises:
+        InputError: If the case lacks any of these, or no experiment keeps within the limits.
+
+    Source:
+        Chaloner and Verdinelli (1995), "Bayesian experimental design: a review".
+    """
+    case = case if isinstance(case, Case) else load_case(case)
+    bench = _Bench.of(case)
+    progress("looking at sines and tours")
+    starts = bench.starts
+    both = lambda p: _valued(bench, p)
+    known = [both(p) for p in starts]
+    ranked = sorted(range(len(starts)), key=lambda k: known[k][0])[:_IMPROVED]
+    found = []
+    for k in ranked:
+        progress("improving the most telling")
+        found.append(improved(both, starts[k], known[k], _EVALUATIONS))
+    tour, *others = (bench.kept(p) for p in (*starts, *(p for _, p in found)))
+    kept = [k for k in (tour, *others) if k is not None]
+    if not kept:
+        raise InputError(
+            "no experiment within the limits was found", where=f"{case.path}, [limits]",
+            mend="widen them, or check the loop's gains: the machine went beyond whatever it was asked",
+        )
+    best = max(kept, key=lambda k: bench.nats(k[0]))
+    return bench.designed(*best, kept[0][0])
+
+
+_signal = eqx.filter_jit(lambda shapes, p: shapes(p))
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """What a design is tried on."""
+
+    machine: Machine
+    replay: Replay
+    weight: np.ndarray
+    prior: Prior
+    on: str
+    limits: Limits
+    shapes: Shapes
+    starts: list[np.ndarray]
+
+    @classmethod
+    def of(cls, case: Case) -> _Bench:
+        setting, where = case.simulation, str(case.path)
+        for table, key in (("simulation", "duration"), ("simulation", "sample_rate"), ("limits", "stroke"),
+                           ("limits", "speed")):
+            if key not in getattr(case, table):
+                raise InputError(f"[{table}] has no {key}", where=where, mend=f"add {key} = ... to [{table}]")
+        rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+        machine = build_machine(case, period=1 / rate)
+        if not machine.parameters.free:
+            raise InputError("nothing is unknown", where=where, mend="give a parameter as { guess = ... }")
+        limits = _limits(case, machine)
+        period = machine.hold_period or 1 / rate
+        every = max(1, round(1 / (rate * period)))
+        ticks = (round(duration * rate) - 1) * every + 1
+        speed = float(limits.speed.max())
+        plant = replace(machine.plant, velocity_scale=np.asarray(speed), sharpness=np.asarray(_SHARPNESS))
+        machine = machine.with_plant(plant, machine.parameters)
+        shapes, starts = _family(machine, limits, ticks, period)
+        m, n = machine.gain.size, case.plant.joints
+        looped = machine.controller is not None
+        drive = Drive(machine.gain, period, "zero_order", 1, True)
+        none = np.zeros((ticks, m))
+        still, undisturbed = np.zeros(n), np.zeros((ticks, 1))
+        inputs = (none, undisturbed, None) if looped else (None, None, none)
+        # While an experiment is sought the command may go beyond: a cost without slope leads nowhere.
+        free = machine.controller
+        if looped and free.limit is not None:
+            free = replace(free, limit=_BEYOND * jnp.asarray(free.limit))
+        replay = Replay(drive, free, Sensor(), *inputs, still, still, None, every)
+        q = jnp.zeros((1, n))
+        steps = min(needed_substeps(plant, drive, q, q, jnp.zeros((1, m))), _STEPS)
+        replay = replace(replay, drive=replace(drive, substeps=steps))
+        on = case.output_error.get("on", "position")
+        prior = Prior.of(machine, case.output_error.get("prior", _PRIOR), np.zeros(0))
+        bench = cls(machine, replay, np.zeros(0), prior, on, limits, shapes, starts)
+        return replace(bench, weight=_weights(case, bench, len(range(0, ticks, every))))
+
+    def run(self, signal: Array, sensor: Sensor | None = None) -> Replay:
+        """The machine under a signal."""
+        replay = self.replay if sensor is None else with_sensor(self.replay, sensor)
+        return _under(replay, self.machine.plant, jnp.asarray(signal))
+
+    def peaks(self, signal: np.ndarray) -> Peaks:
+        """How far it goes."""
+        run = _trajectory(self.run(signal), self.machine.plant)
+        return Peaks.of(*(np.asarray(x) for x in (run.position, run.velocity, run.command)))
+
+    def kept(self, p: np.ndarray) -> tuple[np.ndarray, Peaks] | None:
+        """The signal of some numbers, at the largest amplitude at which the machine keeps to its limits."""
+        for factor in _AMPLITUDES:
+            signal = np.asarray(_signal(self.shapes, jnp.asarray(self.shapes.smaller(p, factor))))
+            peaks = self.peaks(signal)
+            if not self.limits.broken(peaks):
+                return signal, peaks
+        return None
+
+    def information(self, signal: np.ndarray) -> np.ndarray:
+        """Of a signal's log in units of the prior, the prior's included, (p, p)."""
+        return np.eye(self.prior.base.size) + np.asarray(_information(*self.args(), jnp.asarray(signal)))
+
+    def nats(self, signal: np.ndarray) -> float:
+        """Information gained over the guesses."""
+        return 0.5 * float(np.linalg.slogdet(self.information(signal))[1])
+
+    def args(self) -> tuple:
+        """For the compiled functions."""
+        unknown = self.machine.parameters
+        return (self.replay, unknown.places, self.machine.plant, self.weight, self.prior, self.on)
+
+    def designed(self, signal: np.ndarray, peaks: Peaks, tour: np.ndarray) -> Design:
+        """The design with what is expected of it."""
+        of = (signal, tour)
+        std = [np.sqrt(np.diag(np.linalg.inv(self.information(x)))) * self.relative for x in of]
+        nats = (self.nats(signal), self.nats(tour))
+        period = self.replay.drive.period
+        name = "reference" if self.replay.controller is not None else "input"
+        time = float(period) * np.arange(len(signal))
+        return Design(self.machine, name, time, signal, *std, nats, self.limits, peaks)
+
+    @property
+    def relative(self) -> np.ndarray:
+        """A prior as a part of its guess."""
+        return np.where(self.prior.log, 1.0, 1.0 / np.abs(self.prior.base)) * self.prior.scale
+
+
+def _limits(case: Case, machine: Machine) -> Limits:
+    """The limits that a case states; the command's is within the controller's where it states none."""
+    stated, n, m = case.limits, case.plant.joints, machine.gain.size
+    low, high = np.broadcast_to(np.asarray(stated["stroke"], float), (n, 2)).T
+    own = None if machine.controller is None else machine.controller.limit
+    force = stated.get("force", np.inf if own is None else _UNSATURATED * np.asarray(own))
+    if machine.controller is None and "force" not in stated:
+        raise InputError("[limits] has no force", where=str(case.path), mend="add force = ... to [limits]")
+    return Limits(
+        np.array(low), np.array(high), np.broadcast_to(stated["speed"], n).astype(float),
+        np.broadcast_to(force, m).astype(float), tuple(stated),
+    )
+
+
+def _family(
+    machine: Machine, limits: Limits, ticks: int, period: float
+) -> tuple[Shapes, list[np.ndarray]]:
+    """Signals within the limits, and where to start: the tour first."""
+    speed, looped = float(limits.speed.max()), machine.controller is not None
+    if looped:
+        ends = (limits.low, limits.high, limits.speed * period)
+        low, high, step = (machine.plant.at_drives(x) for x in ends)
+    else:
+        low, high, step = -limits.force, limits.force, np.full(limits.force.shape, np.inf)
+    stroke = float((high - low).max())
+    pace = speed if looped else 20 * stroke / (ticks * period)
+    hardest = pace**2 / (_RUN_UP * stroke)
+    fastest = min(hardest / (2 * np.pi * pace), _FASTEST / period)
+    functions, weights = basis(ticks, period, fastest, (stroke, pace, hardest), None)
+    shapes = Shapes.within(functions, low, high, step)
+    return shapes, [shapes.numbers(w) for w in weights]
+
+
+def _weights(case: Case, bench: _Bench, samples: int) -> Float[np.ndarray, "time k"]:
+    """One over the noise of what is compared; that of the command holds what rounding does in the loop."""
+    sensor, n, m = bench.machine.sensor, case.plant.joints, bench.machine.gain.size
+    std: list[np.ndarray] = []
+    if bench.on in ("position", "both"):
+        if sensor.position_std is None:
+            raise _no_noise(case, "position", "position_noise or position_resolution")
+        std.append(np.broadcast_to(np.asarray(sensor.position_std), n))
+    if bench.on in ("force", "both"):
+        if sensor.force_noise is None:
+            raise _no_noise(case, "force", "force_noise")
+        signal = np.asarray(_signal(bench.shapes, jnp.asarray(bench.starts[0])))
+        runs = (_trajectory(bench.run(signal, s), bench.machine.plant) for s in (sensor, Sensor()))
+        rounded, exact = (np.asarray(run.command) for run in runs)
+        through = np.sqrt(np.mean((rounded - exact) ** 2, axis=0))
+        own = np.broadcast_to(np.asarray(sensor.force_noise), m)
+        std.append(np.abs(bench.machine.gain) * np.hypot(own, through))
+    return np.tile(1.0 / np.concatenate(std), (samples, 1))
+
+
+def _no_noise(case: Case, what: str, key: str) -> InputError:
+    return InputError(
+        f"the noise of the {what} is not known", where=f"{case.path}, [sensor]",
+        mend=f"add {key}: without it no experiment is better than another",
+    )
+
+
+def _under(replay: Replay, plant: Plant, signal: Array) -> Replay:
+    """A run under a signal, from rest at its first value in a loop."""
+    if replay.controller is None:
+        return replace(replay, command=signal)
+    start = jnp.asarray(replay.position)
+    driven = jnp.asarray(plant.driven(start.size))
+    return replace(replay, reference=signal, position=start.at[driven].set(signal[0]))
+
+
+_trajectory = eqx.filter_jit(lambda replay, plant: replay(plant))
+
+
+def _sensitivity(
+    replay: Replay, places: tuple, plant: Plant, weight: Array, prior: Prior, on: str, signal: Array
+) -> Array:
+    """Derivative of what is compared over its noise, in units of the prior, (rows, p)."""
+    p, none = len(places), jnp.zeros(weight.shape)
+    run = residual_of(
+        _under(replay, plant, signal), places, plant, none, weight, prior, on, jnp.eye(p)
+    )
+    return jax.jacfwd(run)(jnp.zeros(p)).reshape(-1, p)
+
+
+@eqx.filter_jit
+def _information(*args: Any) -> Array:
+    j = _sensitivity(*args)
+    return j.T @ j
+
+
+@eqx.filter_jit
+def _loss(p: Array, args: tuple, shapes: Shapes, bounds: Bounds) -> tuple[Array, Array]:
+    """Minus the information gained [nats] and what limits cost, with the slope."""
+    replay, places, plant, _, prior, _ = args
+
+    def of(p: Array) -> tuple[Array, Array]:
+        signal = shapes(p)
+        j = _sensitivity(*args, signal)
+        gained = 0.5 * jnp.linalg.slogdet(jnp.eye(j.shape[1]) + j.T @ j)[1]
+        here = scatter(places, plant, prior.base)
+        value = -gained + _STERN * bounds.cost(_under(replay, plant, signal)(here))
+        return value, value
+
+    slope, value = jax.jacfwd(of, has_aux=True)(p)
+    return value, slope
+
+
+def _valued(bench: _Bench, p: np.ndarray) -> tuple[float, np.ndarray]:
+    value, slope = _loss(jnp.asarray(p), bench.args(), bench.shapes, Bounds.of(bench.limits))
+    good = np.isfinite(value) & np.all(np.isfinite(slope))
+    return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))
