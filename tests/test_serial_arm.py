@@ -174,6 +174,8 @@ def test_units_of_a_joint_are_those_of_its_motion():
     assert [plant.motion(k) for k in range(3)] == ["rotary", "rotary", "linear"]
     assert plant.joints == 3
     assert plant.own_inertia() is None
+    # a force on a joint stands in no other's balance, so that a search shares its columns
+    assert [plant.reached(k, 3) for k in range(3)] == [(0,), (1,), (2,)]
     assert set(arm_oracle.NAMES) < set(parameters_of(SerialArm))
 
 

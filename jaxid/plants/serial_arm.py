@@ -76,6 +76,9 @@ class SerialArm(Plant):
     def motion(self, port: int) -> str:
         return "rotary" if self.geometry.joints[port] == "revolute" else "linear"
 
+    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+        return (port,)
+
     def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         return ("rotor_inertia", port) if effect.kind == "added_mass" else None
 
