@@ -145,17 +145,21 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
         if value is not None and name in entry.cls.__dataclass_fields__
     }
     values: dict[str, Any] = {}
+    for name, given in entry.parameters.items():
+        listed = isinstance(given, tuple)
+        values[name] = [v.start(true) for v in given] if listed else given.start(true)
+    plant = entry.cls(**values, **options, **entry.options)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
         given = entry.parameters.get(name)
         if isinstance(given, tuple):
-            values[name] = [v.start(true) for v in given]
             for k, v in enumerate(given):
-                free += _free(v, f"{name}[{k + 1}]", (name,), info, info.motion, case, true, index=k)
+                # Of one entry a joint it is the joint's motion, where these differ.
+                motion = info.motion or (plant.motion(k) if info.more == 0 else None)
+                free += _free(v, f"{name}[{k + 1}]", (name,), info, motion, case, true, index=k)
         elif given is not None:
-            values[name] = given.start(true)
             free += _free(given, name, (name,), info, info.motion, case, true)
-    return entry.cls(**values, **options), free
+    return plant, free
 
 
 def _with_effect(

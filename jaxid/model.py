@@ -151,11 +151,11 @@ class Scales:
 
     def natural(self, dimension: str) -> float:
         """Size at which a parameter of this dimension would explain all of the force."""
-        if dimension == "inertia":
-            return self.force / self.acceleration
         base = {
             "force": self.force, "position": self.position, "time": self.position / self.velocity,
         }
+        if "inertia" in dimension:
+            base["inertia"] = self.force / self.acceleration
         over, _, under = dimension.partition("/")
         value = 1.0
         for words, sign in ((over, 1), (under, -1)):
@@ -286,6 +286,10 @@ class Plant(eqx.Module):
     couplings: ClassVar[Mapping[str, type[Plant]]] = {}
     # Joints that are driven, 0-based, in the order of their drives; None: the first ones, all of them.
     actuated = None
+    # "linear" or "rotary" where a case does not say; None: linear.
+    usual_motion: ClassVar[str | None] = None
+    # Whether a case describes it link by link: then it takes a `geometry`.
+    linked: ClassVar[bool] = False
     effects: eqx.AbstractVar[tuple[Effect, ...]]
     sharpness: eqx.AbstractVar[Array]
     velocity_scale: eqx.AbstractVar[Array]
@@ -312,8 +316,7 @@ class Plant(eqx.Module):
         """How many ports behind the parts are elongations of springs."""
         return 0
 
-    @classmethod
-    def motion(cls, port: int) -> str | None:
+    def motion(self, port: int) -> str | None:
         """Whether a port is "linear" or "rotary", of a machine that has both; None: as the case says."""
         return None
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -128,6 +129,7 @@ class Scene:
         joints = case.plant.joints
         position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
         velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
+        _refuse_massless(machine.plant, position, where)
         if machine.controller is None:
             if not case.input:
                 raise InputError(
@@ -204,6 +206,22 @@ def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
         machine.gain, period, hold, int(case.simulation.get("substeps", 4)),
         "sharpness" not in case.simulation, longest,
     )
+
+
+def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
+    """Refuse an arm that some motion moves without kinetic energy: its acceleration would be infinite."""
+    if not plant.linked:
+        return
+    q = jnp.asarray(position, dtype=jnp.float64)
+    zero = jnp.zeros_like(q)
+    mass = np.asarray(jax.jacfwd(lambda a: plant.inertial(q, zero, a))(zero))
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(mass), 1e-300))
+    if np.diagonal(mass).min() <= 0 or np.linalg.eigvalsh(mass * np.outer(scale, scale))[0] < 1e-12:
+        joint = int(np.argmin(np.diagonal(mass))) + 1
+        raise InputError(
+            f"the mass matrix at initial_position is not positive definite (least about joint {joint})",
+            where=where, mend="give the links mass and inertia that bodies can have",
+        )
 
 
 def _refuse_coarse(case: Case, machine: Machine, drive: Drive, reference: np.ndarray) -> None:

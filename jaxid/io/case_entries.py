@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
+from jaxid.io.case_links import LINKED, count_links, read_links
 from jaxid.io.case_places import check_places, read_ports
 from jaxid.io.case_tables import PLANNED_PLANTS, PLANT
 from jaxid.io.case_values import Value, read_value, read_values
@@ -46,6 +47,7 @@ class PlantEntry:
         gravity: Its acceleration [m/s^2]; None: the class's own.
         joints: How many there are.
         actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
+        options: What else its class takes, by field: the geometry of an arm.
     """
 
     cls: type[Plant]
@@ -55,6 +57,7 @@ class PlantEntry:
     gravity: float | None
     joints: int
     actuated: tuple[int, ...] | None = None
+    options: dict[str, Any] = field(default_factory=dict)
 
     @property
     def drives(self) -> int:
@@ -97,6 +100,8 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
     spot = Spot(file, "[plant]")
     cls = PLANTS[read_kind(table, PLANTS, PLANNED_PLANTS, spot)]
     keys = {"kind": Key(lambda value, spot: value), **PLANT}
+    if cls.linked:
+        return _linked(table, cls, keys, spot)
     if cls.couplings:
         keys["coupling"] = Key(choice(tuple(cls.couplings)))
         if "coupling" in table:
@@ -109,7 +114,7 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
     if "parameters" not in given:
         needed = ", ".join(f"{name} = {_shape(info)}" for name, info in parameters_of(cls).items())
         raise spot.fault("'parameters' is missing", f"add [plant.parameters] with {needed}")
-    motion = given.get("motion", cls.motion(0) or "linear")
+    motion = given.get("motion", cls.usual_motion or "linear")
     vertical = given.get("orientation") == "vertical"
     if vertical and motion == "rotary":
         mend = 'leave orientation out, or set motion = "linear"; an unbalanced load is an effect'
@@ -118,6 +123,20 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
     return PlantEntry(
         cls, given["parameters"], units, vertical, given.get("gravity"), joints,
         given.get("actuated", cls.actuated),
+    )
+
+
+def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot) -> PlantEntry:
+    """[plant] of an arm, which [[plant.links]] describe."""
+    joints = count_links(table, spot)
+    # Weight is a vector there, and acts whichever way the arm stands.
+    own = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
+    given = read_table(table, {**own, **LINKED}, spot)
+    parameters, geometry = read_links(table["links"], cls, spot.file)
+    options = {name: given[name] for name in ("gravity_vector",) if name in given}
+    units = Units(given.get("motion", cls.usual_motion), **given.get("units", {}))
+    return PlantEntry(
+        cls, parameters, units, False, None, joints, cls.actuated, {"geometry": geometry, **options}
     )
 
 

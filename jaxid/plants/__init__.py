@@ -6,10 +6,13 @@ To add one: write its class in a file of its own and register it here.
 from jaxid.model import Plant
 from jaxid.plants.axis import Axis as Axis
 from jaxid.plants.chain import Chain as Chain
+from jaxid.plants.denavit_hartenberg import DenavitHartenberg as DenavitHartenberg
 from jaxid.plants.flexible_axis import FlexibleAxis as FlexibleAxis
 from jaxid.plants.micropositioning_stage import MicropositioningStage as MicropositioningStage
 from jaxid.plants.micropositioning_stage import RigidMicropositioningStage as RigidMicropositioningStage
+from jaxid.plants.pa10 import pa10 as pa10
+from jaxid.plants.serial_arm import SerialArm as SerialArm
 
 PLANTS: dict[str, type[Plant]] = {
-    cls.kind: cls for cls in (Axis, Chain, FlexibleAxis, MicropositioningStage)
+    cls.kind: cls for cls in (Axis, Chain, FlexibleAxis, MicropositioningStage, SerialArm)
 }

@@ -33,6 +33,7 @@ class Stage(Plant):
     kind = "micropositioning_stage"
     diagonal = True
     stage = True
+    usual_motion = _MOTIONS[0]
 
     motor_inertia: Array = parameter("inertia", "positive", "of the motor", motion="rotary")
     table_mass: Array = parameter("inertia", "positive", "of the table", motion="linear")
@@ -52,8 +53,7 @@ class Stage(Plant):
         """Inertia of all that turns [kg m^2]."""
         return self.motor_inertia + (0.0 if self.screw_inertia is None else self.screw_inertia)
 
-    @classmethod
-    def motion(cls, port: int) -> str:
+    def motion(self, port: int) -> str:
         return _MOTIONS[port]
 
     def port_width(self, q: Array) -> Array:

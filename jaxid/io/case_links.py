@@ -1,0 +1,118 @@
+"""[[plant.links]] of a case: the links of an arm, from the base to the tip."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from jaxid.io.case_values import Value, read_value, read_values
+from jaxid.io.schema import Key, Keys, Spot, choice, number, read_table, several
+from jaxid.model import Plant, parameters_of
+from jaxid.plants.denavit_hartenberg import JOINTS, DenavitHartenberg
+
+# Chosen: beyond any arm; what lies behind it is a slip.
+_MOST_LINKS = 50
+# Entries of a list of the case, by the plant's parameters that they are.
+_LISTS = {
+    "first_moment": ("first_moment_x", "first_moment_y", "first_moment_z"),
+    "inertia": (
+        "inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz",
+    ),
+}
+# Angles, which may be in degrees: a right angle in rad has no end.
+_ANGLES = ("alpha", "theta")
+
+# Keys of [plant] that only an arm has.
+LINKED: Keys = {
+    "links": Key(lambda value, spot: value, "a table [[plant.links]] for each link", True),
+    "gravity_vector": Key(several(number(), shortest=3, longest=3), "in the frame of the base [m/s^2]"),
+}
+
+
+def count_links(table: dict[str, Any], spot: Spot) -> int:
+    """How many links [plant] has.
+
+    Raises:
+        InputError: If there is none, or no table is where one should be.
+    """
+    links = table.get("links")
+    if links is None:
+        mend = "add a table [[plant.links]] for each, from the base to the tip"
+        raise spot.fault("'links' is missing", mend)
+    if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
+        raise spot.at("links").fault("is not a list of tables", "write [[plant.links]], in double brackets")
+    if not 1 <= len(links) <= _MOST_LINKS:
+        raise spot.at("links").fault(f"has {len(links)} entries", f"an arm has 1 to {_MOST_LINKS}")
+    return len(links)
+
+
+def read_links(
+    links: list[dict[str, Any]], cls: type[Plant], file: str
+) -> tuple[dict[str, tuple[Value, ...]], DenavitHartenberg]:
+    """Inertial parameters of the links by name, one value a link, and their geometry.
+
+    Raises:
+        InputError: If a link states what it cannot have, or not what it must.
+    """
+    rows, parameters = [], {}
+    for k, link in enumerate(links, start=1):
+        spot = Spot(file, f"[[plant.links]] {k}")
+        given = read_table(_in_rad(link, spot), _keys(cls), spot)
+        rows.append([given["joint"], *(given.get(name, 0.0) for name in ("alpha", "a", "d", "theta"))])
+        for name, values in given.items():
+            if name in _LISTS:
+                for part, value in zip(_LISTS[name], values, strict=True):
+                    parameters.setdefault(part, []).append(value)
+            elif isinstance(values, Value):
+                parameters.setdefault(name, []).append(values)
+        if any("rotor_inertia" in other for other in links) and "rotor_inertia" not in given:
+            parameters.setdefault("rotor_inertia", []).append(Value(0.0))
+    return {name: tuple(values) for name, values in parameters.items()}, DenavitHartenberg.of_rows(rows)
+
+
+def _keys(cls: type[Plant]) -> Keys:
+    """Keys of one link."""
+    infos = parameters_of(cls)
+    value = "a number, or { guess = ... }"
+    keys = {
+        "joint": Key(choice(JOINTS), '"revolute" or "prismatic"', True),
+        "alpha": Key(number(), "twist from the axis before to this one [rad], or alpha_deg", True),
+        "a": Key(number(), "distance from the axis before to this one [m]", True),
+        "d": Key(number(), "offset along the axis [m]"),
+        "theta": Key(number(), "angle about the axis [rad], or theta_deg"),
+    }
+    for name in ("mass", "first_moment", "inertia", "rotor_inertia"):
+        parts = _LISTS.get(name, (name,))
+        info = infos[parts[0]]
+        if name in _LISTS:
+            axes = ", ".join(part.rpartition("_")[2] for part in parts)
+            read, doc = _listed(info, parts), f"the list {axes}; each {value}"
+        else:
+            read, doc = (lambda v, s, info=info: read_value(v, info, s)), f"{info.doc}; {value}"
+        keys[name] = Key(read, doc, not info.optional)
+    return keys
+
+
+def _listed(info: Any, parts: tuple[str, ...]) -> Any:
+    """A list with an entry for each axis, or pair of axes."""
+
+    def read(value: Any, spot: Spot) -> tuple[Value, ...]:
+        inner = isinstance(value, dict) and any(isinstance(v, list) for v in value.values())
+        if not isinstance(value, list) and not inner:
+            axes = ", ".join(part.rpartition("_")[2] for part in parts)
+            raise spot.refuse(value, "is not a list", f"give {len(parts)} entries: {axes}")
+        return read_values(value, info, len(parts), spot, "component")
+
+    return read
+
+
+def _in_rad(link: dict[str, Any], spot: Spot) -> dict[str, Any]:
+    """The table with its angles in rad."""
+    out = dict(link)
+    for name in _ANGLES:
+        degrees = f"{name}_deg"
+        if degrees in link:
+            if name in link:
+                raise spot.fault(f"both {name} and {degrees} are given", "keep one of them")
+            out[name] = math.radians(number()(out.pop(degrees), spot.at(degrees)))
+    return out

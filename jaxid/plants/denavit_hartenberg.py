@@ -1,0 +1,87 @@
+"""Geometry of an open chain of joints, by modified Denavit-Hartenberg parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.model import as_array
+
+JOINTS = ("revolute", "prismatic")
+
+
+class DenavitHartenberg(eqx.Module):
+    """Frame of each link in the one before it.
+
+    Frame j is fixed to link j, z_j along the axis of joint j. From frame j - 1 it is reached by turning
+    alpha about x, moving a along x, turning theta about z and moving d along z.
+    The variable of a revolute joint is added to theta, that of a prismatic one to d.
+
+    Args:
+        joints: "revolute" or "prismatic", from the base to the tip, n of them.
+        alpha: Twists [rad], (n,).
+        a: Lengths [m], (n,).
+        d: Offsets [m], (n,).
+        theta: Angles [rad], (n,).
+
+    Raises:
+        ValueError: If there is no joint, one of another kind, or a column of another length.
+
+    Source:
+        Khalil & Kleinfinger (1986); Craig, Introduction to Robotics, chapter 3.
+    """
+
+    joints: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    alpha: Array = eqx.field(converter=as_array)
+    a: Array = eqx.field(converter=as_array)
+    d: Array = eqx.field(converter=as_array)
+    theta: Array = eqx.field(converter=as_array)
+
+    def __check_init__(self) -> None:
+        if not self.joints:
+            raise ValueError("an arm has at least one joint; give a row for each.")
+        for k, joint in enumerate(self.joints, start=1):
+            if joint not in JOINTS:
+                raise ValueError(f"joint {k} is {joint!r}; take one of {', '.join(JOINTS)}.")
+        for name in ("alpha", "a", "d", "theta"):
+            shape = np.shape(getattr(self, name))
+            # Trees that JAX fills with markers of its own pass; arrays count.
+            if isinstance(getattr(self, name), (np.ndarray, Array)) and shape[-1:] != (len(self.joints),):
+                raise ValueError(f"{name} has shape {shape}; give {len(self.joints)}, one a joint.")
+
+    @classmethod
+    def of_rows(cls, rows: Sequence[Sequence]) -> DenavitHartenberg:
+        """From a table: joint, alpha [rad], a [m], d [m], theta [rad], a row for each joint.
+
+        Raises:
+            ValueError: If a row has another number of columns, or holds what it cannot.
+        """
+        for k, row in enumerate(rows, start=1):
+            if len(row) != 5:
+                raise ValueError(f"row {k} has {len(row)} columns; give joint, alpha, a, d, theta.")
+        columns = list(zip(*rows, strict=True)) or [()] * 5
+        return cls(columns[0], *(np.asarray(c, dtype=np.float64) for c in columns[1:]))
+
+    @property
+    def revolute(self) -> Float[np.ndarray, " n"]:
+        """One for a revolute joint, zero for a prismatic one."""
+        return np.asarray([float(joint == "revolute") for joint in self.joints])
+
+    def frames(self, q: Float[Array, " n"]) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:
+        """Each frame in the one before: its axes, as columns, and its origin [m].
+
+        Args:
+            q: Joint coordinates [rad or m].
+        """
+        theta = self.theta + self.revolute * q
+        d = self.d + (1.0 - self.revolute) * q
+        c, s, ca, sa = jnp.cos(theta), jnp.sin(theta), jnp.cos(self.alpha), jnp.sin(self.alpha)
+        zero = jnp.zeros_like(c)
+        axes = [[c, -s, zero], [s * ca, c * ca, -sa], [s * sa, c * sa, ca]]
+        origin = [jnp.broadcast_to(self.a, d.shape), -sa * d, ca * d]
+        rows = [jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in axes]
+        return jnp.stack(rows, axis=-2), jnp.stack(origin, axis=-1)

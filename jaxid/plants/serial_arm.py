@@ -1,0 +1,144 @@
+"""An arm: an open chain of rigid links with revolute and prismatic joints."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.model import Effect, Plant, as_array, parameter
+from jaxid.plants.denavit_hartenberg import DenavitHartenberg
+
+_FIRST = ("inertia*position", "free")
+_SECOND = ("inertia", "free")
+_Z = np.array([0.0, 0.0, 1.0])
+
+
+class SerialArm(Plant):
+    """tau = M(q) qdd + h(q, qd), of links by ten inertial parameters each; ports are the joints.
+
+    What stands in `inertial` is linear in the parameters: mass, first moments and inertia of a link
+    count about the origin of its frame and along its axes. Which of their combinations the torques
+    tell is for `jaxid.base_parameters` to say.
+
+    Args:
+        mass: m, (n,) [kg].
+        first_moment_x, first_moment_y, first_moment_z: Mass times centre of mass, (n,) [kg m].
+        inertia_xx, inertia_xy, inertia_xz, inertia_yy, inertia_yz, inertia_zz: Inertia tensor about the
+            frame's origin, (n,); off its diagonal -sum of m x y and so on [kg m^2].
+        rotor_inertia: Of each drive, seen at the joint, (n,) [kg m^2, or kg at a prismatic joint], or None
+            for none.
+        geometry: Frames of the links; the first one's predecessor is the base.
+        gravity_vector: Acceleration of gravity in the base's frame, (3,) [m/s^2].
+        effects: Forces beside these, in the order of the drive.
+        sharpness: Width of the smoothed sign over `velocity_scale`, dimensionless.
+        velocity_scale: A typical velocity [rad/s or m/s].
+
+    Source:
+        Luh, Walker & Paul (1980) for the recursion; Khalil & Kleinfinger (1987) for its form about the
+        origins of modified Denavit-Hartenberg frames, in which it is linear in the parameters.
+    """
+
+    kind = "serial_arm"
+    linked = True
+    usual_motion = "rotary"
+    # Beside each link's others these are the ones to leave out where columns depend on each other.
+    regrouped: ClassVar[tuple[str, ...]] = ("first_moment_z", "mass", "inertia_yy")
+
+    mass: Array = parameter("inertia", "nonnegative", "masses, one a link", more=0, motion="linear")
+    first_moment_x: Array = parameter(*_FIRST, "m x of the centre of mass", more=0, motion="linear")
+    first_moment_y: Array = parameter(*_FIRST, "m y of the centre of mass", more=0, motion="linear")
+    first_moment_z: Array = parameter(*_FIRST, "m z of the centre of mass", more=0, motion="linear")
+    inertia_xx: Array = parameter(*_SECOND, "about the frame's origin", more=0, motion="rotary")
+    inertia_xy: Array = parameter(*_SECOND, "-sum m x y", more=0, motion="rotary")
+    inertia_xz: Array = parameter(*_SECOND, "-sum m x z", more=0, motion="rotary")
+    inertia_yy: Array = parameter(*_SECOND, "about the frame's origin", more=0, motion="rotary")
+    inertia_yz: Array = parameter(*_SECOND, "-sum m y z", more=0, motion="rotary")
+    inertia_zz: Array = parameter(*_SECOND, "about the frame's origin", more=0, motion="rotary")
+    rotor_inertia: Array | None = parameter(
+        "inertia", "nonnegative", "of each drive, seen at the joint", optional=True, more=0
+    )
+    geometry: DenavitHartenberg = eqx.field(kw_only=True)
+    gravity_vector: Array = eqx.field(converter=as_array, default=(0.0, 0.0, -9.81), kw_only=True)
+    effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
+    sharpness: Array = eqx.field(converter=as_array, default=1e-3, kw_only=True)
+    velocity_scale: Array = eqx.field(converter=as_array, default=1.0, kw_only=True)
+
+    @property
+    def joints(self) -> int:
+        """Joints, as many as links."""
+        return len(self.geometry.joints)
+
+    def motion(self, port: int) -> str:
+        return "rotary" if self.geometry.joints[port] == "revolute" else "linear"
+
+    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+        return (port,)
+
+    def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
+        return ("rotor_inertia", port) if effect.kind == "added_mass" else None
+
+    def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Recursive Newton-Euler: motion from the base out, forces from the tip back.
+
+        One scan each way. Of seven joints, on two CPU cores, compiled for 1000 states: 0.6 s to compile
+        and 2.2 ms to run, against 1.4 s and 1.2 ms unrolled, and 4.1 s and 13 ms as the Lagrangian
+        differentiated. The regressor (its Jacobian in 70 parameters): 88, 111 and 892 ms; the mass matrix
+        of one state: 0.05, 0.13 and 0.08 ms. Scans also keep the compiler from copying one link's motion into
+        every use of it: without, in the base's frame, a run of two joints compiles three times as long.
+        """
+        axes, origins = self.geometry.frames(q)
+        turns = jnp.asarray(self.geometry.revolute)
+        body = (self.mass, self._first_moments(), self._tensors())
+
+        def out(carry: tuple, link: tuple) -> tuple[tuple, tuple]:
+            # Angular velocity and acceleration of the link, and the acceleration of its origin: gravity is
+            # a base that accelerates upwards.
+            w, dw, dv = carry
+            r, p, turn, v, a, (m, ms, tensor) = link
+            dv = _into(r, dv + jnp.cross(dw, p) + jnp.cross(w, jnp.cross(w, p)))
+            w, dw = _into(r, w), _into(r, dw)
+            across = jnp.cross(w, v * _Z)
+            dv = dv + (1.0 - turn) * (2.0 * across + a * _Z)
+            dw = dw + turn * (across + a * _Z)
+            w = w + turn * v * _Z
+            force = m * dv + jnp.cross(dw, ms) + jnp.cross(w, jnp.cross(w, ms))
+            moment = _times(tensor, dw) + jnp.cross(w, _times(tensor, w)) + jnp.cross(ms, dv)
+            return (w, dw, dv), (force, moment)
+
+        def back(carry: tuple, link: tuple) -> tuple[tuple, Array]:
+            r, p, turn, force, moment = link
+            force, moment = carry[0] + force, carry[1] + moment
+            along = turn * moment[2] + (1.0 - turn) * force[2]
+            force = _times(r, force)
+            return (force, _times(r, moment) + jnp.cross(p, force)), along
+
+        rest = jnp.zeros(3)
+        links = (axes, origins, turns, qd, qdd, body)
+        _, (forces, moments) = jax.lax.scan(out, (rest, rest, -self.gravity_vector), links)
+        links = (axes, origins, turns, forces, moments)
+        _, tau = jax.lax.scan(back, (rest, rest), links, reverse=True)
+        return tau if self.rotor_inertia is None else tau + self.rotor_inertia * qdd
+
+    def _first_moments(self) -> Float[Array, "n 3"]:
+        return jnp.stack([self.first_moment_x, self.first_moment_y, self.first_moment_z], axis=-1)
+
+    def _tensors(self) -> Float[Array, "n 3 3"]:
+        xx, xy, xz = self.inertia_xx, self.inertia_xy, self.inertia_xz
+        yy, yz, zz = self.inertia_yy, self.inertia_yz, self.inertia_zz
+        rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _times(matrix: Float[Array, "3 3"], x: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Matrix times vector, without a call to a matrix library: these stand in loops."""
+    return jnp.sum(matrix * x, axis=1)
+
+
+def _into(axes: Float[Array, "3 3"], x: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Components of a vector along a frame's axes."""
+    return jnp.sum(axes * x[:, None], axis=0)

@@ -1,0 +1,248 @@
+"""The arm through the case file: identified from other physics, simulated, and refused where it is wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from case_faults import message
+from cli_setup import run
+from two_links import TwoLinks, followed
+from written_logs import write_csv
+
+from jaxid.base_parameters import base_parameters
+from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.io.case import load_case
+from jaxid.machine import build_machine
+from jaxid.session import open_session
+
+FRICTION = """
+[[effects]]
+kind = "viscous_friction"
+coefficient = {viscous}
+[[effects]]
+kind = "coulomb_friction"
+level = {coulomb}
+"""
+LOG = '[log]\ntime = "t"\nposition = ["q1", "q2"]\nforce = ["u1", "u2"]\n'
+UNKNOWN = "[{ guess = 0.1 }, { guess = 0.1 }]"
+# A guess of nothing where something is, and tenfold too little where something must be.
+BASE = (
+    ("0.0", "[{ guess = 0.0 }, { guess = 0.0 }, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, { guess = 0.1 }]"),
+) * 2
+WHOLE = (
+    (
+        "{ guess = 1.0 }", "[{ guess = 0.0 }, { guess = 0.0 }, { guess = 0.0 }]",
+        "{ guess = [0.1, 0.0, 0.0, 0.1, 0.0, 0.1] }",
+    ),
+) * 2
+
+
+def text(links=BASE, viscous=UNKNOWN, coulomb=UNKNOWN, rest=LOG) -> str:
+    tables = [
+        f'[[plant.links]]\njoint = "revolute"\nalpha_deg = 0.0\na = {a}\n'
+        f"mass = {mass}\nfirst_moment = {first}\ninertia = {inertia}\n"
+        for a, (mass, first, inertia) in zip((0.0, 0.5), links, strict=True)
+    ]
+    plant = '[plant]\nkind = "serial_arm"\ngravity_vector = [0.0, -9.81, 0.0]\n'
+    friction = FRICTION.format(viscous=viscous, coulomb=coulomb) if viscous else ""
+    return plant + "".join(tables) + friction + rest
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return write_csv(tmp_path_factory.mktemp("log") / "log.csv", followed(TwoLinks()))
+
+
+@pytest.fixture(scope="module")
+def estimates(log, tmp_path_factory):
+    """Fits of the base parameters alone, and of all twenty inertial parameters."""
+    out = {}
+    for name, links in (("base", BASE), ("whole", WHOLE)):
+        path = tmp_path_factory.mktemp(name) / "case.toml"
+        path.write_text(text(links))
+        session = open_session(path, log)
+        out[name] = inverse_dynamics(session.machine, session.fit.data)
+    return out
+
+
+def truth():
+    arm = TwoLinks()
+    friction = {"viscous_friction": "coefficient", "coulomb_friction": "level"}
+    values = dict(zip(friction, (arm.viscous, arm.coulomb), strict=True))
+    return arm.base | {
+        f"{kind}[{k + 1}].{key}": values[kind][k] for kind, key in friction.items() for k in range(2)
+    }
+
+
+def test_base_parameters_of_two_links_come_back(estimates):
+    estimate = estimates["base"]
+    assert estimate.converged
+    assert set(estimate.names) == set(truth())
+    for name, value, std in zip(estimate.names, estimate.theta, estimate.std, strict=True):
+        assert abs(value - truth()[name]) < 3 * std, name
+        assert std < 0.01 * max(abs(truth()[name]), 1.0), name
+    # and the start is off by far more than that
+    off = np.abs(estimate.precision.std[:6]) * 10
+    assert np.all(np.abs([truth()[n] - 0.1 for n in estimate.names[:6]]) > off)
+
+
+def test_what_a_log_cannot_tell_is_named_and_has_no_sigma(estimates):
+    estimate, told = estimates["whole"], estimates["base"]
+    assert estimate.converged
+    std = dict(zip(estimate.names, estimate.std, strict=True))
+    blind = {n for n in estimate.names if np.isnan(std[n])}
+    # 20 unknowns, 6 combinations; of those that no torque depends on none is told
+    assert blind >= {
+        "mass[1]", "inertia_xx[1]", "inertia_yy[2]", "inertia_yz[2]", "first_moment_z[2]", "mass[2]",
+    }
+    # what stands in no sum with another is told
+    for name in ("first_moment_x[2]", "first_moment_y[2]", "inertia_zz[2]"):
+        assert std[name] > 0
+    # link 2's mass beside the first link's first moment and inertia: untold together
+    named = [set(c) for c in estimate.precision.unidentifiable]
+    assert len(named) == 20 - 6
+    assert any({"first_moment_x[1]", "inertia_zz[1]", "mass[2]"} & n for n in named)
+    found = base_parameters(estimate.machine.plant)
+    values = dict(zip(found.chosen_names, found.of(estimate.machine.plant), strict=True))
+    assert set(values) == set(TwoLinks().base)
+    for name, value, sigma in zip(told.names, told.theta, told.std, strict=True):
+        if name in values:
+            assert abs(values[name] - truth()[name]) < 3 * sigma, name
+            assert abs(values[name] - value) < 0.1 * sigma, name
+
+
+def true_values(arm: TwoLinks) -> tuple:
+    """The links with their own values, in full."""
+    def link(m, x, y, inertia):
+        own = f"[0.01, {-m * x * y}, 0.0, 0.01, 0.0, {inertia + m * (x**2 + y**2)}]"
+        return str(m), f"[{m * x}, {m * y}, 0.0]", own
+
+    return link(arm.m1, arm.x1, 0.0, arm.i1), link(arm.m2, arm.x2, arm.y2, arm.i2)
+
+
+def test_open_loop_simulation_is_the_closed_form(tmp_path, capsys):
+    arm = dataclasses.replace(TwoLinks(), coulomb=(0.0, 0.0))
+    rest = LOG + (
+        '[input]\nkind = "multisine"\nband_hz = [0.5, 3.0]\namplitude = [4.0, 2.0]\noffset = [14.0, 4.0]\n'
+        "[simulation]\nduration = 1.0\nsample_rate = 500.0\ninitial_position = [0.3, -0.8]\n"
+    )
+    values = text(true_values(arm), viscous="[1.5, 0.8]", coulomb="[0.0, 0.0]", rest=rest)
+    path = tmp_path / "case.toml"
+    path.write_text(values)
+    ran = run(capsys, "simulate", path, "-o", tmp_path / "log.csv")
+    assert (ran.status, ran.err) == (0, "")
+    rows = np.genfromtxt(tmp_path / "log.csv", delimiter=",", names=True)
+    x, q = (0.3, -0.8, 0.0, 0.0), []
+    for u in zip(rows["u1"], rows["u2"], strict=True):
+        q.append(x[:2])
+        x = arm.advance(x, u, 0.2e-3, 10)
+    swing = np.ptp(q, axis=0)
+    assert np.all(swing > 0.1)
+    # a fourth-order step of 0.5 ms
+    np.testing.assert_allclose(np.stack([rows["q1"], rows["q2"]], axis=-1), q, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_command_line_goes_from_simulated_loop_to_result(tmp_path, capsys):
+    rest = LOG.replace('"u2"]', '"u2"]\nreference = ["r1", "r2"]') + (
+        '[controller]\nkind = "pd"\nkp = [300.0, 150.0]\nkd = [30.0, 10.0]\nperiod = 0.002\n'
+        "[sensor]\nposition_noise = 1e-5\n"
+        '[reference]\nkind = "multisine"\nband_hz = [0.2, 2.0]\namplitude = [1.0, 1.5]\n'
+        "[simulation]\nduration = 6.0\nsample_rate = 500.0\n"
+    )
+    links = [
+        (
+            mass, f"[{{ guess = 0.0, true = {first} }}, 0.0, 0.0]",
+            f"[0.0, 0.0, 0.0, 0.0, 0.0, {{ guess = 0.1, true = {second} }}]",
+        )
+        for mass, first, second in ((0.0, 1.6, 0.7), (1.0, 0.5, 0.2))
+    ]
+    levels = "[{ guess = 0.1, true = 2.0 }, { guess = 0.1, true = 1.0 }]"
+    path, made = tmp_path / "case.toml", tmp_path / "log.csv"
+    path.write_text(text(links, viscous="[{ guess = 0.1, true = 1.5 }, 0.8]", coulomb=levels, rest=rest))
+    assert run(capsys, "simulate", path, "-o", made, "--seed", 1).status == 0
+    argv = ("identify", path, made, "--method", "inverse_dynamics")
+    ran = run(capsys, *argv, folder=tmp_path / "out")
+    assert (ran.status, ran.err) == (0, "")
+    found = ran.json("result.json")["parameters"]
+    assert found["inertia_zz"]["unit"] == "kg m^2"
+    assert found["first_moment_x"]["unit"] == "kg m"
+    for name, values in (("inertia_zz", (0.7, 0.2)), ("first_moment_x", (1.6, 0.5))):
+        for value, std, true in zip(found[name]["value"], found[name]["std"], values, strict=True):
+            assert abs(value - true) < 4 * std, name
+
+
+GOOD = text()
+LINK = "[[plant.links]]"
+FAULTS = {
+    "joint": (
+        ('joint = "revolute"', 'joint = "helical"'), ["links]] 1", "joint", "helical", "revolute, prismatic"],
+    ),
+    "missing row": (("a = 0.5\n", ""), ["[[plant.links]] 2", "'a' is missing", "[m]"]),
+    "missing angle": (("alpha_deg = 0.0\n", ""), ["links]] 1", "'alpha' is missing", "alpha_deg"]),
+    "angle twice": (("alpha_deg = 0.0", "alpha_deg = 0.0\nalpha = 0.0"), ["both alpha and alpha_deg"]),
+    "missing mass": (("mass = 0.0\n", ""), ["links]] 1", "'mass' is missing", "{ guess = ... }"]),
+    "negative mass": (("mass = 0.0", "mass = -1.0"), ["mass = -1.0 is negative"]),
+    "columns": (
+        ("[0.0, 0.0, 0.0, 0.0, 0.0, {", "[0.0, 0.0, 0.0, 0.0, {"), ["inertia", "5 entries", "6 in a list"],
+    ),
+    "no list": (
+        ("first_moment = [{ guess = 0.0 }, { guess = 0.0 }, 0.0]", "first_moment = 0.0"),
+        ["first_moment = 0.0 is not a list; give 3 entries: x, y, z"],
+    ),
+    "unknown key": (("mass = 0.0", "mas = 0.0"), ["links]] 1", "'mas'", "'mass'"]),
+    "gravity": (("= [0.0, -9.81, 0.0]", "= [0.0, -9.81]"), ["gravity_vector", "3"]),
+    "scalar gravity": (
+        ("gravity_vector = [0.0, -9.81, 0.0]", "gravity = 9.81"), ["'gravity'", "gravity_vector"],
+    ),
+    "guessed length": (("a = 0.5", "a = { guess = 0.5 }"), ["a", "must be a known number"]),
+    "parameters": (("[log]", "[plant.parameters]\nmass = 1.0\n[log]"), ["'parameters'", "there is: kind"]),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_told_in_one_line(tmp_path, fault):
+    (old, new), words = FAULTS[fault]
+    assert old in GOOD
+    told = message(tmp_path, GOOD.replace(old, new, 1))
+    assert not [word for word in words if word not in told], told
+
+
+@pytest.mark.parametrize(
+    ("plant", "words"),
+    [
+        ('kind = "serial_arm"', "'links' is missing; add a table [[plant.links]] for each"),
+        ('kind = "serial_arm"\nlinks = []', "links has 0 entries; an arm has 1 to 50"),
+        ('kind = "serial_arm"\nlinks = 3', "links is not a list of tables; write [[plant.links]]"),
+    ],
+)
+def test_links_must_be_there(tmp_path, plant, words):
+    assert words in message(tmp_path, f"[plant]\n{plant}\n")
+
+
+def test_massless_arm_is_not_simulated(tmp_path, capsys):
+    none = ("0.0", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.0]")
+    rest = LOG + '[input]\nkind = "fourier"\nbase_frequency_hz = 1.0\nsine = [1.0]\n'
+    rest += "[simulation]\nduration = 1.0\nsample_rate = 100.0\n"
+    path = tmp_path / "case.toml"
+    path.write_text(text((BASE[0], none), rest=rest))
+    ran = run(capsys, "simulate", path, "-o", tmp_path / "log.csv")
+    assert ran.status == 2
+    assert "mass matrix at initial_position is not positive definite (least about joint 2)" in ran.err
+    assert ran.err.count("\n") == 1
+
+
+def test_rotors_and_units_by_joint(tmp_path):
+    slide = GOOD.replace('joint = "revolute"\nalpha_deg = 0.0\na = 0.5', (
+        'joint = "prismatic"\nalpha_deg = 90.0\na = 0.5\nrotor_inertia = { guess = 3.0 }'))
+    path = tmp_path / "case.toml"
+    path.write_text(slide)
+    built = build_machine(load_case(path))
+    assert built.plant.geometry.joints == ("revolute", "prismatic")
+    assert float(built.plant.geometry.alpha[1]) == np.pi / 2
+    np.testing.assert_array_equal(built.plant.rotor_inertia, [0.0, 3.0])
+    units = {f.name: f.unit for f in built.parameters.free}
+    assert units["rotor_inertia[2]"] == "kg"
+    assert units["inertia_zz[2]"] == "kg m^2"
+    assert units["viscous_friction[1].coefficient"] == "N m s/rad"
+    assert units["viscous_friction[2].coefficient"] == "N s/m"
