@@ -46,7 +46,7 @@ class Root(Effect):
 
 
 class Unsized(Effect):
-    strength: object = parameter("inertia*position", "free", "k")
+    strength: object = parameter("gravity", "free", "k")
 
     def act(self, x, state):
         return Action(force=-self.strength * x.yd)

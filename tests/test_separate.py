@@ -201,7 +201,7 @@ def test_no_more_evaluations_than_may_be_spent():
         return float(np.sum((p - 3.0) ** 4)), 4 * (p - 3.0) ** 3
 
     start = np.zeros(3)
-    value, where = separate._improved(bowl, start, bowl(start), 4)
+    value, where = separate.improved(bowl, start, bowl(start), 4)
     assert len(asked) == 1 + 4
     assert value == min(np.sum((p - 3.0) ** 4) for p in asked)
     assert value < np.sum((start - 3.0) ** 4)
