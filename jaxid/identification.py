@@ -192,7 +192,7 @@ def _shown(machine: Machine, log: Log) -> SimulationGap | None:
 
 def simulated(machine: Machine, log: Log, *, at_rest: bool = False) -> SimulationGap | None:
     """Gap in position over the whole log; None where the simulation cannot run or diverges."""
-    if machine.controller is not None and log.reference is None:
+    if machine.controller is not None and log.reference is None and machine.course is None:
         machine = replace(machine, controller=None)
     # Nothing is differentiated here: friction sticks exactly, break-away friction too.
     try:

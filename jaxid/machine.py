@@ -45,7 +45,7 @@ class Machine:
             start [s], or the name of a column of the log; None: none.
         sensor: What is known of the measurement.
         hold: How the command runs between samples.
-        course: The reference of the loop, where it has unknowns; None: that of the log.
+        course: What the loop followed, with its unknowns, in a log that has no reference; None: unknown.
     """
 
     plant: Plant

@@ -132,27 +132,27 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
             f"{log.source}: one sample every {log.period:g} s is no whole multiple of the "
             f"controller's period {period:g} s; resample the log or correct [controller] period."
         )
-    if log.reference is None:
+    if log.reference is None and machine.course is None:
         raise InputError(
             f"{log.source}: the loop cannot be simulated without a reference; name its column "
             "as reference in [log], or leave out [controller] to simulate from the measured force."
         )
     driven = log.force.shape[1]
-    if log.reference.shape[1] not in (1, driven):
+    if log.reference is not None and log.reference.shape[1] not in (1, driven):
         raise InputError(
             f"{log.source}: the reference has {log.reference.shape[1]} columns for {driven} drives; "
             "name one a drive in [log]."
         )
     ticks = log.time[0] + period * np.arange((log.samples - 1) * every + 1)
-    if every == 1:
+    if log.reference is None:
+        reference, times = machine.course.at(ticks - log.time[0]), ticks
+    elif every == 1:
         reference, times = log.reference, log.time
     else:
         # Akima's cubic passes a ramp of speed exactly and does not ring at a step. A line between samples
         # ten ticks apart is off by a hundredth of a millimetre at 0.8 m/s^2, and bends an inertia by 10 %.
         curve = scipy.interpolate.Akima1DInterpolator(log.time, log.reference, axis=0)
         reference, times = curve(np.minimum(ticks, log.time[-1])), ticks
-    if machine.course is not None:
-        reference = machine.course.at(ticks - log.time[0])
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"), machine.controller,

@@ -163,8 +163,10 @@ def _read(
 
 
 def _followed(case: Case, log: Log) -> Log:
-    """The log with the reference that the case states, where the log has none."""
+    """The log with the reference that the case knows, where the log has none."""
     if log.reference is not None or case.controller is None or case.reference is None:
+        return log
+    if case.unknown_reference:
         return log
     rate = 1 / log.period
     reference = make_reference(case.reference, rate, log.samples / rate, case.folder)

@@ -107,6 +107,18 @@ def test_machine_and_reference_are_found_together(case, log):
     assert found.gaps[0].simulation.relative[0] < 1e-3
 
 
+def test_another_log_is_simulated_with_the_reference_that_it_has(case, log):
+    """Its motion is another one, and what the fitted log followed is nothing to it."""
+    reference = 0.1 * (1 - np.cos(2 * np.pi * 1.5 * np.arange(2000) / 1000))
+    machine = Machine(95.0, {"viscous_friction": {"coefficient": 203.0}, "coulomb_friction": {"level": 20.0}})
+    loop = Loop("cascade_pd", reference=reference, kp=60.0, kv=3000.0)
+    made = simulate(machine, loop, Sensor(position_noise=1e-7), rate=1000.0, duration=2.0)
+    columns = {k: made[k][:, None] for k in ("position", "force")}
+    other = Log(time=made["t"], **columns, reference=reference[:, None], source="other")
+    found = jaxid.identify(case(AXIS + table()), log, validate=[other])
+    assert found.gaps[1].simulation.relative[0] < 1e-3
+
+
 def test_a_hundred_samples_of_a_stage_tell_its_reference_too(case):
     move = stages.MOVES[1]
     true = {"onset": move["onset"], "speed": move["speed"] / stages.R}

@@ -65,7 +65,6 @@ def discover(
         InputError: If case or log are unsound.
     """
     session = open_session(case, log, validate, align_hold=True, method="discover")
-    need_known_reference(session, "what it is would be taken for an effect")
     return explore(session, max_effects=max_effects, refit=refit, progress=progress)
 
 
@@ -78,7 +77,11 @@ def explore(
     Args:
         session: Case and logs, prepared with the hold aligned.
         max_effects, refit, progress: As there.
+
+    Raises:
+        InputError: If the reference has unknowns.
     """
+    need_known_reference(session, "what it is would be taken for an effect")
     data = session.fit.data
     progress("fitting what is there")
     baseline, search = start_search(session, progress)

@@ -87,13 +87,15 @@ class Runner:
         machine = at.machine.with_estimate(start)
         rows = []
         virtual = yield from at.scene.virtual(at.scene.machine.with_estimate(truth), rng)
-        session = session_around(at.model, machine, virtual.log, ways.recipe)
+        # What is unknown of a reference is not in the log.
+        log = virtual.log if machine.course is None else replace(virtual.log, reference=None)
+        session = session_around(at.model, machine, log, ways.recipe)
         for method in plan.estimators:
             options = {"numerics": ways.numerics} if method in SIMULATING else {}
             try:
                 if method == DISCOVER:
                     aligned = replace(ways.recipe, align_hold=True)
-                    whole = session_around(at.model, machine, virtual.log, aligned)
+                    whole = session_around(at.model, machine, log, aligned)
                     rows.append(_found(plan, whole))
                     continue
                 rows.append(_row((yield from steps_of(method, session, **options))))
