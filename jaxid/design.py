@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.discovery.limits import Limits, Peaks
+from jaxid.discovery.limits import Limits, Peaks, kept_within
 from jaxid.discovery.rivals import Bounds
 from jaxid.discovery.separate import improved
 from jaxid.discovery.shapes import Shapes, basis
@@ -21,6 +21,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.directions_problem import Prior, residual_of, with_sensor
 from jaxid.io.case import Case, load_case
 from jaxid.io.output import write_whole
+from jaxid.io.proposals import signal_csv
 from jaxid.machine import Machine, build_machine
 from jaxid.model import Plant
 from jaxid.parameters import scatter
@@ -34,8 +35,6 @@ _PRIOR = 0.5
 _RUN_UP, _FASTEST = 0.02, 0.1
 # Starts that are improved, of those that tell most, and evaluations for each.
 _IMPROVED, _EVALUATIONS = 2, 25
-# Amplitudes tried until the machine keeps within its limits.
-_AMPLITUDES = (1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.15)
 # Of the controller's own limit: what saturates is no longer in the loop.
 _UNSATURATED = 0.95
 _BEYOND = 1e6
@@ -76,11 +75,7 @@ class Design:
 
     def csv(self) -> str:
         """Time and signal as `[reference] kind = "csv"` (or `[input]`) takes them, every digit kept."""
-        m = self.values.shape[1]
-        names = [self.signal] if m == 1 else [f"{self.signal}_{k + 1}" for k in range(m)]
-        rows = np.column_stack([self.time, self.values])
-        lines = [",".join(repr(float(v)) for v in row) for row in rows]
-        return "\n".join([",".join(["t", *names]), *lines]) + "\n"
+        return signal_csv(self.signal, self.time, self.values)
 
     def save(self, path: str | Path) -> Path:
         """Write the signal as CSV, whole or not at all."""
@@ -143,9 +138,6 @@ def design(case: Case | str | Path, *, progress: Callable[[str], None] = lambda 
         )
     best = max(kept, key=lambda k: bench.nats(k[0]))
     return bench.designed(*best, kept[0][0])
-
-
-_signal = eqx.filter_jit(lambda shapes, p: shapes(p))
 
 
 @dataclass(frozen=True)
@@ -211,12 +203,7 @@ class _Bench:
 
     def kept(self, p: np.ndarray) -> tuple[np.ndarray, Peaks] | None:
         """The signal of some numbers, at the largest amplitude at which the machine keeps to its limits."""
-        for factor in _AMPLITUDES:
-            signal = np.asarray(_signal(self.shapes, jnp.asarray(self.shapes.smaller(p, factor))))
-            peaks = self.peaks(signal)
-            if not self.limits.broken(peaks):
-                return signal, peaks
-        return None
+        return kept_within(self.limits, self.shapes, p, self.peaks)
 
     def information(self, signal: np.ndarray) -> np.ndarray:
         """Of a signal's log in units of the prior, the prior's included, (p, p)."""
@@ -291,7 +278,7 @@ def _weights(case: Case, bench: _Bench, samples: int) -> Float[np.ndarray, "time
     if bench.on in ("force", "both"):
         if sensor.force_noise is None:
             raise _no_noise(case, "force", "force_noise")
-        signal = np.asarray(_signal(bench.shapes, jnp.asarray(bench.starts[0])))
+        signal = bench.shapes.signal(bench.starts[0])
         runs = (_trajectory(bench.run(signal, s), bench.machine.plant) for s in (sensor, Sensor()))
         rounded, exact = (np.asarray(run.command) for run in runs)
         through = np.sqrt(np.mean((rounded - exact) ** 2, axis=0))

@@ -17,7 +17,7 @@ from jaxid.discovery.rivals import loss
 from jaxid.discovery.shapes import Shapes, basis
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
-from jaxid.io.proposals import proposal_csv, proposal_json, sentence
+from jaxid.io.proposals import proposal_json, sentence, signal_csv
 from jaxid.references import make_reference
 from jaxid.units import Units
 
@@ -95,7 +95,7 @@ def test_the_true_machine_keeps_within_the_limits(springs):
 
 def test_the_csv_is_read_back_as_the_reference(springs, tmp_path):
     _, proposal = springs
-    (tmp_path / proposal.file).write_text(proposal_csv(proposal))
+    (tmp_path / proposal.file).write_text(signal_csv(proposal.signal, proposal.time, proposal.values))
     table = {"kind": "csv", "file": proposal.file, "time": "t", "column": "reference"}
     read = make_reference(table, 1000.0, len(proposal.time) / 1000.0, tmp_path)
     np.testing.assert_allclose(read, proposal.values, atol=1e-12)
@@ -126,7 +126,7 @@ def test_an_open_loop_gets_an_input(tmp_path):
     assert np.abs(proposal.values).max() < 2.5
     ran = setups.again(setup, proposal)
     assert ran["true_position"].max() <= proposal.limits.high[0]
-    assert proposal_csv(proposal).startswith("t,input\n0.0,")
+    assert signal_csv(proposal.signal, proposal.time, proposal.values).startswith("t,input\n0.0,")
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +12,12 @@ from jaxtyping import Float
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.preprocess import Prepared
+
+if TYPE_CHECKING:
+    from jaxid.discovery.shapes import Shapes
+
+# Amplitudes tried until the machine keeps within its limits.
+_AMPLITUDES = (1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.15, 0.07)
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,27 @@ class Limits:
             or np.any(peaks.speed > self.speed) or np.any(peaks.force > self.force)
             or not np.all(np.isfinite(peaks.speed))
         )
+
+
+def kept_within(
+    limits: Limits, shapes: Shapes, p: Float[np.ndarray, " p"], peaks_of: Callable[[np.ndarray], Peaks]
+) -> tuple[Float[np.ndarray, "time m"], Peaks] | None:
+    """The signal of some numbers at the largest amplitude at which a machine keeps to its limits.
+
+    Args:
+        limits: The limits.
+        shapes, p: The family of signals, and the numbers.
+        peaks_of: How far the machine goes under a signal.
+
+    Returns:
+        The signal and how far it goes; None where it goes beyond whatever the amplitude.
+    """
+    for factor in _AMPLITUDES:
+        signal = shapes.signal(shapes.smaller(p, factor))
+        peaks = peaks_of(signal)
+        if not limits.broken(peaks):
+            return signal, peaks
+    return None
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.limits import Limits, Peaks
+from jaxid.discovery.limits import Limits, Peaks, kept_within
 from jaxid.discovery.rehearsal import Outcome, Stage, compared, exact
 from jaxid.discovery.rivals import Bench, Bounds, Duel, Pair, loss
 from jaxid.discovery.screen import Score
@@ -46,8 +45,6 @@ _FEWEST = 8
 _SMOOTH = 4
 # Order of the noise's model, as in the search.
 _ORDER = 20
-# Amplitudes tried until the machine keeps within its limits, whichever rival it is.
-_AMPLITUDES = (1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.15, 0.07)
 # Alternatives of one effect for which an experiment is sought: the next where one cannot be.
 _RIVALS = 2
 # Samples of past command that a loop keeps for a delay, as in a replay.
@@ -151,7 +148,7 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
     shapes, starts = _family(session, limits, bench)
     best, outcome, peaks = None, None, None
     for p in _optimised(starts, bench, Duel.of(rounded), shapes, limits):
-        fitting = _within(stage, pair, shapes, p, limits)
+        fitting = kept_within(limits, shapes, p, lambda signal: stage.peaks(pair, signal))
         if fitting is None:
             continue
         signal, reached = fitting
@@ -297,18 +294,3 @@ def improved(
 
 class _Spent(Exception):
     """The evaluations that may be spent are spent."""
-
-
-def _within(
-    stage: Stage, pair: Pair, shapes: Shapes, p: np.ndarray, limits: Limits
-) -> tuple[np.ndarray, Peaks] | None:
-    """The signal at the largest amplitude at which the machine keeps to its limits; None for none."""
-    for factor in _AMPLITUDES:
-        signal = np.asarray(_signal(shapes, jnp.asarray(shapes.smaller(p, factor))))
-        peaks = stage.peaks(pair, signal)
-        if not limits.broken(peaks):
-            return signal, peaks
-    return None
-
-
-_signal = eqx.filter_jit(lambda shapes, p: shapes(p))

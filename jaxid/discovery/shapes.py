@@ -62,6 +62,10 @@ class Shapes(eqx.Module):
         scale = 1.0 / largest(needs)
         return centre + jax.nn.sigmoid(p[-1]) * scale * x
 
+    def signal(self, p: Float[np.ndarray, " p"]) -> Float[np.ndarray, "time n"]:
+        """The signal of some numbers, compiled."""
+        return np.asarray(_signal(self, jnp.asarray(p)))
+
     def numbers(self, weights: Float[np.ndarray, " k"], centre: float = 0.0) -> np.ndarray:
         """Numbers of a signal in which all joints have the same weights; 0.98 of the amplitude."""
         n = self.low.size
@@ -71,6 +75,9 @@ class Shapes(eqx.Module):
         """The same signal with its amplitude times a factor below one."""
         amplitude = factor / (1 + np.exp(-p[-1]))
         return np.append(p[:-1], np.log(amplitude / (1 - amplitude)))
+
+
+_signal = eqx.filter_jit(lambda shapes, p: shapes(p))
 
 
 def largest(x: Float[Array, "time *n"]) -> Float[Array, "*n"]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.io.output import ready_folder, write_json, write_whole
-from jaxid.io.proposals import proposal_csv, proposal_json
+from jaxid.io.proposals import proposal_json, signal_csv
 from jaxid.parameters import leaf, several_places
 
 if TYPE_CHECKING:
@@ -299,7 +299,7 @@ def save_discovery(result: Discovery, folder: Path, *, force: bool = False) -> P
     ready_folder(folder, discovery_files(result), force=force)
     for proposal in result.proposals:
         if proposal.separates:
-            write_whole(folder / proposal.file, proposal_csv(proposal))
+            write_whole(folder / proposal.file, signal_csv(proposal.signal, proposal.time, proposal.values))
     write_whole(folder / "report.html", discovery_report(result))
     write_json(folder / "discovery.json", discovery_json(result))
     return folder
