@@ -83,12 +83,12 @@ def directions_steps(
     p = len(machine.parameters.free)
     r, z = found.count, np.asarray(found.minimum.theta)
     remarks: list[str] = []
-    if hessian and told is not None:
+    if hessian and told is not None and rounds(machine, found):
+        remarks.append("rounding was simulated: the Hessian says nothing beside it")
+    elif hessian and told is not None:
         args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
         full = np.asarray((yield Solve(hessian_of, args)))[:r, :r]
-        if rounds(machine, found):
-            remarks.append("rounding was simulated: the Hessian says nothing beside it")
-        elif np.linalg.eigvalsh(full)[0] > 0.0:
+        if np.linalg.eigvalsh(full)[0] > 0.0:
             told = told_of(found, full)
         else:
             remarks.append("the cost does not curve upwards everywhere: Gauss-Newton's curvature was taken")
