@@ -131,6 +131,8 @@ def levenberg_marquardt(
         return Minimum(
             theta, cost, jnp.asarray(1), jnp.isfinite(cost), kept, jnp.zeros((kept.size, 0)),
         )
+    # Traced once, for its shape and for its Jacobian.
+    residual = jax.jit(residual)
     lower, upper = transform.inward(lower), transform.inward(upper)
     moves = jnp.ones(theta.size, bool) if active is None else active
 

@@ -318,10 +318,16 @@ def _turning_steps(machine: Machine, log: Log) -> int:
     n = log.position.shape[1]
     zero, u = jnp.zeros(n), jnp.zeros(log.force.shape[1])
     q = jnp.asarray(log.filled[0])
-    levels = plant.balance(q, zero, zero, u, jnp.zeros(()), plant.initial_states(u))
-    dry = np.asarray(levels.dry + levels.stick)[:n]
+    dry = np.asarray(_levels(plant, q, zero, u))[:n]
     off = _TURNING * np.max(np.abs(dry) / np.broadcast_to(np.asarray(inertia), n)) * period**2
     return int(np.clip(np.ceil(np.sqrt(off / (_LITTLE * np.min(noise[noise > 0])))), 1, _MOST))
+
+
+@eqx.filter_jit
+def _levels(plant: Plant, q: Array, v: Array, u: Array) -> Array:
+    """Dry friction at rest, what it takes to break away included."""
+    levels = plant.balance(q, v, v, u, jnp.zeros(()), plant.initial_states(u))
+    return levels.dry + levels.stick
 
 
 def _sharp_steps(machine: Machine, log: Log) -> int:
