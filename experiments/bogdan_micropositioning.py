@@ -12,7 +12,9 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from common import Table, parser_of
@@ -85,11 +87,11 @@ def off_in_sigma(estimate: Estimate, case: Path, log: Log, start: float, data: i
 
 
 def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, more: str = ON_FORCE,
-            resolution: float = stages.COUNT) -> Path:
+            **stated: Any) -> Path:
     """A case file; guesses at the truth, or drawn up to 50 % around it."""
     drawn = None if guess is None else stages.drawn(guess, data=data)
     path = folder / f"{name}.toml"
-    path.write_text(stages.text(data, guess=drawn, more=more, resolution=resolution))
+    path.write_text(stages.text(data, guess=drawn, more=more, **stated))
     return path
 
 
@@ -124,6 +126,50 @@ def published(folder: Path, runs: int) -> None:
             parts = " ".join(f"{v:+.2f} {n}" for n, v in d["combination"].items() if abs(v) > 0.15)
             print(f"  {0.5 * d['value']:+.3f} +- {0.5 * d['std']:.3f} ({off:+.1f} sigma): {parts}")
         bogdan_figures.fit(folder / f"data{data}.png", found, data)
+
+
+def begun(folder: Path, runs: int) -> None:
+    """Data 1 with the fit begun elsewhere than at the guesses."""
+    (log,), (begin,) = logs_of(1, 1)
+    table = Table(
+        "Data 1, the fit begun from", ["start", "criterion %", "evaluations", "combinations, in sigma off"]
+    )
+    start = time.perf_counter()
+    for name in ("guess", "inverse_dynamics", "recursive"):
+        case = case_of(folder, f"from_{name}", 1, guess=1, more=f'{ON_FORCE}start = "{name}"\n')
+        estimate = jaxid.identify(case, log).estimate
+        off = off_in_sigma(estimate, case, log, begin, 1)
+        table.row(name, f"{estimate.details['criterion_percent']:.2f}", estimate.steps,
+                  ", ".join(f"{o:+.1f}" for o in off))
+    table.show(time.perf_counter() - start)
+
+
+# Guesses of what the reference was, over the truth.
+REFERENCE_OFF = {"onset": 1.4, "speed": 0.8, "acceleration": 1.3}
+
+
+def unrecorded(folder: Path, runs: int) -> None:
+    """Data 1 without its reference: onset, speed and ramp are fitted with the machine."""
+    start = time.perf_counter()
+    move = stages.MOVES[1]
+    speed = move["speed"] / stages.R
+    true = {"onset": move["onset"], "speed": speed, "acceleration": speed / stages.RAMP}
+    stated = f'[reference]\nkind = "trapezoid"\ntargets = [{move["distance"] / stages.R!r}]\nrepeat = false\n'
+    stated += "".join(f"{k} = {{ guess = {v * REFERENCE_OFF[k]!r} }}\n" for k, v in true.items())
+    case = case_of(folder, "unrecorded", 1, guess=1, more=ON_FORCE + stated, reference="")
+    (log,), _ = logs_of(1, 1)
+    found = jaxid.identify(case, replace(log, reference=None))
+    found.save(folder / "unrecorded", force=True)
+    table = Table(
+        f"Data 1 without its reference: criterion {found.estimate.details['criterion_percent']:.2f} %",
+        ["of the reference", "true", "guess", "found", "sigma"],
+    )
+    for name, std in zip(found.estimate.names, found.estimate.std, strict=True):
+        where, _, key = name.partition(".")
+        if where == "reference":
+            table.row(key, f"{true[key]:.4g}", f"{true[key] * REFERENCE_OFF[key]:.4g}",
+                      f"{found.value(name):.4g}", f"{std:.2g}" if np.isfinite(std) else "not told")
+    table.show(time.perf_counter() - start)
 
 
 def studied(
@@ -270,7 +316,8 @@ def hidden(folder: Path, runs: int) -> None:
 
 
 STUDIES: dict[str, Callable[[Path, int], None]] = {
-    f.__name__: f for f in (published, scatter, position, designed, needles, frictions, hidden)
+    f.__name__: f
+    for f in (published, begun, unrecorded, scatter, position, designed, needles, frictions, hidden)
 }
 
 
