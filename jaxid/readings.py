@@ -255,23 +255,40 @@ def _classical_step(
     h: Array,
     reaction: Array | None,
 ) -> State:
-    q, v = x.q, x.qd
-    half = 0.5 * h
+    def slope(q: Array, v: Array, part: Array, u: Array) -> Array:
+        return acceleration(plant, State(q, v, x.own), u, t + part * h, reaction)
 
-    def acc(q: Array, v: Array, s: float) -> Array:
-        s = jnp.asarray(s)
-        return acceleration(plant, State(q, v, x.own), u(s), t + s * h, reaction)
-
-    a1 = acc(q, v, 0.0)
+    parts = jnp.asarray([0.0, 0.5, 0.5, 1.0])
+    forces = [u(part) for part in parts]
+    if plant.linked:
+        return _rolled(slope, x, h, parts, jnp.stack(forces))
+    q, v, half = x.q, x.qd, 0.5 * h
+    a1 = slope(q, v, parts[0], forces[0])
     v2 = v + half * a1
-    a2 = acc(q + half * v, v2, 0.5)
+    a2 = slope(q + half * v, v2, parts[1], forces[1])
     v3 = v + half * a2
-    a3 = acc(q + half * v2, v3, 0.5)
+    a3 = slope(q + half * v2, v3, parts[2], forces[2])
     v4 = v + h * a3
-    a4 = acc(q + h * v3, v4, 1.0)
+    a4 = slope(q + h * v3, v4, parts[3], forces[3])
     q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
     v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
     return State(q, v, x.own)
+
+
+def _rolled(slope: Callable[..., Array], x: State, h: Array, parts: Array, forces: Array) -> State:
+    """The four stages as a loop: four copies of what it takes to accelerate an arm compile four times as long."""
+
+    def stage(carry: tuple, now: tuple) -> tuple[tuple, None]:
+        v, a, q_sum, v_sum = carry
+        part, weight, u = now
+        q, v = x.q + part * h * v, x.qd + part * h * a
+        a = slope(q, v, part, u)
+        return (v, a, q_sum + weight * v, v_sum + weight * a), None
+
+    zero = jnp.zeros_like(x.q)
+    weights = jnp.asarray([1.0, 2.0, 2.0, 1.0])
+    (_, _, q, v), _ = jax.lax.scan(stage, (x.qd, zero, zero, zero), (parts, weights, forces))
+    return State(x.q + h / 6 * q, x.qd + h / 6 * v, x.own)
 
 
 def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array) -> Affine | None:
