@@ -276,7 +276,7 @@ def _classical_step(
 
 
 def _rolled(slope: Callable[..., Array], x: State, h: Array, parts: Array, forces: Array) -> State:
-    """The four stages as a loop: four copies of what it takes to accelerate an arm compile four times as long."""
+    """The four stages as a loop: four copies of an arm compile four times as long."""
 
     def stage(carry: tuple, now: tuple) -> tuple[tuple, None]:
         v, a, q_sum, v_sum = carry
