@@ -184,3 +184,21 @@ def test_batches_of_many_unknowns_run_side_by_side():
     """LAPACK's batched factorisation, as jaxlib 0.10.2 has it, hangs here for ever."""
     done = subprocess.run([sys.executable, "-c", TOGETHER], capture_output=True, text=True, timeout=120)
     assert done.stdout == "done\n", done.stderr
+
+
+def test_what_only_rounding_moves_rests_at_its_guess():
+    """A column of 1e-16 beside others of one: solved for, it would be sent to 1e15."""
+    rng = np.random.default_rng(2)
+    x = rng.standard_normal((80, 4)) * np.array([1.0, 1.0, 1e-16, 1.0])
+    e = 0.1 * rng.standard_normal(80)
+    linear = Transform(np.zeros(4, bool))
+    data = x @ np.array([3.0, -2.0, 0.0, 5.0]) + e
+    minimum = levenberg_marquardt(
+        lambda theta: data - x @ theta, np.array([1.0, 1.0, 0.7, 0.0]), linear, np.full(4, -np.inf),
+        np.full(4, np.inf), damping=1e-10,
+    )
+    assert bool(minimum.converged)
+    assert int(minimum.steps) <= 4
+    assert float(minimum.theta[2]) == 0.7
+    best = np.linalg.lstsq(x[:, [0, 1, 3]], data)[0]
+    np.testing.assert_allclose(np.asarray(minimum.theta)[[0, 1, 3]], best, atol=0.01)

@@ -286,7 +286,8 @@ def force_precision(
     rows: np.ndarray,
 ) -> Precision:
     """Precision of a fit in the force domain; `size` is what `force_size` says."""
-    scale = np.where(theta != 0, theta, 1.0)
+    guess = machine.parameters.guess
+    scale = np.where(guess != 0, guess, 1.0)
     return assess(machine.parameters.names, jacobian, e, rows, float(size), scale)
 
 

@@ -25,6 +25,9 @@ _WHOLE = 1e-2
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
 _ROUGH = 1e-6
 _STUCK = 1e3
+# An unknown whose own size moves the first residual by less than this part of it is without effect: what its
+# column holds is rounding, and dividing by it sends the unknown to 1e15.
+_NOTHING = 1e-12
 
 
 class Transform(eqx.Module):
@@ -85,6 +88,7 @@ class _Progress(eqx.Module):
     kept: tuple[Array, Array]
     damping: Array
     growth: Array
+    moves: Array
     steps: Array
     done: Array
 
@@ -145,14 +149,15 @@ def levenberg_marquardt(
         return e, jacobian
 
     def advance(p: _Progress) -> _Progress:
-        return _advanced(p, *evaluate(p.trial), (lower, upper), moves, keep, tolerance)
+        return _advanced(p, *evaluate(p.trial), (lower, upper), own, keep, tolerance)
 
     x0 = jnp.clip(transform.inward(theta), lower, upper)
+    own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
     p, size = theta.size, jax.eval_shape(residual, theta).size if keep else 0
     start = _Progress(
         x0, jnp.asarray(0.0), x0, jnp.asarray(jnp.inf), jnp.zeros(p), jnp.zeros((p, p)),
         (jnp.zeros(size), jnp.zeros((size, p))), jnp.asarray(damping), jnp.asarray(2.0),
-        jnp.asarray(0), jnp.asarray(False),
+        moves, jnp.asarray(0), jnp.asarray(False),
     )
     end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, start)
     theta = transform.outward(end.x)
@@ -163,10 +168,10 @@ def levenberg_marquardt(
 
 
 def _advanced(
-    p: _Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
+    p: _Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], own: Float[Array, " p"],
     keep: bool, tolerance: float,
 ) -> _Progress:
-    """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
+    """Take or refuse the trial, given residual and Jacobian there, and choose the next; `own`: sizes."""
     lower, upper = bounds
     cost = 0.5 * e @ e
     first = p.steps == 0
@@ -179,6 +184,7 @@ def _advanced(
         (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept),
         (p.x, p.cost, p.gradient, p.normal, p.kept),
     )
+    moves = p.moves & (~first | (own * jnp.sqrt(jnp.diag(normal)) > _NOTHING * jnp.linalg.norm(e)))
     pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     aim = x + _step(gradient, normal, damping, moves & ~pressed)
     trial = jnp.clip(aim, lower, upper)
@@ -193,7 +199,7 @@ def _advanced(
     stuck = rough | (~better & (damping > 1e12))
     growth = jnp.where(better, 2.0, 2 * p.growth)
     return _Progress(
-        trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.steps + 1,
+        trial, predicted, x, cost, gradient, normal, kept, damping, growth, moves, p.steps + 1,
         small | stuck | ~jnp.isfinite(cost),
     )
 
