@@ -250,15 +250,26 @@ def assess(
     seen = vectors[:, ~blind]
     inverse = seen @ np.diag(1 / values[~blind]) @ seen.T if (~blind).any() else 0 * normal
     covariance = inverse @ meat @ inverse / np.outer(norm, norm)
-    weight = np.abs(vectors[:, blind])
-    identifiable = ~np.any(weight > _NEGLIGIBLE, axis=1)
+    identifiable = np.linalg.norm(vectors[:, blind], axis=1) <= _NEGLIGIBLE
     covariance[~identifiable] = np.nan
     covariance[:, ~identifiable] = np.nan
     combinations = [
         {n: float(w) for n, w in zip(names, _signed(v), strict=True) if abs(w) > _NEGLIGIBLE}
-        for v in vectors[:, blind].T
+        for v in _sparse(vectors[:, blind]).T
     ]
     return Precision(covariance, identifiable, combinations, values / max(values[-1], 1e-300))
+
+
+def _sparse(vectors: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
+    """A basis of the same space of which each vector is the only one to hold some unknown.
+
+    Eigenvectors of one eigenvalue are mixed at will: of an arm's two dozen each would name every link.
+    """
+    if vectors.shape[1] < 2:
+        return vectors
+    own = scipy.linalg.qr(vectors.T, mode="r", pivoting=True)[1][: vectors.shape[1]]
+    basis = np.linalg.solve(vectors[np.sort(own)].T, vectors.T).T
+    return basis / np.linalg.norm(basis, axis=0)
 
 
 def _signed(v: np.ndarray) -> np.ndarray:

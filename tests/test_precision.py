@@ -187,6 +187,23 @@ def test_parameter_below_the_noise_is_not_told():
     assert precision_of(x, 1e-3 * e).identifiable.all()
 
 
+def test_each_untold_combination_names_what_no_other_does():
+    """Three columns proportional to one another, two others alike: whatever mixture eigenvectors are."""
+    rng = np.random.default_rng(11)
+    one, two, own = rng.standard_normal((3, 400))
+    x = np.stack([one, 2 * one, -one, two, two, own], axis=1)
+    e = 0.1 * rng.standard_normal((400, 1))
+    names = ["a", "b", "c", "d", "e", "f"]
+    got = assess(names, x[:, None], e, np.ones((400, 1), bool), np.linalg.norm(x @ np.ones(6)), np.ones(6))
+    np.testing.assert_array_equal(got.identifiable, [False] * 5 + [True])
+    assert len(got.unidentifiable) == 3
+    assert sorted("".join(sorted(c)) for c in got.unidentifiable)[-1] == "de"
+    for combination in got.unidentifiable:
+        assert len(combination) == 2
+        change = np.array([combination.get(n, 0.0) for n in names]) / np.linalg.norm(x, axis=0)
+        assert np.linalg.norm(x @ change) < 1e-9
+
+
 def test_first_leaves_nuisances_out():
     x = regressor()
     e = np.random.default_rng(10).standard_normal(len(x))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -116,12 +116,22 @@ def discovery_table(result: Discovery) -> str:
 
 
 def _blind(estimate: Estimate) -> list[str]:
-    """Combinations that the log does not tell; a fit within a prior holds them."""
-    said = "held at the guesses" if "directions" in estimate.details else "cannot be told apart"
-    return [
-        f"{said}: " + ", ".join(f"{w:+.2f} {n}" for n, w in c.items())
-        for c in estimate.precision.unidentifiable
-    ]
+    """What the log does not tell; a fit within a prior holds it."""
+    combinations = estimate.precision.unidentifiable
+    if "directions" in estimate.details:
+        return [f"held at the guesses: {_sum(c)}" for c in combinations]
+    return _untold(combinations)
+
+
+def _untold(combinations: Sequence[Mapping[str, float]]) -> list[str]:
+    """Unknowns that are without effect, and combinations that are, a line each."""
+    alone = [name for c in combinations if len(c) == 1 for name in c]
+    lines = [f"cannot be told: {', '.join(alone)}"] if alone else []
+    return lines + [f"cannot be told apart: {_sum(c)}" for c in combinations if len(c) > 1]
+
+
+def _sum(combination: Mapping[str, float]) -> str:
+    return ", ".join(f"{w:+.2f} {n}" for n, w in combination.items())
 
 
 def _notes(lines: Sequence[str]) -> list[str]:
@@ -153,10 +163,7 @@ def check_table(result: Any) -> str:
     for name, p in content["parameters"].items():
         best = f"{p['expected_std']:.2g}" if p["identifiable"] else "this log cannot tell it"
         rows.append([name, f"{p['guess']:.4g}", best, p["unit"]])
-    blind = [
-        "cannot be told apart: " + ", ".join(f"{w:+.2f} {n}" for n, w in c["combination"].items())
-        for c in content["unidentifiable"]
-    ]
+    blind = _untold([c["combination"] for c in content["unidentifiable"]])
     table = ["", aligned(rows)] if len(rows) > 1 else []
     return "\n".join(["the log is sound", head, how, *table, *blind, *_notes(content["warnings"])])
 
