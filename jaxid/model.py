@@ -22,6 +22,8 @@ from jaxid import smooth
 from jaxid.alike import acted, alike
 
 SIGNS = ("free", "nonnegative", "positive")
+# What the ports of a plant may be called; they count from 1 by kind.
+PLACES = ("joint", "spring", "shaft")
 
 
 @dataclass(frozen=True)
@@ -302,6 +304,11 @@ class Plant(eqx.Module):
         """Coordinates on which effects act: the joints, and behind them what else there is."""
         return q
 
+    @property
+    def ports_are_joints(self) -> bool:
+        """Whether there is nothing else: to differentiate `ports` takes half of all compile time."""
+        return type(self).ports is Plant.ports
+
     def own_inertia(self) -> Array | None:
         """What a force on each joint accelerates of it alone [kg or kg m^2]; None where that varies."""
         return None
@@ -329,7 +336,7 @@ class Plant(eqx.Module):
         return ()
 
     def place(self, port: int) -> tuple[str, int]:
-        """What a port is called: a joint or a spring, counted from 1."""
+        """What a port is called: one of `PLACES`, and which, counted from 1."""
         parts = self.parts(self.joints)
         return ("joint", port + 1) if port < parts else ("spring", port - parts + 1)
 
@@ -507,7 +514,7 @@ def port_motion(
     plant: Plant, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array, Array]:
     """Coordinate, velocity and acceleration of the ports by forward-mode differentiation."""
-    if _ports_are_joints(plant):
+    if plant.ports_are_joints:
         return q, qd, qdd
 
     def velocity(q: Array, qd: Array) -> tuple[Array, Array]:
@@ -519,12 +526,7 @@ def port_motion(
 
 def _pull_back(plant: Plant, q: Array, force: Array) -> Array:
     """Generalized force of forces on the ports: the transposed Jacobian."""
-    return force if _ports_are_joints(plant) else jax.vjp(plant.ports, q)[1](force)[0]
-
-
-def _ports_are_joints(plant: Plant) -> bool:
-    """Whether there is nothing to differentiate, which takes half of all compile time."""
-    return type(plant).ports is Plant.ports
+    return force if plant.ports_are_joints else jax.vjp(plant.ports, q)[1](force)[0]
 
 
 def _stack(parts: list[Array | float]) -> Array:

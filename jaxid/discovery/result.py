@@ -26,7 +26,7 @@ class Found:
     Args:
         kind: Its name.
         label: Kind and place, as results name it.
-        place: "joint" or "spring", and which, 1-based.
+        place: one of `PLACES`, and which, 1-based.
         names: Names of its parameters in the estimate.
         score: Its evidence when it was added.
         alternatives: Effects that this log cannot tell from it.

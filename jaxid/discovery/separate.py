@@ -60,7 +60,7 @@ class Proposal:
     Args:
         named: The effect that was named, with its place.
         rival: The other.
-        places: Where each acts: "joint" or "spring", and which, 1-based.
+        places: Where each acts: one of `PLACES`, and which, 1-based.
         signal: "reference" for a loop, "input" for open loop.
         time: Ticks [s].
         values: Reference or command at each, (ticks, m); None where no experiment was found.

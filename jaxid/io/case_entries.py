@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.io.case_links import LINKED, count_links, read_links
+from jaxid.io.case_links import LINKED, count_links, read_links, read_shafts
 from jaxid.io.case_places import check_places, read_ports
 from jaxid.io.case_tables import PLANNED_PLANTS, PLANT
 from jaxid.io.case_values import Value, read_value, read_values
@@ -27,7 +27,7 @@ from jaxid.io.schema import (
     whole,
 )
 from jaxid.io.user_effect import user_effect
-from jaxid.model import Effect, ParameterInfo, Plant, parameters_of
+from jaxid.model import PLACES, Effect, ParameterInfo, Plant, parameters_of
 from jaxid.plants import PLANTS
 from jaxid.units import Units
 
@@ -47,7 +47,7 @@ class PlantEntry:
         gravity: Its acceleration [m/s^2]; None: the class's own.
         joints: How many there are.
         actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
-        options: What else its class takes, by field: the geometry of an arm.
+        options: What else its class takes, by field: the geometry and the shafts of an arm.
     """
 
     cls: type[Plant]
@@ -72,7 +72,7 @@ class EffectEntry:
     Args:
         cls: Its class.
         parameters: By name, one value for each of `ports`.
-        ports: Where it acts: joints from 0 on, and behind them the springs.
+        ports: Where it acts: joints from 0 on, and behind them springs or shafts.
     """
 
     cls: type[Effect]
@@ -134,6 +134,8 @@ def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot:
     given = read_table(table, {**own, **LINKED}, spot)
     parameters, geometry = read_links(table["links"], cls, spot.file)
     options = {name: given[name] for name in ("gravity_vector",) if name in given}
+    if "shafts" in table:
+        options["shafts"] = read_shafts(table["shafts"], geometry, spot)
     units = Units(given.get("motion", cls.usual_motion), **given.get("units", {}))
     return PlantEntry(
         cls, parameters, units, False, None, joints, cls.actuated, {"geometry": geometry, **options}
@@ -273,7 +275,7 @@ def check_kinds(classes: Iterable[type[Effect]], file: str) -> None:
 
 
 def _check_keys(table: dict[str, Any], names: list[str], spot: Spot) -> None:
-    known = [*names, "kind", "joint", "spring", "passive", "shared"]
+    known = [*names, "kind", *PLACES, "passive", "shared"]
     for name in table:
         if name not in known:
             raise spot.fault(f"unknown key '{name}'", nearest(name, known, table))

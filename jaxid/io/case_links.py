@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from jaxid.io.case_places import check_places
 from jaxid.io.case_values import Value, read_value, read_values
-from jaxid.io.schema import Key, Keys, Spot, choice, number, read_table, several
+from jaxid.io.schema import Key, Keys, Spot, choice, number, read_table, several, whole
 from jaxid.model import Plant, parameters_of
 from jaxid.plants.denavit_hartenberg import JOINTS, DenavitHartenberg
 
@@ -22,9 +23,15 @@ _LISTS = {
 # Angles, which may be in degrees: a right angle in rad has no end.
 _ANGLES = ("alpha", "theta")
 
+# Keys of [[plant.shafts]].
+_SHAFT: Keys = {
+    "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
+    "ratios": Key(several(number()), "by how much, a number a joint; 1 each where absent"),
+}
 # Keys of [plant] that only an arm has.
 LINKED: Keys = {
     "links": Key(lambda value, spot: value, "a table [[plant.links]] for each link", True),
+    "shafts": Key(lambda value, spot: value, "a table [[plant.shafts]] for each"),
     "gravity_vector": Key(several(number(), shortest=3, longest=3), "in the frame of the base [m/s^2]"),
 }
 
@@ -68,6 +75,34 @@ def read_links(
         if any("rotor_inertia" in other for other in links) and "rotor_inertia" not in given:
             parameters.setdefault("rotor_inertia", []).append(Value(0.0))
     return {name: tuple(values) for name, values in parameters.items()}, DenavitHartenberg.of_rows(rows)
+
+
+def read_shafts(
+    shafts: Any, geometry: DenavitHartenberg, spot: Spot
+) -> tuple[tuple[float, ...], ...]:
+    """[[plant.shafts]]: by how much each turns with every joint.
+
+    Raises:
+        InputError: If one names joints that are not there, or of which some turn and some slide.
+    """
+    if not isinstance(shafts, list) or not all(isinstance(shaft, dict) for shaft in shafts):
+        raise spot.at("shafts").fault("is not a list of tables", "write [[plant.shafts]], in double brackets")
+    joints, out = len(geometry.joints), []
+    for k, shaft in enumerate(shafts, start=1):
+        own = Spot(spot.file, f"[[plant.shafts]] {k}")
+        given = read_table(shaft, _SHAFT, own)
+        named = given["joints"]
+        check_places(shaft["joints"], named, joints, "joint", own.at("joints"))
+        if len({geometry.joints[j - 1] for j in named}) > 1:
+            raise own.at("joints").refuse(shaft["joints"], "names joints that turn and joints that slide",
+                                          "a shaft goes with joints of one kind")
+        ratios = given.get("ratios", (1.0,) * len(named))
+        if len(ratios) != len(named) or 0.0 in ratios:
+            raise own.at("ratios").refuse(shaft["ratios"], f"does not go with {len(named)} joints",
+                                          "give a ratio other than zero for each")
+        row = dict(zip(named, ratios, strict=True))
+        out.append(tuple(float(row.get(j + 1, 0.0)) for j in range(joints)))
+    return tuple(out)
 
 
 def _keys(cls: type[Plant]) -> Keys:

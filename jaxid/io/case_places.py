@@ -1,11 +1,11 @@
-"""Where the effects of a case act: on joints or springs, which count from 1."""
+"""Where the effects of a case act: on joints, springs or shafts, which count from 1."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from jaxid.io.schema import Spot, count, several, whole
-from jaxid.model import Effect
+from jaxid.model import PLACES, Effect
 
 if TYPE_CHECKING:
     from jaxid.io.case_entries import PlantEntry
@@ -19,7 +19,7 @@ def read_ports(
     Raises:
         InputError: If a place that is named is none of the plant's, or none for such an effect.
     """
-    places = [name for name in ("joint", "spring", "passive") if name in table]
+    places = [name for name in (*PLACES, "passive") if name in table]
     if len(places) > 1:
         raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
     parts, springs = plant.cls.parts(plant.joints), plant.cls.springs(plant.joints)
@@ -28,8 +28,10 @@ def read_ports(
             "springs of its own", "axis, or state the spring there",
         )
         raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {mend}")
-    for name in ("spring", "passive"):
-        if name in table and (name == "passive" or not springs):
+    shafts = len(plant.options.get("shafts", ()))
+    there = {"spring": springs, "shaft": shafts, "passive": 0}
+    for name in (name for name in places if name in there):
+        if not there[name]:
             mend = f"leave {name} out: the effect then acts on the joint"
             what = f"does not exist on kind = '{plant.cls.kind}'"
             raise spot.at(name).refuse(table[name], what, mend)
@@ -39,6 +41,11 @@ def read_ports(
             raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", mend)
         chosen = _places(table, "spring", springs, spot)
         return tuple(parts + k for k in chosen), "spring"
+    if "shaft" in table:
+        if cls.in_drive:
+            what, mend = f"has no command for {cls.kind} to act on", "name the joint of the drive"
+            raise spot.at("shaft").refuse(table["shaft"], what, mend)
+        return tuple(parts + k for k in _places(table, "shaft", shafts, spot)), "shaft"
     if "joint" in table:
         chosen = _places(table, "joint", parts, spot)
         undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.model import PLACES
 from jaxid.units import Units
 
 if TYPE_CHECKING:
@@ -43,8 +44,7 @@ def proposal_json(proposal: Proposal, units: Units) -> dict[str, Any]:
     period = float(p.time[1] - p.time[0])
     return {
         "separates": [p.named, p.rival],
-        "joints": [k if what == "joint" else None for what, k in p.places],
-        "springs": [k if what == "spring" else None for what, k in p.places],
+        **{f"{place}s": [k if what == place else None for what, k in p.places] for place in PLACES},
         "possible": p.separates,
         "text": sentence(p, units),
         "nats": {"present": p.present, "expected": p.expected, "needed": p.needed},

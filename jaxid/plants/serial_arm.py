@@ -19,11 +19,12 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 
 class SerialArm(Plant):
-    """tau = M(q) qdd + h(q, qd), of links by ten inertial parameters each; ports are the joints.
+    """tau = M(q) qdd + h(q, qd), of links by ten inertial parameters each.
 
     What stands in `inertial` is linear in the parameters: mass, first moments and inertia of a link
     count about the origin of its frame and along its axes. Which of their combinations the torques
-    tell is for `jaxid.base_parameters` to say.
+    tell is for `jaxid.base_parameters` to say. Ports are the joints, and behind them the shafts: drives
+    that turn with several joints, as where a belt to the last joint of a wrist runs over the one before.
 
     Args:
         mass: m, (n,) [kg].
@@ -33,6 +34,7 @@ class SerialArm(Plant):
         rotor_inertia: Of each drive, seen at the joint, (n,) [kg m^2, or kg at a prismatic joint], or None
             for none.
         geometry: Frames of the links; the first one's predecessor is the base.
+        shafts: By how much each turns with every joint, a row of n ratios a shaft.
         gravity_vector: Acceleration of gravity in the base's frame, (3,) [m/s^2].
         effects: Forces beside these, in the order of the drive.
         sharpness: Width of the smoothed sign over `velocity_scale`, dimensionless.
@@ -63,6 +65,7 @@ class SerialArm(Plant):
         "inertia", "nonnegative", "of each drive, seen at the joint", optional=True, more=0
     )
     geometry: DenavitHartenberg = eqx.field(kw_only=True)
+    shafts: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
     gravity_vector: Array = eqx.field(converter=as_array, default=(0.0, 0.0, -9.81), kw_only=True)
     effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
     sharpness: Array = eqx.field(converter=as_array, default=1e-3, kw_only=True)
@@ -73,14 +76,25 @@ class SerialArm(Plant):
         """Joints, as many as links."""
         return len(self.geometry.joints)
 
+    def ports(self, q: Array) -> Array:
+        return jnp.concatenate([q, np.array(self.shafts) @ q]) if self.shafts else q
+
+    @property
+    def ports_are_joints(self) -> bool:
+        return not self.shafts
+
+    def place(self, port: int) -> tuple[str, int]:
+        return ("joint", port + 1) if port < self.joints else ("shaft", port - self.joints + 1)
+
     def motion(self, port: int) -> str:
-        return "rotary" if self.geometry.joints[port] == "revolute" else "linear"
+        first = self.reached(port, self.joints)[0]
+        return "rotary" if self.geometry.joints[first] == "revolute" else "linear"
 
     def reached(self, port: int, joints: int) -> tuple[int, ...]:
-        return (port,)
+        return (port,) if port < joints else tuple(np.flatnonzero(self.shafts[port - joints]).tolist())
 
     def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
-        return ("rotor_inertia", port) if effect.kind == "added_mass" else None
+        return ("rotor_inertia", port) if effect.kind == "added_mass" and port < self.joints else None
 
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Recursive Newton-Euler: motion from the base out, forces from the tip back.

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from jaxid.model import PLACES
 from jaxid.report.data import ParameterRow, ReportData, SearchStep
 from jaxid.report.numbers import (
     ABSENT,
@@ -88,7 +89,7 @@ def unbroken(text: str) -> str:
 
 def place_words(entry: Mapping) -> str:
     """Say where an effect acts: "joint 2", "spring 3", or nothing."""
-    for key in ("joint", "spring"):
+    for key in PLACES:
         if entry.get(key) is not None:
             return f"{key} {entry[key]}"
     return ""
