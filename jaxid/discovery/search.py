@@ -164,7 +164,7 @@ class Search:
         promising = [s for s in screened.scores if s.evidence > least]
         refitted = []
         for score in few(promising):
-            self.progress(f"refitting with {score.candidate.kind}")
+            self.progress(f"refitting with {score.candidate.label}")
             refitted.append(self._refit(score, screened))
         refitted.sort(key=lambda s: -s.total)
         rest = [s for s in screened.scores if all(s.candidate is not r.candidate for r in refitted)]
@@ -191,7 +191,7 @@ class Search:
             guess = guess_pair(pair, screened, jacobian[..., self.active], e, self)
             if guess is None:
                 continue
-            self.progress("refitting with " + " and ".join(p.candidate.kind for p in pair))
+            self.progress("refitting with " + " and ".join(p.candidate.label for p in pair))
             first, second = (
                 Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True)
             )
@@ -216,7 +216,7 @@ class Search:
         found: dict[int, tuple[Score, ...]] = {}
         for k in range(len(self.added)):
             own = self.added[k]
-            self.progress(f"looking for what could replace {own.kind}")
+            self.progress(f"looking for what could replace {own.label}")
             kept, theta = list(self.added), self.theta
             self.theta = self.without(own)
             self.added = [c for c in kept if c is not own]
