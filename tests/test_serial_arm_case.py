@@ -120,13 +120,48 @@ def true_values(arm: TwoLinks) -> tuple:
     return link(arm.m1, arm.x1, 0.0, arm.i1), link(arm.m2, arm.x2, arm.y2, arm.i2)
 
 
-def test_open_loop_simulation_is_the_closed_form(tmp_path, capsys):
-    arm = dataclasses.replace(TwoLinks(), coulomb=(0.0, 0.0))
+SHAFT = "[[plant.shafts]]\njoints = [1, 2]\n"
+
+
+def on_shaft(inertia: str, viscous: str, coulomb: str) -> str:
+    values = (("added_mass", "mass", inertia), ("viscous_friction", "coefficient", viscous),
+              ("coulomb_friction", "level", coulomb))
+    return "".join(f'[[effects]]\nkind = "{k}"\nshaft = 1\n{name} = {v}\n' for k, name, v in values)
+
+
+def test_friction_of_a_shaft_is_told_from_that_of_its_joints(tmp_path):
+    arm = dataclasses.replace(TwoLinks(), shaft=(0.7, 1.6, 0.1))
+    log = write_csv(tmp_path / "log.csv", followed(arm))
+    rest = SHAFT + on_shaft("0.1", "{ guess = 0.1 }", "{ guess = 0.1 }") + LOG
+    path = tmp_path / "case.toml"
+    path.write_text(text().replace(FRICTION.format(viscous=UNKNOWN, coulomb=UNKNOWN) + LOG,
+                                   rest + FRICTION.format(viscous=UNKNOWN, coulomb=UNKNOWN)))
+    session = open_session(path, log)
+    estimate = inverse_dynamics(session.machine, session.fit.data)
+    assert estimate.converged
+    wanted = truth() | {"viscous_friction[shaft 1].coefficient": 0.7, "coulomb_friction[shaft 1].level": 1.6}
+    assert set(estimate.names) == set(wanted)
+    for name, value, std in zip(estimate.names, estimate.theta, estimate.std, strict=True):
+        assert abs(value - wanted[name]) < 3 * std, name
+        assert std < 0.02 * max(abs(wanted[name]), 1.0), name
+    # without it, what it does is left over
+    path.write_text(text())
+    session = open_session(path, log)
+    without = inverse_dynamics(session.machine, session.fit.data)
+    assert np.nanstd(without.residual) > 10 * np.nanstd(estimate.residual)
+
+
+@pytest.mark.parametrize("shaft", [(0.0, 0.0, 0.0), (0.7, 0.0, 0.1)])
+def test_open_loop_simulation_is_the_closed_form(tmp_path, capsys, shaft):
+    arm = dataclasses.replace(TwoLinks(), coulomb=(0.0, 0.0), shaft=shaft)
     rest = LOG + (
         '[input]\nkind = "multisine"\nband_hz = [0.5, 3.0]\namplitude = [4.0, 2.0]\noffset = [14.0, 4.0]\n'
         "[simulation]\nduration = 1.0\nsample_rate = 500.0\ninitial_position = [0.3, -0.8]\n"
     )
     values = text(true_values(arm), viscous="[1.5, 0.8]", coulomb="[0.0, 0.0]", rest=rest)
+    if any(shaft):
+        with_shaft = SHAFT + on_shaft(str(shaft[2]), str(shaft[0]), "0.0") + "[log]"
+        values = values.replace("[log]", with_shaft, 1)
     path = tmp_path / "case.toml"
     path.write_text(values)
     ran = run(capsys, "simulate", path, "-o", tmp_path / "log.csv")
@@ -196,6 +231,19 @@ FAULTS = {
         ("gravity_vector = [0.0, -9.81, 0.0]", "gravity = 9.81"), ["'gravity'", "gravity_vector"],
     ),
     "guessed length": (("a = 0.5", "a = { guess = 0.5 }"), ["a", "must be a known number"]),
+    "shafts": (("[log]", "[[plant.shafts]]\njoints = [2, 3]\n[log]"), ["shafts]] 1", "[2, 3]", "from 1 to 2"]),
+    "one joint": (("[log]", "[[plant.shafts]]\njoints = [2]\n[log]"), ["shafts]] 1", "joints", "2"]),
+    "ratios": (
+        ("[log]", "[[plant.shafts]]\njoints = [1, 2]\nratios = [1.0]\n[log]"),
+        ["ratios = [1.0] does not go with 2 joints; give a ratio other than zero for each"],
+    ),
+    "sliding shaft": (
+        ('joint = "revolute"', 'joint = "prismatic"'), ["joints that turn and joints that slide"],
+    ),
+    "no shaft": (
+        ('kind = "viscous_friction"', 'kind = "viscous_friction"\nshaft = 1'),
+        ["shaft = 1 does not exist on kind = 'serial_arm'; leave shaft out"],
+    ),
     "parameters": (("[log]", "[plant.parameters]\nmass = 1.0\n[log]"), ["'parameters'", "there is: kind"]),
 }
 
@@ -203,8 +251,9 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_are_told_in_one_line(tmp_path, fault):
     (old, new), words = FAULTS[fault]
-    assert old in GOOD
-    told = message(tmp_path, GOOD.replace(old, new, 1))
+    good = GOOD.replace("[log]", SHAFT + "[log]") if fault == "sliding shaft" else GOOD
+    assert old in good
+    told = message(tmp_path, good.replace(old, new, 1))
     assert not [word for word in words if word not in told], told
 
 

@@ -25,6 +25,8 @@ class TwoLinks:
     viscous: tuple[float, float] = (1.5, 0.8)
     coulomb: tuple[float, float] = (2.0, 1.2)
     gravity: float = 9.81
+    # Of a shaft that turns with the sum of both joints: viscous, Coulomb friction, and inertia.
+    shaft: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Of the smoothed sign [rad/s]; far below any speed at which a sample counts.
     width: float = 1e-3
 
@@ -53,6 +55,9 @@ class TwoLinks:
         w1 = g * b["first_moment_x[1]"] * cos(q1) + w2
         f1 = self.viscous[0] * v1 + self.coulomb[0] * tanh(v1 / self.width)
         f2 = self.viscous[1] * v2 + self.coulomb[1] * tanh(v2 / self.width)
+        viscous, coulomb, inertia = self.shaft
+        fs = viscous * (v1 + v2) + coulomb * tanh((v1 + v2) / self.width)
+        f1, f2, m11, m12, m22 = f1 + fs, f2 + fs, m11 + inertia, m12 + inertia, m22 + inertia
         r1 = u1 - w1 - f1 + bend * (2.0 * v1 * v2 + v2 * v2)
         r2 = u2 - w2 - f2 - bend * v1 * v1
         det = m11 * m22 - m12 * m12
