@@ -93,8 +93,8 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
             this version does not have.
     """
     if case.transmission is not None:
-        mend = "leave transmission out and log the joints' own positions and forces"
-        what = "transmission is not available in this version"
+        mend = "leave it out, and state what the joints do and their drives"
+        what = "transmission goes with a measured log that is checked, fitted or searched"
         raise InputError(what, where=f"{case.path}, [actuator]", mend=mend)
     plant, free = _plant(case, true)
     course, more = _course(case, true, plant)

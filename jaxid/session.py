@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -90,7 +91,9 @@ def open_session(
         InputError: If anything in case or logs is unsound.
     """
     case = case if isinstance(case, Case) else load_case(case)
-    fit = _read(case, log)
+    read = functools.partial(_read, case)
+    case = at_joints(case)
+    fit = read(log)
     machine = build_machine(case, period=fit.period)
     held = method == "output_error" and "prior" in case.output_error
     findings = _check(case, fit, machine, held)
@@ -104,18 +107,18 @@ def open_session(
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
-        read = _read(case, source, columns=entry.columns)
-        findings += _check(case, read, machine, held)
-        opened.append(_run(entry.name, read, machine, recipe, needed, entry.disturbance))
+        measured = read(source, columns=entry.columns)
+        findings += _check(case, measured, machine, held)
+        opened.append(_run(entry.name, measured, machine, recipe, needed, entry.disturbance))
         names.add(entry.name)
     for extra in validate:
-        read = _read(case, extra, whole=True)
-        findings += _check(case, read, machine, held)
-        name = Path(read.source).stem
+        measured = read(extra, whole=True)
+        findings += _check(case, measured, machine, held)
+        name = Path(measured.source).stem
         while name in names:
             name += "'"
         names.add(name)
-        opened.append(_run(name, read, machine, recipe, needed, disturbance))
+        opened.append(_run(name, measured, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
 
@@ -149,7 +152,8 @@ def _read(
         columns = case.columns if columns is None else columns
         kept = {k: v for k, v in columns.items() if not (whole and k == "rows")}
         own = joints if load is None else None
-        return _followed(case, with_load(read_log(log, kept, joints=own, drives=drives), load, joints))
+        log = read_log(log, kept, joints=own, drives=drives)
+        return _followed(case, with_load(_without_gears(case, log), load, joints))
     log = _followed(case, with_load(log, load, joints))
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):
         values = getattr(log, name)
@@ -159,7 +163,24 @@ def _read(
                 f"{name} has {values.shape[1]} column(s) where {width} belong", where=log.source,
                 mend=f"give one column a {what}, in the order of the {what}s",
             )
-    return log
+    return _without_gears(case, log)
+
+
+def at_joints(case: Case) -> Case:
+    """The case of what is logged at the joints, where its own logs are of motors that move several."""
+    return case if case.transmission is None else replace(case, transmission=None, gain=1.0)
+
+
+def _without_gears(case: Case, log: Log) -> Log:
+    """A log of the motors as one of the joints: positions R^-1 p, forces R' times gain times command."""
+    if case.transmission is None:
+        return log
+    rows = np.asarray(case.transmission)
+    moved = {
+        name: np.linalg.solve(rows, getattr(log, name).T).T
+        for name in ("position", "velocity", "acceleration", "reference") if getattr(log, name) is not None
+    }
+    return replace(log, force=log.force * np.asarray(case.gain) @ rows, **moved)
 
 
 def _followed(case: Case, log: Log) -> Log:

@@ -10,6 +10,7 @@ from two_links import TwoLinks, followed
 from written_logs import write_csv
 
 from jaxid.base_parameters import base_parameters
+from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.io.case import load_case
 from jaxid.machine import build_machine
@@ -84,6 +85,26 @@ def test_base_parameters_of_two_links_come_back(estimates):
     # and the start is off by far more than that
     off = np.abs(estimate.precision.std[:6]) * 10
     assert np.all(np.abs([truth()[n] - 0.1 for n in estimate.names[:6]]) > off)
+
+
+RATIO = np.array([[20.0, 0.0], [30.0, -30.0]])
+
+
+def test_a_log_of_the_motors_says_the_same(estimates, tmp_path):
+    """The second motor turns with both joints; commands are amperes."""
+    rows = followed(TwoLinks())
+    motor = np.stack([rows["q1"], rows["q2"]]).T @ RATIO.T
+    command = np.stack([rows["u1"], rows["u2"]]).T @ np.linalg.inv(RATIO) / np.array([0.5, 2.0])
+    log = {"t": rows["t"], **dict(zip(("q1", "q2", "u1", "u2"), [*motor.T, *command.T], strict=True))}
+    path = tmp_path / "case.toml"
+    gears = f"[actuator]\ngain = [0.5, 2.0]\ntransmission = {RATIO.tolist()}\n"
+    path.write_text(text(rest=gears + LOG))
+    session = open_session(path, write_csv(tmp_path / "log.csv", log))
+    estimate = inverse_dynamics(session.machine, session.fit.data)
+    np.testing.assert_allclose(estimate.theta, estimates["base"].theta, rtol=1e-5, atol=1e-8)
+    path.write_text(path.read_text() + '[controller]\nkind = "pd"\nkp = [1.0, 1.0]\nkd = [1.0, 1.0]\n')
+    with pytest.raises(InputError, match="does not go with a loop"):
+        load_case(path)
 
 
 def test_what_a_log_cannot_tell_is_named_and_has_no_sigma(estimates):
@@ -231,7 +252,9 @@ FAULTS = {
         ("gravity_vector = [0.0, -9.81, 0.0]", "gravity = 9.81"), ["'gravity'", "gravity_vector"],
     ),
     "guessed length": (("a = 0.5", "a = { guess = 0.5 }"), ["a", "must be a known number"]),
-    "shafts": (("[log]", "[[plant.shafts]]\njoints = [2, 3]\n[log]"), ["shafts]] 1", "[2, 3]", "from 1 to 2"]),
+    "shafts": (
+        ("[log]", "[[plant.shafts]]\njoints = [2, 3]\n[log]"), ["shafts]] 1", "[2, 3]", "from 1 to 2"],
+    ),
     "one joint": (("[log]", "[[plant.shafts]]\njoints = [2]\n[log]"), ["shafts]] 1", "joints", "2"]),
     "ratios": (
         ("[log]", "[[plant.shafts]]\njoints = [1, 2]\nratios = [1.0]\n[log]"),

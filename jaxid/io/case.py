@@ -171,7 +171,9 @@ def load_case(path: str | Path) -> Case:
         return read_table(tables.get(name, {}), keys, Spot(file, f"[{name}]"))
 
     followed, unknown = read_unknown_reference(tables, drives, file)
-    actuator = _checked_transmission(read("actuator", actuator_keys(drives)), drives, file)
+    actuator = _checked_transmission(
+        read("actuator", actuator_keys(drives)), drives, file, "controller" in tables
+    )
     case = Case(
         path=path,
         plant=plant,
@@ -245,7 +247,9 @@ def _toml(path: Path) -> dict[str, Any]:
         raise InputError(what, where=str(path), mend="name a TOML file that may be read") from error
 
 
-def _checked_transmission(actuator: dict[str, Any], joints: int, file: str) -> dict[str, Any]:
+def _checked_transmission(
+    actuator: dict[str, Any], joints: int, file: str, looped: bool
+) -> dict[str, Any]:
     rows, spot = actuator.get("transmission"), Spot(file, "[actuator]", "transmission")
     if rows is None:
         return actuator
@@ -255,6 +259,9 @@ def _checked_transmission(actuator: dict[str, Any], joints: int, file: str) -> d
     if {len(rows), *map(len, rows)} != {joints} or np.linalg.matrix_rank(rows) < joints:
         mend = f"give {joints} rows of {joints} numbers, none a sum of others"
         raise spot.fault("is not an invertible square matrix", mend)
+    if looped:
+        mend = "leave [controller] out: what was logged is then identified without the loop"
+        raise spot.fault("does not go with a loop, whose gains are at the motors", mend)
     return actuator
 
 
