@@ -51,6 +51,7 @@ KINDS = {
     "cascade_pd": kernel.CASCADE_PD,
     "pd": kernel.PD,
     "pid": kernel.PID,
+    "friction_compensation": kernel.COMPENSATED,
 }
 
 
@@ -84,7 +85,7 @@ class Loop:
     """What gives the command.
 
     Attributes:
-        kind: open_loop, cascade_pd, pd or pid.
+        kind: open_loop, cascade_pd, pd, pid or friction_compensation.
         input: Command a tick, open loop only [unit of command].
         hold: Of the open-loop input between ticks: zero_order or linear.
         reference: Wanted position a tick, closed loop [m].
@@ -96,6 +97,7 @@ class Loop:
         derivative_filter: Time constant of the low-pass on pid's derivative [s].
         anti_windup: Stop pid's integral while saturated outward.
         limit: Saturation of the command [unit of command].
+        coulomb, viscous, inertia: Fed forward by friction_compensation.
         disturbance: level, on [s], off [s], start [s]; added to the command before `limit`.
     """
 
@@ -111,6 +113,9 @@ class Loop:
     derivative_filter: float = 0.0
     anti_windup: bool = False
     limit: float = np.inf
+    coulomb: float = 0.0
+    viscous: float = 0.0
+    inertia: float = 0.0
     disturbance: Mapping[str, float] | None = None
 
 
@@ -170,7 +175,9 @@ def control_law(loop: Loop) -> kernel.Law:
     pulses = {name: float(value) for name, value in (loop.disturbance or {}).items()}
     gains = {
         name: float(getattr(loop, name))
-        for name in ("kp", "kv", "ki", "kd", "derivative_filter", "limit")
+        for name in (
+            "kp", "kv", "ki", "kd", "derivative_filter", "limit", "coulomb", "viscous", "inertia"
+        )
     }
     average, windup = int(loop.velocity_average), bool(loop.anti_windup)
     return kernel.Law(kind=KINDS[loop.kind], average=average, anti_windup=windup, **gains, **pulses)

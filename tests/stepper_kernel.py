@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from numba import njit
 
-OPEN, CASCADE_PD, PD, PID = 0, 1, 2, 3
+OPEN, CASCADE_PD, PD, PID, COMPENSATED = 0, 1, 2, 3, 4
 
 
 class Physics(NamedTuple):
@@ -66,6 +66,9 @@ class Law(NamedTuple):
     on: float = 1.0  # s
     off: float = 0.0  # s
     start: float = 0.0  # s
+    coulomb: float = 0.0  # fed forward, unit of command
+    viscous: float = 0.0
+    inertia: float = 0.0
 
 
 @njit(cache=True)
@@ -232,6 +235,14 @@ def command(law, k, reference, reading, memory, period):
         u = law.kv * (law.kp * error - speed) + extra
     elif law.kind == PD:
         u = law.kp * error + law.kd * (aim - speed) + extra
+    elif law.kind == COMPENSATED:
+        n = reference.size
+        before = reference[k - 1] if k > 0 else 2.0 * reference[0] - reference[min(1, n - 1)]
+        after = reference[k + 1] if k + 1 < n else 2.0 * reference[k] - reference[max(n - 2, 0)]
+        u = law.kp * error + law.kd * ((after - before) / (2.0 * period) - speed) + extra
+        u += law.inertia * (after - 2.0 * reference[k] + before) / period**2 + law.viscous * speed
+        if speed != 0.0:
+            u += math.copysign(law.coulomb, speed)
     else:
         u = pid(law, error, aim - speed, memory, extra, period)
     return min(max(u, -law.limit), law.limit)

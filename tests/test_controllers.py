@@ -23,6 +23,7 @@ CASES: dict[str, dict[str, Any]] = {
     "cascade_pd limited": {"kp": 30.0, "kv": 12.0, "limit": 6.0},
     "pd": {"kp": 300.0, "kd": 10.0},
     "pd disturbed": {"kp": 300.0, "kd": 10.0, "limit": 11.0, "velocity_average": 2},
+    "friction_compensation": {"kp": 300.0, "kd": 10.0, "coulomb": 0.7, "viscous": 3.0, "inertia": 1.5},
     "pid": {"kp": 300.0, "ki": 900.0, "kd": 10.0},
     "pid filtered": {"kp": 300.0, "ki": 900.0, "kd": 10.0, "derivative_filter": 8e-3},
     "pid winding up": {"kp": 300.0, "ki": 4e3, "kd": 10.0, "limit": 6.0},
@@ -57,6 +58,13 @@ def plain(name: str, reading: np.ndarray) -> np.ndarray:
                 u -= law["ki"] * PERIOD * error
             else:
                 integral = grown
+        elif name.startswith("friction"):
+            ends = [2 * REFERENCE[0] - REFERENCE[1]], [2 * REFERENCE[-1] - REFERENCE[-2]]
+            wider = np.concatenate([ends[0], REFERENCE, ends[1]])
+            before, here, after = wider[k : k + 3]
+            u = law["kp"] * error + law["kd"] * ((after - before) / (2 * PERIOD) - velocity)
+            u += law["inertia"] * (after - 2 * here + before) / PERIOD**2
+            u += law["viscous"] * velocity + law["coulomb"] * np.sign(velocity)
         else:
             u = law["kp"] * error + law["kd"] * (aim - velocity)
         out.append(np.clip(u + extra, -law["limit"], law["limit"]))

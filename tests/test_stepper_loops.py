@@ -14,7 +14,7 @@ IDEAL = Sensor()
 RATE = 1000.0
 
 
-@pytest.mark.parametrize("kind", ["cascade_pd", "pd", "pid"])
+@pytest.mark.parametrize("kind", ["cascade_pd", "pd", "pid", "friction_compensation"])
 def test_command_can_be_recomputed_from_the_log(kind):
     setup = machines.emps_like(duration=2.0)
     gains = (
@@ -22,7 +22,9 @@ def test_command_can_be_recomputed_from_the_log(kind):
     )
     pulses = {"level": 1.5, "on": 0.2, "off": 0.3, "start": 0.1}
     filtered = {"velocity_average": 2, "derivative_filter": 3e-3 * (kind == "pid")}
-    loop = Loop(kind=kind, reference=setup.loop.reference, disturbance=pulses, **gains, **filtered)
+    fed = dict(coulomb=2.0, viscous=30.0, inertia=0.4) if kind == "friction_compensation" else {}
+    reference = setup.loop.reference
+    loop = Loop(kind=kind, reference=reference, disturbance=pulses, **gains, **filtered, **fed)
     log = dataclasses.replace(setup, loop=loop, sensor=Sensor(5e-8, 2e-8)).run()
     q, r = log["position"], log["reference"]
     mean = 0.5 * (q + np.r_[q[0], q[:-1]])
@@ -31,6 +33,11 @@ def test_command_can_be_recomputed_from_the_log(kind):
         u = 243.45 * (160.18 * (r - q) - slope)
     elif kind == "pd":
         u = 39000.0 * (r - q) + 243.45 * (aim - slope)
+    elif kind == "friction_compensation":
+        wide = np.r_[2 * r[0] - r[1], r, 2 * r[-1] - r[-2]]
+        centre, bend = 0.5 * (wide[2:] - wide[:-2]) * RATE, np.diff(wide, 2) * RATE**2
+        u = 39000.0 * (r - q) + 243.45 * (centre - slope) + 0.4 * bend
+        u += 30.0 * slope + 2.0 * np.sign(slope)
     else:
         smooth = np.zeros_like(q)
         for k in range(len(q)):

@@ -8,8 +8,9 @@ from jaxid.controllers.base import Path as Path
 from jaxid.controllers.base import Tick as Tick
 from jaxid.controllers.flatness import Flatness
 from jaxid.controllers.flatness import flat_inputs as flat_inputs
-from jaxid.controllers.linear import PD, PID, CascadePD
+from jaxid.controllers.linear import PD, PID, CascadePD, FrictionCompensation
 
 CONTROLLERS: dict[str, type[Controller]] = {
-    "cascade_pd": CascadePD, "pd": PD, "pid": PID, "flatness": Flatness
+    "cascade_pd": CascadePD, "pd": PD, "pid": PID, "flatness": Flatness,
+    "friction_compensation": FrictionCompensation,
 }

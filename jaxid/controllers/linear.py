@@ -1,4 +1,4 @@
-"""Linear sampled laws: cascade PD, PD, PID."""
+"""Sampled laws of position and velocity: cascade PD, PD, PD with friction compensation, PID."""
 
 from __future__ import annotations
 
@@ -35,6 +35,30 @@ class PD(Controller):
         slope = (tick.reference - memory) / self.period
         error = tick.reference - tick.position
         return self.kp * error + self.kd * (slope - tick.at_drives(velocity)), tick.reference
+
+
+class FrictionCompensation(Controller):
+    """u = kp (r - q) + kd (r' - dq) + inertia r'' + viscous dq + coulomb sign(dq).
+
+    A PD law beside a model of one's own of each drive: inertia from the reference, friction from the measured
+    velocity. All in units of the command. Without kp and kd it lets a joint go as if it had no friction.
+
+    Source:
+        "PA-10 traineeship", (5.6), (5.13) and (5.14).
+    """
+
+    kp: Array
+    kd: Array
+    coulomb: Array = eqx.field(default=0.0, kw_only=True)
+    viscous: Array = eqx.field(default=0.0, kw_only=True)
+    inertia: Array = eqx.field(default=0.0, kw_only=True)
+
+    anticipates = True
+
+    def law(self, tick: Tick, velocity: Array, memory: None, disturbance: Array) -> tuple:
+        v, path = tick.at_drives(velocity), tick.path
+        fed = self.inertia * path.curvature + self.viscous * v + self.coulomb * jnp.sign(v)
+        return self.kp * (path.reference - tick.position) + self.kd * (path.slope - v) + fed, None
 
 
 class PID(Controller):
