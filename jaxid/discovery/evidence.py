@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 import scipy.sparse
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxid.precision import NoiseModel
 
@@ -19,6 +19,8 @@ BLOCKS = 10
 # Rows that whitening may leave correlated; fewest stretches of a surrogate.
 _CORRELATED = 10
 _STRETCHES = 20
+# Of a normal matrix, relative to its diagonal.
+_RIDGE = 1e-9
 # Probability with which noise alone may exceed the threshold for all candidates together.
 _FALSE_POSITIVE = 1e-3
 
@@ -140,22 +142,63 @@ def held_out(
     squares: Float[np.ndarray, "block r"],
 ) -> Float[np.ndarray, " r"]:
     """Sum of squares on each block after a least-squares fit to the others, for every residual."""
-    total_gram, total_mixed = gram.sum(axis=0), mixed.sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(total_gram), 1e-300))
-    ridge = 1e-9 * np.eye(len(scale))
-    out = np.zeros(squares.shape[1])
-    for b in range(len(gram)):
-        matrix = (total_gram - gram[b]) / np.outer(scale, scale) + ridge
-        x = -np.linalg.solve(matrix, (total_mixed - mixed[b]) / scale[:, None]) / scale[:, None]
-        out += squares[b] + 2 * np.sum(x * mixed[b], axis=0)
-        out += np.einsum("ir,ij,jr->r", x, gram[b], x)
-    return out
+    return _left(_others(gram), gram, mixed.sum(axis=0) - mixed, mixed, squares)
+
+
+def _left(
+    trained: Float[np.ndarray, "block k k"], held: Float[np.ndarray, "block k k"],
+    trained_e: Float[np.ndarray, "block k r"], held_e: Float[np.ndarray, "block k r"],
+    squares: Float[np.ndarray, "block r"],
+) -> Float[np.ndarray, " r"]:
+    """What is left on the blocks: products over the others, with residuals too, and on each itself."""
+    x = -np.linalg.solve(trained, trained_e)
+    return np.sum(squares + np.sum(x * (2 * held_e + held @ x), axis=1), axis=0)
+
+
+def _others(gram: Float[np.ndarray, "block k k"]) -> Float[np.ndarray, "block k k"]:
+    """Products over all blocks but each, with a trace of a ridge: columns may depend on one another."""
+    total = gram.sum(axis=0)
+    return total - gram + _RIDGE * np.diag(np.maximum(np.diag(total), 1e-300))
+
+
+def swept(
+    gram: Float[np.ndarray, "block n n"], base: int
+) -> tuple[Float[np.ndarray, "block m m"], Float[np.ndarray, "block m m"]]:
+    """Products of columns from which a base is taken out that was fitted to the other blocks.
+
+    A base of sixty columns beside ten thousand pairs need not be solved for each again.
+
+    Args:
+        gram: Products of all columns.
+        base: How many of them, the first ones, are the base.
+
+    Returns:
+        Of the others: over the blocks fitted to, and on the block itself.
+    """
+    rest = _others(gram)
+    taken = np.linalg.solve(rest[:, :base, :base], rest[:, :base, base:])
+    trained = rest[:, base:, base:] - np.swapaxes(rest[:, :base, base:], 1, 2) @ taken
+    back = np.swapaxes(taken, 1, 2)
+    cross = back @ gram[:, :base, base:]
+    held = gram[:, base:, base:] - cross - np.swapaxes(cross, 1, 2) + back @ gram[:, :base, :base] @ taken
+    return trained, held
+
+
+def left_beside(
+    trained: Float[np.ndarray, "block m m"], held: Float[np.ndarray, "block m m"],
+    columns: Int[np.ndarray, " j"], target: Int[np.ndarray, " t"],
+) -> float:
+    """What is left of a sum of columns once some others, and the base, are fitted; by `swept`."""
+    own, mixed = (columns[:, None], columns), (columns[:, None], target)
+    squares = held[:, target[:, None], target].sum(axis=(1, 2))[:, None]
+    with_target = [x[:, *mixed].sum(axis=2)[..., None] for x in (trained, held)]
+    return float(_left(trained[:, *own], held[:, *own], *with_target, squares)[0])
 
 
 class Beside:
     """Held-out sums of squares of a base with further columns beside it, for many residuals.
 
-    What the base and the residuals have in common is summed once; a candidate adds only its own.
+    What the base and the residuals have in common is summed and solved once; a candidate adds its own.
 
     Args:
         base: Whitened columns of the base.
@@ -168,7 +211,12 @@ class Beside:
     ) -> None:
         self.base, self.e, self.blocks = base, e, blocks
         self.gram = grams(base, blocks)
-        self.mixed, self.squares = products(base, e, blocks)
+        self.mixed, squares = products(base, e, blocks)
+        self.inverse = np.linalg.inv(_others(self.gram))
+        # What the base says of the residuals where it is fitted to the other blocks, and its products.
+        self.said = self.inverse @ (self.mixed.sum(axis=0) - self.mixed)
+        self.seen = self.gram @ self.said
+        self.squares = squares + np.sum(self.said * (self.seen - 2 * self.mixed), axis=1)
 
     def crossed(
         self, extra: Float[np.ndarray, "row j"]
@@ -188,19 +236,26 @@ class Beside:
         offset: Float[np.ndarray, "row 1"] | None = None,
     ) -> Float[np.ndarray, " r"]:
         """With further columns and their products, and with an offset that all residuals share."""
-        slices = _slices(self.blocks)
-        cross, with_residuals = crossed
-        own = grams(extra, self.blocks)
-        gram = np.block([[self.gram, cross], [np.swapaxes(cross, 1, 2), own]])
-        mixed = np.concatenate([self.mixed, with_residuals], axis=1)
-        squares = self.squares
         if offset is not None:
-            both = np.concatenate([self.base, extra], axis=1)
-            shift, size = products(both, offset, self.blocks)
-            mixed = mixed + shift
-            with_e = np.stack([offset[b].T @ self.e[b] for b in slices])[:, 0]
-            squares = squares + 2 * with_e + size
-        return held_out(gram, mixed, squares)
+            more = self.crossed(offset)
+            extra = np.concatenate([extra, offset], axis=1)
+            crossed = [np.concatenate([crossed[k], more[k]], axis=2 - k) for k in range(2)]
+        with_base, with_e = crossed
+        own = grams(extra, self.blocks)
+        others = with_base.sum(axis=0) - with_base
+        taken = self.inverse @ others
+        back = np.swapaxes(taken, 1, 2)
+        trained = _others(own) - np.swapaxes(others, 1, 2) @ taken
+        trained_e = with_e.sum(axis=0) - with_e - np.swapaxes(others, 1, 2) @ self.said
+        cross = back @ with_base
+        held = own - cross - np.swapaxes(cross, 1, 2) + back @ self.gram @ taken
+        held_e = with_e - back @ self.mixed - np.swapaxes(with_base, 1, 2) @ self.said + back @ self.seen
+        if offset is None:
+            return _left(trained, held, trained_e, held_e, self.squares)
+        squares = self.squares + 2 * held_e[:, -1] + held[:, -1, -1:]
+        trained_e = trained_e[:, :-1] + trained[:, :-1, -1:]
+        held_e = held_e[:, :-1] + held[:, :-1, -1:]
+        return _left(trained[:, :-1, :-1], held[:, :-1, :-1], trained_e, held_e, squares)
 
 
 def log_evidence(rows: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:

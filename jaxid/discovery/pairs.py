@@ -70,21 +70,19 @@ def score_pairs(
         points: Each with its whitened columns, and by how much the residual differs there.
         blocks: Block of time of every row.
     """
-    parts = [e, base]
+    parts = [base, e]
     for _, columns, offset in points:
         parts += [columns, np.zeros_like(e) if offset is None else offset]
-    ends = np.cumsum([0, *[p.shape[1] for p in parts]])
+    ends = np.cumsum([0, *[p.shape[1] for p in parts[1:]]])
     places = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
-    gram = ev.grams(np.concatenate(parts, axis=1), blocks)
+    swept = ev.swept(ev.grams(np.concatenate(parts, axis=1), blocks), base.shape[1])
     rows = len(blocks)
 
     def left(*chosen: int) -> float:
         """Held-out sum of squares with the columns of some points, the residual at their offsets."""
-        columns = np.concatenate([places[1], *[places[2 + 2 * k] for k in chosen]])
-        target = np.concatenate([places[0], *[places[3 + 2 * k] for k in chosen]])
-        mixed = gram[:, columns][:, :, target].sum(axis=2)[..., None]
-        squares = gram[:, target][:, :, target].sum(axis=(1, 2))[:, None]
-        return float(ev.held_out(gram[:, columns][:, :, columns], mixed, squares)[0])
+        columns = np.concatenate([np.zeros(0, int), *[places[1 + 2 * k] for k in chosen]])
+        target = np.concatenate([places[0], *[places[2 + 2 * k] for k in chosen]])
+        return ev.left_beside(*swept, columns, target)
 
     before, n = left(), len(points)
     evidence = np.zeros((n, n))
