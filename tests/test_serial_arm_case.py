@@ -265,7 +265,11 @@ FAULTS = {
     ),
     "no shaft": (
         ('kind = "viscous_friction"', 'kind = "viscous_friction"\nshaft = 1'),
-        ["shaft = 1 does not exist on kind = 'serial_arm'; leave shaft out"],
+        ["shaft = 1 does not exist on kind = 'serial_arm'; add [[plant.shafts]]"],
+    ),
+    "second shaft": (
+        ("[log]", SHAFT + '[[effects]]\nkind = "coulomb_friction"\nshaft = 2\nlevel = 1.0\n[log]'),
+        ["shaft = 2 is out of range: the plant has 1 shaft; name shaft 1"],
     ),
     "parameters": (("[log]", "[plant.parameters]\nmass = 1.0\n[log]"), ["'parameters'", "there is: kind"]),
 }
