@@ -10,6 +10,8 @@ from two_links import TwoLinks, followed
 from written_logs import write_csv
 
 from jaxid.base_parameters import base_parameters
+from jaxid.discovery.discover import break_away_at_joints
+from jaxid.discovery.union import build_union
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.io.case import load_case
@@ -170,6 +172,17 @@ def test_friction_of_a_shaft_is_told_from_that_of_its_joints(tmp_path):
     session = open_session(path, log)
     without = inverse_dynamics(session.machine, session.fit.data)
     assert np.nanstd(without.residual) > 10 * np.nanstd(estimate.residual)
+
+
+def test_starts_from_rest_are_looked_at_where_a_reading_shows_them(log, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(text(rest=SHAFT + LOG))
+    session = open_session(path, log)
+    rest = build_union(session.machine, session.fit.data).candidates
+    shaft = [c for c in rest if c.label == "static_friction[shaft 1]"]
+    assert len(shaft) == 1
+    at_joints = break_away_at_joints(rest, 2)
+    assert [c.label for c in at_joints] == ["static_friction[1]", "static_friction[2]"]
 
 
 @pytest.mark.parametrize("shaft", [(0.0, 0.0, 0.0), (0.7, 0.0, 0.1)])
