@@ -174,6 +174,15 @@ def test_friction_of_a_shaft_is_told_from_that_of_its_joints(tmp_path):
     assert np.nanstd(without.residual) > 10 * np.nanstd(estimate.residual)
 
 
+def test_ratios_go_with_the_joints_that_are_named(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(text(rest=SHAFT.replace("[1, 2]", "[2, 1]\nratios = [3.0, -0.5]") + SHAFT + LOG))
+    plant = build_machine(load_case(path)).plant
+    q = np.array([0.2, 0.7])
+    np.testing.assert_allclose(plant.ports(q), [0.2, 0.7, 3.0 * 0.7 - 0.5 * 0.2, 0.9], rtol=1e-15)
+    assert [plant.place(k) for k in range(4)] == [("joint", 1), ("joint", 2), ("shaft", 1), ("shaft", 2)]
+
+
 def test_starts_from_rest_are_looked_at_where_a_reading_shows_them(log, tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(text(rest=SHAFT + LOG))
