@@ -253,9 +253,14 @@ def assess(
     identifiable = np.linalg.norm(vectors[:, blind], axis=1) <= _NEGLIGIBLE
     covariance[~identifiable] = np.nan
     covariance[:, ~identifiable] = np.nan
+    untold = _sparse(vectors[:, blind])
+    weight = np.abs(untold)
+    # Many small weights hold an unknown as one large one does: each is named at least once.
+    named = weight > _NEGLIGIBLE
+    named |= ~identifiable[:, None] & (weight >= weight.max(axis=1, keepdims=True, initial=0.0))
     combinations = [
-        {n: float(w) for n, w in zip(names, _signed(v), strict=True) if abs(w) > _NEGLIGIBLE}
-        for v in _sparse(vectors[:, blind]).T
+        {n: float(w) for n, w, there in zip(names, _signed(v), k, strict=True) if there}
+        for v, k in zip(untold.T, named.T, strict=True)
     ]
     return Precision(covariance, identifiable, combinations, values / max(values[-1], 1e-300))
 

@@ -307,6 +307,10 @@ FAULTS = {
     "actuated twice": ('"chain"', '"chain"\nactuated = [2, 2]', ["actuated", "twice"]),
     "actuated nothing": ('"chain"', '"chain"\nactuated = []', ["actuated", "is empty"]),
     "actuated number": ('"chain"', '"chain"\nactuated = 2', ["actuated", "not a list"]),
+    "gears to two drives": (
+        '"chain"', '"chain"\nactuated = [1, 3]\n[actuator]\ntransmission = [[1.0, 0.0], [1.0, 1.0]]',
+        ["transmission", "a drive for each joint, not 2 for 3", "leave it out"],
+    ),
     "actuated axis": ('"chain"', '"axis"\nactuated = [1]', ["actuated", "unknown key"]),
 }
 PLACES = {

@@ -202,3 +202,14 @@ def test_what_only_rounding_moves_rests_at_its_guess():
     assert float(minimum.theta[2]) == 0.7
     best = np.linalg.lstsq(x[:, [0, 1, 3]], data)[0]
     np.testing.assert_allclose(np.asarray(minimum.theta)[[0, 1, 3]], best, atol=0.01)
+
+
+def test_what_shows_only_beside_another_is_found():
+    """A rate leaves no trace where its amplitude begins at zero, and has one after a step."""
+    t = jnp.linspace(0.0, 3.0, 200)
+    minimum = levenberg_marquardt(
+        lambda theta: theta[0] * jnp.exp(-t / theta[1]) - 2.0 * jnp.exp(-t / 0.4), np.array([0.0, 1.0]),
+        Transform(np.array([False, True])), np.array([-np.inf, 0.0]), np.full(2, np.inf),
+    )
+    assert bool(minimum.converged)
+    np.testing.assert_allclose(minimum.theta, [2.0, 0.4], rtol=1e-9)

@@ -204,6 +204,16 @@ def test_each_untold_combination_names_what_no_other_does():
         assert np.linalg.norm(x @ change) < 1e-9
 
 
+def test_what_small_weights_of_several_combinations_hold_is_named():
+    rng = np.random.default_rng(3)
+    one, two, shared = np.linalg.qr(rng.standard_normal((400, 3)))[0].T
+    x = np.stack([one + 0.12 * shared, one, two + 0.12 * shared, two, shared], axis=1)
+    e = 0.1 * rng.standard_normal((400, 1))
+    got = assess(list("abcde"), x[:, None], e, np.ones((400, 1), bool), 2.0, np.ones(5))
+    assert not got.identifiable.any()
+    assert set().union(*got.unidentifiable) == set("abcde")
+
+
 def test_first_leaves_nuisances_out():
     x = regressor()
     e = np.random.default_rng(10).standard_normal(len(x))

@@ -10,6 +10,8 @@ from two_links import TwoLinks, followed
 from written_logs import write_csv
 
 from jaxid.base_parameters import base_parameters
+from jaxid.discovery.discover import break_away_at_joints
+from jaxid.discovery.union import build_union
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.io.case import load_case
@@ -172,6 +174,26 @@ def test_friction_of_a_shaft_is_told_from_that_of_its_joints(tmp_path):
     assert np.nanstd(without.residual) > 10 * np.nanstd(estimate.residual)
 
 
+def test_ratios_go_with_the_joints_that_are_named(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(text(rest=SHAFT.replace("[1, 2]", "[2, 1]\nratios = [3.0, -0.5]") + SHAFT + LOG))
+    plant = build_machine(load_case(path)).plant
+    q = np.array([0.2, 0.7])
+    np.testing.assert_allclose(plant.ports(q), [0.2, 0.7, 3.0 * 0.7 - 0.5 * 0.2, 0.9], rtol=1e-15)
+    assert [plant.place(k) for k in range(4)] == [("joint", 1), ("joint", 2), ("shaft", 1), ("shaft", 2)]
+
+
+def test_starts_from_rest_are_looked_at_where_a_reading_shows_them(log, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(text(rest=SHAFT + LOG))
+    session = open_session(path, log)
+    rest = build_union(session.machine, session.fit.data).candidates
+    shaft = [c for c in rest if c.label == "static_friction[shaft 1]"]
+    assert len(shaft) == 1
+    at_joints = break_away_at_joints(rest, 2)
+    assert [c.label for c in at_joints] == ["static_friction[1]", "static_friction[2]"]
+
+
 @pytest.mark.parametrize("shaft", [(0.0, 0.0, 0.0), (0.7, 0.0, 0.1)])
 def test_open_loop_simulation_is_the_closed_form(tmp_path, capsys, shaft):
     arm = dataclasses.replace(TwoLinks(), coulomb=(0.0, 0.0), shaft=shaft)
@@ -265,7 +287,11 @@ FAULTS = {
     ),
     "no shaft": (
         ('kind = "viscous_friction"', 'kind = "viscous_friction"\nshaft = 1'),
-        ["shaft = 1 does not exist on kind = 'serial_arm'; leave shaft out"],
+        ["shaft = 1 does not exist on kind = 'serial_arm'; add [[plant.shafts]]"],
+    ),
+    "second shaft": (
+        ("[log]", SHAFT + '[[effects]]\nkind = "coulomb_friction"\nshaft = 2\nlevel = 1.0\n[log]'),
+        ["shaft = 2 is out of range: the plant has 1 shaft; name shaft 1"],
     ),
     "parameters": (("[log]", "[plant.parameters]\nmass = 1.0\n[log]"), ["'parameters'", "there is: kind"]),
 }

@@ -25,8 +25,8 @@ _WHOLE = 1e-2
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
 _ROUGH = 1e-6
 _STUCK = 1e3
-# An unknown whose own size moves the first residual by less than this part of it is without effect: what its
-# column holds is rounding, and dividing by it sends the unknown to 1e15.
+# An unknown whose own size moves the residual by less than this part of the first one is without effect: what
+# its column holds is rounding, and dividing by it sends the unknown to 1e15.
 _NOTHING = 1e-12
 
 
@@ -88,7 +88,7 @@ class _Progress(eqx.Module):
     kept: tuple[Array, Array]
     damping: Array
     growth: Array
-    moves: Array
+    nothing: Array
     steps: Array
     done: Array
 
@@ -149,7 +149,7 @@ def levenberg_marquardt(
         return e, jacobian
 
     def advance(p: _Progress) -> _Progress:
-        return _advanced(p, *evaluate(p.trial), (lower, upper), own, keep, tolerance)
+        return _advanced(p, *evaluate(p.trial), (lower, upper), moves, own, keep, tolerance)
 
     x0 = jnp.clip(transform.inward(theta), lower, upper)
     own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
@@ -157,7 +157,7 @@ def levenberg_marquardt(
     start = _Progress(
         x0, jnp.asarray(0.0), x0, jnp.asarray(jnp.inf), jnp.zeros(p), jnp.zeros((p, p)),
         (jnp.zeros(size), jnp.zeros((size, p))), jnp.asarray(damping), jnp.asarray(2.0),
-        moves, jnp.asarray(0), jnp.asarray(False),
+        jnp.asarray(0.0), jnp.asarray(0), jnp.asarray(False),
     )
     end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, start)
     theta = transform.outward(end.x)
@@ -168,8 +168,8 @@ def levenberg_marquardt(
 
 
 def _advanced(
-    p: _Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], own: Float[Array, " p"],
-    keep: bool, tolerance: float,
+    p: _Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
+    own: Float[Array, " p"], keep: bool, tolerance: float,
 ) -> _Progress:
     """Take or refuse the trial, given residual and Jacobian there, and choose the next; `own`: sizes."""
     lower, upper = bounds
@@ -184,7 +184,9 @@ def _advanced(
         (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept),
         (p.x, p.cost, p.gradient, p.normal, p.kept),
     )
-    moves = p.moves & (~first | (own * jnp.sqrt(jnp.diag(normal)) > _NOTHING * jnp.linalg.norm(e)))
+    nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
+    # Asked at every step: a velocity of which a level of zero leaves no trace has one as soon as that moves.
+    moves = moves & (own * jnp.sqrt(jnp.diag(normal)) > nothing)
     pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     aim = x + _step(gradient, normal, damping, moves & ~pressed)
     trial = jnp.clip(aim, lower, upper)
@@ -199,7 +201,7 @@ def _advanced(
     stuck = rough | (~better & (damping > 1e12))
     growth = jnp.where(better, 2.0, 2 * p.growth)
     return _Progress(
-        trial, predicted, x, cost, gradient, normal, kept, damping, growth, moves, p.steps + 1,
+        trial, predicted, x, cost, gradient, normal, kept, damping, growth, nothing, p.steps + 1,
         small | stuck | ~jnp.isfinite(cost),
     )
 

@@ -79,9 +79,18 @@ class RealTime(eqx.Module):
         for name, value in {**sizes, "gate_velocity": gate_velocity}.items():
             if not np.all(np.asarray(value, float) > 0):
                 raise InputError(f"{name} = {value} is not positive", where="RealTime", mend="it must be > 0")
-        if np.shape(spread) != (len(names),):
-            mend = f"give one of each of {', '.join(names)}"
-            raise InputError(f"spread has shape {np.shape(spread)}", where="RealTime", mend=mend)
+        # A negative gate would let samples at rest through.
+        if not np.all(np.asarray(gate_acceleration, float) >= 0):
+            what = f"gate_acceleration = {gate_acceleration} is negative"
+            raise InputError(what, where="RealTime", mend="it must be >= 0")
+        for name, value in {"spread": spread, "start": spread if start is None else start}.items():
+            if np.shape(value) != (len(names),):
+                mend = f"give one of each of {', '.join(names)}"
+                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", mend=mend)
+        for name, value in {"gate_velocity": gate_velocity, "gate_acceleration": gate_acceleration}.items():
+            if np.shape(value) not in ((), (1,), (n,)):
+                mend = f"give one for all joints, or {n}"
+                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", mend=mend)
         check_instant(machine, "RealTime")
         velocity, acceleration = (
             np.broadcast_to(np.asarray(x, float), (n,)) for x in (gate_velocity, gate_acceleration)

@@ -172,7 +172,7 @@ def load_case(path: str | Path) -> Case:
 
     followed, unknown = read_unknown_reference(tables, drives, file)
     actuator = _checked_transmission(
-        read("actuator", actuator_keys(drives)), drives, file, "controller" in tables
+        read("actuator", actuator_keys(drives)), plant, file, "controller" in tables
     )
     case = Case(
         path=path,
@@ -248,14 +248,18 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _checked_transmission(
-    actuator: dict[str, Any], joints: int, file: str, looped: bool
+    actuator: dict[str, Any], plant: PlantEntry, file: str, looped: bool
 ) -> dict[str, Any]:
     rows, spot = actuator.get("transmission"), Spot(file, "[actuator]", "transmission")
     if rows is None:
         return actuator
+    joints = plant.joints
     if joints == 1:
         mend = "leave it out; a ratio of gears goes into gain"
         raise spot.fault("is for plants with several joints", mend)
+    if plant.drives < joints:
+        mend = "leave it out, and take a log of the joints"
+        raise spot.fault(f"is for plants with a drive for each joint, not {plant.drives} for {joints}", mend)
     if {len(rows), *map(len, rows)} != {joints} or np.linalg.matrix_rank(rows) < joints:
         mend = f"give {joints} rows of {joints} numbers, none a sum of others"
         raise spot.fault("is not an invertible square matrix", mend)

@@ -33,6 +33,8 @@ def read_ports(
     for name in (name for name in places if name in there):
         if not there[name]:
             mend = f"leave {name} out: the effect then acts on the joint"
+            if name == "shaft" and plant.cls.linked:
+                mend = "add [[plant.shafts]] with the joints that it turns with, or name joints"
             what = f"does not exist on kind = '{plant.cls.kind}'"
             raise spot.at(name).refuse(table[name], what, mend)
     if "spring" in table:
@@ -78,7 +80,9 @@ def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot
     """
     if max(named) > there:
         fault = f"is out of range: the plant has {count(there, what)}"
-        mend = f"{what}s count from 1 to {there}" if there > 1 else f"leave {what} out"
+        # Without its place an effect is on the joints, not on the only shaft.
+        alone = "name shaft 1" if what == "shaft" else f"leave {what} out"
+        mend = f"{what}s count from 1 to {there}" if there > 1 else alone
         raise spot.refuse(given, fault, mend)
     if len(set(named)) < len(named):
         raise spot.refuse(given, f"names a {what} twice", f"name each {what} once")
