@@ -145,10 +145,13 @@ def test_a_root_keeps_what_a_covariance_loses():
     theta, p = textbook(START, own, 1.0, y, r)
     inverse = np.linalg.inv(y.T @ y)
     exact, size = inverse @ (y.T @ r), inverse.max()
-    assert np.max(np.abs(memory.root @ memory.root.T - inverse)) < 1e-7 * size
-    assert np.max(np.abs(p - inverse)) > 1e-2 * size
-    assert np.max(np.abs(memory.theta / exact - 1)) < 1e-6
-    assert np.max(np.abs(theta / exact - 1)) > 1e-5
+    off = np.max(np.abs(memory.root @ memory.root.T - inverse))
+    assert off < 1e-7 * size
+    # How much P loses is up to the processor.
+    assert np.max(np.abs(p - inverse)) > 1e3 * off
+    lost = np.max(np.abs(memory.theta / exact - 1))
+    assert lost < 1e-6
+    assert np.max(np.abs(theta / exact - 1)) > 1e3 * lost
 
 
 @pytest.mark.parametrize("beta", [1.0, 1.0 - 1e-4])
