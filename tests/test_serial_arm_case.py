@@ -12,6 +12,7 @@ from written_logs import write_csv
 from jaxid.base_parameters import base_parameters
 from jaxid.discovery.discover import break_away_at_joints
 from jaxid.discovery.union import build_union
+from jaxid.discovery.breakaway import break_away
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.io.case import load_case
@@ -87,6 +88,13 @@ def test_base_parameters_of_two_links_come_back(estimates):
     # and the start is off by far more than that
     off = np.abs(estimate.precision.std[:6]) * 10
     assert np.all(np.abs([truth()[n] - 0.1 for n in estimate.names[:6]]) > off)
+
+
+def test_starts_of_an_arm_are_no_place_to_look_for_break_away_friction(estimates, log, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(text())
+    found = break_away(estimates["base"], open_session(path, log).runs, (0, 1))
+    assert ["push one another" in why for why in found] == [True, True]
 
 
 RATIO = np.array([[20.0, 0.0], [30.0, -30.0]])
