@@ -10,8 +10,6 @@ from two_links import TwoLinks, followed
 from written_logs import write_csv
 
 from jaxid.base_parameters import base_parameters
-from jaxid.discovery.discover import break_away_at_joints
-from jaxid.discovery.union import build_union
 from jaxid.discovery.breakaway import break_away
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
@@ -93,8 +91,8 @@ def test_base_parameters_of_two_links_come_back(estimates):
 def test_starts_of_an_arm_are_no_place_to_look_for_break_away_friction(estimates, log, tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(text())
-    found = break_away(estimates["base"], open_session(path, log).runs, (0, 1))
-    assert ["push one another" in why for why in found] == [True, True]
+    found = break_away(estimates["base"], open_session(path, log).runs, (0, 1, 2))
+    assert ["push one another" in why for why in found] == [True, True, True]
 
 
 RATIO = np.array([[20.0, 0.0], [30.0, -30.0]])
@@ -189,17 +187,6 @@ def test_ratios_go_with_the_joints_that_are_named(tmp_path):
     q = np.array([0.2, 0.7])
     np.testing.assert_allclose(plant.ports(q), [0.2, 0.7, 3.0 * 0.7 - 0.5 * 0.2, 0.9], rtol=1e-15)
     assert [plant.place(k) for k in range(4)] == [("joint", 1), ("joint", 2), ("shaft", 1), ("shaft", 2)]
-
-
-def test_starts_from_rest_are_looked_at_where_a_reading_shows_them(log, tmp_path):
-    path = tmp_path / "case.toml"
-    path.write_text(text(rest=SHAFT + LOG))
-    session = open_session(path, log)
-    rest = build_union(session.machine, session.fit.data).candidates
-    shaft = [c for c in rest if c.label == "static_friction[shaft 1]"]
-    assert len(shaft) == 1
-    at_joints = break_away_at_joints(rest, 2)
-    assert [c.label for c in at_joints] == ["static_friction[1]", "static_friction[2]"]
 
 
 @pytest.mark.parametrize("shaft", [(0.0, 0.0, 0.0), (0.7, 0.0, 0.1)])

@@ -104,7 +104,7 @@ def explore(
         after = _refit(session.with_machine(after.machine), after) if effects else before
     separating = proposals(session, search, effects, progress)
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
-    missing = [] if unseen else break_away_at_joints(search.rest(), after.machine.plant.joints)
+    missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]
     while missing:
         progress("looking at the starts from rest")
         leaving = break_away(after, session.runs, [c.port for c in missing])
@@ -127,11 +127,6 @@ def explore(
         tuple(_round(search, s) for s in steps), before, after, old, new, search.floor, separating,
         unseen,
     )
-
-
-def break_away_at_joints(rest: Sequence[cand.Candidate], joints: int) -> list[cand.Candidate]:
-    """Break-away friction among candidates, where a reading shows a start: a shaft has none of its own."""
-    return [c for c in rest if c.kind == StaticFriction.kind and c.port < joints]
 
 
 def start_search(
