@@ -305,7 +305,7 @@ def same_logs(folder: Path) -> None:
     (folder / "swing.toml").write_text(SWING % DRY)
     table = Table("from one log of a swing, K_p = 400", ["", "inertia", "Coulomb", "viscous"])
     table.row("true", INERTIA, COULOMB, VISCOUS)
-    period = settled(swinging(400.0, 0.3))[1]
+    period = settled(made)[1]
     table.row("K_p T^2 / 4 pi^2", f"{400 * period**2 / (4 * np.pi**2):.4f}", "", "")
     for method in ("inverse_dynamics", "output_error"):
         found = jaxid.identify(folder / "swing.toml", log, method=method)

@@ -3,7 +3,7 @@
 Hypothesis: with the balance of the whole arm, base parameters and friction of every joint are found by least
 squares, and less of the torque is left on the last third of the log than by a friction and an inertia of
 each joint alone; what is left at the last two joints is the friction of the shaft that both turn, and
-`discover` names it.
+`discover` names it. Of the last half holds: it names the shaft's viscous friction, not its Coulomb friction.
 
     JAXID_DATA=... python experiments/tx40.py [-o results/tx40] [--only models|hidden]
 """
