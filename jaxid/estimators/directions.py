@@ -20,7 +20,17 @@ from jaxid.estimators.directions_precision import (
     hessian_of,
     told_of,
 )
-from jaxid.estimators.directions_problem import FAR, NO_PULL, SETTLED, Found, Problem, fit, fit_each
+from jaxid.estimators.directions_problem import (
+    FAR,
+    NO_PULL,
+    SETTLED,
+    Found,
+    Problem,
+    columns,
+    fit,
+    fit_each,
+    read,
+)
 from jaxid.estimators.directions_rounding import covariance_with_rounding, rounds
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
@@ -86,7 +96,7 @@ def directions_steps(
     if hessian and told is not None and rounds(machine, found):
         remarks.append("rounding was simulated: the Hessian says nothing beside it")
     elif hessian and told is not None:
-        args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
+        args = (*found.problem.args, found.problem.ladder[-1], found.first, z)
         full = np.asarray((yield Solve(hessian_of, args)))[:r, :r]
         if np.linalg.eigvalsh(full)[0] > 0.0:
             told = told_of(found, full)
@@ -95,7 +105,7 @@ def directions_steps(
     precision, stated = assessed(machine, found, told)
     if profile:
         remarks += yield from add_profiles(found, stated)
-    theta = np.asarray(found.problem.prior.outward(found.vectors @ z))[:p]
+    theta = np.asarray(found.problem.prior.outward(found.point))[:p]
     e = np.asarray(found.minimum.residual).reshape(found.problem.measured.shape)
     counts = found.problem.weight > 0
     converged = bool(found.minimum.converged) and found.settled
@@ -132,27 +142,26 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]
     `last`: at the sharpest only, from a point that is near.
     """
     size, spent = problem.prior.base.size, 0
-    whole, none = np.eye(size), np.zeros(size, bool)
     ladder = problem.ladder[-1:] if last else problem.ladder
-    minimum = yield Solve(fit, (*problem.args, ladder[0], NO_PULL, whole, w, none))
     count, cost, settled = 0, np.inf, False
     for rung in range(len(ladder) + _ROUNDS):
         sharpness, before = ladder[min(rung, len(ladder) - 1)], count
         # Directions that change places with one another for ever are taken as they are.
         if rung < len(ladder) + _READ:
-            problem = problem.weighed(minimum)
-            here = yield Solve(fit, (*problem.args, sharpness, NO_PULL, whole, w, none))
+            problem, here = problem.weighed((yield from read(problem, sharpness, w)))
             spent += int(here.steps)
             if not np.all(np.isfinite(here.jacobian)):
-                return Found(problem, whole, 0, here, spent, False)
+                still = np.zeros(columns(np.eye(size), 0).shape[1])
+                return Found(problem, np.eye(size), 0, replace(here, theta=still), spent, False)
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
-        fitted = np.arange(size) < count
-        start = np.where(fitted, np.clip(vectors.T @ w, -FAR, FAR), 0.0)
+        some = columns(vectors, count)
+        fitted = np.arange(some.shape[1]) < count
+        start = np.where(fitted, np.clip(some.T @ w, -FAR, FAR), 0.0)
         pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
-        minimum = yield Solve(fit, (*problem.args, sharpness, pull, vectors, start, fitted))
+        minimum = yield Solve(fit, (*problem.args, sharpness, pull, np.zeros(size), some, start, fitted))
         spent += int(minimum.steps)
-        w = vectors @ np.asarray(minimum.theta)
+        w = some @ np.asarray(minimum.theta)
         moved = abs(float(minimum.cost) - cost)
         close = before == count and moved <= SETTLED / len(problem.measured) * cost
         settled, cost = close and sharpness is ladder[-1], float(minimum.cost)
@@ -178,9 +187,11 @@ def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
         rest = np.arange(found.count, len(found.vectors))
         order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
         vectors, count = found.vectors[:, order], int(stays.sum())
-        fitted = np.arange(len(vectors)) < count
-        z = np.where(fitted, np.asarray(found.minimum.theta)[order], 0.0)
-        args = (*found.problem.args, found.problem.ladder[-1], NO_PULL, vectors, z, fitted)
+        some = columns(vectors, count)
+        fitted = np.arange(some.shape[1]) < count
+        z = np.where(fitted, some.T @ found.point, 0.0)
+        origin = np.zeros(len(vectors))
+        args = (*found.problem.args, found.problem.ladder[-1], NO_PULL, origin, some, z, fitted)
         minimum = yield Solve(fit, args)
         spent = found.evaluations + int(minimum.steps)
         found = replace(found, vectors=vectors, count=count, minimum=minimum, evaluations=spent)
@@ -202,8 +213,8 @@ def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
 
 def _elsewhere(problem: Problem, found: Found, points: np.ndarray) -> Steps[Found]:
     """The rounds from the best of some points too: a machine that sticks at the guesses shows nothing."""
-    size = problem.prior.base.size
-    still = (np.eye(size), points, np.zeros((len(points), size), bool))
+    nothing = np.zeros(points.shape[1])
+    still = (nothing, np.eye(points.shape[1]), points, np.zeros(points.shape, bool))
     _, costs, _, _ = yield Solve(fit_each, (*problem.args, problem.ladder[0], NO_PULL, *still))
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     other = yield from _rounds(problem, points[best])
@@ -215,21 +226,22 @@ def _many_starts(found: Found, points: np.ndarray) -> Steps[tuple[Found, dict[st
     """The best of many starts, and how many end there."""
     spent = found.evaluations
     for again in (True, False):
-        fitted = np.arange(found.vectors.shape[0]) < found.count
-        z = np.where(fitted, np.clip(points @ found.vectors, -FAR, FAR), 0.0)
+        some, origin = found.first, np.zeros(points.shape[1])
+        fitted = np.arange(some.shape[1]) < found.count
+        z = np.where(fitted, np.clip(points @ some, -FAR, FAR), 0.0)
         active = np.tile(fitted, (len(z), 1))
         noise = found.problem.noise(found.minimum, found.count)
         ladder = found.problem.ladder
         for sharpness in ladder:
             pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
-            args = (*found.problem.args, sharpness, pull, found.vectors, z, active)
+            args = (*found.problem.args, sharpness, pull, origin, some, z, active)
             z, costs, _, _ = (np.asarray(x) for x in (yield Solve(fit_each, args)))
         costs = np.where(np.isfinite(costs), costs, np.inf)
         best, cost = int(np.argmin(costs)), float(found.minimum.cost)
         if not again or costs[best] >= cost * (1 - _SAME):
             break
         # Other directions may be told from there.
-        other = yield from _rounds(found.problem, found.vectors @ z[best], last=True)
+        other = yield from _rounds(found.problem, some @ z[best], last=True)
         spent += other.evaluations
         if float(other.minimum.cost) >= cost:
             break

@@ -82,7 +82,7 @@ def assessed(
     names = [*machine.parameters.names, *problem.nuisances]
     z = np.asarray(found.minimum.theta)
     seen, held = found.vectors[:, :r], found.vectors[:, r:]
-    slope = problem.prior.slope(np.asarray(problem.prior.outward(found.vectors @ z)))
+    slope = problem.prior.slope(np.asarray(problem.prior.outward(found.point)))
     whole = seen @ told.covariance @ seen.T + held @ held.T
     p = len(problem.places)
     left = np.sqrt(np.diag(whole))[:p]
@@ -118,17 +118,18 @@ def add_profiles(found: Found, stated: list[dict[str, Any]]) -> Steps[list[str]]
     Returns:
         What to remark: profiles that fall below the fit.
     """
-    r, size = found.count, found.vectors.shape[0]
+    r, some = found.count, found.first
     if not r:
         return []
     best = np.asarray(found.minimum.theta)
     z = np.tile(best, (r, _PROFILED.size, 1))
-    active = np.tile(np.arange(size) < r, (r, _PROFILED.size, 1))
+    active = np.tile(np.arange(best.size) < r, (r, _PROFILED.size, 1))
     for k in range(r):
         z[k, :, k] += _PROFILED * stated[k]["std"]
         active[k, :, k] = False
-    flat = (z.reshape(-1, size), active.reshape(-1, size))
-    args = (*found.problem.args, found.problem.ladder[-1], NO_PULL, found.vectors, *flat)
+    flat = (z.reshape(-1, best.size), active.reshape(-1, best.size))
+    still = (NO_PULL, np.zeros(len(some)), some)
+    args = (*found.problem.args, found.problem.ladder[-1], *still, *flat)
     _, costs, _, _ = yield Solve(fit_each, args)
     rise = 2 * (np.asarray(costs).reshape(r, -1) - float(found.minimum.cost))
     noise = found.problem.noise(found.minimum, r) ** 2

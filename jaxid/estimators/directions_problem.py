@@ -24,6 +24,9 @@ from jaxid.sensors import Sensor
 SETTLED = 0.02
 # Farther from its guess than so many priors no unknown is taken.
 FAR = 8.0
+# Coordinates of a compiled fit come in multiples of this: few directions are told, and each costs as much
+# as the simulation itself.
+_TOGETHER = 4
 # No pull towards the guesses.
 NO_PULL = np.zeros(())
 # Friction that rises with speeding up lets a velocity stand, and costs have a kink wherever it does: such
@@ -93,6 +96,7 @@ class Problem:
         measured, weight: (time, k).
         prior: Of the unknowns, nuisances behind them.
         on: What of the simulation is compared.
+        ladder: Sharpnesses at which to fit, one after the other.
     """
 
     replay: Replay
@@ -102,20 +106,12 @@ class Problem:
     weight: np.ndarray
     prior: Prior
     on: str
+    ladder: tuple[np.ndarray, ...]
 
     @property
     def args(self) -> tuple:
         """For the compiled functions."""
         return (self.replay, self.places, self.plant, self.measured, self.weight, self.prior, self.on)
-
-    @property
-    def ladder(self) -> list[np.ndarray]:
-        """Sharpnesses at which to fit, one after the other."""
-        n, m = self.replay.position.size, self.replay.drive.gain.size
-        none, u = jnp.zeros(n), jnp.zeros(m)
-        own = self.plant.initial_states(u)
-        rises = self.plant.balance(none, none, none, u, jnp.zeros(()), own).rises
-        return [np.asarray(s) for s in (_LADDER if rises else (self.plant.sharpness,))]
 
     @classmethod
     def of(cls, machine: Machine, log: Log, prior: float, on: str, numerics: Numerics) -> Problem:
@@ -133,7 +129,10 @@ class Problem:
         start = np.zeros(0) if std is None else np.broadcast_to(np.asarray(std), n)
         whole = Prior.of(machine, prior, start)
         weight = np.tile(counts.astype(float), (len(measured), 1))
-        return cls(replay, machine.parameters.places, machine.plant, measured, weight, whole, on)
+        plant, m = machine.plant, log.force.shape[1]
+        ladder = _LADDER if _rises(plant, np.zeros(n), np.zeros(m)) else (plant.sharpness,)
+        sharp = tuple(np.asarray(s) for s in ladder)
+        return cls(replay, machine.parameters.places, plant, measured, weight, whole, on, sharp)
 
     @property
     def nuisances(self) -> list[str]:
@@ -144,16 +143,20 @@ class Problem:
         """Unknowns with all nuisances at zero."""
         return np.concatenate([theta, np.zeros(self.prior.base.size - len(theta))])
 
-    def weighed(self, minimum: Minimum) -> Problem:
-        """Columns of the residual by their own spread, where there are several."""
+    def weighed(self, minimum: Minimum) -> tuple[Problem, Minimum]:
+        """Columns of the residual by their own spread, where there are several; the minimum likewise."""
         counts = self.weight[0] > 0
         if counts.sum() == 1:
-            return self
+            return self, minimum
         e = np.asarray(minimum.residual).reshape(self.measured.shape)[:, counts] / self.weight[0, counts]
         least = 1e-12 * np.std(self.measured[:, counts], axis=0)
-        row = np.zeros(len(counts))
+        row, factor = np.zeros(len(counts)), np.zeros(len(counts))
         row[counts] = 1.0 / np.maximum(np.std(e, axis=0), least)
-        return replace(self, weight=np.tile(row, (len(self.measured), 1)))
+        factor[counts] = row[counts] / self.weight[0, counts]
+        by = np.tile(factor, len(self.measured))
+        e, jacobian = by * np.asarray(minimum.residual), by[:, None] * np.asarray(minimum.jacobian)
+        weighed = replace(minimum, residual=e, jacobian=jacobian, cost=np.asarray(0.5 * e @ e))
+        return replace(self, weight=np.tile(row, (len(self.measured), 1))), weighed
 
     def noise(self, minimum: Minimum, count: int) -> float:
         """Standard deviation of a weighted residual of which so many directions are fitted."""
@@ -166,23 +169,34 @@ class Problem:
         return float(100 * 2 * float(minimum.cost) / spread)
 
 
+@eqx.filter_jit
+def _rises(plant: Plant, q: Array, u: Array) -> bool:
+    """Whether any friction acts only while speed grows; known when it is compiled."""
+    return bool(plant.balance(q, q, q, u, jnp.zeros(()), plant.initial_states(u)).rises)
+
+
+def columns(vectors: Float[np.ndarray, "q q"], count: int) -> Float[np.ndarray, "q k"]:
+    """The first directions, so many at least, in a number that compiled code is made for."""
+    return vectors[:, : _TOGETHER * max(1, -(-count // _TOGETHER))]
+
+
 def residual_of(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, prior: Prior, on: str,
-    vectors: Array,
+    vectors: Array, origin: Array | float = 0.0,
 ) -> Any:
-    """Residual as a function of the directions' coordinates."""
+    """Residual as a function of the directions' coordinates, counted from a point in units of the prior."""
     physical = output_residual(replay, places, plant, measured, weight, on)
     # Behind the unknowns stand positions at the start; velocities there are known to be those of the log.
     still = jnp.zeros(prior.base.size - len(places))
-    return lambda z: physical(jnp.concatenate([prior.outward(vectors @ z), still]))
+    return lambda z: physical(jnp.concatenate([prior.outward(origin + vectors @ z), still]))
 
 
 def _descent(*args: Any) -> Minimum:
     """Down the cost; `pull`, the noise that a prior is held against, keeps the way near the guesses."""
-    replay, places, plant, *rest, sharpness, pull, vectors, z, active = args
+    replay, places, plant, *rest, sharpness, pull, origin, vectors, z, active = args
     bound = jnp.full(z.shape, FAR)
     linear = Transform(np.zeros(z.shape, bool))
-    compared = residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors)
+    compared = residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors, origin)
     residual = lambda z: jnp.concatenate([compared(z).ravel(), pull * z])
     tolerance = 0.1 * SETTLED / rest[0].shape[0]
     found = levenberg_marquardt(
@@ -196,17 +210,33 @@ def _descent(*args: Any) -> Minimum:
 
 @eqx.filter_jit
 def fit(*args: Any) -> Minimum:
-    """From one start: `Problem.args`, sharpness, pull, directions, coordinates, and which are fitted."""
+    """From one start: `Problem.args`, sharpness, pull, origin, directions, coordinates, and which are fitted."""
     return _descent(*args)
+
+
+def read(problem: Problem, sharpness: np.ndarray, w: Float[np.ndarray, " q"]) -> Steps[Minimum]:
+    """Residual and its Jacobian in all coordinates at a point in units of the prior; nothing moves.
+
+    By the compiled fit, a few columns at a time: code of its own would take as long again to compile.
+    """
+    size, width = w.size, min(w.size, _TOGETHER)
+    vectors = np.eye(size, -(-size // width) * width)
+    still = (np.zeros(width), np.zeros(width, bool))
+    found = []
+    for first in range(0, size, width):
+        some = vectors[:, first : first + width]
+        found.append((yield Solve(fit, (*problem.args, sharpness, NO_PULL, w, some, *still))))
+    jacobian = np.concatenate([np.asarray(m.jacobian) for m in found], axis=1)[:, :size]
+    return replace(found[0], theta=w, jacobian=jacobian)
 
 
 @eqx.filter_jit
 def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
     """From many starts, or with many things held: coordinates, cost, convergence and steps of each."""
-    *problem, vectors, z, active = args
+    *problem, z, active = args
 
     def one(z: Array, active: Array) -> tuple:
-        found = _descent(*problem, vectors, z, active)
+        found = _descent(*problem, z, active)
         return found.theta, found.cost, found.converged, found.steps
 
     return eqx.filter_vmap(one)(z, active)
@@ -214,7 +244,10 @@ def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Found:
-    """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum."""
+    """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum.
+
+    The minimum is in the coordinates of the first few directions; the others' are zero.
+    """
 
     problem: Problem
     vectors: np.ndarray
@@ -223,6 +256,16 @@ class Found:
     evaluations: int
     settled: bool
 
+    @property
+    def first(self) -> np.ndarray:
+        """Directions of the minimum's coordinates."""
+        return columns(self.vectors, self.count)
+
+    @property
+    def point(self) -> np.ndarray:
+        """In units of the prior."""
+        return self.first @ np.asarray(self.minimum.theta)
+
 
 def criterion_steps(
     machine: Machine, log: Log, theta: Float[np.ndarray, " p"], *, on: str = "position",
@@ -230,8 +273,5 @@ def criterion_steps(
 ) -> Steps[float]:
     """Criterion of the same simulation at given unknowns, percent; nothing is fitted."""
     problem = Problem.of(machine, log, 1.0, on, numerics or choose_numerics(machine, log))
-    size = problem.prior.base.size
     w = problem.prior.inward(problem.padded(theta))
-    nothing = (np.eye(size), w, np.zeros(size, bool))
-    found = yield Solve(fit, (*problem.args, problem.ladder[-1], NO_PULL, *nothing))
-    return problem.criterion(found)
+    return problem.criterion((yield from read(problem, problem.ladder[-1], w)))

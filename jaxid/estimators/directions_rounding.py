@@ -88,7 +88,7 @@ def _within(
     z = np.tile(best, (_DRAWS, 1))
     z[:, :r] += off
     args = (with_sensor(problem.replay, machine.sensor), *problem.args[1:], problem.ladder[-1])
-    e = np.asarray((yield Solve(_each, (*args, found.vectors, z, starts))))
+    e = np.asarray((yield Solve(_each, (*args, found.first, z, starts))))
     # Of data drawn, less what the estimate says: what a fit of them would begin with.
     shape = problem.measured.shape
     apart = (np.asarray(found.minimum.residual).reshape(shape) - e).reshape(_DRAWS, -1)
