@@ -27,7 +27,7 @@ from jaxid.estimators.directions_problem import (
     Found,
     Problem,
     columns,
-    fit,
+    descent,
     fit_each,
     read,
 )
@@ -146,8 +146,9 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]
     count, cost, settled = 0, np.inf, False
     for rung in range(len(ladder) + _ROUNDS):
         sharpness, before = ladder[min(rung, len(ladder) - 1)], count
-        # Directions that change places with one another for ever are taken as they are.
-        if rung < len(ladder) + _READ:
+        # Between the first rung and the last they hardly turn; those that change places with one another for
+        # ever are taken as they are.
+        if rung == 0 or len(ladder) - 1 <= rung < len(ladder) + _READ:
             problem, here = problem.weighed((yield from read(problem, sharpness, w)))
             spent += int(here.steps)
             if not np.all(np.isfinite(here.jacobian)):
@@ -159,7 +160,7 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]
         fitted = np.arange(some.shape[1]) < count
         start = np.where(fitted, np.clip(some.T @ w, -FAR, FAR), 0.0)
         pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
-        minimum = yield Solve(fit, (*problem.args, sharpness, pull, np.zeros(size), some, start, fitted))
+        minimum = yield from descent(problem, sharpness, pull, np.zeros(size), some, start, fitted)
         spent += int(minimum.steps)
         w = some @ np.asarray(minimum.theta)
         moved = abs(float(minimum.cost) - cost)
@@ -191,8 +192,8 @@ def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
         fitted = np.arange(some.shape[1]) < count
         z = np.where(fitted, some.T @ found.point, 0.0)
         origin = np.zeros(len(vectors))
-        args = (*found.problem.args, found.problem.ladder[-1], NO_PULL, origin, some, z, fitted)
-        minimum = yield Solve(fit, args)
+        last = found.problem.ladder[-1]
+        minimum = yield from descent(found.problem, last, NO_PULL, origin, some, z, fitted)
         spent = found.evaluations + int(minimum.steps)
         found = replace(found, vectors=vectors, count=count, minimum=minimum, evaluations=spent)
     return found, None
@@ -201,7 +202,8 @@ def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
 def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     """Directions as columns, best told first, and how many are fitted; of a Jacobian over the noise."""
     size = jacobian.shape[1]
-    _, values, rows = np.linalg.svd(jacobian, full_matrices=True)
+    # Of its triangle, a tenth as long.
+    _, values, rows = np.linalg.svd(np.linalg.qr(jacobian, mode="r"), full_matrices=True)
     told = np.zeros(size)
     told[: values.size] = values
     count = int(np.sum(told > 1.0 / _TOLD_TWICE))

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxid.errors import InputError
-from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.least_squares import Minimum, Progress, Transform, descend
 from jaxid.estimators.output_error import choose_numerics, measured_output, output_residual
 from jaxid.estimators.steps import Solve, Steps
 from jaxid.io.log import Log
@@ -20,8 +21,9 @@ from jaxid.model import Plant
 from jaxid.replay import Numerics, Replay, from_rest, make_replay, with_sensor
 from jaxid.sensors import Sensor
 
-# In parts of the variance of one sample.
+# In parts of the variance of one sample: where a fit has settled, and where it is near enough to go on sharper.
 SETTLED = 0.02
+_NEAR = 1.0
 # Farther from its guess than so many priors no unknown is taken.
 FAR = 8.0
 # Coordinates of a compiled fit come in multiples of this: few directions are told, and each costs as much
@@ -33,6 +35,8 @@ NO_PULL = np.zeros(())
 # a machine is fitted with that rounded over these parts of it. At most so many evaluations at each.
 _LADDER = (1.0, 0.3, 0.1)
 _A_RUNG = 25
+# Evaluations in a compiled call.
+_AT_ONCE = 4
 
 
 class Prior(eqx.Module):
@@ -191,27 +195,55 @@ def residual_of(
     return lambda z: physical(jnp.concatenate([prior.outward(origin + vectors @ z), still]))
 
 
-def _descent(*args: Any) -> Minimum:
+def _goes_on(*args: Any) -> Progress:
     """Down the cost; `pull`, the noise that a prior is held against, keeps the way near the guesses."""
-    replay, places, plant, *rest, sharpness, pull, origin, vectors, z, active = args
-    bound = jnp.full(z.shape, FAR)
-    linear = Transform(np.zeros(z.shape, bool))
+    replay, places, plant, *rest, sharpness, pull, origin, vectors, active, tolerance, stop, progress = args
+    bound = jnp.full(active.shape, FAR)
     compared = residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors, origin)
-    residual = lambda z: jnp.concatenate([compared(z).ravel(), pull * z])
-    tolerance = 0.1 * SETTLED / rest[0].shape[0]
-    found = levenberg_marquardt(
-        residual, z, linear, -bound, bound, active, max_steps=_A_RUNG, tolerance=tolerance
-    )
-    e = found.residual[: -z.size]
-    return replace(
-        found, residual=e, jacobian=found.jacobian[: -z.size], cost=0.5 * jnp.sum(e * e),
-    )
+    residual = jax.jit(lambda z: jnp.concatenate([compared(z).ravel(), pull * z]))
+    return descend(residual, progress, (-bound, bound), stop, active, tolerance)
 
 
-@eqx.filter_jit
-def fit(*args: Any) -> Minimum:
-    """From one start: `Problem.args`, sharpness, pull, origin, directions, coordinates, and which are fitted."""
-    return _descent(*args)
+_go_on = eqx.filter_jit(_goes_on)
+
+
+def descent(
+    problem: Problem, sharpness: np.ndarray, pull: np.ndarray, origin: np.ndarray, vectors: np.ndarray,
+    z: Float[np.ndarray, " k"], active: Bool[np.ndarray, " k"],
+) -> Steps[Minimum]:
+    """Fit from one start, a few evaluations at a time: side by side no run then waits long for another.
+
+    Args:
+        problem: The problem.
+        sharpness: Of the smoothed sign.
+        pull: See `_goes_on`.
+        origin: Point in units of the prior from which coordinates are counted.
+        vectors: Directions, as columns.
+        z: Coordinates along them.
+        active: Which are fitted.
+    """
+    progress = _begun(z, problem.measured.size)
+    # A rung above the last is only to lead near.
+    settled = SETTLED if sharpness is problem.ladder[-1] else _NEAR
+    tolerance = np.asarray(0.1 * settled / len(problem.measured))
+    args = (*problem.args, sharpness, pull, origin, vectors, active, tolerance)
+    while not progress.done and progress.steps < _A_RUNG:
+        stop = np.minimum(progress.steps + _AT_ONCE, _A_RUNG)
+        progress = yield Solve(_go_on, (*args, stop, progress))
+    return _compared(progress)
+
+
+def _begun(z: Array, size: int) -> Progress:
+    xp = np if isinstance(z, np.ndarray) else jnp
+    return Progress.at(z, xp.where(z == 0, 1.0, xp.abs(z)), size + z.size)
+
+
+def _compared(progress: Progress) -> Minimum:
+    """The minimum, without the pull; the solver's scale is that of the coordinates."""
+    e, jacobian = (x[: -progress.x.size] for x in progress.kept)
+    cost = 0.5 * e @ e
+    sound = progress.done & (abs(cost) < np.inf)
+    return Minimum(progress.x, cost, progress.steps, sound, e, jacobian)
 
 
 def read(problem: Problem, sharpness: np.ndarray, w: Float[np.ndarray, " q"]) -> Steps[Minimum]:
@@ -225,18 +257,22 @@ def read(problem: Problem, sharpness: np.ndarray, w: Float[np.ndarray, " q"]) ->
     found = []
     for first in range(0, size, width):
         some = vectors[:, first : first + width]
-        found.append((yield Solve(fit, (*problem.args, sharpness, NO_PULL, w, some, *still))))
+        found.append((yield from descent(problem, sharpness, NO_PULL, w, some, *still)))
     jacobian = np.concatenate([np.asarray(m.jacobian) for m in found], axis=1)[:, :size]
     return replace(found[0], theta=w, jacobian=jacobian)
 
 
 @eqx.filter_jit
 def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
-    """From many starts, or with many things held: coordinates, cost, convergence and steps of each."""
+    """From many starts, or with many things held: coordinates, cost, convergence and steps of each.
+
+    Args as of `descent`, with `Problem.args` first, and many of the last two.
+    """
     *problem, z, active = args
+    size, tolerance = problem[3].size, 0.1 * SETTLED / len(problem[3])
 
     def one(z: Array, active: Array) -> tuple:
-        found = _descent(*problem, z, active)
+        found = _compared(_goes_on(*problem, active, tolerance, _A_RUNG, _begun(z, size)))
         return found.theta, found.cost, found.converged, found.steps
 
     return eqx.filter_vmap(one)(z, active)

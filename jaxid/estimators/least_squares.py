@@ -78,7 +78,19 @@ class Minimum(eqx.Module):
     jacobian: Array
 
 
-class _Progress(eqx.Module):
+class Progress(eqx.Module):
+    """Where a descent stands, on the solver's scale; it can be cut short anywhere, and go on to the same bits.
+
+    Args:
+        trial: Point to evaluate next, and by how much the cost should fall there (`predicted`).
+        x, cost, gradient, normal: Best point, and the quadratic picture of the cost there.
+        kept: Residual and Jacobian there; empty where not kept.
+        damping, growth: Of the steps.
+        own: Sizes of the unknowns at the start. `nothing`: of the residual, what counts as nothing.
+        steps: Evaluations so far.
+        done: Whether the cost can fall no further, or is not finite.
+    """
+
     trial: Array
     predicted: Array
     x: Array
@@ -88,9 +100,31 @@ class _Progress(eqx.Module):
     kept: tuple[Array, Array]
     damping: Array
     growth: Array
+    own: Array
     nothing: Array
     steps: Array
     done: Array
+
+    @classmethod
+    def at(cls, x: Array, own: Array, size: int, damping: float = DAMPING) -> Progress:
+        """At a start; `size`: of the residual that is kept, zero for none.
+
+        Of numpy's arrays where x is one: to make jax's outside of compiled code takes longer.
+        """
+        p, xp = x.size, np if isinstance(x, np.ndarray) else jnp
+        return cls(
+            x, xp.asarray(0.0), x, xp.asarray(np.inf), xp.zeros(p), xp.zeros((p, p)),
+            (xp.zeros(size), xp.zeros((size, p))), xp.asarray(damping), xp.asarray(2.0), own,
+            xp.asarray(0.0), xp.asarray(0), xp.asarray(False),
+        )
+
+    def minimum(self, transform: Transform) -> Minimum:
+        """As a result."""
+        theta = transform.outward(self.x)
+        return Minimum(
+            theta, self.cost, self.steps, self.done & jnp.isfinite(self.cost), self.kept[0],
+            self.kept[1] / transform.slope(theta),
+        )
 
 
 def levenberg_marquardt(
@@ -137,42 +171,51 @@ def levenberg_marquardt(
         )
     # Traced once, for its shape and for its Jacobian.
     residual = jax.jit(residual)
-    lower, upper = transform.inward(lower), transform.inward(upper)
-    moves = jnp.ones(theta.size, bool) if active is None else active
-
-    def evaluate(x: Array) -> tuple[Array, Array]:
-        def flat(x: Array) -> tuple[Array, Array]:
-            e = residual(transform.outward(x)).ravel()
-            return e, e
-
-        jacobian, e = jax.jacfwd(flat, has_aux=True)(x)
-        return e, jacobian
-
-    def advance(p: _Progress) -> _Progress:
-        return _advanced(p, *evaluate(p.trial), (lower, upper), moves, own, keep, tolerance)
-
-    x0 = jnp.clip(transform.inward(theta), lower, upper)
+    bounds = transform.inward(lower), transform.inward(upper)
+    x0 = jnp.clip(transform.inward(theta), *bounds)
     own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
-    p, size = theta.size, jax.eval_shape(residual, theta).size if keep else 0
-    start = _Progress(
-        x0, jnp.asarray(0.0), x0, jnp.asarray(jnp.inf), jnp.zeros(p), jnp.zeros((p, p)),
-        (jnp.zeros(size), jnp.zeros((size, p))), jnp.asarray(damping), jnp.asarray(2.0),
-        jnp.asarray(0.0), jnp.asarray(0), jnp.asarray(False),
-    )
-    end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, start)
-    theta = transform.outward(end.x)
-    return Minimum(
-        theta, end.cost, end.steps, end.done & jnp.isfinite(end.cost), end.kept[0],
-        end.kept[1] / transform.slope(theta),
-    )
+    size = jax.eval_shape(residual, theta).size if keep else 0
+    start = Progress.at(x0, own, size, damping)
+    on_scale = lambda x: residual(transform.outward(x))
+    return descend(on_scale, start, bounds, max_steps, active, tolerance).minimum(transform)
+
+
+def descend(
+    residual: Callable[[Float[Array, " p"]], Float[Array, "..."]],
+    progress: Progress,
+    bounds: tuple[Float[Array, " p"], Float[Array, " p"]],
+    max_steps: Array | int,
+    active: Bool[Array, " p"] | None = None,
+    tolerance: float = _TOLERANCE,
+) -> Progress:
+    """Go on with a descent; see `levenberg_marquardt`, but on the solver's scale.
+
+    Args:
+        residual: Of the solver's unknowns.
+        progress: Where it stands.
+        bounds: On the solver's unknowns.
+        max_steps: Evaluations at which to stop, those so far among them.
+        active, tolerance: As there.
+    """
+    moves = jnp.ones(progress.x.size, bool) if active is None else active
+
+    def flat(x: Array) -> tuple[Array, Array]:
+        e = residual(x).ravel()
+        return e, e
+
+    def advance(p: Progress) -> Progress:
+        jacobian, e = jax.jacfwd(flat, has_aux=True)(p.trial)
+        return _advanced(p, e, jacobian, bounds, moves, tolerance)
+
+    return jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, progress)
 
 
 def _advanced(
-    p: _Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
-    own: Float[Array, " p"], keep: bool, tolerance: float,
-) -> _Progress:
-    """Take or refuse the trial, given residual and Jacobian there, and choose the next; `own`: sizes."""
-    lower, upper = bounds
+    p: Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
+    tolerance: float,
+) -> Progress:
+    """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
+    (lower, upper), keep = bounds, p.kept[0].size > 0
     cost = 0.5 * e @ e
     first = p.steps == 0
     better = first | (cost < p.cost)
@@ -186,7 +229,7 @@ def _advanced(
     )
     nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
     # Asked at every step: a velocity of which a level of zero leaves no trace has one as soon as that moves.
-    moves = moves & (own * jnp.sqrt(jnp.diag(normal)) > nothing)
+    moves = moves & (p.own * jnp.sqrt(jnp.diag(normal)) > nothing)
     pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     aim = x + _step(gradient, normal, damping, moves & ~pressed)
     trial = jnp.clip(aim, lower, upper)
@@ -200,8 +243,8 @@ def _advanced(
     rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))
     stuck = rough | (~better & (damping > 1e12))
     growth = jnp.where(better, 2.0, 2 * p.growth)
-    return _Progress(
-        trial, predicted, x, cost, gradient, normal, kept, damping, growth, nothing, p.steps + 1,
+    return Progress(
+        trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.own, nothing, p.steps + 1,
         small | stuck | ~jnp.isfinite(cost),
     )
 

@@ -55,30 +55,30 @@ def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
         What each returns, or the exception that ended it.
     """
     ended: dict[int, T | Exception] = {}
-    waiting = {k: _advanced(steps, None, k, ended) for k, steps in enumerate(many)}
-    while waiting := {k: asked for k, asked in waiting.items() if asked is not None}:
-        groups: dict[Any, list[int]] = {}
-        parts = {k: _parted(asked) for k, asked in waiting.items()}
-        for k, (key, _) in parts.items():
-            groups.setdefault(key, []).append(k)
-        answers: dict[int, Any] = {}
-        for key, members in groups.items():
-            for first in range(0, len(members), lanes):
-                some = members[first : first + lanes]
-                found = _solved(key, [parts[k][1] for k in some], lanes)
-                answers.update(zip(some, found, strict=True))
-        waiting = {k: _advanced(many[k], answers[k], k, ended) for k in waiting}
+    # What waits to be solved: by what must be alike, the runs and their arrays, in the order in which they asked.
+    groups: dict[Any, list[tuple[int, list[np.ndarray]]]] = {}
+
+    def advance(k: int, answer: Any) -> None:
+        try:
+            key, arrays = _parted(many[k].send(answer))
+        except StopIteration as end:
+            ended[k] = end.value
+        except Exception as error:  # it ends its own run only
+            ended[k] = error
+        else:
+            groups.setdefault(key, []).append((k, arrays))
+
+    for k in range(len(many)):
+        advance(k, None)
+    while groups:
+        # The largest group first: those left in small ones may grow meanwhile.
+        key = max(groups, key=lambda key: len(groups[key]))
+        some, groups[key] = groups[key][:lanes], groups[key][lanes:]
+        if not groups[key]:
+            del groups[key]
+        for (k, _), answer in zip(some, _solved(key, [arrays for _, arrays in some], lanes), strict=True):
+            advance(k, answer)
     return [ended[k] for k in range(len(many))]
-
-
-def _advanced(steps: Steps[T], answer: Any, k: int, ended: dict[int, T | Exception]) -> Solve | None:
-    try:
-        return steps.send(answer)
-    except StopIteration as end:
-        ended[k] = end.value
-    except Exception as error:  # it ends its own run only
-        ended[k] = error
-    return None
 
 
 def _parted(asked: Solve) -> tuple[Any, list[np.ndarray]]:
@@ -94,7 +94,7 @@ class _Hole:
     """Stands where an array belongs."""
 
 
-_ARRAYS = (np.ndarray, jax.Array)
+_ARRAYS = (np.ndarray, np.generic, jax.Array)
 
 
 def _solved(key: Any, runs: list[list[np.ndarray]], lanes: int) -> list[Any]:

@@ -21,10 +21,12 @@ from jaxid.virtual import Scene
 
 DISCOVER = "discover"
 _RUNS = 100
-# Part of the memory that the chunks in work may take together, and most runs in one on a processor's
-# cores: of more, the arrays of long logs no longer fit its cache.
+# Part of the memory that the chunks in work may take together.
 _MEMORY = 0.25
-_LARGEST = 8
+# On a processor's cores: most runs in a chunk of long logs, of more the arrays no longer fit its cache; of
+# short ones, that many samples in all, and most runs in a compiled call. Runs that want different things
+# next then fill each other's gaps.
+_LARGEST, _SAMPLES, _LANES = 8, 6400, 16
 # Likewise on an accelerator; and memory of a device that does not state it [bytes].
 _RUNS_OF_DEVICE = 4096
 _UNSTATED = 2**32
@@ -118,6 +120,11 @@ class Plan:
         """Where the model's parameters stand among those of what is simulated."""
         return [self.scene.machine.parameters.names.index(name) for name in self.names]
 
+    @property
+    def lanes(self) -> int:
+        """Runs in a compiled call: all of a chunk on an accelerator."""
+        return self.chunk if _accelerator() else min(self.chunk, _LANES)
+
     @functools.cached_property
     def chunks(self) -> list[tuple[int, range]]:
         """Level and runs of each chunk, in order."""
@@ -177,18 +184,22 @@ def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
     refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
     # Residual, Jacobian and trajectory, kept twice over by the solver.
     each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)
-    memory, most = _memory()
+    most = _RUNS_OF_DEVICE if _accelerator() else max(_LARGEST, _SAMPLES // samples)
     shared = -(-runs // workers)
-    return int(np.clip(_MEMORY * memory / workers / each, 1, min(most, shared)))
+    return int(np.clip(_MEMORY * _memory() / workers / each, 1, min(most, shared)))
 
 
-def _memory() -> tuple[float, int]:
-    """Bytes that arrays may take, and most runs in a chunk: an accelerator is filled."""
-    device = jax.local_devices()[0]
-    if device.platform != "cpu":
-        return (device.memory_stats() or {}).get("bytes_limit", _UNSTATED), _RUNS_OF_DEVICE
+def _accelerator() -> bool:
+    """Whether there is one: it is filled."""
+    return jax.local_devices()[0].platform != "cpu"
+
+
+def _memory() -> float:
+    """Bytes that arrays may take."""
+    if _accelerator():
+        return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", _UNSTATED)
     stated = hasattr(os, "sysconf")
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if stated else _UNSTATED, _LARGEST
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if stated else _UNSTATED
 
 
 def cores() -> int:

@@ -71,7 +71,7 @@ class Runner:
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
         ways = self.ways(level)
-        found = together([self._run(level, k, ways) for k in runs], self.plan.chunk)
+        found = together([self._run(level, k, ways) for k in runs], self.plan.lanes)
         # Whatever ends a run, in a library too, ends that run only.
         found = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
         out = {name: np.stack([row[name] for row in found], axis=1) for name in _BY_METHOD}
