@@ -21,7 +21,8 @@ from jaxid.model import Plant
 from jaxid.replay import Numerics, Replay, from_rest, make_replay, with_sensor
 from jaxid.sensors import Sensor
 
-# In parts of the variance of one sample: where a fit has settled, and where it is near enough to go on sharper.
+# In parts of the variance of one sample: where a fit has settled, and where it is near enough to go on
+# sharper.
 SETTLED = 0.02
 _NEAR = 1.0
 # Farther from its guess than so many priors no unknown is taken.

@@ -79,7 +79,7 @@ class Minimum(eqx.Module):
 
 
 class Progress(eqx.Module):
-    """Where a descent stands, on the solver's scale; it can be cut short anywhere, and go on to the same bits.
+    """Where a descent stands, on the solver's scale: cut short anywhere, it goes on to the same bits.
 
     Args:
         trial: Point to evaluate next, and by how much the cost should fall there (`predicted`).

@@ -55,7 +55,7 @@ def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
         What each returns, or the exception that ended it.
     """
     ended: dict[int, T | Exception] = {}
-    # What waits to be solved: by what must be alike, the runs and their arrays, in the order in which they asked.
+    # What waits to be solved: by what must be alike, the runs and their arrays, in the order of asking.
     groups: dict[Any, list[tuple[int, list[np.ndarray]]]] = {}
 
     def advance(k: int, answer: Any) -> None:
