@@ -124,16 +124,20 @@ class FiveBar(Plant):
         """Angles for a tool's position [m], (28)-(30): elbow 1 left of its way from ground, elbow 2 right.
 
         For tools above the x axis these are the lowest x of elbow 1 and the highest of elbow 2. Not a number
-        where an arm does not reach, or only stretched or folded.
+        where an arm does not reach, or only stretched or folded, or where the tool would lie to the right of
+        the way between such elbows, or on it.
         """
         proximal, distal = self.length[1:3], self.length[3:]
-        x, y = tool[0] - self.length[0] * _SIDES, tool[1]
-        square = x**2 + y**2
+        way = tool - self.length[0] * _SIDES[:, None] * _X
+        square = jnp.sum(way**2, axis=1)
         along = 0.5 + 0.5 * (proximal**2 - distal**2) / square
-        height = jnp.sqrt(proximal**2 / square - along**2)
-        sine = height * square / (proximal * distal)
-        height = jnp.where(sine > SINGULAR, height, jnp.nan) * np.array([1.0, -1.0])
-        return jnp.arctan2(along * y + height * x, along * x - height * y)
+        height = jnp.sqrt(proximal**2 / square - along**2) * np.array([1.0, -1.0])
+        left = jnp.stack([-way[:, 1], way[:, 0]], axis=1)
+        arm = along[:, None] * way + height[:, None] * left
+        (x1, y1), (x2, y2) = way - arm
+        apart = jnp.abs(height) * square > SINGULAR * proximal * distal
+        apart = jnp.all(apart) & (x1 * y2 - y1 * x2 > SINGULAR * distal[0] * distal[1])
+        return jnp.where(apart, jnp.arctan2(arm[:, 1], arm[:, 0]), jnp.nan)
 
     def condition(self, q: Float[Array, " 2"]) -> Float[Array, ""]:
         """Least over greatest eigenvalue of D_p' D_p: one where the tool moves alike in all directions."""
