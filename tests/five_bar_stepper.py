@@ -161,12 +161,12 @@ def acceleration(robot: Robot, q, v, torque) -> np.ndarray:
     return (end - v) / h
 
 
-def course(times, seed, home=(2.0, 1.14), amplitude=0.09, count=6, band=(0.2, 2.0)) -> np.ndarray:
-    """Sines about a place amid the workspace, (time, 2) [rad]."""
+def course(times, seed, home=(1.9, 1.24), peak=0.32, count=6, band=(0.4, 3.0)) -> np.ndarray:
+    """Sines about a place amid the workspace, which a robot of `Robot()` can reach, (time, 2) [rad]."""
     rng = np.random.default_rng(seed)
     f, phase = rng.uniform(*band, (2, count)), rng.uniform(0, 2 * np.pi, (2, count))
-    waves = np.sin(2 * np.pi * f * times[:, None, None] + phase)
-    return np.array(home) + amplitude * waves.sum(axis=-1)
+    waves = np.sin(2 * np.pi * f * times[:, None, None] + phase).sum(axis=-1)
+    return np.array(home) + peak * waves / np.abs(waves).max(axis=0)
 
 
 def followed(

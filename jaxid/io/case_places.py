@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from jaxid.io.case_entries import PlantEntry
 
 
-# What a place is called, where that is not its key with an s.
-_NOUNS = {"passive": ("passive angle", "passive angles")}
+# What a place is called, where that is not its key.
+_NOUNS = {"passive": "passive angle"}
 
 
 def read_ports(
@@ -88,12 +88,12 @@ def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot
     Raises:
         InputError: If there are any.
     """
+    noun = _NOUNS.get(what, what)
     if max(named) > there:
-        fault = f"is out of range: the plant has {count(there, *_NOUNS.get(what, (what,)))}"
+        fault = f"is out of range: the plant has {count(there, noun)}"
         # Without its place an effect is on the joints, not on the only shaft.
         alone = f"leave {what} out" if what in ("joint", "spring") else f"name {what} 1"
-        noun = _NOUNS.get(what, ("", f"{what}s"))[1]
-        mend = f"{noun} count from 1 to {there}" if there > 1 else alone
+        mend = f"{noun}s count from 1 to {there}" if there > 1 else alone
         raise spot.refuse(given, fault, mend)
     if len(set(named)) < len(named):
-        raise spot.refuse(given, f"names a {what} twice", f"name each {what} once")
+        raise spot.refuse(given, f"names a {noun} twice", f"name each {noun} once")
