@@ -38,7 +38,7 @@ class Machine:
     Args:
         plant: The plant at its guesses (or true values).
         parameters: Its unknowns.
-        gain: Declared force per unit of the logged command, (m,).
+        gain: Declared force at the joint per unit of the logged command, gears of the plant included, (m,).
         units: Labels.
         controller: The sampled law; None: unknown, only open loop can be simulated.
         disturbance: Added to the command in the loop: a square wave's level, on, off [s] and
@@ -98,7 +98,8 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
         raise InputError(what, where=f"{case.path}, [actuator]", mend=mend)
     plant, free = _plant(case, true)
     course, more = _course(case, true, plant)
-    gain = np.broadcast_to(np.asarray(case.gain, dtype=np.float64), (case.plant.drives,)).copy()
+    gain = np.asarray(case.gain, dtype=np.float64) * np.asarray(plant.gearing)
+    gain = np.broadcast_to(gain, (case.plant.drives,)).copy()
     return Machine(
         plant=plant,
         parameters=Parameters((*free, *more)),
@@ -147,7 +148,7 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
     values: dict[str, Any] = {}
     for name, given in entry.parameters.items():
         listed = isinstance(given, tuple)
-        values[name] = [v.start(true) for v in given] if listed else given.start(true)
+        values[name] = _starts(given, true) if listed else given.start(true)
     plant = entry.cls(**values, **options, **entry.options)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
@@ -156,10 +157,18 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
             for k, v in enumerate(given):
                 # Of one entry a joint it is the joint's motion, where these differ.
                 motion = info.motion or (plant.motion(k) if info.more == 0 else None)
-                free += _free(v, f"{name}[{k + 1}]", (name,), info, motion, case, true, index=k)
+                row = [(k, v)] if isinstance(v, Value) else [((k, i), x) for i, x in enumerate(v)]
+                for at, x in row:
+                    number = k + 1 if isinstance(v, Value) else f"{k + 1}, {at[1] + 1}"
+                    free += _free(x, f"{name}[{number}]", (name,), info, motion, case, true, index=at)
         elif given is not None:
             free += _free(given, name, (name,), info, info.motion, case, true)
     return plant, free
+
+
+def _starts(given: tuple, true: bool) -> list:
+    """Values of a list, or of a list of lists."""
+    return [v.start(true) if isinstance(v, Value) else _starts(v, true) for v in given]
 
 
 def _with_effect(
@@ -187,7 +196,7 @@ def _free(
     case: Case,
     true: bool,
     *,
-    index: int | None = None,
+    index: int | tuple[int, int] | None = None,
 ) -> list[Free]:
     """The unknown that a value is; empty where it is known."""
     if not value.free:

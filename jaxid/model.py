@@ -23,7 +23,7 @@ from jaxid.alike import acted, alike
 
 SIGNS = ("free", "nonnegative", "positive")
 # What the ports of a plant may be called; they count from 1 by kind.
-PLACES = ("joint", "spring", "shaft")
+PLACES = ("joint", "spring", "shaft", "passive", "tool")
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class ParameterInfo:
         optional: May be absent (None).
         more: Of a list that is as long as the plant has joints, and so many more; None: no list.
         motion: "linear" or "rotary", of a machine that has both; None: as the case says.
+        width: Of a list whose entries are lists, of so many numbers; None: of numbers.
+        known: Must be a number: no log tells it from an effect in the drive.
     """
 
     dimension: str
@@ -45,17 +47,19 @@ class ParameterInfo:
     optional: bool = False
     more: int | None = None
     motion: str | None = None
+    width: int | None = None
+    known: bool = False
 
 
 def parameter(
     dimension: str, sign: str, doc: str, *, optional: bool = False, more: int | None = None,
-    motion: str | None = None,
+    motion: str | None = None, width: int | None = None, known: bool = False,
 ) -> Any:
     """Declare a field of a plant or effect as a physical parameter, a float64 array leaf.
 
     The conversion matters: a Python float is no array leaf and would silently count as known.
     """
-    info = ParameterInfo(dimension, sign, doc, optional, more, motion)
+    info = ParameterInfo(dimension, sign, doc, optional, more, motion, width, known)
     convert = _optional_array if optional else as_array
     if optional:
         return eqx.field(converter=convert, metadata={"parameter": info}, default=None)
@@ -206,6 +210,8 @@ class Effect(eqx.Module):
     of_spring: ClassVar[bool] = False
     # Whether only a plant with springs of its own (True), or only one without (False), can have it.
     with_springs: ClassVar[bool | None] = None
+    # Whether it is the same along every direction: then it may act on a tool, which moves along several.
+    any_direction: ClassVar[bool] = False
     # Whether a search looks for it on stages only: elsewhere what differs by direction is taken for it.
     of_stages: ClassVar[bool] = False
 
@@ -280,6 +286,8 @@ class Plant(eqx.Module):
     joints: ClassVar[int] = 1
     # Whether no joint's acceleration enters the balance of another: there is nothing to solve then.
     diagonal: ClassVar[bool] = False
+    # Whether joints push one another through a mass matrix that varies.
+    coupled: ClassVar[bool] = False
     # Joint behind an elastic coupling, which may go without an encoder; None where there is none.
     load: ClassVar[int | None] = None
     # Whether it is a stage (see `Effect.of_stages`).
@@ -292,6 +300,9 @@ class Plant(eqx.Module):
     usual_motion: ClassVar[str | None] = None
     # Whether a case describes it link by link: then it takes a `geometry`.
     linked: ClassVar[bool] = False
+    # How many angles between links that no drive turns, and tools, are ports behind the joints.
+    passives: ClassVar[int] = 0
+    tools: ClassVar[int] = 0
     effects: eqx.AbstractVar[tuple[Effect, ...]]
     sharpness: eqx.AbstractVar[Array]
     velocity_scale: eqx.AbstractVar[Array]
@@ -334,6 +345,35 @@ class Plant(eqx.Module):
         Their dry friction is that joint's: two that slide as one share no load that anything could tell.
         """
         return ()
+
+    @property
+    def gearing(self) -> Array | float:
+        """Force at each driven joint per unit of its drive's own: known ratios of gears.
+
+        `balance` counts at the joints; the gain of a machine holds these ratios.
+        """
+        return 1.0
+
+    def impossible(self, q: Float[np.ndarray, "time n"]) -> tuple[int, str] | None:
+        """First row of some positions that the machine cannot take, and why; None where it can take all."""
+        return None
+
+    def any_motion(self, random: np.random.Generator) -> Float[np.ndarray, "3 n"]:
+        """A position that it can take, a velocity and an acceleration, to ask what the balance depends on.
+
+        Raises:
+            ValueError: If no position in a thousand is possible.
+        """
+        motion = random.uniform(0.5, 1.5, (3, self.joints))
+        for _ in range(1000):
+            if self.impossible(motion[:1]) is None:
+                return motion
+            motion[0] = random.uniform(-np.pi, np.pi, self.joints)
+        raise ValueError(f"this {self.kind} cannot take any position: check its lengths.")
+
+    def along(self, port: int) -> tuple[int, ...]:
+        """Coordinates, as entries of `ports`, along which an effect on a port acts, each for itself."""
+        return (port,)
 
     def place(self, port: int) -> tuple[str, int]:
         """What a port is called: one of `PLACES`, and which, counted from 1."""
@@ -458,23 +498,25 @@ class Plant(eqx.Module):
         ports = [e.port for e in self.effects]
         drives = [self.drive_of(i, u.size) for i in ports]
         for run in alike(self.effects, drives):
+            spots = [(k, i, drives[k]) for k in run for i in self.along(ports[k])]
             signals = [
                 Signals(
                     y[i], yd[i], ydd[i], jnp.zeros(()) if j is None else drive[j], t, width[i],
                     jnp.asarray(dry_scale[i]), gravity[i], normal[i], stiffness[i], damping[i],
                 )
-                for i, j in ((ports[k], drives[k]) for k in run)
+                for _, i, j in spots
             ]
-            actions = acted([self.effects[k] for k in run], signals, [states[k] for k in run])
-            for k, action in zip(run, actions, strict=True):
-                i, j = ports[k], drives[k]
+            each = [k for k, _, _ in spots]
+            actions = acted([self.effects[k] for k in each], signals, [states[k] for k in each])
+            for (k, i, j), action in zip(spots, actions, strict=True):
                 force[i], dry[i] = force[i] + action.force, dry[i] + action.dry
                 stick[i] = stick[i] + action.stick
                 if action.rising is not None:
                     forth[i], back[i] = forth[i] + action.rising[0], back[i] + action.rising[1]
                 if j is not None and action.drive is not None:
                     drive[j] = action.drive
-                rates.append(action.rate)
+                if i == ports[k]:
+                    rates.append(action.rate)
         for levels in (dry, stick, forth, back):
             for i in (i for i in range(y.size) if not isinstance(levels[i], float)):
                 levels[i] = levels[i] * dry_scale[i]

@@ -31,7 +31,7 @@ class Free:
         sign: "free", "nonnegative" or "positive".
         guess: Where a fit starts.
         lower, upper: Bounds.
-        index: Entry of the leaf, where the leaf is a list.
+        index: Entry of the leaf, where the leaf is a list; row and entry, of a list of lists.
         true: Value for simulation and studies, where it differs from the guess.
     """
 
@@ -42,7 +42,7 @@ class Free:
     guess: float
     lower: float = -np.inf
     upper: float = np.inf
-    index: int | None = None
+    index: int | tuple[int, int] | None = None
     true: float | None = None
 
     def get(self, plant: Plant) -> Array:
@@ -78,7 +78,7 @@ class Parameters:
         return scatter(self.places, plant, theta)
 
     @property
-    def places(self) -> tuple[tuple[tuple[str | int, ...], int | None], ...]:
+    def places(self) -> tuple[tuple[tuple[str | int, ...], int | tuple[int, int] | None], ...]:
         """Path and index of each unknown: hashable, so that compiled code can depend on it."""
         return tuple((f.path, f.index) for f in self.free)
 
@@ -125,7 +125,7 @@ def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
     return jax.tree.unflatten(structure, leaves)
 
 
-def _with_entry(values: Array, index: int, value: float) -> np.ndarray:
+def _with_entry(values: Array, index: int | tuple[int, int], value: float) -> np.ndarray:
     out = np.array(values)
     out[index] = value
     return out

@@ -260,7 +260,7 @@ def _classical_step(
 
     parts = jnp.asarray([0.0, 0.5, 0.5, 1.0])
     forces = [u(part) for part in parts]
-    if plant.linked:
+    if plant.coupled:
         return _rolled(slope, x, h, parts, jnp.stack(forces))
     q, v, half = x.q, x.qd, 0.5 * h
     a1 = slope(q, v, parts[0], forces[0])

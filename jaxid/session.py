@@ -205,6 +205,11 @@ def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
         units={"position": units.position} if units.position else None, driven=driven,
         fewest_levels=2 if held else FEWEST_LEVELS, resolution_stated=stated,
     )
+    impossible = plant.impossible(log.position) if all(log.measured) else None
+    if impossible is not None:
+        row, what = impossible
+        mend = "check the lengths, the zeros of the angles and their unit (rad)"
+        findings.append(Finding("error", f"row {log.rows[0] + row}: {what}", f"{log.source}, position", mend))
     inertia = plant.own_inertia()
     if inertia is not None:
         slip = plausible_inertia(

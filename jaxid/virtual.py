@@ -129,6 +129,7 @@ class Scene:
         joints = case.plant.joints
         position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
         velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
+        _refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
         _refuse_massless(machine.plant, position, where)
         if machine.controller is None:
             if not case.input:
@@ -143,9 +144,11 @@ class Scene:
             raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
         period = machine.controller.period
         reference = _by_drive(make_reference(case.true_reference, 1 / period, duration, case.folder), machine)
+        if reference.shape[1] == joints:
+            _refuse_impossible(machine.plant, reference, f"{where}, [reference]", period)
         machine = _scaled(machine, reference, period)
         drive = _drive(case, machine, period, longer_delays)
-        _refuse_coarse(case, machine, drive, reference)
+        _refuse_coarse(case, machine, drive, reference, position)
         every = max(1, round(1 / (rate * period)))
         if abs(1 / (rate * period * every) - 1) > 1e-3:
             raise InputError(
@@ -172,6 +175,7 @@ class Scene:
             run = yield Solve(_closed_run, args)
         else:
             run = yield Solve(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
+        _refuse_ended(machine.plant, run, self.drive.period, str(self.case.path))
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
@@ -210,7 +214,7 @@ def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
 
 def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
     """Refuse an arm that some motion moves without kinetic energy: its acceleration would be infinite."""
-    if not plant.linked:
+    if not plant.coupled:
         return
     q = jnp.asarray(position, dtype=jnp.float64)
     zero = jnp.zeros_like(q)
@@ -224,12 +228,40 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
         )
 
 
-def _refuse_coarse(case: Case, machine: Machine, drive: Drive, reference: np.ndarray) -> None:
+def _refuse_impossible(
+    plant: Plant, positions: np.ndarray, where: str, period: float | None = None
+) -> None:
+    """Refuse positions that the machine cannot take; `period` is the time from one to the next."""
+    found = plant.impossible(positions)
+    if found is not None:
+        row, what = found
+        when = "" if period is None else f" at t = {row * period:.4g} s"
+        raise InputError(what + when, where=where, mend="keep away from it, or check the lengths")
+
+
+def _refuse_ended(plant: Plant, run: Trajectory, period: float, where: str) -> None:
+    """Refuse a motion that ended where the machine cannot go on."""
+    known = np.isfinite(run.position).all(axis=1)
+    if known.all():
+        return
+    last = max(int(np.argmin(known)) - 1, 0)
+    q, v = np.asarray(run.position)[last], np.asarray(run.velocity)[last]
+    found = plant.impossible(q + period * np.arange(3)[:, None] * v)
+    if found is not None:
+        raise InputError(
+            f"the motion ends at t = {last * period:.4g} s: {found[1]}", where=where,
+            mend="keep reference or input away from it, or check gains and lengths",
+        )
+
+
+def _refuse_coarse(
+    case: Case, machine: Machine, drive: Drive, reference: np.ndarray, position: np.ndarray
+) -> None:
     """Refuse a step too coarse for the smoothed sign: its trajectory only looks plausible."""
     if drive.set_valued:
         return
     u = jnp.zeros_like(jnp.asarray(reference[:: max(1, len(reference) // 50)]))
-    q = jnp.zeros((len(u), case.plant.joints))
+    q = jnp.broadcast_to(position, (len(u), case.plant.joints))
     needed = needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
     if needed > drive.substeps:
         raise InputError(

@@ -8,9 +8,8 @@ from case_faults import CASCADE, FAULTS, GOOD, message, more, swapped, write
 from jaxid.controllers import CONTROLLERS
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
-from jaxid.io.case_tables import PLANNED_CONTROLLERS, PLANNED_PLANTS
+from jaxid.io.case_tables import PLANNED_CONTROLLERS
 from jaxid.io.case_values import Value
-from jaxid.plants import PLANTS
 
 # The example of the documentation, to the letter.
 DOCUMENTED = """
@@ -77,13 +76,6 @@ def test_fault_is_told_with_key_and_mend(tmp_path, fault):
     told = message(tmp_path, text)
     missing = [word for word in words if word not in told]
     assert not missing, told
-
-
-@pytest.mark.parametrize("kind", [k for k in PLANNED_PLANTS if k not in PLANTS])
-def test_planned_plants_are_told_from_unknown_ones(tmp_path, kind):
-    told = message(tmp_path, swapped('"axis"', f'"{kind}"'))
-    assert "not available in this version" in told
-    assert "have: axis" in told
 
 
 @pytest.mark.parametrize("kind", [k for k in PLANNED_CONTROLLERS if k not in CONTROLLERS])

@@ -184,8 +184,8 @@ def _unknown(machine: Machine, log: Log) -> str:
     """What of the moment of a start is not known; empty where all is."""
     if not any(e.kind == CoulombFriction.kind for e in machine.plant.effects):
         return "there is no sliding friction that it could stand above"
-    if machine.plant.linked:
-        return "the joints of an arm push one another, by more than what keeps one from starting"
+    if machine.plant.coupled:
+        return "the joints push one another, by more than what keeps one from starting"
     for e in machine.plant.effects:
         if e.adds_force and e.initial_state(jnp.zeros(())) is not None:
             return f"the state of {e.kind} at rest is not known"

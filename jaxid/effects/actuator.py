@@ -14,7 +14,20 @@ _CORNER = 1e-3
 
 @register("actuator_gain")
 class ActuatorGain(Effect):
-    """The force is gain times the declared one."""
+    """The force is gain times the declared one.
+
+    Of a drive with a current loop the declared force is the measured torque, or, where the regulator is fast,
+    the wanted one. With k_T the motor's torque constant and k_T^ what the drive takes it for, k_S the factor
+    of its current sensor and H the static gain of its regulator,
+
+        actual / wanted   = k_T H / (k_T^ (1 + k_S H))
+        measured / wanted = k_S H / (1 + k_S H)
+        actual / measured = k_T / (k_T^ k_S) = gain, whatever H is.
+
+    Source:
+        Righettini et al. (2025), Robotics 14(4), 36, (6), (19)-(23). As printed the denominator of (19)
+        has k_T^ k_T where k_T^ belongs; (23) holds at any H, not in the limit only.
+    """
 
     adds_force = False
     in_drive = True

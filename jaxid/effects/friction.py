@@ -14,6 +14,8 @@ from jaxid.model import Action, Effect, Scales, Signals, parameter
 class ViscousFriction(Effect):
     """-c v."""
 
+    any_direction = True
+
     coefficient: Array = parameter("force*time/position", "nonnegative", "c, drag per velocity")
 
     def act(self, x: Signals, state: None) -> Action:

@@ -12,6 +12,8 @@ from jaxid.model import Action, Effect, Signals, parameter
 class AddedMass(Effect):
     """-m (a + g): extra inertia, and its weight where gravity acts along the joint."""
 
+    any_direction = True
+
     mass: Array = parameter("inertia", "free", "m")
 
     def act(self, x: Signals, state: None) -> Action:

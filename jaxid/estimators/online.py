@@ -356,7 +356,7 @@ def _ages(machine: Machine) -> bool:
     """Whether time stands in the balance, by its value along random motion now and later."""
     plant, parameters, random = machine.plant, machine.parameters, np.random.default_rng(0)
     theta = np.where(parameters.guess == 0, 1.0, parameters.guess)
-    motion, u = random.uniform(0.5, 1.5, (3, plant.joints)), random.uniform(0.5, 1.5, machine.gain.size)
+    motion, u = plant.any_motion(random), random.uniform(0.5, 1.5, machine.gain.size)
     early, late = (_value(plant, parameters.places, theta, motion, u, np.asarray(t)) for t in (0.0, 1.0))
     return bool(np.any(np.asarray(early) != np.asarray(late)))
 

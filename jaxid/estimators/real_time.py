@@ -98,7 +98,7 @@ class RealTime(eqx.Module):
         sharp = (np.asarray(1 / 3), np.asarray(np.min(velocity)))
         plant = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), machine.plant, sharp)
         random, guess = np.random.default_rng(0), machine.parameters.guess
-        motion, u = random.uniform(0.5, 1.5, (3, n)), random.uniform(0.5, 1.5, machine.gain.size)
+        motion, u = plant.any_motion(random), random.uniform(0.5, 1.5, machine.gain.size)
         here, there = (np.asarray(slopes(plant, places, x, motion, u)) for x in (guess, elsewhere(guess)))
         check_proportion(names, here, there)
         recursion = Recursion(

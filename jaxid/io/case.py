@@ -43,7 +43,7 @@ from jaxid.io.case_tables import (
 from jaxid.io.case_values import Value
 from jaxid.io.log import LOG_KEYS
 from jaxid.io.schema import Key, Keys, Spot, read_table
-from jaxid.model import Effect
+from jaxid.model import Effect, parameters_of
 
 
 @dataclass(frozen=True)
@@ -266,6 +266,10 @@ def _checked_transmission(
     if looped:
         mend = "leave [controller] out: what was logged is then identified without the loop"
         raise spot.fault("does not go with a loop, whose gains are at the motors", mend)
+    gears = [n for n, i in parameters_of(plant.cls).items() if i.known and n in plant.parameters]
+    if gears:
+        mend = "keep transmission where the log is of the motors' angles, else the other"
+        raise spot.fault(f"and {gears[0]} of [plant.parameters] are both given", mend)
     return actuator
 
 

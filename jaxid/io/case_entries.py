@@ -11,7 +11,7 @@ from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.io.case_links import LINKED, count_links, read_links, read_shafts
 from jaxid.io.case_places import check_places, read_ports
-from jaxid.io.case_tables import PLANNED_PLANTS, PLANT
+from jaxid.io.case_tables import PLANT
 from jaxid.io.case_values import Value, read_value, read_values
 from jaxid.io.schema import (
     Key,
@@ -72,7 +72,7 @@ class EffectEntry:
     Args:
         cls: Its class.
         parameters: By name, one value for each of `ports`.
-        ports: Where it acts: joints from 0 on, and behind them springs or shafts.
+        ports: Where it acts: joints from 0 on, and behind them springs, shafts, passive angles or tools.
     """
 
     cls: type[Effect]
@@ -98,7 +98,7 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         InputError: If it states what the plant cannot have, or not what it must.
     """
     spot = Spot(file, "[plant]")
-    cls = PLANTS[read_kind(table, PLANTS, PLANNED_PLANTS, spot)]
+    cls = PLANTS[read_kind(table, PLANTS, (), spot)]
     keys = {"kind": Key(lambda value, spot: value), **PLANT}
     if cls.linked:
         return _linked(table, cls, keys, spot)
@@ -149,9 +149,9 @@ def _shape(info: ParameterInfo) -> str:
 
 def _count_joints(table: Any, cls: type[Plant], spot: Spot) -> int:
     """How many joints a plant has: as many as its lists tell, or as its class says."""
-    name = next((n for n, info in parameters_of(cls).items() if info.more == 0), None)
-    if name is None:
+    if isinstance(cls.joints, int):
         return cls.joints
+    name = next(n for n, info in parameters_of(cls).items() if info.more == 0)
     given = table.get(name) if isinstance(table, dict) else None
     if isinstance(given, dict):
         given = given.get("guess", given)
@@ -181,7 +181,7 @@ def _plant_parameters(
     def reader(info: ParameterInfo) -> Any:
         def read(value: Any, spot: Spot) -> Value | tuple[Value, ...]:
             if info.more is not None:
-                return _plant_list(value, info, joints, spot)
+                return _plant_list(value, info, joints, spot, isinstance(cls.joints, int))
             if isinstance(value, list) and joints > 1:
                 return read_values(value, info, joints, spot)
             return read_value(value, info, spot)
@@ -195,20 +195,36 @@ def _plant_parameters(
     return read_table(table, keys, Spot(file, "[plant.parameters]"))
 
 
-def _plant_list(value: Any, info: ParameterInfo, joints: int, spot: Spot) -> tuple[Value, ...]:
-    """A list of the plant's: as long as it has joints, or longer by what the class says."""
+def _plant_list(
+    value: Any, info: ParameterInfo, joints: int, spot: Spot, fixed: bool
+) -> tuple[Value | tuple[Value, ...], ...]:
+    """A list of the plant's: as long as it has joints, or longer by what the class says.
+
+    Where every machine of a kind has as many joints (fixed) a fault tells what the entries are.
+    """
     entries = joints + info.more
     whole_list = value if isinstance(value, list) else None
-    if isinstance(value, dict) and isinstance(value.get("guess"), list):
+    if info.width is None and isinstance(value, dict) and isinstance(value.get("guess"), list):
         whole_list = value["guess"]
     beside = "" if info.more == 0 else f": {info.more} more than joints"
+    beside = f": {info.doc}" if fixed else beside
     if whole_list is None:
         mend = f"give a list of {entries}{beside}"
         raise spot.refuse(value, "is not a list", mend)
     if len(whole_list) != entries:
-        mend = f"the plant has {count(joints, 'joint')}: give {count(entries, 'entry', 'entries')}{beside}"
+        mend = f"give {count(entries, 'entry', 'entries')}{beside}"
+        mend = mend if fixed else f"the plant has {count(joints, 'joint')}: {mend}"
         raise spot.fault(f"has {count(len(whole_list), 'entry', 'entries')}", mend)
+    if info.width is not None:
+        return tuple(_row(row, info, spot.entry(k)) for k, row in enumerate(whole_list, start=1))
     return read_values(value, info, entries, spot, "entry")
+
+
+def _row(value: Any, info: ParameterInfo, spot: Spot) -> tuple[Value, ...]:
+    """An entry of a list that is a list itself."""
+    if not isinstance(value, list):
+        raise spot.refuse(value, "is not a list", f"give {info.width} numbers: {info.doc}")
+    return read_values(value, info, info.width, spot, "component")
 
 
 def read_effects(tables: list, plant: PlantEntry, path: Path) -> tuple[EffectEntry, ...]:
@@ -275,7 +291,7 @@ def check_kinds(classes: Iterable[type[Effect]], file: str) -> None:
 
 
 def _check_keys(table: dict[str, Any], names: list[str], spot: Spot) -> None:
-    known = [*names, "kind", *PLACES, "passive", "shared"]
+    known = [*names, "kind", *PLACES, "shared"]
     for name in table:
         if name not in known:
             raise spot.fault(f"unknown key '{name}'", nearest(name, known, table))

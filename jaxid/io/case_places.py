@@ -1,4 +1,4 @@
-"""Where the effects of a case act: on joints, springs or shafts, which count from 1."""
+"""Where the effects of a case act: on joints, springs, shafts, passive angles, tools; all count from 1."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from jaxid.io.case_entries import PlantEntry
 
 
+# What a place is called, where that is not its key.
+_NOUNS = {"passive": "passive angle"}
+
+
 def read_ports(
     table: dict[str, Any], cls: type[Effect], plant: PlantEntry, spot: Spot
 ) -> tuple[tuple[int, ...], str]:
@@ -19,7 +23,7 @@ def read_ports(
     Raises:
         InputError: If a place that is named is none of the plant's, or none for such an effect.
     """
-    places = [name for name in (*PLACES, "passive") if name in table]
+    places = [name for name in PLACES if name in table]
     if len(places) > 1:
         raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
     parts, springs = plant.cls.parts(plant.joints), plant.cls.springs(plant.joints)
@@ -29,7 +33,8 @@ def read_ports(
         )
         raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {mend}")
     shafts = len(plant.options.get("shafts", ()))
-    there = {"spring": springs, "shaft": shafts, "passive": 0}
+    passives, tools = plant.cls.passives, plant.cls.tools
+    there = {"spring": springs, "shaft": shafts, "passive": passives, "tool": tools}
     for name in (name for name in places if name in there):
         if not there[name]:
             mend = f"leave {name} out: the effect then acts on the joint"
@@ -43,11 +48,16 @@ def read_ports(
             raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", mend)
         chosen = _places(table, "spring", springs, spot)
         return tuple(parts + k for k in chosen), "spring"
-    if "shaft" in table:
+    for name, before in (("shaft", parts), ("passive", parts), ("tool", parts + passives)):
+        if name not in table:
+            continue
         if cls.in_drive:
             what, mend = f"has no command for {cls.kind} to act on", "name the joint of the drive"
-            raise spot.at("shaft").refuse(table["shaft"], what, mend)
-        return tuple(parts + k for k in _places(table, "shaft", shafts, spot)), "shaft"
+            raise spot.at(name).refuse(table[name], what, mend)
+        if name == "tool" and not cls.any_direction:
+            mend = "name a joint; on a tool acts what is the same in all directions (added_mass)"
+            raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", mend)
+        return tuple(before + k for k in _places(table, name, there[name], spot)), name
     if "joint" in table:
         chosen = _places(table, "joint", parts, spot)
         undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]
@@ -78,11 +88,12 @@ def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot
     Raises:
         InputError: If there are any.
     """
+    noun = _NOUNS.get(what, what)
     if max(named) > there:
-        fault = f"is out of range: the plant has {count(there, what)}"
+        fault = f"is out of range: the plant has {count(there, noun)}"
         # Without its place an effect is on the joints, not on the only shaft.
-        alone = "name shaft 1" if what == "shaft" else f"leave {what} out"
-        mend = f"{what}s count from 1 to {there}" if there > 1 else alone
+        alone = f"leave {what} out" if what in ("joint", "spring") else f"name {what} 1"
+        mend = f"{noun}s count from 1 to {there}" if there > 1 else alone
         raise spot.refuse(given, fault, mend)
     if len(set(named)) < len(named):
-        raise spot.refuse(given, f"names a {what} twice", f"name each {what} once")
+        raise spot.refuse(given, f"names a {noun} twice", f"name each {noun} once")

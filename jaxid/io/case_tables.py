@@ -26,7 +26,6 @@ from jaxid.io.schema import (
 )
 
 # Names that the case file promises and this version does not have yet.
-PLANNED_PLANTS = ("five_bar",)
 PLANNED_CONTROLLERS = ("computed_torque", "adaptive")
 METHODS = (
     "inverse_dynamics",

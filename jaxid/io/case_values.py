@@ -46,6 +46,9 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
     signed = number(info.sign)
     if isinstance(value, list):
         raise spot.refuse(value, "is a list", "this parameter takes one value")
+    if isinstance(value, dict) and info.known:
+        mend = f"give the number, and let an effect in the drive (actuator_gain) be unknown: {info.doc}"
+        raise spot.refuse(value, "must be a known number", mend)
     if not isinstance(value, dict):
         if isinstance(value, bool) or not isinstance(value, int | float):
             mend = "give a number where it is known, { guess = ... } where it is not"

@@ -43,14 +43,16 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
             continue
         listed = out.setdefault(f.name.partition("[")[0], _known(leaf(plant, f.path), f.unit))
         for key in ("value", "std", "identifiable"):
-            listed[key][f.index] = entry[key]
+            *row, at = np.atleast_1d(f.index)
+            (listed[key][row[0]] if row else listed[key])[at] = entry[key]
     return out
 
 
 def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
     """A list of the plant's before its unknown entries are filled in."""
-    known = [float(v) for v in values]
-    return {"value": known, "std": [None] * len(known), "unit": unit, "identifiable": [True] * len(known)}
+    known = np.asarray(values, float)
+    std, told = np.full(known.shape, None), np.full(known.shape, True)
+    return {"value": known.tolist(), "std": std.tolist(), "unit": unit, "identifiable": told.tolist()}
 
 
 def _one(x: np.ndarray | None) -> Any:

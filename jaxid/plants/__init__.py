@@ -7,12 +7,14 @@ from jaxid.model import Plant
 from jaxid.plants.axis import Axis as Axis
 from jaxid.plants.chain import Chain as Chain
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg as DenavitHartenberg
+from jaxid.plants.five_bar import FiveBar as FiveBar
 from jaxid.plants.flexible_axis import FlexibleAxis as FlexibleAxis
 from jaxid.plants.micropositioning_stage import MicropositioningStage as MicropositioningStage
 from jaxid.plants.micropositioning_stage import RigidMicropositioningStage as RigidMicropositioningStage
 from jaxid.plants.pa10 import pa10 as pa10
+from jaxid.plants.righettini_five_bar import righettini_five_bar as righettini_five_bar
 from jaxid.plants.serial_arm import SerialArm as SerialArm
 
 PLANTS: dict[str, type[Plant]] = {
-    cls.kind: cls for cls in (Axis, Chain, FlexibleAxis, MicropositioningStage, SerialArm)
+    cls.kind: cls for cls in (Axis, Chain, FlexibleAxis, MicropositioningStage, SerialArm, FiveBar)
 }

@@ -47,6 +47,7 @@ class SerialArm(Plant):
 
     kind = "serial_arm"
     linked = True
+    coupled = True
     usual_motion = "rotary"
     # Beside each link's others these are the ones to leave out where columns depend on each other.
     regrouped: ClassVar[tuple[str, ...]] = ("first_moment_z", "mass", "inertia_yy")

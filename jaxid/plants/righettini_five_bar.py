@@ -1,0 +1,32 @@
+"""The five-bar robot that Righettini et al. measured."""
+
+from __future__ import annotations
+
+from jaxtyping import Array
+
+from jaxid.model import Effect
+from jaxid.plants.five_bar import FiveBar
+
+
+def righettini_five_bar(
+    effects: tuple[Effect, ...] = (), *, reduction: Array | list[float] | None = None
+) -> FiveBar:
+    """The robot of tables 1 and 2.
+
+    Args:
+        effects: Forces beside the inertia.
+        reduction: Turns of each motor for one of its joint: not published.
+
+    Source:
+        Righettini et al. (2025), Robotics 14(4), 36, tables 1 and 2. Where the proximal links' own centres of
+        mass are (118.8, 0.7 mm) is not needed: I_p counts about the fixed joints, and nothing weighs.
+    """
+    return FiveBar(
+        length=[0.180, 0.250, 0.250, 0.250, 0.250],
+        center=[[0.1254, 0.0009], [0.1303, 0.0006]],
+        mass=[2.32, 2.78],
+        inertia=[0.292, 0.292, 0.030, 0.036],
+        tip_mass=2.72,
+        reduction=reduction,
+        effects=effects,
+    )
