@@ -335,6 +335,10 @@ class Plant(eqx.Module):
         """
         return ()
 
+    def joint_positions(self, tool: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"] | None:
+        """Coordinates that bring the tool to a place; NaN out of reach, None of a plant that cannot say."""
+        return None
+
     def place(self, port: int) -> tuple[str, int]:
         """What a port is called: one of `PLACES`, and which, counted from 1."""
         parts = self.parts(self.joints)

@@ -136,13 +136,18 @@ class Scene:
                     "nothing drives the plant", where=where,
                     mend="add an [input], or a [reference] and a [controller]",
                 )
-            command = make_reference(case.input, rate, duration, case.folder, where="input")
+            command = make_reference(
+                case.input, rate, duration, case.folder, where="input", plant=machine.plant
+            )
             drive = _drive(case, machine, 1 / rate, longer_delays)
             return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
         if not case.reference:
             raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
         period = machine.controller.period
-        reference = _by_drive(make_reference(case.true_reference, 1 / period, duration, case.folder), machine)
+        reference = make_reference(
+            case.true_reference, 1 / period, duration, case.folder, plant=machine.plant
+        )
+        reference = _by_drive(reference, machine)
         machine = _scaled(machine, reference, period)
         drive = _drive(case, machine, period, longer_delays)
         _refuse_coarse(case, machine, drive, reference)
