@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxid.controllers import Controller, Tick
 from jaxid.errors import InputError
 from jaxid.estimators.online import Memory, Online, Told
+from jaxid.estimators.recursion import Told as Estimate
 from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
 from jaxid.machine import Machine, build_machine
@@ -39,6 +40,8 @@ class Live:
     Attributes:
         told: What the rows so far say; None without `identify`, and before the second tick.
         switched: Tick from which on the controller knows what was found; None: not yet.
+        memory: Of the controller, a tree of arrays; None before the first tick. One that was saved may be
+            put here, and all goes on from it.
 
     Raises:
         InputError: If the case has no controller or reference, or asks for what cannot be identified
@@ -60,23 +63,33 @@ class Live:
         self._path = jax.tree.map(np.asarray, path)
         self._driven = self.machine.plant.driven(case.plant.joints)
         self._tick = 0
-        self._memory: object = None
+        self.memory: object = None
+        self._hold = self.machine.sensor.hold
+        self._adapts = "estimator" in self._controller.of_machine
         self._last: np.ndarray | None = None
         self._online, self._rows = None, None
         if identify:
-            if "model" not in self._controller.of_machine:
+            if "model" not in self._controller.of_machine or self._adapts:
                 kind = (case.controller or {})["kind"]
+                what = "identifies by itself" if self._adapts else "has no model to put what is found into"
                 raise InputError(
-                    f"a controller of kind {kind!r} has no model to put what is found into",
-                    where=str(case.path), mend="take kind = 'flatness'",
+                    f"a controller of kind {kind!r} {what}",
+                    where=str(case.path),
+                    mend="leave identify out" if self._adapts else "take kind = 'flatness'",
                 )
             self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
 
-    def command(self, position: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    def command(
+        self, position: Float[np.ndarray, " n"], velocity: Float[np.ndarray, " n"] | None = None,
+        acceleration: Float[np.ndarray, " n"] | None = None, measured: Float[np.ndarray, " m"] | None = None,
+    ) -> Float[np.ndarray, " m"]:
         """The command to hold until the next tick.
 
         Args:
             position: Readings of all joints [m or rad].
+            velocity, acceleration: Likewise, of a gyroscope and an accelerometer; absent: differenced.
+                The same are to be given at every tick.
+            measured: Command that the drives report since the last tick; absent: as it was given.
 
         Raises:
             InputError: If the reference has ended.
@@ -87,14 +100,30 @@ class Live:
                 mend="let [simulation] duration be longer",
             )
         position = np.asarray(position, dtype=np.float64)
-        tick = Tick(position, jax.tree.map(lambda x: x[self._tick], self._path), self._driven)
-        if self._tick == 0:
-            self._memory = self._controller.start(tick, np.zeros_like(position))
+        fresh = np.asarray(self._tick % self._hold == 0)
+        path = jax.tree.map(lambda x: x[self._tick], self._path)
+        tick = Tick(position, path, self._driven, fresh, velocity, acceleration, measured)
+        if self.memory is None:
+            self.memory = self._controller.start(tick, np.zeros_like(position), self._path)
         if self._online is not None and self.switched is None:
             self._identify(position)
-        u, self._memory = _command(self._controller, tick, self._memory)
+        u, self.memory = _command(self._controller, tick, self.memory)
+        if self._adapts and self.switched is None and self._controller.told(self.memory).closed:
+            self.switched = self._tick
         self._tick, self._last = self._tick + 1, np.asarray(u)
         return self._last
+
+    @property
+    def estimate(self) -> Estimate:
+        """What a controller that identifies says of the unknowns, in the order of `machine.parameters`.
+
+        Raises:
+            InputError: If it does not identify, or nothing has been read yet.
+        """
+        if not self._adapts or self.memory is None:
+            what = "no reading yet" if self._adapts else "the controller does not identify"
+            raise InputError(what, where="Live", mend="take kind = 'adaptive', and give it readings")
+        return self._controller.estimate(self.memory)
 
     def _identify(self, position: np.ndarray) -> None:
         if self._rows is None:

@@ -22,11 +22,13 @@ class Sensor(eqx.Module):
         position_resolution: One count [m or rad].
         position_noise: Standard deviation of white noise before rounding [m or rad].
         force_noise: Standard deviation on the logged command, in its units.
+        hold: Ticks of the loop for which a reading is held.
     """
 
     position_resolution: Array | None = None
     position_noise: Array | None = None
     force_noise: Array | None = None
+    hold: int = eqx.field(static=True, default=1)
 
     def read(self, q: Array, noise: Array | None = None) -> Array:
         """Reading of a position; rounded with a straight-through gradient.
@@ -40,6 +42,10 @@ class Sensor(eqx.Module):
             return q
         counts = jnp.round(q / self.position_resolution) * self.position_resolution
         return q + jax.lax.stop_gradient(counts - q)
+
+    def read_command(self, u: Array, noise: Array | None = None) -> Array:
+        """Reading of a command, in its units."""
+        return u if noise is None or self.force_noise is None else u + self.force_noise * noise
 
     @property
     def mean(self) -> Sensor:

@@ -9,7 +9,7 @@ different model from a sampled one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -47,12 +47,14 @@ class Trajectory(eqx.Module):
         velocity: (time, n).
         command: Logged command, (time, m), before the declared gain.
         reading: Position as the sensor reports it, (time, n).
+        found: What a law that identifies had found, see `Controller.told`; else None.
     """
 
     position: Float[Array, "time n"]
     velocity: Float[Array, "time n"]
     command: Float[Array, "time m"]
     reading: Float[Array, "time n"]
+    found: Any = None
 
 
 class Drive(eqx.Module):
@@ -206,16 +208,17 @@ def closed_loop(
         disturbance: Added to the command at every tick, before its limit.
         position, velocity: At the first tick.
         sensor: What the controller reads; absent: exact.
-        noise: Standard normal numbers for the sensor's noise; absent: none.
+        noise: Standard normal numbers for the sensor's noise, of the positions and, where there are more
+            columns, of the measured commands; absent: none.
 
     Returns:
         One row a tick.
     """
-    sensor = Sensor() if sensor is None else sensor
+    sensor, n = Sensor() if sensor is None else sensor, position.size
     driven = plant.driven(position.size)
     path = controller.path(reference)
     first = jax.tree.map(lambda x: x[0], path)
-    memory = controller.start(Tick(position, first, driven), velocity)
+    memory = controller.start(Tick(position, first, driven), velocity, path)
     times = drive.period * jnp.arange(reference.shape[0])
     tick0 = Tick(sensor.read(position), first, driven)
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
@@ -224,17 +227,24 @@ def closed_loop(
     advance = drive.stepper(plant, x0, (held,))
 
     def tick(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        x, memory, past = carry
-        path, disturbance, noise, t = now
-        reading = sensor.read(x.q, noise)
-        u, memory = controller.command(Tick(reading, path, driven), memory, disturbance)
+        x, memory, past, last, held = carry
+        path, disturbance, noise, t, fresh = now
+        reading = sensor.read(x.q, None if noise is None else noise[:n])
+        if fresh is not None:
+            reading = held = jnp.where(fresh, reading, held)
+        seen = Tick(reading, path, driven, True if fresh is None else fresh, measured=last)
+        u, memory = controller.command(seen, memory, disturbance)
         force, past = _delayed_force(plant, drive, u, past)
         new = advance(x, (force,), t)
-        return (new, memory, past), (x.q, x.qd, u, reading)
+        last = None if last is None else sensor.read_command(u, noise[n:])
+        return (new, memory, past, last, held), (x.q, x.qd, u, reading, controller.told(memory))
 
-    inputs = (path, disturbance, noise, times)
-    _, (q, v, u, reading) = jax.lax.scan(tick, (x0, memory, past), inputs)
-    return Trajectory(q, v, u, reading)
+    fresh = None if sensor.hold == 1 else jnp.arange(len(times)) % sensor.hold == 0
+    measures = noise is not None and noise.shape[1] > n and sensor.force_noise is not None
+    last, held = held / drive.gain if measures else None, None if fresh is None else position
+    inputs = (path, disturbance, noise, times, fresh)
+    _, (q, v, u, reading, found) = jax.lax.scan(tick, (x0, memory, past, last, held), inputs)
+    return Trajectory(q, v, u, reading, found)
 
 
 def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[Array, Array]:

@@ -166,7 +166,10 @@ class Scene:
             machine: Its plant and its sensor count.
             rng: Draws the sensors' noise.
         """
-        noise = rng.standard_normal((len(self.signal), self.case.plant.joints))
+        joints = self.case.plant.joints
+        # A law that measures the command sees the noise that the log has.
+        measures = "estimator" in type(machine.controller).of_machine if machine.controller else False
+        noise = rng.standard_normal((len(self.signal), joints + measures * machine.gain.size))
         times = self.drive.period * np.arange(len(self.signal))
         start, sensor = (self.position, self.velocity), (machine.sensor, noise)
         looped = machine.controller is not None
@@ -180,7 +183,9 @@ class Scene:
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
-        log = _log(self.case, machine, times[pick], reading, command, rng, reference)
+        shape = command.shape if machine.sensor.force_noise is not None else (0, 0)
+        more = noise[pick, joints:] if measures else rng.standard_normal(shape)
+        log = _log(self.case, machine, times[pick], reading, command, more, reference)
         return Virtual(log, run, _columns(self.case, reference=looped))
 
 
@@ -255,12 +260,9 @@ def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
 
 def _log(
     case: Case, machine: Machine, times: np.ndarray, reading: np.ndarray, command: np.ndarray,
-    rng: np.random.Generator, reference: np.ndarray | None,
+    noise: np.ndarray, reference: np.ndarray | None,
 ) -> Log:
-    noise = machine.sensor.force_noise
-    command = np.asarray(command)
-    if noise is not None:
-        command = command + np.asarray(noise) * rng.standard_normal(command.shape)
+    command = np.asarray(machine.sensor.read_command(np.asarray(command), noise))
     if not np.all(np.isfinite(reading)):
         raise InputError(
             "the simulation diverged", where=str(case.path),

@@ -27,7 +27,6 @@ from jaxid.io.case_reference import read_signal, read_unknown_reference
 from jaxid.io.case_tables import (
     ALGEBRAIC,
     OUTPUT_ERROR,
-    PLANNED_CONTROLLERS,
     STUDY,
     TOP,
     actuator_keys,
@@ -321,7 +320,7 @@ def _controller(tables: Mapping[str, Any], drives: int, file: str) -> dict[str, 
     if "controller" not in tables:
         return None
     table, spot = tables["controller"], Spot(file, "[controller]")
-    kind = read_kind(table, CONTROLLERS, PLANNED_CONTROLLERS, spot)
+    kind = read_kind(table, CONTROLLERS, (), spot)
     keys = {"kind": Key(lambda value, spot: value), **controller_keys(kind, drives)}
     return read_table(table, keys, spot)
 
