@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxid import signals
 from jaxid.controllers import CONTROLLERS, Controller
 from jaxid.errors import InputError
+from jaxid.inertial import Inertial, InertialSensors
 from jaxid.io.case import Case
 from jaxid.io.case_entries import EffectEntry
 from jaxid.io.case_reference import info_of
@@ -110,25 +113,19 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
         units=case.plant.units,
         controller=controller,
         disturbance=(case.controller or {}).get("disturbance"),
-        sensor=_sensor(case, controller),
+        sensor=_sensor(case, controller, plant),
         hold=case.log.get("hold", "zero_order"),
         course=course,
     )
 
 
-def _sensor(case: Case, controller: Controller | None) -> Sensor:
+def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:
     """What measures; readings slower than the loop are held for some of its ticks."""
     given = {name: as_array(value) for name, value in case.sensor.items() if name != "rate"}
-    rate, where = case.sensor.get("rate"), f"{case.path}, [sensor]"
-    if rate is None:
+    given["inertial"] = _inertial(case, controller, plant) if case.sensors else None
+    if "rate" not in case.sensor:
         return Sensor(**given)
-    if controller is None:
-        mend = "leave it out; sample_rate says how often a log without a loop is read"
-        raise InputError("rate goes with a loop", where=where, mend=mend)
-    hold = round(1 / (rate * controller.period))
-    if hold < 1 or abs(hold * rate * controller.period - 1) > 1e-3:
-        mend = f"take {1 / controller.period:g} Hz, the loop's, or a whole part of it"
-        raise InputError(f"rate = {rate:g} Hz does not fit the loop", where=where, mend=mend)
+    hold = _held(case.sensor["rate"], controller, f"{case.path}, [sensor]")
     # A difference over part of a hold is nothing, and then several times too much.
     for name in ("velocity_average", "reach"):
         ticks = getattr(controller, name, 0)
@@ -138,6 +135,47 @@ def _sensor(case: Case, controller: Controller | None) -> Sensor:
                 where=f"{case.path}, [controller]", mend=f"take {name} = {hold}, or a multiple of it",
             )
     return Sensor(**given, hold=hold)
+
+
+@eqx.filter_jit
+def _told(sensors: InertialSensors, plant: Plant, q: Array, readings: Array, zero: Array) -> Array:
+    return sensors.fused(plant, q, readings, zero, zero)[2]
+
+
+def _held(rate: float, controller: Controller | None, where: str) -> int:
+    """Ticks of the loop for which readings at this rate are held."""
+    if controller is None:
+        mend = "leave it out; sample_rate says how often a log without a loop is read"
+        raise InputError("rate goes with a loop", where=where, mend=mend)
+    hold = round(1 / (rate * controller.period))
+    if hold < 1 or abs(hold * rate * controller.period - 1) > 1e-3:
+        mend = f"take {1 / controller.period:g} Hz, the loop's, or a whole part of it"
+        raise InputError(f"rate = {rate:g} Hz does not fit the loop", where=where, mend=mend)
+    return hold
+
+
+def _inertial(case: Case, controller: Controller | None, plant: Plant) -> InertialSensors:
+    """Gyroscopes and accelerometers; together they must tell every joint, wherever the arm stands."""
+    sensors, known, holds = [], [], []
+    for k, stated in enumerate(case.sensors, start=1):
+        own = {n: v for n, v in stated.items() if n not in ("rate", "calibrated", "link")}
+        own["link"] = stated["link"] - 1
+        nominal = {n: v for n, v in own.items() if n not in ("rotation", "scale", "bias")}
+        sensors.append(Inertial(**own))
+        known.append(Inertial(**(own if stated.get("calibrated", True) else nominal)))
+        where = f"{case.path}, [[sensors]] {k}"
+        holds.append(_held(stated["rate"], controller, where) if "rate" in stated else 1)
+    out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
+    zero = np.zeros(plant.joints)
+    for q in np.random.default_rng(0).uniform(-1.0, 1.0, (3, plant.joints)):
+        readings = out.read(plant, q, zero, zero)
+        if not bool(_told(out, plant, q, readings, zero)):
+            what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"
+            raise InputError(
+                f"{what} do not tell the motion of every joint", where=f"{case.path}, [[sensors]]",
+                mend="add one of each kind on the last link, or with more axes, and a range beyond gravity",
+            )
+    return out
 
 
 def _plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:

@@ -169,7 +169,10 @@ class Scene:
         joints = self.case.plant.joints
         # A law that measures the command sees the noise that the log has.
         measures = "estimator" in type(machine.controller).of_machine if machine.controller else False
-        noise = rng.standard_normal((len(self.signal), joints + measures * machine.gain.size))
+        inertial, drives = machine.sensor.inertial, machine.gain.size
+        columns = joints + drives * (measures or inertial is not None)
+        columns += 0 if inertial is None else inertial.count
+        noise = rng.standard_normal((len(self.signal), columns))
         times = self.drive.period * np.arange(len(self.signal))
         start, sensor = (self.position, self.velocity), (machine.sensor, noise)
         looped = machine.controller is not None
@@ -179,12 +182,13 @@ class Scene:
             args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
             run = yield Solve(_closed_run, args)
         else:
+            sensor = (machine.sensor, noise[:, :joints])
             run = yield Solve(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
         shape = command.shape if machine.sensor.force_noise is not None else (0, 0)
-        more = noise[pick, joints:] if measures else rng.standard_normal(shape)
+        more = noise[pick, joints : joints + drives] if measures else rng.standard_normal(shape)
         log = _log(self.case, machine, times[pick], reading, command, more, reference)
         return Virtual(log, run, _columns(self.case, reference=looped))
 

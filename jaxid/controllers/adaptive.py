@@ -163,7 +163,8 @@ class Adaptive(FeedForward):
         """Position, velocity, acceleration and command at one instant, and whether there is a new one."""
         if tick.acceleration is not None:
             # The command that the acceleration answers to is that of the interval just past.
-            return (tick.joints, tick.velocity, tick.acceleration, memory.commands[0]), memory.ticks > 0
+            sample = (tick.joints, tick.velocity, tick.acceleration, memory.commands[0])
+            return sample, (memory.ticks > 0) & tick.renewed
         d, now = self.stride, tick.joints
         middle, last = memory.positions[d - 1], memory.positions[2 * d - 1]
         velocity = (now - last) / (2 * d * self.period)

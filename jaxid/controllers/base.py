@@ -34,6 +34,7 @@ class Tick(eqx.Module):
         fresh: Whether the readings are new; else they are held from an earlier tick.
         velocity, acceleration: Of all joints, where sensors measure them; acceleration is the mean since
             the tick before. None: positions are to be differenced.
+        renewed: Whether these are new.
         measured: Command that the drives report for the interval just past; None: as it was given.
     """
 
@@ -44,6 +45,7 @@ class Tick(eqx.Module):
     velocity: Float[Array, " n"] | None = None
     acceleration: Float[Array, " n"] | None = None
     measured: Float[Array, " m"] | None = None
+    renewed: Array | bool = True
 
     def at_drives(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """Of a quantity by joint, the entries of the driven ones."""

@@ -46,7 +46,7 @@ class FeedForward(Controller):
         u = (kp (r - q) + kd (r' - q') + (dynamics + friction) / gain) / gains
 
     r' is differenced as q' is, so that both are late by as much; where the velocity is measured, it is the
-    reference's own. Where readings are held, the PD law is held with them.
+    reference's own. Where readings are held, the parts of the PD law are held with them.
 
     Args:
         kp, kd: In units of the command, as those of `PD`.
@@ -75,19 +75,21 @@ class FeedForward(Controller):
     epsilon: Array = eqx.field(default=1e-3, kw_only=True)
 
     def start_feedback(self, tick: Tick) -> tuple[Array, Array]:
-        """Past references, and the PD law's last command."""
+        """Past references, and the PD law's last parts."""
         back = self.period * jnp.arange(1, self.velocity_average + 1)[:, None]
-        return tick.reference - back * tick.path.slope, jnp.zeros_like(tick.reference)
+        return tick.reference - back * tick.path.slope, jnp.zeros((2, tick.reference.size))
 
     def feedback(self, tick: Tick, velocity: Array, memory: tuple) -> tuple[Array, tuple]:
         """The PD law's command, and its memory."""
         past, held = memory
         slope = (tick.reference - past[-1]) / (self.velocity_average * self.period)
-        slope = slope if tick.velocity is None else tick.path.slope
+        measured = tick.velocity is not None
+        slope = tick.path.slope if measured else slope
         error = tick.reference - tick.position
-        u = self.kp * error + self.kd * (slope - tick.at_drives(velocity))
-        u = jnp.where(tick.fresh, u, held)
-        return u, (jnp.concatenate([tick.reference[None], past[:-1]]), u)
+        parts = self.kp * error, self.kd * (slope - tick.at_drives(velocity))
+        fresh = tick.fresh, tick.renewed if measured else tick.fresh
+        held = jnp.stack([jnp.where(f, u, old) for f, u, old in zip(fresh, parts, held, strict=True)])
+        return held[0] + held[1], (jnp.concatenate([tick.reference[None], past[:-1]]), held)
 
     def fed(self, model: Plant, tick: Tick) -> tuple[Array, Array]:
         """What a model asks for along the reference, without friction and for it, in units of the command."""

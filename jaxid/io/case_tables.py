@@ -55,6 +55,7 @@ TOP = {
     "recursive": False,
     "controller": False,
     "sensor": False,
+    "sensors": True,
     "limits": False,
     "validation": True,
     "discover": False,
