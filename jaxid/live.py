@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxid.controllers import Controller, Tick
 from jaxid.errors import InputError
 from jaxid.estimators.online import Memory, Online, Told
+from jaxid.estimators.recursion import Told as Estimate
 from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
 from jaxid.machine import Machine, build_machine
@@ -60,23 +61,34 @@ class Live:
         self._path = jax.tree.map(np.asarray, path)
         self._driven = self.machine.plant.driven(case.plant.joints)
         self._tick = 0
-        self._memory: object = None
+        self._law = _Law(self._controller)
+        self._memory: list[Array] | None = None
+        self._hold = self.machine.sensor.hold
+        self._adapts = "estimator" in self._controller.of_machine
         self._last: np.ndarray | None = None
         self._online, self._rows = None, None
         if identify:
-            if "model" not in self._controller.of_machine:
+            if "model" not in self._controller.of_machine or self._adapts:
                 kind = (case.controller or {})["kind"]
+                what = "identifies by itself" if self._adapts else "has no model to put what is found into"
                 raise InputError(
-                    f"a controller of kind {kind!r} has no model to put what is found into",
-                    where=str(case.path), mend="take kind = 'flatness'",
+                    f"a controller of kind {kind!r} {what}",
+                    where=str(case.path),
+                    mend="leave identify out" if self._adapts else "take kind = 'flatness'",
                 )
             self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
 
-    def command(self, position: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    def command(
+        self, position: Float[np.ndarray, " n"], velocity: Float[np.ndarray, " n"] | None = None,
+        acceleration: Float[np.ndarray, " n"] | None = None, measured: Float[np.ndarray, " m"] | None = None,
+    ) -> Float[np.ndarray, " m"]:
         """The command to hold until the next tick.
 
         Args:
             position: Readings of all joints [m or rad].
+            velocity, acceleration: Likewise, of a gyroscope and an accelerometer; absent: differenced.
+                The same are to be given at every tick.
+            measured: Command that the drives report since the last tick; absent: as it was given.
 
         Raises:
             InputError: If the reference has ended.
@@ -87,14 +99,41 @@ class Live:
                 mend="let [simulation] duration be longer",
             )
         position = np.asarray(position, dtype=np.float64)
-        tick = Tick(position, jax.tree.map(lambda x: x[self._tick], self._path), self._driven)
-        if self._tick == 0:
-            self._memory = self._controller.start(tick, np.zeros_like(position))
+        fresh = np.asarray(self._tick % self._hold == 0)
+        path = jax.tree.map(lambda x: x[self._tick], self._path)
+        others = (None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured))
+        tick = Tick(position, path, self._driven, fresh, *others)
+        if self._memory is None:
+            self.memory = self._controller.start(tick, np.zeros_like(position), self._path)
         if self._online is not None and self.switched is None:
             self._identify(position)
-        u, self._memory = _command(self._controller, tick, self._memory)
+        u, self._memory = self._law(tick, self._memory)
+        if self._adapts and self.switched is None and self._controller.told(self.memory).closed:
+            self.switched = self._tick
         self._tick, self._last = self._tick + 1, np.asarray(u)
         return self._last
+
+    @property
+    def memory(self) -> object:
+        """What the controller remembers, a tree of arrays; one that was saved may be put back."""
+        return None if self._memory is None else jax.tree.unflatten(self._law.memory, self._memory)
+
+    @memory.setter
+    def memory(self, memory: object) -> None:
+        leaves, self._law.memory = jax.tree.flatten(memory)
+        self._memory = [jnp.asarray(x) for x in leaves]
+
+    @property
+    def estimate(self) -> Estimate:
+        """What a controller that identifies says of the unknowns, in the order of `machine.parameters`.
+
+        Raises:
+            InputError: If it does not identify, or nothing has been read yet.
+        """
+        if not self._adapts or self.memory is None:
+            what = "no reading yet" if self._adapts else "the controller does not identify"
+            raise InputError(what, where="Live", mend="take kind = 'adaptive', and give it readings")
+        return self._controller.estimate(self.memory)
 
     def _identify(self, position: np.ndarray) -> None:
         if self._rows is None:
@@ -105,6 +144,7 @@ class Live:
         if self.told.trusted.all():
             model = self.machine.with_estimate(self.told.theta).plant
             self._controller = eqx.tree_at(lambda c: c.model, self._controller, model)
+            self._law.take(self._controller)
             self.switched = self._tick
 
 
@@ -136,9 +176,38 @@ def _followed(online: Online, position: Array, command: Array) -> Told:
     return jax.lax.scan(step, online.start(position[0]), (position[1:], command[:-1]))[1]
 
 
-@eqx.filter_jit
-def _command(controller: Controller, tick: Tick, memory: object) -> tuple:
-    return controller.command(tick, memory, jnp.zeros(1))
+class _Law:
+    """A controller's command, compiled as a function of leaves, and of one array for the tick.
+
+    To walk through the trees of controller and memory at every tick takes twice as long as all else.
+    """
+
+    def __init__(self, controller: Controller):
+        self.take(controller)
+        self.memory: object = None
+        self._tick: object = None
+
+    def take(self, controller: Controller) -> None:
+        """Go on with a controller of the same structure."""
+        arrays, self._static = eqx.partition(controller, eqx.is_array)
+        leaves, self._arrays = jax.tree.flatten(arrays)
+        self._leaves = [jnp.asarray(x) for x in leaves]
+
+    def __call__(self, tick: Tick, memory: list[Array]) -> tuple[Array, list[Array]]:
+        leaves, structure = jax.tree.flatten(tick)
+        if self._tick is None or structure != self._tick:
+            self._tick, self._compiled = structure, jax.jit(self._command)
+            self._shapes = [(x.shape, x.dtype) for x in leaves]
+        return self._compiled(self._leaves, np.concatenate([x.ravel() for x in leaves]), memory)
+
+    def _command(self, own: list, tick: Array, memory: list) -> tuple[Array, list[Array]]:
+        controller = eqx.combine(jax.tree.unflatten(self._arrays, own), self._static)
+        ends = np.cumsum([int(np.prod(shape)) for shape, _ in self._shapes])[:-1]
+        parts = zip(jnp.split(tick, ends), self._shapes, strict=True)
+        tick = jax.tree.unflatten(self._tick, [x.reshape(shape).astype(d) for x, (shape, d) in parts])
+        memory = jax.tree.unflatten(self.memory, memory)
+        u, memory = controller.command(tick, memory, jnp.zeros(1))
+        return u, jax.tree.leaves(memory)
 
 
 def _learn(online: Online, memory: Memory, position: Array, command: Array) -> tuple[Memory, Told]:

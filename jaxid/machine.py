@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxid import signals
 from jaxid.controllers import CONTROLLERS, Controller
 from jaxid.errors import InputError
+from jaxid.inertial import Inertial, InertialSensors
 from jaxid.io.case import Case
 from jaxid.io.case_entries import EffectEntry
 from jaxid.io.case_reference import info_of
+from jaxid.io.case_tables import ON_LINE
 from jaxid.io.case_values import Value
 from jaxid.io.log import Log
 from jaxid.model import ParameterInfo, Plant, as_array, parameters_of
@@ -25,6 +29,8 @@ from jaxid.sensors import Sensor
 from jaxid.tables import read_columns
 from jaxid.units import Units
 
+# Velocity above which a joint's row counts for a law that identifies, where the case states none.
+_GATE = 1e-2
 # A disturbance switches at start + k (on + off); the tick at that very instant still sees the
 # old value, and a time stamp that is off by its rounding must not change that. In parts of
 # on + off: half a microsecond at a usual 0.5 s, far below any tick, above the jitter of logs.
@@ -100,17 +106,77 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
     course, more = _course(case, true, plant)
     gain = np.asarray(case.gain, dtype=np.float64) * np.asarray(plant.gearing)
     gain = np.broadcast_to(gain, (case.plant.drives,)).copy()
+    controller = _controller(case, period, gain)
     return Machine(
         plant=plant,
         parameters=Parameters((*free, *more)),
         gain=gain,
         units=case.plant.units,
-        controller=_controller(case, period, gain),
+        controller=controller,
         disturbance=(case.controller or {}).get("disturbance"),
-        sensor=Sensor(**{name: as_array(value) for name, value in case.sensor.items()}),
+        sensor=_sensor(case, controller, plant),
         hold=case.log.get("hold", "zero_order"),
         course=course,
     )
+
+
+def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:
+    """What measures; readings slower than the loop are held for some of its ticks."""
+    given = {name: as_array(value) for name, value in case.sensor.items() if name != "rate"}
+    given["inertial"] = _inertial(case, controller, plant) if case.sensors else None
+    if "rate" not in case.sensor:
+        return Sensor(**given)
+    hold = _held(case.sensor["rate"], controller, f"{case.path}, [sensor]")
+    # A difference over part of a hold is nothing, and then several times too much.
+    for name in ("velocity_average", "reach"):
+        ticks = getattr(controller, name, 0)
+        if ticks % hold:
+            raise InputError(
+                f"{name} = {ticks} ticks, and readings are new every {hold}",
+                where=f"{case.path}, [controller]", mend=f"take {name} = {hold}, or a multiple of it",
+            )
+    return Sensor(**given, hold=hold)
+
+
+@eqx.filter_jit
+def _told(sensors: InertialSensors, plant: Plant, q: Array, readings: Array, zero: Array) -> Array:
+    return sensors.fused(plant, q, readings, zero, zero)[2]
+
+
+def _held(rate: float, controller: Controller | None, where: str) -> int:
+    """Ticks of the loop for which readings at this rate are held."""
+    if controller is None:
+        mend = "leave it out; sample_rate says how often a log without a loop is read"
+        raise InputError("rate goes with a loop", where=where, mend=mend)
+    hold = round(1 / (rate * controller.period))
+    if hold < 1 or abs(hold * rate * controller.period - 1) > 1e-3:
+        mend = f"take {1 / controller.period:g} Hz, the loop's, or a whole part of it"
+        raise InputError(f"rate = {rate:g} Hz does not fit the loop", where=where, mend=mend)
+    return hold
+
+
+def _inertial(case: Case, controller: Controller | None, plant: Plant) -> InertialSensors:
+    """Gyroscopes and accelerometers; together they must tell every joint, wherever the arm stands."""
+    sensors, known, holds = [], [], []
+    for k, stated in enumerate(case.sensors, start=1):
+        own = {n: v for n, v in stated.items() if n not in ("rate", "calibrated", "link")}
+        own["link"] = stated["link"] - 1
+        nominal = {n: v for n, v in own.items() if n not in ("rotation", "scale", "bias")}
+        sensors.append(Inertial(**own))
+        known.append(Inertial(**(own if stated.get("calibrated", True) else nominal)))
+        where = f"{case.path}, [[sensors]] {k}"
+        holds.append(_held(stated["rate"], controller, where) if "rate" in stated else 1)
+    out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
+    zero = np.zeros(plant.joints)
+    for q in np.random.default_rng(0).uniform(-1.0, 1.0, (3, plant.joints)):
+        readings = out.read(plant, q, zero, zero)
+        if not bool(_told(out, plant, q, readings, zero)):
+            what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"
+            raise InputError(
+                f"{what} do not tell the motion of every joint", where=f"{case.path}, [[sensors]]",
+                mend="add one of each kind on the last link, or with more axes, and a range beyond gravity",
+            )
+    return out
 
 
 def _plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
@@ -233,10 +299,43 @@ def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controlle
     values |= given
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
     arrays = {k: v if k in static else as_array(v) for k, v in values.items()}
+    period = case.controller.get("period") or _log_period(case, period)
+    if cls.every_drive and case.plant.drives < case.plant.joints:
+        raise InputError(
+            f"kind = '{case.controller['kind']}' needs a drive at every joint: no reference says how the "
+            "others move", where=f"{case.path}, [controller]", mend="take kind = 'flatness'",
+        )
     if "model" in cls.of_machine:
         # The law knows what the case guesses, whatever the machine truly is.
-        arrays |= {"model": _plant(case, False)[0], "gain": as_array(gain.tolist())}
-    return cls(period=case.controller.get("period") or _log_period(case, period), **arrays)
+        plant, free = _plant(case, False)
+        arrays |= {"model": plant, "gain": as_array(gain.tolist())}
+        if "estimator" in cls.of_machine:
+            known = Machine(plant, Parameters(tuple(free)), gain, case.plant.units)
+            stated = {k: arrays.pop(k) for k in ON_LINE if k in arrays}
+            arrays["estimator"] = _estimator(case, known, period, stated)
+    return cls(period=period, **arrays)
+
+
+def _estimator(case: Case, machine: Machine, period: float, stated: Mapping[str, Any]) -> Any:
+    """Of a law that identifies: what finds the unknowns; how certain its start is, the law says."""
+    from jaxid.estimators.real_time import RealTime
+
+    where, count = f"{case.path}, [controller]", len(machine.parameters.free)
+    if not count:
+        mend = "take kind = 'computed_torque', or give a guess in place of a value"
+        raise InputError("kind = 'adaptive' has nothing to find: all is known", where=where, mend=mend)
+    velocity = stated.get("gate_velocity", _GATE)
+    at_guess = stated.get("start") == "guess"
+    try:
+        return RealTime.of(
+            machine, period, noise=1.0, spread=np.ones(count), gate_velocity=velocity,
+            gate_acceleration=stated.get("gate_acceleration", np.inf),
+            half_life=stated.get("half_life", np.inf), summed=stated.get("rows") == "summed",
+            instrument=stated.get("instrument") == "model",
+            start=machine.parameters.guess if at_guess else None,
+        )
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _log_period(case: Case, period: float | None) -> float:

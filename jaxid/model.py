@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxid import smooth
 from jaxid.alike import acted, alike
+from jaxid.errors import InputError
 
 SIGNS = ("free", "nonnegative", "positive")
 # What the ports of a plant may be called; they count from 1 by kind.
@@ -374,6 +375,24 @@ class Plant(eqx.Module):
     def along(self, port: int) -> tuple[int, ...]:
         """Coordinates, as entries of `ports`, along which an effect on a port acts, each for itself."""
         return (port,)
+
+    def joint_positions(self, tool: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"] | None:
+        """Coordinates that bring the tool to a place; NaN out of reach, None of a plant that cannot say."""
+        return None
+
+    def frame(self, link: int, q: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+        """Axes of a link's frame, as columns, and its origin [m], in the base's frame.
+
+        Raises:
+            InputError: If the plant has no links that move in space.
+        """
+        what = f"kind = '{self.kind}' has no links that move in space"
+        raise InputError(what, mend="put sensors on the links of kind = 'serial_arm'")
+
+    @property
+    def base_gravity(self) -> Float[Array, "3"]:
+        """Acceleration of gravity in the base's frame [m/s^2]."""
+        return jnp.asarray(getattr(self, "gravity_vector", (0.0, 0.0, -9.81)))
 
     def place(self, port: int) -> tuple[str, int]:
         """What a port is called: one of `PLACES`, and which, counted from 1."""

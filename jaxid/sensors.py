@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxid.inertial import InertialSensors
+
 # Noise of so many counts leaves of the rounding's error nothing that goes with the signal
 # (Schuchman 1964; Gaussian noise, to 1 %).
 _DITHERS = 0.5
@@ -22,11 +24,15 @@ class Sensor(eqx.Module):
         position_resolution: One count [m or rad].
         position_noise: Standard deviation of white noise before rounding [m or rad].
         force_noise: Standard deviation on the logged command, in its units.
+        hold: Ticks of the loop for which a reading of a position is held.
+        inertial: Gyroscopes and accelerometers; None where there are none.
     """
 
     position_resolution: Array | None = None
     position_noise: Array | None = None
     force_noise: Array | None = None
+    hold: int = eqx.field(static=True, default=1)
+    inertial: InertialSensors | None = None
 
     def read(self, q: Array, noise: Array | None = None) -> Array:
         """Reading of a position; rounded with a straight-through gradient.
@@ -40,6 +46,10 @@ class Sensor(eqx.Module):
             return q
         counts = jnp.round(q / self.position_resolution) * self.position_resolution
         return q + jax.lax.stop_gradient(counts - q)
+
+    def read_command(self, u: Array, noise: Array | None = None) -> Array:
+        """Reading of a command, in its units."""
+        return u if noise is None or self.force_noise is None else u + self.force_noise * noise
 
     @property
     def mean(self) -> Sensor:

@@ -189,8 +189,8 @@ def _followed(case: Case, log: Log) -> Log:
         return log
     if case.unknown_reference:
         return log
-    rate = 1 / log.period
-    reference = make_reference(case.reference, rate, log.samples / rate, case.folder)
+    rate, plant = 1 / log.period, build_machine(at_joints(case), period=log.period).plant
+    reference = make_reference(case.reference, rate, log.samples / rate, case.folder, plant=plant)
     return replace(log, reference=np.broadcast_to(reference, (log.samples, case.plant.drives)))
 
 

@@ -9,7 +9,7 @@ different model from a sampled one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -47,12 +47,14 @@ class Trajectory(eqx.Module):
         velocity: (time, n).
         command: Logged command, (time, m), before the declared gain.
         reading: Position as the sensor reports it, (time, n).
+        found: What a law that identifies had found, see `Controller.told`; else None.
     """
 
     position: Float[Array, "time n"]
     velocity: Float[Array, "time n"]
     command: Float[Array, "time m"]
     reading: Float[Array, "time n"]
+    found: Any = None
 
 
 class Drive(eqx.Module):
@@ -206,16 +208,17 @@ def closed_loop(
         disturbance: Added to the command at every tick, before its limit.
         position, velocity: At the first tick.
         sensor: What the controller reads; absent: exact.
-        noise: Standard normal numbers for the sensor's noise; absent: none.
+        noise: Standard normal numbers for the sensor's noise, of the positions and, where there are more
+            columns, of the measured commands and the inertial sensors; absent: none.
 
     Returns:
         One row a tick.
     """
-    sensor = Sensor() if sensor is None else sensor
+    sensor, n = Sensor() if sensor is None else sensor, position.size
     driven = plant.driven(position.size)
     path = controller.path(reference)
     first = jax.tree.map(lambda x: x[0], path)
-    memory = controller.start(Tick(position, first, driven), velocity)
+    memory = controller.start(Tick(position, first, driven), velocity, path)
     times = drive.period * jnp.arange(reference.shape[0])
     tick0 = Tick(sensor.read(position), first, driven)
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
@@ -223,18 +226,42 @@ def closed_loop(
     x0 = State(position, velocity, plant.initial_states(held))
     advance = drive.stepper(plant, x0, (held,))
 
+    inertial, m = sensor.inertial, drive.gain.size
+
+    def sensed(x: State, reading: Array, moved: tuple, noise: Array | None, renews: Array) -> tuple:
+        """Velocity and acceleration by inertial sensors, whether they are new, and what is to be kept."""
+        before, v, a = moved
+        mean = (x.qd - before) / drive.period
+        raw = inertial.read(plant, x.q, x.qd, mean, noise)
+        new_v, new_a, sound = inertial.fused(plant, reading, raw, v, a)
+        v, a = jnp.where(renews, new_v, v), jnp.where(renews, new_a, a)
+        return (v, a if inertial.accelerates else None, renews & sound), (x.qd, v, a)
+
     def tick(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        x, memory, past = carry
-        path, disturbance, noise, t = now
-        reading = sensor.read(x.q, noise)
-        u, memory = controller.command(Tick(reading, path, driven), memory, disturbance)
+        x, memory, past, last, held, moved = carry
+        path, disturbance, noise, t, fresh, renews = now
+        reading = sensor.read(x.q, None if noise is None else noise[:n])
+        if fresh is not None:
+            reading = held = jnp.where(fresh, reading, held)
+        v, a, renewed = None, None, True
+        if inertial is not None:
+            more = None if noise is None or noise.shape[0] <= n + m else noise[n + m :]
+            (v, a, renewed), moved = sensed(x, reading, moved, more, renews)
+        seen = Tick(reading, path, driven, True if fresh is None else fresh, v, a, last, renewed)
+        u, memory = controller.command(seen, memory, disturbance)
         force, past = _delayed_force(plant, drive, u, past)
         new = advance(x, (force,), t)
-        return (new, memory, past), (x.q, x.qd, u, reading)
+        last = None if last is None else sensor.read_command(u, noise[n : n + m])
+        return (new, memory, past, last, held, moved), (x.q, x.qd, u, reading, controller.told(memory))
 
-    inputs = (path, disturbance, noise, times)
-    _, (q, v, u, reading) = jax.lax.scan(tick, (x0, memory, past), inputs)
-    return Trajectory(q, v, u, reading)
+    fresh = None if sensor.hold == 1 else jnp.arange(len(times)) % sensor.hold == 0
+    measures = noise is not None and noise.shape[1] > n and sensor.force_noise is not None
+    last, held = held / drive.gain if measures else None, None if fresh is None else position
+    moved = None if inertial is None else (velocity, velocity, jnp.zeros_like(velocity))
+    renews = None if inertial is None else jnp.arange(len(times)) % inertial.hold == 0
+    inputs = (path, disturbance, noise, times, fresh, renews)
+    _, (q, v, u, reading, found) = jax.lax.scan(tick, (x0, memory, past, last, held, moved), inputs)
+    return Trajectory(q, v, u, reading, found)
 
 
 def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[Array, Array]:

@@ -137,13 +137,18 @@ class Scene:
                     "nothing drives the plant", where=where,
                     mend="add an [input], or a [reference] and a [controller]",
                 )
-            command = make_reference(case.input, rate, duration, case.folder, where="input")
+            command = make_reference(
+                case.input, rate, duration, case.folder, where="input", plant=machine.plant
+            )
             drive = _drive(case, machine, 1 / rate, longer_delays)
             return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
         if not case.reference:
             raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
         period = machine.controller.period
-        reference = _by_drive(make_reference(case.true_reference, 1 / period, duration, case.folder), machine)
+        reference = make_reference(
+            case.true_reference, 1 / period, duration, case.folder, plant=machine.plant
+        )
+        reference = _by_drive(reference, machine)
         if reference.shape[1] == joints:
             _refuse_impossible(machine.plant, reference, f"{where}, [reference]", period)
         machine = _scaled(machine, reference, period)
@@ -164,7 +169,13 @@ class Scene:
             machine: Its plant and its sensor count.
             rng: Draws the sensors' noise.
         """
-        noise = rng.standard_normal((len(self.signal), self.case.plant.joints))
+        joints = self.case.plant.joints
+        # A law that measures the command sees the noise that the log has.
+        measures = "estimator" in type(machine.controller).of_machine if machine.controller else False
+        inertial, drives = machine.sensor.inertial, machine.gain.size
+        columns = joints + drives * (measures or inertial is not None)
+        columns += 0 if inertial is None else inertial.count
+        noise = rng.standard_normal((len(self.signal), columns))
         times = self.drive.period * np.arange(len(self.signal))
         start, sensor = (self.position, self.velocity), (machine.sensor, noise)
         looped = machine.controller is not None
@@ -174,12 +185,15 @@ class Scene:
             args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
             run = yield Solve(_closed_run, args)
         else:
+            sensor = (machine.sensor, noise[:, :joints])
             run = yield Solve(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
         _refuse_ended(machine.plant, run, self.drive.period, str(self.case.path))
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
-        log = _log(self.case, machine, times[pick], reading, command, rng, reference)
+        shape = command.shape if machine.sensor.force_noise is not None else (0, 0)
+        more = noise[pick, joints : joints + drives] if measures else rng.standard_normal(shape)
+        log = _log(self.case, machine, times[pick], reading, command, more, reference)
         return Virtual(log, run, _columns(self.case, reference=looped))
 
 
@@ -282,12 +296,9 @@ def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
 
 def _log(
     case: Case, machine: Machine, times: np.ndarray, reading: np.ndarray, command: np.ndarray,
-    rng: np.random.Generator, reference: np.ndarray | None,
+    noise: np.ndarray, reference: np.ndarray | None,
 ) -> Log:
-    noise = machine.sensor.force_noise
-    command = np.asarray(command)
-    if noise is not None:
-        command = command + np.asarray(noise) * rng.standard_normal(command.shape)
+    command = np.asarray(machine.sensor.read_command(np.asarray(command), noise))
     if not np.all(np.isfinite(reading)):
         raise InputError(
             "the simulation diverged", where=str(case.path),

@@ -86,7 +86,7 @@ def second(keys: str) -> str:
 # Each fault, and what its message must hold: table, key, mend.
 FAULTS = {
     # names
-    "unknown table": (more("[sensors]"), ["[sensors]", "'sensor'"]),
+    "unknown table": (more("[sensr]"), ["[sensr]", "'sensor'"]),
     "key outside of tables": ("gain = 3.0\n" + GOOD, ["'gain'", "outside", "move it below"]),
     "table far from any": (more("[zzz]"), ["[zzz]", "there is: plant, effects"]),
     "unknown key": (swapped("[plant]", "[plant]\nmotoin = 1"), ["[plant]", "motoin", "'motion'"]),

@@ -8,7 +8,6 @@ from case_faults import CASCADE, FAULTS, GOOD, message, more, swapped, write
 from jaxid.controllers import CONTROLLERS
 from jaxid.errors import InputError
 from jaxid.io.case import load_case
-from jaxid.io.case_tables import PLANNED_CONTROLLERS
 from jaxid.io.case_values import Value
 
 # The example of the documentation, to the letter.
@@ -76,12 +75,6 @@ def test_fault_is_told_with_key_and_mend(tmp_path, fault):
     told = message(tmp_path, text)
     missing = [word for word in words if word not in told]
     assert not missing, told
-
-
-@pytest.mark.parametrize("kind", [k for k in PLANNED_CONTROLLERS if k not in CONTROLLERS])
-def test_planned_controllers_are_told_from_unknown_ones(tmp_path, kind):
-    told = message(tmp_path, swapped('"cascade_pd"', f'"{kind}"'))
-    assert "not available in this version; have: cascade_pd, pd, pid" in told
 
 
 def test_missing_file_lists_what_is_beside(tmp_path):

@@ -87,11 +87,16 @@ def test_inverse_dynamics_is_pinocchios(name):
     close(plant.inertial(jnp.asarray(q), zero, zero), pinocchio.computeGeneralizedGravity(model, data, q))
 
 
-def mujoco_model(mujoco, rows, parameters, gravity):
-    """The arm as nested bodies; MuJoCo counts inertia about the centre of mass."""
+def mujoco_model(mujoco, rows, parameters, gravity, sites=(), sensors=""):
+    """The arm as nested bodies; MuJoCo counts inertia about the centre of mass.
+
+    sites: what else is on each link; sensors: what reads it; both as MuJoCo writes them.
+    """
     words = " ".join
     text, tail = "", ""
-    for (joint, *dh), (m, x, y, z, xx, xy, xz, yy, yz, zz) in zip(rows, parameters, strict=True):
+    sites = sites or [""] * len(rows)
+    for (joint, *dh), body, site in zip(rows, parameters, sites, strict=True):
+        m, x, y, z, xx, xy, xz, yy, yz, zz = body
         home = arm_oracle.transforms([(joint, *dh)], [0.0])[0]
         axes = words(repr(float(v)) for v in home[:3, :2].T.ravel())
         com = np.array([x, y, z]) / m
@@ -103,12 +108,13 @@ def mujoco_model(mujoco, rows, parameters, gravity):
             f'<body pos="{words(repr(float(v)) for v in home[:3, 3])}" xyaxes="{axes}">'
             f'<joint type="{kind}" axis="0 0 1"/>'
             f'<inertial pos="{words(repr(float(v)) for v in com)}" mass="{float(m)!r}" fullinertia="{full}"/>'
+            f"{site}"
         )
         tail += "</body>"
     weight = words(repr(float(v)) for v in gravity)
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><compiler angle="radian"/><option gravity="{weight}"><flag contact="disable"/></option>'
-        f"<worldbody>{text}{tail}</worldbody></mujoco>"
+        f"<worldbody>{text}{tail}</worldbody><sensor>{sensors}</sensor></mujoco>"
     )
 
 

@@ -31,16 +31,34 @@ class Tick(eqx.Module):
         joints: Measured coordinates of all joints.
         path: Where those that are driven should be.
         driven: Which these are, 0-based, in the order of the drives.
+        fresh: Whether the readings are new; else they are held from an earlier tick.
+        velocity, acceleration: Of all joints, where sensors measure them; acceleration is the mean since
+            the tick before. None: positions are to be differenced.
+        renewed: Whether these are new.
+        measured: Command that the drives report for the interval just past; None: as it was given.
     """
 
     joints: Float[Array, " n"]
     path: Path
     driven: tuple[int, ...] = eqx.field(static=True)
+    fresh: Array | bool = True
+    velocity: Float[Array, " n"] | None = None
+    acceleration: Float[Array, " n"] | None = None
+    measured: Float[Array, " m"] | None = None
+    renewed: Array | bool = True
 
     def at_drives(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """Of a quantity by joint, the entries of the driven ones."""
         whole = self.driven == tuple(range(x.size))
         return x if whole else jnp.stack([x[i] for i in self.driven])
+
+    def at_joints(self, x: Float[Array, " m"]) -> Float[Array, " n"]:
+        """A quantity by drive at its joints; zero at those that none drives."""
+        n = self.joints.size
+        if self.driven == tuple(range(n)):
+            return x
+        zero = jnp.zeros((), x.dtype)
+        return jnp.stack([x[self.driven.index(i)] if i in self.driven else zero for i in range(n)])
 
     @property
     def position(self) -> Float[Array, " m"]:
@@ -68,8 +86,10 @@ class Controller(eqx.Module):
 
     # Whether the law needs the reference's derivatives.
     anticipates: ClassVar[bool] = False
-    # Fields that no case states: the machine's own model and gain.
+    # Fields that no case states: the machine's own model, gain and estimator.
     of_machine: ClassVar[tuple[str, ...]] = ()
+    # Whether it needs a drive at every joint.
+    every_drive: ClassVar[bool] = False
 
     def path(self, reference: Float[Array, "ticks m"]) -> Path:
         """The reference as the law needs it, at every tick; differences are central."""
@@ -80,14 +100,24 @@ class Controller(eqx.Module):
         curvature = (after - 2 * reference + before) / self.period**2
         return Path(reference, (after - before) / (2 * self.period), curvature)
 
-    def start(self, tick: Tick, velocity: Float[Array, " n"]) -> Any:
-        """Memory of a controller that has watched the joints pass at constant velocity."""
+    def start(self, tick: Tick, velocity: Float[Array, " n"], path: Path | None = None) -> Any:
+        """Memory of a controller that has watched the joints pass at constant velocity.
+
+        Args:
+            tick: The first.
+            velocity: Of all joints.
+            path: The whole course, for a law that looks ahead on it.
+        """
         ticks = range(1, self.velocity_average + 1)
         past = tuple(tick.joints - k * self.period * velocity for k in ticks)
-        return past, self.start_law(tick, velocity)
+        return past, self.start_law(tick, velocity, path)
 
-    def start_law(self, tick: Tick, velocity: Float[Array, " n"]) -> Any:
+    def start_law(self, tick: Tick, velocity: Float[Array, " n"], path: Path | None = None) -> Any:
         """Memory of the law itself."""
+        return None
+
+    def told(self, memory: Any) -> Any:
+        """What a law that identifies has found so far; None of one that does not."""
         return None
 
     def law(self, tick: Tick, velocity: Float[Array, " n"], memory: Any, disturbance: Array) -> tuple:
@@ -101,7 +131,9 @@ class Controller(eqx.Module):
         (p[k] - p[k-1]) / period, which telescopes to two positions.
         """
         past, inner = memory
-        velocity = (tick.joints - past[-1]) / (self.velocity_average * self.period)
+        velocity = tick.velocity
+        if velocity is None:
+            velocity = (tick.joints - past[-1]) / (self.velocity_average * self.period)
         u, inner = self.law(tick, velocity, inner, disturbance)
         return self.clipped(u + disturbance), ((tick.joints, *past[:-1]), inner)
 

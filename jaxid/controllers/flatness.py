@@ -86,7 +86,7 @@ class Flatness(Controller):
         """Whether the law sees a reconstructed velocity."""
         return len(self.poles) == 3
 
-    def start_law(self, tick: Tick, velocity: Array) -> Any:
+    def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Any:
         if not self.reconstructs:
             return None
         none = jnp.zeros_like(tick.position)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxid.controllers.base import Controller, Tick
+from jaxid.controllers.base import Controller, Path, Tick
 
 
 class CascadePD(Controller):
@@ -28,7 +28,7 @@ class PD(Controller):
     kp: Array
     kd: Array
 
-    def start_law(self, tick: Tick, velocity: Array) -> Array:
+    def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Array:
         return tick.reference
 
     def law(self, tick: Tick, velocity: Array, memory: Array, disturbance: Array) -> tuple:
@@ -74,7 +74,7 @@ class PID(Controller):
     derivative_filter: Array = eqx.field(default=0.0, kw_only=True)
     anti_windup: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    def start_law(self, tick: Tick, velocity: Array) -> tuple:
+    def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> tuple:
         none = jnp.zeros_like(tick.reference)
         return tick.reference, none, none
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxid.errors import InputError
 from jaxid.estimators.online import check_instant, slopes
-from jaxid.estimators.recursion import Memory, Recursion, Told
+from jaxid.estimators.recursion import Memory, Recursion, Told, column_squares
 from jaxid.estimators.recursive import gains_of, start_of
 from jaxid.estimators.recursive_rows import check_proportion, elsewhere
 from jaxid.machine import Machine
@@ -127,6 +127,14 @@ class RealTime(eqx.Module):
         rows, e = jax.jacfwd(residual, has_aux=True)(guess)
         counts = (jnp.abs(qd) > self.gate_velocity) | (jnp.abs(qdd) > self.gate_acceleration)
         return rows, rows @ guess - e, counts
+
+    def sizes(
+        self, rows: Float[Array, "time n p"], counts: Bool[Array, "time n"], force: Float[Array, "time n"]
+    ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+        """Mean square of each column, and root mean square of the force, of samples that count."""
+        natural = jnp.where(self.guess == 0, 1.0, jnp.asarray(self.guess))
+        square, force = column_squares(rows, counts, force, natural)
+        return square, jnp.sqrt(force)
 
     @eqx.filter_jit
     def update(

@@ -36,6 +36,8 @@ from jaxid.estimators.least_squares import eliminated
 # Of the variance with which an unknown starts, what may be left where the rows tell it: it is then by less
 # than a hundredth of the start's own error off.
 TOLD = 0.01
+# Below this part of the force a column is nothing.
+_NOTHING = 1e-9
 # A gain below this part of its start makes no model of the drive's force.
 _LEAST_GAIN = 0.1
 
@@ -256,6 +258,23 @@ def run(
 
     memory, (told, z) = jax.lax.scan(block, memory, padded)
     return memory, told, None if z is None else z.reshape(-1, *z.shape[2:])[:time]
+
+
+def column_squares(
+    rows: Float[Array, "time m p"], counts: Bool[Array, "time m"], force: Float[Array, "time m"],
+    natural: Float[Array, " p"],
+) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+    """Mean square of each column, and of the force, over the samples that count.
+
+    Args:
+        rows, counts: As `Recursion.update` takes them, by sample.
+        force: Of the drives in each row.
+        natural: Sizes of the unknowns: a column that never stirs is a billionth of the force over it.
+    """
+    moved = jnp.maximum(jnp.any(counts, axis=1).sum(), 1)
+    square = jnp.sum(jnp.where(counts[..., None], rows, 0.0) ** 2, axis=(0, 1)) / moved
+    force = jnp.sum(jnp.where(counts, force, 0.0) ** 2) / moved
+    return jnp.maximum(square, _NOTHING**2 * jnp.maximum(force, 1e-300) / natural**2), force
 
 
 def instants(samples: int, every: int) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
-from jaxid.estimators.recursion import Memory, Recursion, instants, run
+from jaxid.estimators.recursion import Memory, Recursion, column_squares, instants, run
 from jaxid.estimators.recursive_precision import details_of, precision_of
 from jaxid.estimators.recursive_rows import Rows, rows_steps
 from jaxid.estimators.result import Estimate
@@ -117,11 +117,8 @@ def _recursion(
 
 def _sizes(machine: Machine, used: Rows) -> Float[np.ndarray, " p"]:
     """Mean square of each column over the samples that count; of one that never stirs, that of the force."""
-    moved = max(int(used.moved.sum()), 1)
-    square = np.sum(np.where(used.counts[..., None], used.rows, 0.0) ** 2, axis=(0, 1)) / moved
-    force = np.sum(np.where(used.counts, used.force, 0.0) ** 2) / moved
     natural = np.where(machine.parameters.guess == 0, 1.0, machine.parameters.guess)
-    return np.maximum(square, _NOTHING**2 * max(force, 1e-300) / natural**2)
+    return np.asarray(column_squares(used.rows, used.counts, used.force, natural)[0])
 
 
 def _gates(data: Prepared, stated: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:

@@ -24,10 +24,10 @@ from jaxid.io.case_entries import (
     read_plant,
 )
 from jaxid.io.case_reference import read_signal, read_unknown_reference
+from jaxid.io.case_sensors import read_sensors
 from jaxid.io.case_tables import (
     ALGEBRAIC,
     OUTPUT_ERROR,
-    PLANNED_CONTROLLERS,
     STUDY,
     TOP,
     actuator_keys,
@@ -80,6 +80,7 @@ class Case:
         recursive: [recursive], likewise.
         controller: [controller].
         sensor: [sensor].
+        sensors: [[sensors]], see `jaxid.io.case_sensors`.
         limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
         candidates: User's own effects that a search may name, from [discover].
@@ -102,6 +103,7 @@ class Case:
     recursive: dict[str, Any] = field(default_factory=dict)
     controller: dict[str, Any] | None = None
     sensor: dict[str, Any] = field(default_factory=dict)
+    sensors: tuple[dict[str, Any], ...] = ()
     limits: dict[str, Any] = field(default_factory=dict)
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
@@ -189,6 +191,7 @@ def load_case(path: str | Path) -> Case:
             Spot(file, "[recursive]")),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
+        sensors=read_sensors(tables, joints, plant.cls.linked, file),
         limits=read("limits", limits_keys(joints, drives)),
         validations=_validations(tables, plant, path),
         candidates=read_candidates(tables.get("discover", {}), path),
@@ -325,7 +328,7 @@ def _controller(tables: Mapping[str, Any], drives: int, file: str) -> dict[str, 
     if "controller" not in tables:
         return None
     table, spot = tables["controller"], Spot(file, "[controller]")
-    kind = read_kind(table, CONTROLLERS, PLANNED_CONTROLLERS, spot)
+    kind = read_kind(table, CONTROLLERS, spot)
     keys = {"kind": Key(lambda value, spot: value), **controller_keys(kind, drives)}
     return read_table(table, keys, spot)
 

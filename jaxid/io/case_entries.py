@@ -80,15 +80,15 @@ class EffectEntry:
     ports: tuple[int, ...]
 
 
-def read_kind(table: dict[str, Any], known: Any, planned: tuple[str, ...], spot: Spot) -> str:
+def read_kind(table: dict[str, Any], known: Any, spot: Spot) -> str:
     """The kind that a table names.
 
     Raises:
-        InputError: If it is missing, unknown or not available yet.
+        InputError: If it is missing or unknown.
     """
     if "kind" not in table:
         raise spot.fault("'kind' is missing", f'add kind = "..."; there is: {", ".join(known)}')
-    return choice(known, planned)(table["kind"], spot.at("kind"))
+    return choice(known)(table["kind"], spot.at("kind"))
 
 
 def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
@@ -98,7 +98,7 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         InputError: If it states what the plant cannot have, or not what it must.
     """
     spot = Spot(file, "[plant]")
-    cls = PLANTS[read_kind(table, PLANTS, (), spot)]
+    cls = PLANTS[read_kind(table, PLANTS, spot)]
     keys = {"kind": Key(lambda value, spot: value), **PLANT}
     if cls.linked:
         return _linked(table, cls, keys, spot)
@@ -241,7 +241,7 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
     if ":" in str(table.get("kind", "")) or str(table.get("kind", "")).endswith(".py"):
         cls = user_effect(str(table["kind"]), path.parent, spot.at("kind"))
     else:
-        cls = EFFECTS[read_kind(table, EFFECTS, (), spot)]
+        cls = EFFECTS[read_kind(table, EFFECTS, spot)]
     spot = Spot(str(path), f"[[effects]] {index} ({cls.kind})")
     infos = parameters_of(cls)
     _check_keys(table, list(infos), spot)

@@ -21,7 +21,7 @@ def read_signal(
     if not tables.get(name):
         return None
     table, spot = tables[name], Spot(file, f"[{name}]")
-    kind = read_kind(table, REFERENCES, (), spot)
+    kind = read_kind(table, REFERENCES, spot)
     try:
         read = REFERENCES[kind].read(table, name)
     except InputError as error:
@@ -39,7 +39,7 @@ def read_unknown_reference(
     given = {k: v for k, v in table.items() if isinstance(v, dict)}
     if not given:
         return {}, {}
-    family = REFERENCES[read_kind(table, REFERENCES, (), spot)]
+    family = REFERENCES[read_kind(table, REFERENCES, spot)]
     for name in given:
         if name not in family.unknown:
             mend = f"of {family.kind} may be: {', '.join(family.unknown) or 'nothing'}"

@@ -25,8 +25,6 @@ from jaxid.io.schema import (
     whole,
 )
 
-# Names that the case file promises and this version does not have yet.
-PLANNED_CONTROLLERS = ("computed_torque", "adaptive")
 METHODS = (
     "inverse_dynamics",
     "instrumental_variable",
@@ -55,6 +53,7 @@ TOP = {
     "recursive": False,
     "controller": False,
     "sensor": False,
+    "sensors": True,
     "limits": False,
     "validation": True,
     "discover": False,
@@ -64,9 +63,15 @@ TOP = {
     "study": False,
 }
 # Fields of controllers that are bounded; all others may have any sign.
-_CONTROLLER_SIGNS = {"derivative_filter": "nonnegative", "epsilon": "positive"}
+_CONTROLLER_SIGNS = {"derivative_filter": "nonnegative", "epsilon": "positive", "tolerance": "positive"}
+# Keys that a law which identifies shares with [recursive].
+ON_LINE = ("half_life", "gate_velocity", "gate_acceleration", "rows", "start", "instrument")
 # And fields that are no value by drive.
-_CONTROLLER_READS = {"poles": several(number("negative"), shortest=2, longest=3)}
+_CONTROLLER_READS = {
+    "poles": several(number("negative"), shortest=2, longest=3),
+    "regularization": number("positive"),
+    "reach": whole(1),
+}
 
 DISTURBANCE = either_text(
     inline(
@@ -189,6 +194,8 @@ def controller_keys(kind: str, drives: int) -> Keys:
             read = flag if yes_or_no else by_joint(number(sign), drives, "drive")
             read = _CONTROLLER_READS.get(field.name, read)
             own[field.name] = Key(read, f"it belongs to kind = '{kind}'", required)
+    if "estimator" in cls.of_machine:
+        own |= {k: v for k, v in recursive_keys(drives).items() if k in ON_LINE}
     return {**own, **keys}
 
 
@@ -198,6 +205,7 @@ def sensor_keys(joints: int, drives: int) -> Keys:
         "position_resolution": Key(by_joint(number("positive"), joints)),
         "position_noise": Key(by_joint(number("nonnegative"), joints)),
         "force_noise": Key(by_joint(number("nonnegative"), drives, "drive")),
+        "rate": Key(number("positive"), "readings per second, held in between; absent: one a tick"),
     }
 
 

@@ -199,17 +199,14 @@ def text(value: Any, spot: Spot) -> str:
     return value
 
 
-def choice(known: Iterable[str], planned: Iterable[str] = ()) -> Reader:
-    """One of some names; the planned ones are refused as not being there yet."""
-    names, later = list(known), set(planned)
+def choice(known: Iterable[str]) -> Reader:
+    """One of some names."""
+    names = list(known)
 
     def read(value: Any, spot: Spot) -> str:
         name = text(value, spot)
         if name in names:
             return name
-        if name in later:
-            mend = f"have: {', '.join(names)}"
-            raise spot.refuse(name, "is not available in this version", mend)
         raise spot.refuse(name, "is unknown", suggest(name, names))
 
     return read

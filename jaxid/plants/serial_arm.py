@@ -97,6 +97,14 @@ class SerialArm(Plant):
     def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         return ("rotor_inertia", port) if effect.kind == "added_mass" and port < self.joints else None
 
+    def frame(self, link: int, q: Array) -> tuple[Array, Array]:
+        axes, origins = self.geometry.frames(q)
+        whole, origin = axes[0], origins[0]
+        for k in range(1, link + 1):
+            origin = origin + _times(whole, origins[k])
+            whole = jnp.sum(whole[:, :, None] * axes[k][None, :, :], axis=1)
+        return whole, origin
+
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Recursive Newton-Euler: motion from the base out, forces from the tip back.
 

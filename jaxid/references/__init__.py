@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
+from jaxid.model import Plant
 from jaxid.references.bezier import BEZIER
 from jaxid.references.csv import CSV
 from jaxid.references.family import Family, Grid, Key
@@ -16,12 +17,15 @@ from jaxid.references.fourier import FOURIER
 from jaxid.references.moves import POINT_TO_POINT, TRAPEZOID
 from jaxid.references.multisine import MULTISINE
 from jaxid.references.quarter_sine import QUARTER_SINE
+from jaxid.references.synchronized import SYNCHRONIZED
 
 __all__ = ["REFERENCES", "Family", "Key", "make_reference"]
 
 REFERENCES: dict[str, Family] = {
     family.kind: family
-    for family in (CSV, TRAPEZOID, BEZIER, QUARTER_SINE, FOURIER, MULTISINE, POINT_TO_POINT)
+    for family in (
+        CSV, TRAPEZOID, BEZIER, QUARTER_SINE, FOURIER, MULTISINE, POINT_TO_POINT, SYNCHRONIZED
+    )
 }
 
 
@@ -32,6 +36,7 @@ def make_reference(
     base_dir: str | Path = ".",
     *,
     where: str = "reference",
+    plant: Plant | None = None,
 ) -> Float[np.ndarray, "samples joints"]:
     """Sample the reference that a table of a case describes.
 
@@ -41,6 +46,7 @@ def make_reference(
         duration: Length [s]; round(duration * rate_hz) samples, the first at time zero.
         base_dir: Folder that relative file names start from: the case's own.
         where: Name of the table, for messages.
+        plant: What is to follow; needed where points are those of its tool.
 
     Returns:
         The position (or, for an input, the command) of each joint [unit of the axis].
@@ -56,9 +62,11 @@ def make_reference(
         raise InputError(what, where=place, mend=mend)
     samples = _samples(rate_hz, duration)
     family = REFERENCES[kind]
+    grids = lambda joint: Grid(rate_hz, samples, Path(base_dir), joint, place, plant)
+    if family.together:
+        return family.sample(family.read(table, where), grids(0))
     columns = [
-        family.sample(values, Grid(rate_hz, samples, Path(base_dir), joint, place))
-        for joint, values in enumerate(family.read(table, where))
+        family.sample(values, grids(joint)) for joint, values in enumerate(family.read(table, where))
     ]
     return np.stack(columns, axis=1)
 

@@ -9,9 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxid.errors import InputError, suggest
+from jaxid.model import Plant
 
 REQUIRED = object()
-Shape = Literal["number", "whole", "flag", "text", "list"]
+Shape = Literal["number", "whole", "flag", "text", "list", "range", "points"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,9 @@ class Key:
         doc: What it means.
         unit: Its unit; "position" stands for that of the axis.
         default: Taken where the table has none; `REQUIRED` where it must be given.
-        shape: A number, a whole number, a flag, text, or a list of numbers.
+        shape: A number, a whole number, a flag, text, or a list of numbers; a range: two numbers, the
+            lower negative, the upper positive, or one for both; points: a list of lists, one number a joint,
+            for all joints together.
         minimum: Smallest value allowed.
         positive: Whether zero is refused as well.
         choices: The texts allowed; empty for any.
@@ -49,6 +52,7 @@ class Grid:
         base_dir: Folder that relative file names start from.
         joint: 0-based joint, so that random ones differ.
         where: Name of the table, for messages.
+        plant: What is to follow, for a family that asks for its kinematics; None where it is not known.
     """
 
     rate_hz: float | int
@@ -56,6 +60,7 @@ class Grid:
     base_dir: Path
     joint: int
     where: str
+    plant: Plant | None = None
 
     @property
     def time(self) -> np.ndarray:
@@ -80,17 +85,20 @@ class Family:
         kind: Its name in a case.
         doc: One line for the user.
         keys: Every parameter allowed, by name.
-        sample: From the values of one joint to its positions at the grid's instants.
+        sample: From the values of one joint to its positions at the grid's instants; or, where
+            `together`, from those of all joints to theirs, (samples, joints).
         unknown: Parameters that may be unknown, and are then fitted by `output_error`.
         follow: As `sample`, from values and instants [s] as JAX's arrays; where any may be unknown.
+        together: Whether the joints are sampled together.
     """
 
     kind: str
     doc: str
     keys: Mapping[str, Key]
-    sample: Callable[[dict[str, Any], Grid], np.ndarray]
+    sample: Callable[[Any, Grid], np.ndarray]
     unknown: tuple[str, ...] = ()
     follow: Callable[[Mapping[str, Any], Any], Any] | None = None
+    together: bool = False
 
     def read(self, table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         """Check a table and spread it over the joints.
@@ -121,10 +129,15 @@ class Family:
             else:
                 spread[name] = [key.default]
         joints = max(len(values) for values in spread.values())
+        for name, key in self.keys.items():
+            if key.shape == "points" and spread[name][0] is not None:
+                joints = max(joints, spread[name][0].shape[1])
         for name, values in spread.items():
-            if len(values) not in (1, joints):
-                mend = f"one value for all, or {joints} as in the longest list"
-                raise InputError(f"'{name}' has {len(values)} joints", where=place, mend=mend)
+            points = self.keys[name].shape == "points" and values[0] is not None
+            count = values[0].shape[1] if points else len(values)
+            if count != joints and (points or count != 1):
+                mend = f"{'' if points else 'one value for all, or '}{joints} as in the longest list"
+                raise InputError(f"'{name}' has {count} joints", where=place, mend=mend)
         return [
             {name: values[joint % len(values)] for name, values in spread.items()}
             for joint in range(joints)
@@ -136,6 +149,11 @@ def _by_joint(name: str, key: Key, value: Any, place: str) -> list[Any]:
     several = isinstance(value, list | tuple) and len(value) > 0
     if key.shape == "list":
         several = several and all(isinstance(entry, list | tuple) for entry in value)
+    if key.shape == "range" and several:
+        pair = len(value) == 2 and all(_is_number(entry) for entry in value) and min(value) < 0
+        several = not pair
+    if key.shape == "points":
+        several = False
     return [_checked(name, key, one, place) for one in (value if several else [value])]
 
 
@@ -145,6 +163,16 @@ def _checked(name: str, key: Key, value: Any, place: str) -> Any:
             mend = f"give a list of at least {key.shortest}, or a list of such lists by joint"
             raise InputError(f"{name} = {value!r} is too short", where=place, mend=mend)
         return np.array([_number(name, key, one, place) for one in value])
+    if key.shape == "range":
+        pair = value if isinstance(value, list | tuple) else (value, value)
+        if len(pair) == 2 and all(_is_number(entry) for entry in pair):
+            low, high = pair if isinstance(value, list | tuple) else (-value, value)
+            if low < 0 < high:
+                return np.array([low, high], dtype=float)
+        mend = f"give [lower, upper], the lower negative, or one positive number for both [{key.unit}]"
+        raise InputError(f"{name} = {value!r} is no range about zero", where=place, mend=mend)
+    if key.shape == "points":
+        return _points(name, key, value, place)
     if key.shape == "flag":
         if not isinstance(value, bool):
             raise InputError(f"{name} = {value!r} is no flag", where=place, mend="true or false")
@@ -159,9 +187,25 @@ def _checked(name: str, key: Key, value: Any, place: str) -> Any:
     return _number(name, key, value, place)
 
 
+def _points(name: str, key: Key, value: Any, place: str) -> np.ndarray:
+    """A list of points, one number a joint."""
+    rows = value if isinstance(value, list | tuple) else ()
+    if len(rows) < key.shortest or not all(isinstance(row, list | tuple) and len(row) for row in rows):
+        mend = f"give a list of at least {key.shortest} points, e.g. {name} = [[0.1, 0.2], [0.3, 0.1]]"
+        raise InputError(f"{name} = {value!r} is no list of points", where=place, mend=mend)
+    if len({len(row) for row in rows}) > 1:
+        mend = "give each one number a joint"
+        raise InputError(f"the points of {name} are of unlike lengths", where=place, mend=mend)
+    return np.array([[_number(name, key, one, place) for one in row] for row in rows], dtype=float)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def _number(name: str, key: Key, value: Any, place: str) -> float | int:
     unit = f" {key.unit}" if key.unit else ""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not _is_number(value):
         mend = f"give a finite number [{key.unit or '1'}]"
         raise InputError(f"{name} = {value!r} is not a number", where=place, mend=mend)
     if key.shape == "whole" and value != int(value):

@@ -2,36 +2,31 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, Key
+from jaxid.references.s_curve import Bounds, SCurve, plan_s_curve
 
 _NO_TIME = 1e-300
 
 
 @dataclass(frozen=True)
 class Move:
-    """A time-optimal move from rest to rest under limits of speed, acceleration and jerk.
-
-    Seven phases that mirror at half time: the jerk rises for `jerk_time`, acceleration holds
-    until `ramp_time - jerk_time`, then the jerk falls; after `ramp_time` the speed holds for
-    `cruise_time`. Without a limit of jerk its phases have no length: a trapezoid.
+    """A time-optimal move from rest to rest under limits of speed and acceleration: a trapezoid of velocity.
 
     Times and distance may be JAX's, for positions that can be differentiated in them.
 
     Attributes:
         distance: Way, with its sign [position].
-        jerk_time: Length of one jerk phase [s].
         ramp_time: From rest to the peak speed [s].
         cruise_time: At the peak speed [s].
     """
 
     distance: float
-    jerk_time: float
     ramp_time: float
     cruise_time: float
 
@@ -48,66 +43,33 @@ class Move:
         clipped = xp.clip(time, 0.0, self.duration)
         # Later than half time the move is itself, reversed in time and direction.
         early = xp.minimum(clipped, self.duration - clipped)
-        covered = self._ramp(xp.minimum(early, self.ramp_time), peak)
+        covered = peak / xp.maximum(self.ramp_time, _NO_TIME) * xp.minimum(early, self.ramp_time) ** 2 / 2.0
         covered = covered + peak * xp.maximum(early - self.ramp_time, 0.0)
         return xp.where(clipped <= self.duration / 2.0, covered, self.distance - covered)
 
-    def _ramp(self, t: np.ndarray, peak: float) -> np.ndarray:
-        jerk_time, ramp_time = self.jerk_time, self.ramp_time
-        xp = t.__array_namespace__()
-        acceleration = peak / xp.maximum(ramp_time - jerk_time, _NO_TIME)
-        held = acceleration * (t**2 / 2.0 - t * jerk_time / 2.0 + jerk_time**2 / 6.0)
-        if isinstance(jerk_time, float) and jerk_time == 0.0:
-            return held
-        jerk = acceleration / jerk_time
-        left = ramp_time - t
-        falling = peak * ramp_time / 2.0 - peak * left + jerk * left**3 / 6.0
-        return xp.where(t < jerk_time, jerk * t**3 / 6.0, xp.where(left < jerk_time, falling, held))
 
-
-def plan_move(distance: float, speed: float, acceleration: float, jerk: float = math.inf) -> Move:
-    """Find the fastest move from rest to rest within limits.
+def plan_move(
+    distance: float, speed: float, acceleration: float, jerk: float = math.inf
+) -> Move | SCurve:
+    """Find the fastest move from rest to rest within limits that are the same in both directions.
 
     Args:
         distance: Way, with its sign [position].
         speed: Limit [position/s].
         acceleration: Limit [position/s^2].
         jerk: Limit [position/s^3]; infinite for a trapezoid of velocity.
-
-    Returns:
-        The move.
-
-    Source:
-        Biagiotti & Melchiorri, Trajectory Planning for Automatic Machines and Robots
-        (2008), section 3.4, for the cases in which a limit is not reached.
     """
-    way = abs(distance)
-    if way == 0.0:
-        return Move(0.0, 0.0, 0.0, 0.0)
     if math.isinf(jerk):
         return plan_trapezoid(distance, speed, acceleration)
-    jerk_time = acceleration / jerk
-    if speed * jerk < acceleration**2:
-        jerk_time = math.sqrt(speed / jerk)
-        ramp_time = 2.0 * jerk_time
-    else:
-        ramp_time = jerk_time + speed / acceleration
-    cruise_time = way / speed - ramp_time
-    if cruise_time < 0.0:
-        # The speed limit is out of reach, perhaps the acceleration limit as well.
-        cruise_time = 0.0
-        jerk_time = min(acceleration / jerk, (way / (2.0 * jerk)) ** (1.0 / 3.0))
-        ramp_time = jerk_time / 2.0 + math.sqrt(jerk_time**2 / 4.0 + way / acceleration)
-        if jerk_time < acceleration / jerk:
-            ramp_time = 2.0 * jerk_time
-    return Move(distance, jerk_time, ramp_time, cruise_time)
+    curve = plan_s_curve(abs(distance), Bounds(speed, acceleration, acceleration, jerk, jerk))
+    return curve if distance >= 0 else replace(curve, distance=distance, jerks=-curve.jerks)
 
 
 def plan_trapezoid(distance: float, speed: Any, acceleration: Any, xp: Any = np) -> Move:
     """`plan_move` without a limit of jerk; limits may be JAX's, and `xp` is jax.numpy then."""
     way = abs(distance)
     ramp_time = xp.minimum(speed / acceleration, xp.sqrt(way / acceleration))
-    return Move(distance, 0.0, ramp_time, xp.maximum(way / speed - ramp_time, 0.0))
+    return Move(distance, ramp_time, xp.maximum(way / speed - ramp_time, 0.0))
 
 
 def string_moves(

@@ -1,0 +1,133 @@
+"""Fastest motion from rest to rest under bounds of velocity, acceleration and jerk, in seven segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+
+
+class Bounds(NamedTuple):
+    """What a motion forwards may do; each positive.
+
+    Args:
+        speed: Largest velocity [position/s].
+        gain, loss: Largest acceleration, and largest deceleration [position/s^2].
+        rise, fall: Largest rate at which acceleration grows, and at which it falls [position/s^3].
+    """
+
+    speed: float
+    gain: float
+    loss: float
+    rise: float
+    fall: float
+
+
+@dataclass(frozen=True)
+class SCurve:
+    """Seven segments of constant jerk, zero in the second, fourth and sixth.
+
+    Attributes:
+        distance: Way, with its sign [position].
+        durations: Of the segments [s]; zero where a limit is not reached, (7,).
+        jerks: In the segments [position/s^3], (7,).
+    """
+
+    distance: float
+    durations: Float[np.ndarray, "7"]
+    jerks: Float[np.ndarray, "7"]
+
+    @property
+    def duration(self) -> float:
+        """Length of the motion [s]."""
+        return float(self.durations.sum())
+
+    def position(self, time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+        """Way covered [position] at instants from the start of the motion [s]; rest outside."""
+        ends = np.cumsum(self.durations)
+        state, states = np.zeros(3), []
+        for h, jerk in zip(self.durations, self.jerks, strict=True):
+            states.append(state)
+            s, v, a = state
+            state = np.array(
+                [s + h * (v + h * (a / 2 + h * jerk / 6)), v + h * (a + h * jerk / 2), a + h * jerk]
+            )
+        # A segment without length holds no instant.
+        k = np.minimum(np.searchsorted(ends, time, side="right"), 6)
+        s, v, a = np.array(states)[k].T
+        t = np.maximum(time, 0.0) - (ends - self.durations)[k]
+        way = s + t * (v + t * (a / 2 + t * self.jerks[k] / 6))
+        return np.where(time >= ends[-1], self.distance, way)
+
+
+def plan_s_curve(distance: float, bounds: Bounds) -> SCurve:
+    """Find the fastest motion from rest to rest.
+
+    Velocity rises to a peak and falls back to zero. Rise and fall each take three segments, of which the
+    middle one has no length where the peak is reached before the limit of acceleration; without one of
+    constant velocity the peak is the one of which both together cover the way. That is in closed form where
+    both or neither reach their limits of acceleration, and the bracketed root of a polynomial of fourth
+    order where one does.
+
+    Args:
+        distance: Way, not negative [position].
+        bounds: Of a motion forwards; a motion backwards is one forwards in the mirror.
+
+    Source:
+        Biagiotti & Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), section 3.4,
+        for bounds that are the same in both directions. The order of the jerks (largest, none, least, none,
+        least, none, largest) is that of Pontryagin's principle; a fall is a rise reversed in time, with
+        jerks in the same order.
+    """
+    speed, gain, loss, rise, fall = bounds
+    jerks = np.array([rise, 0.0, -fall, 0.0, -fall, 0.0, rise])
+    if distance == 0.0:
+        return SCurve(0.0, np.zeros(7), jerks)
+    peak = min(speed, _peak(distance, bounds))
+    up, down = _segments(peak, gain, rise, fall), _segments(peak, loss, rise, fall)
+    left = distance - _way(peak, gain, rise, fall) - _way(peak, loss, rise, fall)
+    cruise = max(left, 0.0) / peak if peak == speed else 0.0
+    return SCurve(distance, np.array([*up, cruise, *down[::-1]]), jerks)
+
+
+def _segments(peak: float, limit: float, rise: float, fall: float) -> tuple[float, float, float]:
+    """Durations from rest to a peak velocity: acceleration grows, holds, falls."""
+    both = 1 / rise + 1 / fall
+    held = min(limit, np.sqrt(2 * peak / both))
+    return held / rise, max(peak / held - held * both / 2, 0.0), held / fall
+
+
+def _way(peak: float, limit: float, rise: float, fall: float) -> float:
+    """Way from rest to a peak velocity."""
+    t1, t2, t3 = _segments(peak, limit, rise, fall)
+    a = rise * t1
+    return a * (t1**2 / 6 + t1 * t2 / 2 + t2**2 / 2 + (t1 / 2 + t2) * t3 + t3**2 / 3)
+
+
+def _peak(distance: float, bounds: Bounds) -> float:
+    """Velocity whose rise and fall cover the way, whatever the limit of velocity."""
+    _, gain, loss, rise, fall = bounds
+    both, mean = 1 / rise + 1 / fall, 1 / (6 * rise) + 1 / (3 * fall)
+    # Neither reaches its limit: each covers a^3 both mean.
+    a = (distance / (2 * both * mean)) ** (1 / 3)
+    if a <= min(gain, loss):
+        return a**2 * both / 2
+    low, high = (limit**2 * both / 2 for limit in sorted((gain, loss)))
+    excess = lambda v: _way(v, gain, rise, fall) + _way(v, loss, rise, fall) - distance
+    if excess(high) < 0:
+        # Both do: each covers A^3 both mean + (v - A^2 both / 2) A slope + (v - A^2 both / 2)^2 / (2 A).
+        slope = 1 / (2 * rise) + 1 / fall
+        square = linear = constant = 0.0
+        for A in (gain, loss):
+            v = A**2 * both / 2
+            square += 1 / (2 * A)
+            linear += A * slope - v / A
+            constant += A**3 * both * mean - v * A * slope + v**2 / (2 * A)
+        constant -= distance
+        return (-linear + np.sqrt(linear**2 - 4 * square * constant)) / (2 * square)
+    if excess(low) >= 0:  # by rounding
+        return low
+    return scipy.optimize.brentq(excess, low, high, xtol=1e-300, rtol=4 * np.finfo(float).eps)
