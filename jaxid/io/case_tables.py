@@ -55,7 +55,7 @@ TOP = {
     "recursive": False,
     "controller": False,
     "sensor": False,
-    "sensors": True,
+    "inertial_sensors": True,
     "limits": False,
     "validation": True,
     "discover": False,
