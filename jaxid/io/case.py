@@ -191,7 +191,7 @@ def load_case(path: str | Path) -> Case:
             Spot(file, "[recursive]")),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
-        inertial_sensors=read_inertial_sensors(tables, joints, plant.cls.linked, file),
+        inertial_sensors=read_inertial_sensors(tables, plant.cls.links(joints), file),
         limits=read("limits", limits_keys(joints, drives)),
         validations=_validations(tables, plant, path),
         candidates=read_candidates(tables.get("discover", {}), path),

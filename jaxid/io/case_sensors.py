@@ -44,9 +44,7 @@ def inertial_keys(axes: int) -> Keys:
     }
 
 
-def read_inertial_sensors(
-    tables: Mapping[str, Any], links: int, linked: bool, file: str
-) -> tuple[dict[str, Any], ...]:
+def read_inertial_sensors(tables: Mapping[str, Any], links: int, file: str) -> tuple[dict[str, Any], ...]:
     """Read [[inertial_sensors]], each with the defaults that are not the sensor's own.
 
     Raises:
@@ -56,7 +54,7 @@ def read_inertial_sensors(
     out = []
     for k, table in enumerate(tables.get("inertial_sensors", []), start=1):
         spot = Spot(file, f"[[inertial_sensors]] {k}")
-        if not linked:
+        if not links:
             raise spot.fault("the plant has no links", "leave it out, or take kind = 'serial_arm'")
         axes = table.get("axes", AXES)
         given = read_table(table, inertial_keys(len(axes) if isinstance(axes, list) else 3), spot)
