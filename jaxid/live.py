@@ -63,7 +63,8 @@ class Live:
         self._tick = 0
         self._law = _Law(self._controller)
         self._memory: list[Array] | None = None
-        self._hold = self.machine.sensor.hold
+        sensor = self.machine.sensor
+        self._holds = sensor.hold, 1 if sensor.inertial is None else sensor.inertial.hold
         self._adapts = "estimator" in self._controller.of_machine
         self._last: np.ndarray | None = None
         self._online, self._rows = None, None
@@ -87,7 +88,8 @@ class Live:
         Args:
             position: Readings of all joints [m or rad].
             velocity, acceleration: Likewise, of a gyroscope and an accelerometer; absent: differenced.
-                The same are to be given at every tick.
+                The same are to be given at every tick, held where they are not new: at ticks that are no
+                multiple of what [[inertial_sensors]] rate says.
             measured: Command that the drives report since the last tick; absent: as it was given.
 
         Raises:
@@ -99,10 +101,10 @@ class Live:
                 mend="let [simulation] duration be longer",
             )
         position = np.asarray(position, dtype=np.float64)
-        fresh = np.asarray(self._tick % self._hold == 0)
+        fresh, renewed = (np.asarray(self._tick % hold == 0) for hold in self._holds)
         path = jax.tree.map(lambda x: x[self._tick], self._path)
         others = (None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured))
-        tick = Tick(position, path, self._driven, fresh, *others)
+        tick = Tick(position, path, self._driven, fresh, *others, renewed)
         if self._memory is None:
             self.memory = self._controller.start(tick, np.zeros_like(position), self._path)
         if self._online is not None and self.switched is None:

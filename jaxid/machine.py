@@ -123,7 +123,7 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
 def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:
     """What measures; readings slower than the loop are held for some of its ticks."""
     given = {name: as_array(value) for name, value in case.sensor.items() if name != "rate"}
-    given["inertial"] = _inertial(case, controller, plant) if case.sensors else None
+    given["inertial"] = _inertial(case, controller, plant) if case.inertial_sensors else None
     if "rate" not in case.sensor:
         return Sensor(**given)
     hold = _held(case.sensor["rate"], controller, f"{case.path}, [sensor]")
@@ -158,13 +158,13 @@ def _held(rate: float, controller: Controller | None, where: str) -> int:
 def _inertial(case: Case, controller: Controller | None, plant: Plant) -> InertialSensors:
     """Gyroscopes and accelerometers; together they must tell every joint, wherever the arm stands."""
     sensors, known, holds = [], [], []
-    for k, stated in enumerate(case.sensors, start=1):
+    for k, stated in enumerate(case.inertial_sensors, start=1):
         own = {n: v for n, v in stated.items() if n not in ("rate", "calibrated", "link")}
         own["link"] = stated["link"] - 1
         nominal = {n: v for n, v in own.items() if n not in ("rotation", "scale", "bias")}
         sensors.append(Inertial(**own))
         known.append(Inertial(**(own if stated.get("calibrated", True) else nominal)))
-        where = f"{case.path}, [[sensors]] {k}"
+        where = f"{case.path}, [[inertial_sensors]] {k}"
         holds.append(_held(stated["rate"], controller, where) if "rate" in stated else 1)
     out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
     zero = np.zeros(plant.joints)
@@ -173,7 +173,7 @@ def _inertial(case: Case, controller: Controller | None, plant: Plant) -> Inerti
         if not bool(_told(out, plant, q, readings, zero)):
             what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"
             raise InputError(
-                f"{what} do not tell the motion of every joint", where=f"{case.path}, [[sensors]]",
+                f"{what} do not tell the motion of every joint", where=f"{case.path}, [[inertial_sensors]]",
                 mend="add one of each kind on the last link, or with more axes, and a range beyond gravity",
             )
     return out

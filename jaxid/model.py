@@ -380,6 +380,11 @@ class Plant(eqx.Module):
         """Coordinates that bring the tool to a place; NaN out of reach, None of a plant that cannot say."""
         return None
 
+    @classmethod
+    def links(cls, joints: int) -> int:
+        """How many links have a `frame`."""
+        return 0
+
     def frame(self, link: int, q: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
         """Axes of a link's frame, as columns, and its origin [m], in the base's frame.
 

@@ -62,6 +62,7 @@ def test_a_cold_start_is_computed_torque_until_it_closes(runs):
     assert np.abs(cold[closed] - plain[closed]).max() > 0.5
 
 
+@pytest.mark.slow
 def test_estimates_are_within_their_deviations(tmp_path):
     """Velocity, acceleration and torque with white noise: errors are of the size of their deviations."""
     scores = []
@@ -82,6 +83,7 @@ def test_estimates_are_within_their_deviations(tmp_path):
     assert driven(tmp_path / "case.toml", live=never).live.switched is None
 
 
+@pytest.mark.slow
 def test_the_model_of_the_drives_force_is_an_instrument(tmp_path):
     """2 N m of noise on the measured torque: it stands in the gains' columns, and pulls them down."""
     found = {}

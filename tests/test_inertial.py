@@ -176,7 +176,8 @@ def suite_text(*, calibrated: bool = True, scale: float = 1.0, rate: str = "rate
         for kind, noise, bound in (("gyroscope", 2e-3, 17.45), ("accelerometer", 0.05, 78.5)):
             place = "position = [0.2, 0.0, 0.0]" if kind == "accelerometer" else ""
             parts.append(
-                f'[[sensors]]\nkind = "{kind}"\nlink = {link}\nnoise = {noise}\nrange = {bound}\n{rate}\n'
+                f'[[inertial_sensors]]\nkind = "{kind}"\nlink = {link}\nnoise = {noise}\nrange = {bound}\n'
+                f"{rate}\n"
                 f"scale = {scale}\ncalibrated = {str(calibrated).lower()}\n{place}\n"
             )
     return "force_noise = 0.1\n" + "".join(parts)
@@ -211,7 +212,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("sensor", "match"), REFUSED)
 def test_refuses(tmp_path, sensor, match):
-    path = written(tmp_path, sensor=f"[[sensors]]\n{sensor}")
+    path = written(tmp_path, sensor=f"[[inertial_sensors]]\n{sensor}")
     with pytest.raises(InputError, match=match) as caught:
         build_machine(load_case(path), period=2.5e-4)
     assert "\n" not in str(caught.value)
@@ -220,6 +221,6 @@ def test_refuses(tmp_path, sensor, match):
 def test_refuses_a_plant_without_links(tmp_path):
     path = tmp_path / "axis.toml"
     path.write_text('[plant]\nkind = "axis"\n[plant.parameters]\ninertia = 1.0\n'
-                    '[[sensors]]\nkind = "gyroscope"\nlink = 1\nnoise = 1.0\n')
+                    '[[inertial_sensors]]\nkind = "gyroscope"\nlink = 1\nnoise = 1.0\n')
     with pytest.raises(InputError, match="the plant has no links"):
         load_case(path)

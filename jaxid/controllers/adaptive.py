@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -14,9 +14,9 @@ from jaxid.controllers.base import Path, Tick
 from jaxid.controllers.computed_torque import FeedForward
 from jaxid.parameters import scatter
 
-if TYPE_CHECKING:
-    from jaxid.estimators.real_time import RealTime
-    from jaxid.estimators.recursion import Memory, Told
+# A law is given its estimator, and imports none: `jaxid.estimators.real_time.RealTime`, with the memory and
+# what it tells of `jaxid.estimators.recursion`.
+RealTime = Memory = Told = Any
 
 # Instants of the reference at which columns are looked at, at most.
 _LOOKS = 500

@@ -24,7 +24,7 @@ from jaxid.io.case_entries import (
     read_plant,
 )
 from jaxid.io.case_reference import read_signal, read_unknown_reference
-from jaxid.io.case_sensors import read_sensors
+from jaxid.io.case_sensors import read_inertial_sensors
 from jaxid.io.case_tables import (
     ALGEBRAIC,
     OUTPUT_ERROR,
@@ -80,7 +80,7 @@ class Case:
         recursive: [recursive], likewise.
         controller: [controller].
         sensor: [sensor].
-        sensors: [[sensors]], see `jaxid.io.case_sensors`.
+        inertial_sensors: [[inertial_sensors]], see `jaxid.io.case_sensors`.
         limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
         candidates: User's own effects that a search may name, from [discover].
@@ -103,7 +103,7 @@ class Case:
     recursive: dict[str, Any] = field(default_factory=dict)
     controller: dict[str, Any] | None = None
     sensor: dict[str, Any] = field(default_factory=dict)
-    sensors: tuple[dict[str, Any], ...] = ()
+    inertial_sensors: tuple[dict[str, Any], ...] = ()
     limits: dict[str, Any] = field(default_factory=dict)
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
@@ -191,7 +191,7 @@ def load_case(path: str | Path) -> Case:
             Spot(file, "[recursive]")),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
-        sensors=read_sensors(tables, joints, plant.cls.linked, file),
+        inertial_sensors=read_inertial_sensors(tables, plant.cls.links(joints), file),
         limits=read("limits", limits_keys(joints, drives)),
         validations=_validations(tables, plant, path),
         candidates=read_candidates(tables.get("discover", {}), path),

@@ -1,4 +1,4 @@
-"""[[sensors]] of a case: gyroscopes and accelerometers on links."""
+"""[[inertial_sensors]] of a case: gyroscopes and accelerometers on links."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def _vector(value: Any, spot: Spot) -> tuple[float, ...]:
     return tuple(out)
 
 
-def sensors_keys(axes: int) -> Keys:
-    """Keys of [[sensors]], of a sensor that reads so many axes."""
+def inertial_keys(axes: int) -> Keys:
+    """Keys of [[inertial_sensors]], of a sensor that reads so many axes."""
     each: Reader = by_joint(number(), axes, "axis")
     return {
         "kind": Key(choice(KINDS), f"one of {', '.join(KINDS)}", True),
@@ -44,22 +44,20 @@ def sensors_keys(axes: int) -> Keys:
     }
 
 
-def read_sensors(
-    tables: Mapping[str, Any], links: int, linked: bool, file: str
-) -> tuple[dict[str, Any], ...]:
-    """Read [[sensors]], each with the defaults that are not the sensor's own.
+def read_inertial_sensors(tables: Mapping[str, Any], links: int, file: str) -> tuple[dict[str, Any], ...]:
+    """Read [[inertial_sensors]], each with the defaults that are not the sensor's own.
 
     Raises:
         InputError: If the plant has no links, or one states what it cannot have; if there are
             accelerometers and no gyroscope.
     """
     out = []
-    for k, table in enumerate(tables.get("sensors", []), start=1):
-        spot = Spot(file, f"[[sensors]] {k}")
-        if not linked:
+    for k, table in enumerate(tables.get("inertial_sensors", []), start=1):
+        spot = Spot(file, f"[[inertial_sensors]] {k}")
+        if not links:
             raise spot.fault("the plant has no links", "leave it out, or take kind = 'serial_arm'")
         axes = table.get("axes", AXES)
-        given = read_table(table, sensors_keys(len(axes) if isinstance(axes, list) else 3), spot)
+        given = read_table(table, inertial_keys(len(axes) if isinstance(axes, list) else 3), spot)
         if given["link"] > links:
             raise spot.at("link").refuse(given["link"], "is not there", f"the plant has {links} links")
         names = given.get("axes", AXES)
@@ -72,5 +70,5 @@ def read_sensors(
     kinds = {s["kind"] for s in out}
     if kinds == {"accelerometer"}:
         mend = "add gyroscopes: what turns also accelerates towards its axis"
-        raise Spot(file, "[[sensors]]").fault("there are accelerometers only", mend)
+        raise Spot(file, "[[inertial_sensors]]").fault("there are accelerometers only", mend)
     return tuple(out)

@@ -53,7 +53,7 @@ TOP = {
     "recursive": False,
     "controller": False,
     "sensor": False,
-    "sensors": True,
+    "inertial_sensors": True,
     "limits": False,
     "validation": True,
     "discover": False,

@@ -97,6 +97,10 @@ class SerialArm(Plant):
     def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         return ("rotor_inertia", port) if effect.kind == "added_mass" and port < self.joints else None
 
+    @classmethod
+    def links(cls, joints: int) -> int:
+        return joints
+
     def frame(self, link: int, q: Array) -> tuple[Array, Array]:
         axes, origins = self.geometry.frames(q)
         whole, origin = axes[0], origins[0]
