@@ -29,7 +29,7 @@ FRICTION = {
     "quadratic_drag": (-1.2, -0.9, 0.0, 0.0, 0.0), "cubic_friction": (0.17, 0.13, 0.0, 0.0, 0.0),
 }
 KP, KD = 150.0, 4.0  # at the motors [N m/rad], [N m s/rad]
-PERIOD, UPDATE = 2.5e-4, 1e-3
+PERIOD, UPDATE, LOOK = 2.5e-4, 1e-3, 2e-2
 COUNTS = 2 * np.pi / (4 * 65536)  # of the virtual encoder, at the joint [rad]
 # Of a gyroscope and of the acceleration that an accelerometer 0.1 m from the joint tells.
 GYRO_NOISE, ACCELERATION_NOISE = 1.5e-3, 0.2  # rad/s, rad/s^2
@@ -41,6 +41,23 @@ POLYGON = [
 HOME = [1.5, 0.5]
 STEPS = 5  # of the exact robot in a tick
 ORDERS = {"coulomb_friction": "level"}
+
+
+SENSORS = "".join(
+    f"""[[inertial_sensors]]
+kind = "{kind}"
+link = {link}
+axes = ["{axis}"]
+noise = {noise}
+rate = {1 / UPDATE}
+{where}
+"""
+    for link in (1, 2)
+    for kind, axis, noise, where in (
+        ("gyroscope", "z", GYRO_NOISE, ""),
+        ("accelerometer", "y", 0.1 * ACCELERATION_NOISE, "position = [0.1, 0.0, 0.0]"),
+    )
+)
 
 
 def robot(scale: float = 1.0, **changed: float) -> Robot:
@@ -62,7 +79,7 @@ def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str]
 
 def case_text(
     law: str, *, friction: str | None = None, gain: str = "{ guess = 1.0 }", seed: int = 0, duration: float = 40.0,
-    more: str = "", tip_mass: str = "2.72",
+    more: str = "", tip_mass: str = "2.72", inertial: bool = True,
 ) -> str:
     """A case: the model of the robot, a law for [controller], random targets."""
     gains = f"[{gain}, {gain}]" if isinstance(gain, str) else list(gain)
@@ -98,6 +115,7 @@ acceleration = {ACCELERATION}
 jerk = {JERK}
 dwell = 0.1
 seed = {seed}
+{SENSORS if inertial else ""}
 [simulation]
 duration = {duration}
 sample_rate = {1 / PERIOD}
@@ -114,7 +132,7 @@ class Ran:
         time: [s].
         q, v, a: True motion of the joints, acceleration as the mean over the tick before.
         command: Torque of the motors as commanded [N m].
-        estimates: Of the unknowns, every `UPDATE`; none where the law has none.
+        estimates: Of the unknowns, every `LOOK`; none where the law has none.
     """
 
     live: jaxid.Live
@@ -153,7 +171,7 @@ def driven(
     work = (np.empty((10, 2)), np.empty(10), np.empty((5, 2)), np.empty((2, 2)), np.empty(2), np.empty(5))
     q, v, last = np.array(HOME), np.zeros(2), np.zeros(2)
     out, estimates, sensed = np.empty((ticks, 8)), [], {}
-    gains, adapts = REDUCTION * np.asarray(gains), hasattr(live, "estimate")
+    gains, adapts = REDUCTION * np.asarray(gains), live.adapts
     u, a = np.zeros(2), np.zeros(2)
     for k in range(ticks):
         if inertial and k % every == 0:
@@ -163,8 +181,8 @@ def driven(
             sensed["measured"] = u + torque_noise / REDUCTION * rng.standard_normal(2)
         u = live.command(np.round(q / COUNTS) * COUNTS, **sensed)
         out[k] = *q, *v, *a, *u
-        if adapts and k % every == 0 and live.adaptive:
-            estimates.append(np.asarray(live.found))
+        if adapts and k % (round(LOOK / PERIOD)) == 0:
+            estimates.append(np.asarray(live.estimate.theta))
         last = v.copy()
         levels = friction if drift is None else friction * drift(k * PERIOD)
         _advance(l, c, m, levels, q, v, gains * u, PERIOD / STEPS, STEPS, work)

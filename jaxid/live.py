@@ -39,6 +39,7 @@ class Live:
 
     Attributes:
         told: What the rows so far say; None without `identify`, and before the second tick.
+        adapts: Whether the controller identifies by itself.
         switched: Tick from which on the controller knows what was found; None: not yet.
 
     Raises:
@@ -65,17 +66,17 @@ class Live:
         self._memory: list[Array] | None = None
         sensor = self.machine.sensor
         self._holds = sensor.hold, 1 if sensor.inertial is None else sensor.inertial.hold
-        self._adapts = "estimator" in self._controller.of_machine
+        self.adapts = "estimator" in self._controller.of_machine
         self._last: np.ndarray | None = None
         self._online, self._rows = None, None
         if identify:
-            if "model" not in self._controller.of_machine or self._adapts:
+            if "model" not in self._controller.of_machine or self.adapts:
                 kind = (case.controller or {})["kind"]
-                what = "identifies by itself" if self._adapts else "has no model to put what is found into"
+                what = "identifies by itself" if self.adapts else "has no model to put what is found into"
                 raise InputError(
                     f"a controller of kind {kind!r} {what}",
                     where=str(case.path),
-                    mend="leave identify out" if self._adapts else "take kind = 'flatness'",
+                    mend="leave identify out" if self.adapts else "take kind = 'flatness'",
                 )
             self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
 
@@ -110,7 +111,7 @@ class Live:
         if self._online is not None and self.switched is None:
             self._identify(position)
         u, self._memory = self._law(tick, self._memory)
-        if self._adapts and self.switched is None and self._controller.told(self.memory).closed:
+        if self.adapts and self.switched is None and self._controller.told(self.memory).closed:
             self.switched = self._tick
         self._tick, self._last = self._tick + 1, np.asarray(u)
         return self._last
@@ -132,8 +133,8 @@ class Live:
         Raises:
             InputError: If it does not identify, or nothing has been read yet.
         """
-        if not self._adapts or self.memory is None:
-            what = "no reading yet" if self._adapts else "the controller does not identify"
+        if not self.adapts or self.memory is None:
+            what = "no reading yet" if self.adapts else "the controller does not identify"
             raise InputError(what, where="Live", mend="take kind = 'adaptive', and give it readings")
         return self._controller.estimate(self.memory)
 

@@ -156,7 +156,7 @@ def _held(rate: float, controller: Controller | None, where: str) -> int:
 
 
 def _inertial(case: Case, controller: Controller | None, plant: Plant) -> InertialSensors:
-    """Gyroscopes and accelerometers; together they must tell every joint, wherever the arm stands."""
+    """Gyroscopes and accelerometers; together they must tell every joint, wherever the plant stands."""
     sensors, known, holds = [], [], []
     for k, stated in enumerate(case.inertial_sensors, start=1):
         own = {n: v for n, v in stated.items() if n not in ("rate", "calibrated", "link")}
@@ -168,7 +168,8 @@ def _inertial(case: Case, controller: Controller | None, plant: Plant) -> Inerti
         holds.append(_held(stated["rate"], controller, where) if "rate" in stated else 1)
     out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
     zero = np.zeros(plant.joints)
-    for q in np.random.default_rng(0).uniform(-1.0, 1.0, (3, plant.joints)):
+    rng = np.random.default_rng(0)
+    for q in (plant.any_motion(rng)[0] for _ in range(3)):
         readings = out.read(plant, q, zero, zero)
         if not bool(_told(out, plant, q, readings, zero)):
             what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"

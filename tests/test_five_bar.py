@@ -281,3 +281,18 @@ def test_tables_are_the_published_ones():
     plant, robot = righettini_five_bar(), Robot()
     for name in ("length", "center", "mass", "inertia", "tip_mass"):
         np.testing.assert_array_equal(getattr(plant, name), getattr(robot, name))
+
+
+def test_frames_of_the_links_are_where_the_oracle_has_them():
+    plant, q = righettini_five_bar(), np.array([1.9, 1.24])
+    x = oracle.coordinates(Robot(), q)
+    centers = (None, None, x[2:4], x[5:7])
+    for link, (turn, center) in enumerate(zip(x[[0, 1, 4, 7]], centers, strict=True)):
+        axes, origin = plant.frame(link, jnp.asarray(q))
+        turned = [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+        np.testing.assert_allclose(axes, turned, atol=1e-14)
+        if center is None:
+            np.testing.assert_allclose(origin, [(-0.09, 0.09)[link], 0, 0], atol=1e-15)
+        else:
+            at = axes @ np.array([*plant.center[link - 2], 0.0]) + origin
+            np.testing.assert_allclose(at, [*center, 0.0], atol=1e-14)

@@ -55,7 +55,7 @@ def read_inertial_sensors(tables: Mapping[str, Any], links: int, file: str) -> t
     for k, table in enumerate(tables.get("inertial_sensors", []), start=1):
         spot = Spot(file, f"[[inertial_sensors]] {k}")
         if not links:
-            raise spot.fault("the plant has no links", "leave it out, or take kind = 'serial_arm'")
+            raise spot.fault("the plant has no links", "leave it out, or take a serial_arm or five_bar")
         axes = table.get("axes", AXES)
         given = read_table(table, inertial_keys(len(axes) if isinstance(axes, list) else 3), spot)
         if given["link"] > links:

@@ -164,6 +164,20 @@ class FiveBar(Plant):
         what = f"elbows {apart:.4g} m apart, distal links of {reach[0]:.4g} and {reach[1]:.4g} m"
         return row, f"joints at [{shown}] rad are out of reach: {what}"
 
+    @classmethod
+    def links(cls, joints: int) -> int:
+        return 4
+
+    def frame(self, link: int, q: Array) -> tuple[Array, Array]:
+        """Of proximal links 1 and 2 at their fixed joints, of distal ones at their elbows; z up."""
+        at = self.pose(q)
+        ground = self.length[0] * _SIDES[:, None] * _X
+        along = jnp.concatenate([at.proximal, at.distal])[link] / self.length[1 + link]
+        axes = jnp.zeros((3, 3)).at[:2, 0].set(along).at[2, 2].set(1.0)
+        axes = axes.at[0, 1].set(-along[1]).at[1, 1].set(along[0])
+        origin = jnp.concatenate([ground, at.elbow])[link]
+        return axes, jnp.concatenate([origin, jnp.zeros(1)])
+
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         """D' M* (D qdd + dD/dt qd): the motion of every mass, times it, pulled back to the joints."""
 
