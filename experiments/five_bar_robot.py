@@ -11,7 +11,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
+import scipy.signal
 
 import jaxid
 
@@ -22,8 +24,8 @@ from five_bar_stepper import _advance, arrays
 REDUCTION = 20.0
 # Actual torque over the measured one, by drive.
 GAINS = (0.93, 1.06)
-# By hinge (joints 1, 2, then the passive angles), of sign v, v, v |v|, v^3 [N m (s/rad)^k]. The quadratic terms
-# are negative, as those that were published; the whole dissipates at any velocity.
+# By hinge (joints 1, 2, then the passive angles), of sign v, v, v |v|, v^3 [N m (s/rad)^k]. The quadratic
+# terms are negative, as those that were published; the whole dissipates at any velocity.
 FRICTION = {
     "coulomb_friction": (5.0, 4.0, 0.02, 0.02, 0.02), "viscous_friction": (4.6, 3.6, 0.01, 0.01, 0.01),
     "quadratic_drag": (-1.2, -0.9, 0.0, 0.0, 0.0), "cubic_friction": (0.17, 0.13, 0.0, 0.0, 0.0),
@@ -39,7 +41,9 @@ POLYGON = [
     [1.2, 0.3], [1.5, 0.3], [2.0, 0.85], [2.65, 1.6], [2.6, 1.9], [2.0, 1.7], [1.5, 1.3], [1.2, 0.65],
 ]
 HOME = [1.5, 0.5]
-STEPS = 5  # of the exact robot in a tick
+STEP = 5e-5  # of the exact robot [s]
+# Friction of a joint that no model has: part by which it fluctuates about its mean, and for how long [s].
+FLUCTUATION, MEMORY = 0.25, 0.05
 ORDERS = {"coulomb_friction": "level"}
 
 
@@ -65,6 +69,14 @@ def robot(scale: float = 1.0, **changed: float) -> Robot:
     return replace(Robot(friction={k: scale * np.array(v) for k, v in FRICTION.items()}), **changed)
 
 
+def fluctuating(seconds: float, seed: int, period: float = PERIOD) -> Callable[[float], np.ndarray]:
+    """Factors on the friction of every hinge that wander about one (Ornstein and Uhlenbeck), by time."""
+    rng, keep = np.random.default_rng(seed), np.exp(-period / MEMORY)
+    kicks = FLUCTUATION * np.sqrt(1 - keep**2) * rng.standard_normal((round(seconds / period) + 1, 5))
+    factors = 1.0 + scipy.signal.lfilter([1.0], [1.0, -keep], kicks, axis=0)
+    return lambda t: np.maximum(factors[round(t / period)], 0.0)
+
+
 def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str] | None = None) -> str:
     """Effects of a friction polynomial of an order, on the joints or on the passive angles."""
     count = 3 if where else 2
@@ -78,8 +90,8 @@ def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str]
 
 
 def case_text(
-    law: str, *, friction: str | None = None, gain: str = "{ guess = 1.0 }", seed: int = 0, duration: float = 40.0,
-    more: str = "", tip_mass: str = "2.72", inertial: bool = True,
+    law: str, *, friction: str | None = None, gain: str | Sequence[float] = "{ guess = 1.0 }", seed: int = 0,
+    duration: float = 40.0, more: str = "", tip_mass: str = "2.72", inertial: bool = True,
 ) -> str:
     """A case: the model of the robot, a law for [controller], random targets."""
     gains = f"[{gain}, {gain}]" if isinstance(gain, str) else list(gain)
@@ -149,9 +161,17 @@ class Ran:
         return self.q - self.live.reference[: len(self.q)]
 
 
+def along(live: jaxid.Live, what: Callable) -> tuple[np.ndarray, ...]:
+    """What a function of position, velocity and acceleration is at every tick of a loop's reference."""
+    r = live.reference
+    v = np.gradient(r, live.period, axis=0)
+    return tuple(np.asarray(x) for x in jax.jit(jax.vmap(what))(r, v, np.gradient(v, live.period, axis=0)))
+
+
 def driven(
-    live: jaxid.Live, machine: Robot, *, seconds: float | None = None, seed: int = 0, torque_noise: float = 0.0,
-    inertial: bool = True, gains: Sequence[float] = GAINS, drift: Callable[[float], float] | None = None,
+    live: jaxid.Live, machine: Robot, *, seconds: float | None = None, seed: int = 0,
+    torque_noise: float = 0.0, inertial: bool = True, gains: Sequence[float] = GAINS,
+    drift: Callable[[float], float | np.ndarray] | None = None, period: float = PERIOD,
 ) -> Ran:
     """Drive the exact robot by a case's controller.
 
@@ -163,29 +183,30 @@ def driven(
         torque_noise: Standard deviation of the measured torque at the joint [N m].
         inertial: Whether the loop is given velocity and acceleration by gyroscope and accelerometer.
         gains: Of the drives.
-        drift: Factor on all friction at a time.
+        drift: Factor on all friction at a time, or one a hinge.
+        period: Of the loop [s].
     """
-    ticks = len(live.reference) if seconds is None else round(seconds / PERIOD)
-    every, rng = round(UPDATE / PERIOD), np.random.default_rng(seed)
+    ticks = len(live.reference) if seconds is None else round(seconds / period)
+    every, rng = max(1, round(UPDATE / period)), np.random.default_rng(seed)
     l, c, m, friction = arrays(machine)
     work = (np.empty((10, 2)), np.empty(10), np.empty((5, 2)), np.empty((2, 2)), np.empty(2), np.empty(5))
     q, v, last = np.array(HOME), np.zeros(2), np.zeros(2)
     out, estimates, sensed = np.empty((ticks, 8)), [], {}
     gains, adapts = REDUCTION * np.asarray(gains), live.adapts
-    u, a = np.zeros(2), np.zeros(2)
+    u, a, steps = np.zeros(2), np.zeros(2), round(period / STEP)
     for k in range(ticks):
         if inertial and k % every == 0:
-            noise = rng.standard_normal((2, 2))
-            sensed = {"velocity": v + GYRO_NOISE * noise[0], "acceleration": a + ACCELERATION_NOISE * noise[1]}
+            turn, pull = rng.standard_normal((2, 2)) * [[GYRO_NOISE], [ACCELERATION_NOISE]]
+            sensed = {"velocity": v + turn, "acceleration": a + pull}
         if torque_noise:
             sensed["measured"] = u + torque_noise / REDUCTION * rng.standard_normal(2)
         u = live.command(np.round(q / COUNTS) * COUNTS, **sensed)
         out[k] = *q, *v, *a, *u
-        if adapts and k % (round(LOOK / PERIOD)) == 0:
+        if adapts and k % round(LOOK / period) == 0:
             estimates.append(np.asarray(live.estimate.theta))
         last = v.copy()
-        levels = friction if drift is None else friction * drift(k * PERIOD)
-        _advance(l, c, m, levels, q, v, gains * u, PERIOD / STEPS, STEPS, work)
-        a = (v - last) / PERIOD
-    time = PERIOD * np.arange(ticks)
+        levels = friction if drift is None else friction * drift(k * period)
+        _advance(l, c, m, levels, q, v, gains * u, period / steps, steps, work)
+        a = (v - last) / period
+    time = period * np.arange(ticks)
     return Ran(live, time, *np.split(out, 4, axis=1), np.array(estimates))

@@ -1,0 +1,321 @@
+"""The 5R parallel robot: friction and drive gains identified in its loop, and fed forward.
+
+Righettini et al., "Real Time MEMS-Based Joint Friction Identification for Enhanced Dynamic Performance in
+Robotic Applications" (Robotics 14, 36). The robot is an exact-friction simulator that shares no code with
+jaxid; what is not published is chosen, and stands in `five_bar_robot.py`. Its controller is `jaxid.Live`.
+
+    python experiments/righettini_five_bar.py [-o FOLDER] [--only NAME]
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import five_bar_robot as robots
+import numpy as np
+import righettini_figures
+from common import Table, parser_of
+from five_bar_robot import LOOK, PERIOD, Ran, driven, robot
+
+import jaxid
+from jaxid.controllers.computed_torque import inverse_dynamics
+from jaxid.io.log import Log
+
+ADAPTIVE = 'kind = "adaptive"\ngate_velocity = 0.05\nhalf_life = 600.0'
+TORQUE = 'kind = "computed_torque"'
+PD = TORQUE + "\ndynamics = false"
+# Factors by which errors shrink from law to law, joints 1 and 2: RMS and peak.
+PUBLISHED = {
+    "computed torque": ((2.44, 2.04), (3.88, 3.78)), "adaptive": ((5.05, 3.68), (1.40, 1.97)),
+}
+# Friction when warm, over that when cold.
+WARM = 0.7
+
+
+def live_of(folder: Path, name: str, law: str, **stated: object) -> jaxid.Live:
+    """The loop of a case that is written to the folder."""
+    path = folder / f"{name}.toml"
+    path.write_text(robots.case_text(law, **stated))
+    return jaxid.Live(path)
+
+
+def warmed(folder: Path, inertial: bool = True) -> tuple[jaxid.Live, Ran]:
+    """The adaptive law after 20 s from nothing."""
+    live = live_of(folder, "warming", ADAPTIVE, seed=9, duration=20.0, inertial=inertial)
+    return live, driven(live, robot(), seed=9, inertial=inertial)
+
+
+def sizes(ran: Ran, start: float = 0.0, end: float = 1e9) -> tuple[np.ndarray, np.ndarray]:
+    """RMS and peak of the errors between two times, by joint [mrad]."""
+    e = 1e3 * ran.error[round(start / PERIOD) : round(end / PERIOD)]
+    return np.sqrt(np.mean(e**2, axis=0)), np.abs(e).max(axis=0)
+
+
+def controllers(folder: Path) -> None:
+    """PD, computed torque and adaptive over 40 s, drive gains compensated, friction steady or fluctuating."""
+    begin = time.perf_counter()
+    pair = lambda x: ", ".join(f"{v:.3g}" for v in x)
+    table = Table(
+        "Errors of both joints over 40 s, and by how much smaller than of the law above",
+        ["friction", "law", "RMS [mrad]", "peak [mrad]", "RMS, over", "published", "peak, over", "published"],
+    )
+    warm, first = warmed(folder)
+    table.row("steady", "adaptive, cold, first 2 s", *(pair(x) for x in sizes(first, 0.0, 2.0)), *[""] * 4)
+    laws = {"PD": PD, "computed torque": TORQUE, "adaptive": ADAPTIVE}
+    split = {}
+    for friction in ("steady", "fluctuating"):
+        drift = robots.fluctuating(40.0, 7) if friction == "fluctuating" else None
+        runs, before = {}, None
+        for name, law in laws.items():
+            gain = "{ guess = 1.0 }" if name == "adaptive" else warm.estimate.theta[:2].tolist()
+            live = live_of(folder, name.replace(" ", "_"), law, gain=gain, seed=1)
+            if name == "adaptive":
+                live.memory = warm.memory
+            runs[name] = driven(live, robot(), seed=1, drift=drift)
+            rms, peak = sizes(runs[name])
+            shown = [""] * 4
+            if before is not None:
+                published = PUBLISHED[name]
+                over = before[0] / rms, before[1] / peak
+                shown = [pair(over[0]), pair(published[0]), pair(over[1]), pair(published[1])]
+            table.row(friction, name, pair(rms), pair(peak), *shown)
+            before = (rms, peak)
+        split[friction] = torques(runs["adaptive"])
+        righettini_figures.errors(folder / f"errors_{friction}.png", runs)
+    table.show(time.perf_counter() - begin)
+    published = {"dynamics": (45, 48), "friction": (40, 33), "feedback": (15, 19)}
+    table = Table("RMS torque by its part, % of the sum (figure 11)", ["part", *split, "published"])
+    for part, values in published.items():
+        shares = (100 * s[part] / sum(s.values()) for s in split.values())
+        table.row(part, *(pair(x) for x in shares), pair(values))
+    table.show(time.perf_counter() - begin)
+
+
+def torques(ran: Ran) -> dict[str, np.ndarray]:
+    """RMS torque of the joints by where it comes from [N m]: the model along the reference, and the rest."""
+    machine = ran.live.machine.with_estimate(ran.live.estimate.theta)
+    smooth, friction = robots.along(ran.live, lambda q, v, a: inverse_dynamics(machine.plant, q, v, a, 2))
+    gains = ran.live.estimate.theta[:2]
+    rest = robots.REDUCTION * gains * ran.command - smooth - friction
+    return {
+        name: np.sqrt(np.mean(x**2, axis=0))
+        for name, x in (("dynamics", smooth), ("friction", friction), ("feedback", rest))
+    }
+
+
+def friction_of(names: list[str], theta: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Friction of both joints at some velocities above zero, (velocities, 2) [N m]."""
+    kinds = ("coulomb_friction", "viscous_friction", "quadratic_drag", "cubic_friction")
+    entry = lambda kind, joint: names.index(f"{kind}[{joint}].{robots.ORDERS.get(kind, 'coefficient')}")
+    return sum(theta[[entry(kind, j) for j in (1, 2)]] * v[:, None] ** k for k, kind in enumerate(kinds))
+
+
+def true_friction(v: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """Likewise, of the robot's own joints."""
+    return scale * sum(np.array(c[:2]) * v[:, None] ** k for k, c in enumerate(robots.FRICTION.values()))
+
+
+# Velocities at which friction is compared [rad/s].
+SPEEDS = np.linspace(0.2, 3.6, 18)
+
+
+def settled(times: np.ndarray, off: np.ndarray, bound: float) -> float:
+    """Time from which an error stays below a bound; infinite where it never does."""
+    out = np.flatnonzero(off >= bound)
+    if not len(out):
+        return float(times[0])
+    return float(times[out[-1] + 1]) if out[-1] + 1 < len(times) else np.inf
+
+
+def convergence(folder: Path) -> None:
+    """From gains of one and no friction: how soon, cold and warm, and with noise on the measured torque."""
+    begin = time.perf_counter()
+    table = Table(
+        "Seconds until gains are within 2 %, friction within 5 % of its largest, for good; and at the end",
+        ["temperature", "torque noise [N m]", "instrument", "gains", "friction", "gains off", "friction off"],
+    )
+    kept = {}
+    for scale, noise, instrument in (
+        (1.0, 0.0, "none"), (WARM, 0.0, "none"), (1.0, 0.5, "none"), (1.0, 0.5, "model"), (1.0, 2.0, "none"),
+        (1.0, 2.0, "model"),
+    ):
+        law = ADAPTIVE + f'\ninstrument = "{instrument}"'
+        live = live_of(folder, "cold", law, seed=2, duration=30.0)
+        ran = driven(live, robot(scale), seed=2, torque_noise=noise)
+        names, times = live.machine.parameters.names, LOOK * np.arange(len(ran.estimates))
+        gains = np.abs(ran.estimates[:, :2] / robots.GAINS - 1).max(axis=1)
+        true = true_friction(SPEEDS, scale)
+        friction = np.array([np.abs(friction_of(names, e, SPEEDS) - true).max() for e in ran.estimates])
+        friction /= true.max()
+        table.row(
+            "cold" if scale == 1.0 else "warm", noise, instrument, f"{settled(times, gains, 0.02):.2f}",
+            f"{settled(times, friction, 0.05):.2f}", f"{gains[-1]:.2%}", f"{friction[-1]:.2%}",
+        )
+        if not noise:
+            kept["cold" if scale == 1.0 else "warm"] = (names, times, ran)
+    table.show(time.perf_counter() - begin)
+    righettini_figures.histories(folder / "histories.png", kept)
+    righettini_figures.frictions(folder / "frictions.png", kept, friction_of, true_friction)
+
+
+def temperature(folder: Path) -> None:
+    """Friction that falls by 30 % in 60 s: which half-life follows it."""
+    begin = time.perf_counter()
+    table = Table(
+        "Friction falling by 30 % in 60 s; error of friction at 2 rad/s in the last half, of the tracking",
+        ["half-life [s]", "friction off, RMS", "RMS [mrad]"],
+    )
+    drift = lambda t: 1.0 - (1.0 - WARM) * min(t / 60.0, 1.0)
+    for half_life in (2.0, 5.0, 15.0, 60.0, 600.0):
+        law = ADAPTIVE.replace("600.0", str(half_life))
+        live = live_of(folder, "drift", law, seed=3, duration=60.0)
+        ran = driven(live, robot(), seed=3, drift=drift)
+        names, times = live.machine.parameters.names, LOOK * np.arange(len(ran.estimates))
+        late = times > 30.0
+        at = np.array([2.0])
+        found = np.array([friction_of(names, e, at)[0] for e in ran.estimates[late]])
+        true = np.array([true_friction(at, drift(t))[0] for t in times[late]])
+        off = np.sqrt(np.mean((found / true - 1) ** 2))
+        table.row(f"{half_life:g}", f"{off:.2%}", ", ".join(f"{x:.3g}" for x in sizes(ran, 30.0)[0]))
+    table.show(time.perf_counter() - begin)
+
+
+def log_of(ran: Ran, name: str, noise: float = 0.02, every: int = 4) -> Log:
+    """What an encoder and the drives would log of a run, at 1 kHz."""
+    rng = np.random.default_rng(5)
+    q = np.round(ran.q / robots.COUNTS) * robots.COUNTS
+    u = ran.command + noise * rng.standard_normal(ran.command.shape)
+    pick = slice(None, None, every)
+    reference = ran.live.reference[: len(q)]
+    return Log(time=ran.time[pick], position=q[pick], force=u[pick], reference=reference[pick], source=name)
+
+
+def logged(folder: Path, name: str, machine: object, seconds: float = 15.0, seed: int = 4) -> Log:
+    """A log under the PD law at 1 kHz, whose commands a log at that rate holds whole."""
+    text = robots.case_text(PD, friction="", gain=(1.0, 1.0), seed=seed, duration=seconds, inertial=False)
+    path = folder / f"{name}.toml"
+    path.write_text(text.replace(f"period = {PERIOD}", "period = 0.001").replace("4000.0", "1000.0"))
+    live = jaxid.Live(path)
+    ran = driven(live, machine, seed=seed, inertial=False, period=1e-3)
+    return log_of(ran, name, every=1)
+
+
+MODELS = {
+    1: ("all", 4), 2: ("active", 4), 3: ("active", 3), 4: ("active", 2), 5: ("active", 1),
+}
+
+
+def orders(folder: Path) -> None:
+    """Table 4: what each model leaves (figure 5), and which one `discover` chooses by itself."""
+    begin = time.perf_counter()
+    log = logged(folder, "orders", robot())
+    table = Table(
+        "What models leave of the torque of the joints (figure 5)",
+        ["model", "joints", "order", "unknowns", "left [N m]", "running residual, end [N m]"],
+    )
+    for number, (where, order) in MODELS.items():
+        friction = robots.friction_text(order)
+        if where == "all":
+            friction += robots.friction_text(order, "passive = [1, 2, 3]")
+        path = folder / f"model{number}.toml"
+        path.write_text(robots.case_text(PD, friction=friction, inertial=False, more=RECURSIVE))
+        found = jaxid.identify(path, log, method="recursive")
+        left = found.gaps[0].force.rms
+        running = found.estimate.details["recursive"]["running_residual"]
+        table.row(
+            number, where, order, len(found.estimate.names), ", ".join(f"{x:.3f}" for x in left),
+            ", ".join(f"{x:.3f}" for x in np.ravel(running)),
+        )
+    table.show(time.perf_counter() - begin)
+    path = folder / "chooses.toml"
+    path.write_text(robots.case_text(PD, friction=robots.friction_text(1), inertial=False))
+    found = jaxid.discover(path, log)
+    found.save(folder / "chosen", force=True)
+    print(f"\nfrom Coulomb and viscous friction of the joints ({time.perf_counter() - begin:.0f} s)\n{found}")
+
+
+RECURSIVE = "[recursive]\nhalf_life = 600.0\ngate_velocity = 0.05\n"
+
+
+def payload(folder: Path) -> None:
+    """A mass at the tool, found while it moves: with gains of an unloaded run, and with gains free."""
+    begin = time.perf_counter()
+    extra = 0.8
+    bare = logged(folder, "bare", robot())
+    loaded = logged(folder, "load", robot(tip_mass=2.72 + extra))
+    path = folder / "unloaded.toml"
+    path.write_text(robots.case_text(PD, inertial=False))
+    gains = jaxid.identify(path, bare, method="inverse_dynamics").estimate.theta[:2].tolist()
+    table = Table(
+        f"A payload of {extra} kg", ["drive gains", "found [kg]", "sigma [kg]", "gains"]
+    )
+    for name, gain in (("of the unloaded run", gains), ("free", "{ guess = 1.0 }")):
+        path = folder / "loaded.toml"
+        path.write_text(robots.case_text(PD, gain=gain, tip_mass="{ guess = 2.0 }", inertial=False))
+        estimate = jaxid.identify(path, loaded, method="inverse_dynamics").estimate
+        at = estimate.names.index("tip_mass")
+        free = isinstance(gain, str)
+        shown = [estimate.value(f"actuator_gain[{k}].gain") for k in (1, 2)] if free else gain
+        table.row(name, f"{estimate.theta[at] - 2.72:.4f}", f"{estimate.std[at]:.4f}",
+                  ", ".join(f"{g:.4f}" for g in shown))
+    table.show(time.perf_counter() - begin)
+
+
+def hidden(folder: Path) -> None:
+    """What `discover` names of friction on a passive joint, and of a payload."""
+    begin = time.perf_counter()
+    stated = robots.friction_text(3)
+    passive = {k: list(v) for k, v in robots.FRICTION.items()}
+    passive["viscous_friction"][3] = 0.5
+    machine = robot(friction={k: np.array(v) for k, v in passive.items()})
+    for name, hid in (("passive", machine), ("payload", robot(tip_mass=3.52))):
+        log = logged(folder, name, hid)
+        path = folder / f"hidden_{name}.toml"
+        path.write_text(robots.case_text(PD, friction=stated, gain=robots.GAINS, inertial=False))
+        found = jaxid.discover(path, log)
+        found.save(folder / f"hidden_{name}", force=True)
+        print(f"\nhidden: {name} ({time.perf_counter() - begin:.0f} s)\n{found}", flush=True)
+
+
+def sensors(folder: Path) -> None:
+    """Encoders only against gyroscopes and accelerometers: named as future work in the paper."""
+    begin = time.perf_counter()
+    table = Table(
+        "The adaptive law by what measures motion, last 20 of 40 s",
+        ["sensors", "RMS [mrad]", "peak [mrad]", "friction in 5 % after [s]", "gains off", "friction off"],
+    )
+    pair = lambda x: ", ".join(f"{v:.3g}" for v in x)
+    for name, inertial, more in (
+        ("encoders", False, "\nvelocity_average = 4\nreach = 8"), ("gyroscopes, accelerometers", True, ""),
+    ):
+        live = live_of(folder, "sensors", ADAPTIVE + more, seed=6, inertial=inertial)
+        ran = driven(live, robot(), seed=6, inertial=inertial)
+        names, times = live.machine.parameters.names, LOOK * np.arange(len(ran.estimates))
+        true = true_friction(SPEEDS)
+        off = np.array([np.abs(friction_of(names, e, SPEEDS) - true).max() for e in ran.estimates])
+        off /= true.max()
+        gains = np.abs(ran.estimates[-1, :2] / robots.GAINS - 1).max()
+        table.row(name, *(pair(x) for x in sizes(ran, 20.0)), f"{settled(times, off, 0.05):.2f}",
+                  f"{gains:.2%}", f"{off[-1]:.2%}")
+    table.show(time.perf_counter() - begin)
+
+
+STUDIES: dict[str, Callable[[Path], None]] = {
+    f.__name__: f for f in (controllers, convergence, temperature, orders, payload, hidden, sensors)
+}
+
+
+def main() -> None:
+    parser = parser_of(__doc__, "results/righettini_five_bar")
+    parser.add_argument("--only", choices=STUDIES, help="one of the studies")
+    args = parser.parse_args()
+    args.o.mkdir(parents=True, exist_ok=True)
+    for name, study in STUDIES.items():
+        if args.only in (None, name):
+            study(args.o)
+
+
+if __name__ == "__main__":
+    main()
