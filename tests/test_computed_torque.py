@@ -202,6 +202,36 @@ def test_feedback_does_not_see_how_late_a_velocity_is():
     np.testing.assert_allclose(u, 0.0, atol=1e-9)
 
 
+def test_differences_and_commands_are_of_one_instant(tmp_path):
+    """A mass alone, pushed by what jumps: its second difference over 16 ticks is the commands' own mean."""
+    case = tmp_path / "case.toml"
+    case.write_text("""
+[plant]
+kind = "axis"
+[plant.parameters]
+inertia = { guess = 1.0, true = 2.5 }
+[controller]
+kind = "adaptive"
+kp = 400.0
+kd = 40.0
+reach = 8
+period = 0.001
+disturbance = { level = 30.0, on = 0.013, off = 0.017 }
+[reference]
+kind = "synchronized"
+points = [[0.4], [0.0]]
+velocity = 1.0
+acceleration = 10.0
+jerk = 1000.0
+[simulation]
+duration = 1.0
+sample_rate = 1000.0
+""")
+    found = simulate(case).trajectory.found
+    # The start counts a thousandth of a sample, of a hundred: 1e-5 of what it is off.
+    np.testing.assert_allclose(found.theta[-1], [2.5], rtol=1e-5)
+
+
 REFUSED = [
     ("reach = 3\nvelocity_average = 4", "rate = 1000.0", r"reach = 3 ticks, .* every 4; take reach = 4"),
     ("", "rate = 1000.0", r"velocity_average = 1 ticks, and readings are new every 4"),
