@@ -164,6 +164,9 @@ class FiveBar(Plant):
         what = f"elbows {apart:.4g} m apart, distal links of {reach[0]:.4g} and {reach[1]:.4g} m"
         return row, f"joints at [{shown}] rad are out of reach: {what}"
 
+    def joint_positions(self, tool: Array) -> Array:
+        return self.inverse(tool)
+
     @classmethod
     def links(cls, joints: int) -> int:
         return 4
