@@ -144,7 +144,7 @@ def simulated(tmp_path, capsys, text, name="sim.csv"):
 
 
 @pytest.mark.parametrize(("friction", "apart"), [
-    # without dry friction both are smooth: fourth-order steps of 0.25 ms, midpoint steps of the stepper of 10 us
+    # without dry friction both are smooth: fourth order at 0.25 ms, the stepper's second at 10 us
     ({"viscous_friction": FRICTION["viscous_friction"]}, 2e-9),
     # dry friction in all hinges at once: the stepper's turns are of first order, 7e-7 rad at 10 us
     (FRICTION, 2e-6),
