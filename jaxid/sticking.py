@@ -24,7 +24,7 @@ from jaxid.readings import (
     spread,
     step,
 )
-from jaxid.smooth import ramp, sharp_clip
+from jaxid.smooth import ramp
 
 # Of the Gauss-Seidel iteration; chosen.
 _SWEEPS = 20
@@ -43,8 +43,8 @@ def set_valued_step(
     A port slides under the level of dry friction halfway. Where it comes to rest within the step it
     stays if the break-away level holds it, and else goes back for the rest of the step: the reaction
     is then the mean of both parts, and the position that of two parabolas, of second order in the
-    step. Ports that are coupled through the mass matrix share their reactions by projected
-    Gauss-Seidel sweeps, each the force that brings its port to rest at the step's end, clipped.
+    step. Ports that are coupled through the mass matrix share their reactions by Gauss-Seidel sweeps,
+    each that of such a port under what the others leave it.
 
     Args:
         plant, x, u, t, h: As of `jaxid.readings.step`.
@@ -133,12 +133,7 @@ class _Sliding:
                 for b in (levels, at_rest)
             ]
             return _own_reaction(self.own, self.speed, self.before, dry, held, *rising, self.corner)
-        # The level at rest acts until a port slides, and again where it would pass through rest.
-        slid = self.speed - jnp.sign(self.before) * self.own * dry
-        rests = (self.before == 0.0) | (self.before * slid < 0.0)
-        held = jnp.where(rests, held, dry)
-        reaction, stuck = _box_reaction(self.mobility, self.speed, dry, held)
-        return _Answer(reaction, stuck, stuck & (self.before == 0.0), jnp.ones_like(self.speed))
+        return _shared_reaction(self.mobility, self.speed, self.before, dry, held)
 
 
 def _sliding(
@@ -240,30 +235,32 @@ def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
     return jnp.where(part < 1.0, 0.5 * h * ((1.0 - part) * before + part * after), 0.0)
 
 
-def _box_reaction(
-    mobility: Array, speed: Array, dry: Array, hold: Array
-) -> tuple[Array, Array]:
-    """Reaction that leaves `speed + mobility @ reaction` complementary, and which ports it stops.
+def _shared_reaction(
+    mobility: Array, speed: Array, before: Array, dry: Array, hold: Array
+) -> _Answer:
+    """Mean reaction over a step of ports that push each other: each answers what the others leave it.
 
-    A port is held up to `hold`, the level at rest; one that breaks loose is dragged by `dry`.
+    Its slope in the speed that is left lies between 0 and -1 over the port's own mobility, as that of a
+    force clipped to a box does, so that the sweeps settle. Clipped to a box, a port that turns within the
+    step would be dragged one way for all of it: of first order, 7e-6 rad of a robot's 0.6 at 1 kHz.
+
+    Args:
+        mobility: Change of velocities over the step per unit reaction.
+        speed, before, dry, hold: As of `_own_reaction`.
     """
     n = speed.size
-    inverse = 1.0 / jnp.diagonal(mobility)
+    own = jnp.diagonal(mobility)
 
-    def answer(wanted: Array, dry: Array, hold: Array) -> Array:
-        return jnp.where(jnp.abs(wanted) < hold, wanted, sharp_clip(wanted, dry))
-
-    def sweep(_: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
-        reaction, wanted = at
+    def sweep(_: Array, at: _Answer) -> _Answer:
         for i in range(n):
-            slip = speed[i] + jnp.sum(mobility[i] * reaction)
-            wanted = wanted.at[i].set(reaction[i] - slip * inverse[i])
-            reaction = reaction.at[i].set(answer(wanted[i], dry[i], hold[i]))
-        return reaction, wanted
+            left = speed[i] + jnp.sum(mobility[i] * at.reaction) - own[i] * at.reaction[i]
+            one = _own_reaction(own[i], left, before[i], dry[i], hold[i])
+            at = _Answer(*(whole.at[i].set(entry) for whole, entry in zip(at, one, strict=True)))
+        return at
 
+    no = jnp.zeros(n, bool)
     # A loop, not twenty copies: those of six joints, differentiated, took a minute and a half to compile.
-    reaction, wanted = jax.lax.fori_loop(0, _SWEEPS, sweep, (jnp.zeros(n), jnp.zeros(n)))
-    return reaction, jnp.abs(wanted) < hold
+    return jax.lax.fori_loop(0, _SWEEPS, sweep, _Answer(jnp.zeros(n), no, no, jnp.ones(n)))
 
 
 def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:

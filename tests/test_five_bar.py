@@ -1,5 +1,7 @@
 """The five-bar robot against multipliers, its paper's own derivatives, energy, and an exact stepper."""
 
+import dataclasses
+
 import diffrax
 import five_bar_oracle as oracle
 import jax
@@ -125,6 +127,21 @@ def test_derivatives_are_those_of_the_paper():
             expected = second.elbow[i] + np.einsum("a,jk->ajk", a1 @ r, turns[i])
             expected -= np.einsum("a,j,k->ajk", a0 @ r, turn[i], turn[i])
             np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(there))(q), expected, atol=1e-9)
+
+
+def test_closure_moves_with_its_lengths_as_differences_say():
+    plant, h = plant_of(UNEVEN), 1e-6
+    for q in possible_states(UNEVEN, 5)[0]:
+        tool = lambda l, q=q: dataclasses.replace(plant, length=l).tool(jnp.asarray(q))
+        by = jax.jacfwd(tool)(plant.length)
+        for k in range(5):
+            ends = []
+            for sign in (-1, 1):
+                length = np.array(UNEVEN.length)
+                length[k] += sign * h
+                moved = dataclasses.replace(UNEVEN, length=tuple(length))
+                ends.append(oracle.coordinates(moved, q)[8:])
+            np.testing.assert_allclose(by[:, k], (ends[1] - ends[0]) / (2 * h), rtol=0, atol=1e-7)
 
 
 def test_ports_are_the_angles_between_links():
