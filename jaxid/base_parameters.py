@@ -28,12 +28,14 @@ class BaseParameters:
 
     Args:
         names: Of its standard parameters, as in results: "mass[1]".
+        standard_places: Field of the plant and entry of each, from 0 (None: the field is one number).
         chosen: Which of them stand for a base parameter; the others are regrouped into these.
         mapping: From standard to base parameters, (base, standard): base = mapping @ standard.
         singular_values: Of the regressor on the random states, its columns normed, largest first.
     """
 
     names: tuple[str, ...]
+    standard_places: tuple[tuple[str, int | None], ...]
     chosen: tuple[int, ...]
     mapping: Float[np.ndarray, "base standard"]
     singular_values: Float[np.ndarray, " standard"]
@@ -42,6 +44,11 @@ class BaseParameters:
     def chosen_names(self) -> tuple[str, ...]:
         """Names of the standard parameters that stand for a base parameter."""
         return tuple(self.names[k] for k in self.chosen)
+
+    @property
+    def places(self) -> tuple[tuple[str, int | None], ...]:
+        """Field of the plant and entry of those that stand for a base parameter."""
+        return tuple(self.standard_places[k] for k in self.chosen)
 
     @property
     def without_effect(self) -> tuple[str, ...]:
@@ -157,7 +164,8 @@ def base_parameters(plant: Plant, seed: int = 0, keep: Sequence[str] = ()) -> Ba
     mapping[np.abs(mapping) < 1e-10 * np.abs(mapping).max()] = 0.0
     whole = np.round(mapping)
     mapping = np.where(np.abs(mapping - whole) < 1e-10, whole, mapping)
-    return BaseParameters(names, chosen, mapping, np.linalg.svd(scaled, compute_uv=False))
+    places, singular = tuple(_places(plant)), np.linalg.svd(scaled, compute_uv=False)
+    return BaseParameters(names, places, chosen, mapping, singular)
 
 
 def _columns(plant: Plant, unknowns: int, rng: np.random.Generator) -> Float[np.ndarray, "rows standard"]:

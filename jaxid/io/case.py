@@ -303,7 +303,7 @@ def _log(tables: Mapping[str, Any], plant: PlantEntry, file: str) -> dict[str, A
     if "log" not in tables:
         return {}
     spot = Spot(file, "[log]")
-    keys = log_keys(plant.joints, plant.drives)
+    keys = log_keys(plant.joints, plant.drives, plant.names)
     keys |= {name: Key(keys[name].read, keys[name].doc, True) for name in ("position", "force")}
     return _check_time(read_table(tables["log"], keys, spot), spot)
 
@@ -332,7 +332,7 @@ def _validations(tables: Mapping[str, Any], plant: PlantEntry, path: Path) -> tu
     found: list[Validation] = []
     for k, table in enumerate(tables.get("validation", []), start=1):
         spot = Spot(str(path), f"[[validation]] {k}")
-        given = read_table(table, validation_keys(plant.joints, plant.drives), spot)
+        given = read_table(table, validation_keys(plant.joints, plant.drives, plant.names), spot)
         if given["name"] in [v.name for v in found]:
             raise spot.at("name").refuse(given["name"], "is taken", "give each its own name")
         columns = {key: value for key, value in given.items() if key in LOG_KEYS}

@@ -108,29 +108,29 @@ STUDY: Keys = {
 }
 
 
-def log_keys(joints: int, drives: int) -> Keys:
-    """Keys of [log]."""
-    names = Key(columns(joints), "name of its column")
-    of_drives = Key(columns(drives, "drive"), "name of its column")
+def log_keys(joints: int, drives: int, names: tuple[str, ...] = ()) -> Keys:
+    """Keys of [log]; columns may go by the names of the joints, where these have any."""
+    of_joints = Key(columns(joints, names=names), "name of its column")
+    of_drives = Key(columns(drives, "drive", names), "name of its column")
     return {
         "time": Key(text, "name of its column"),
         "sample_rate": Key(number("positive"), "samples per second"),
-        "position": names,
+        "position": of_joints,
         "force": of_drives,
         "hold": Key(choice(HOLDS)),
         "rows": Key(rows),
-        **{k: of_drives if k == "reference" else names for k in OPTIONAL_COLUMNS},
+        **{k: of_drives if k == "reference" else of_joints for k in OPTIONAL_COLUMNS},
     }
 
 
-def validation_keys(joints: int, drives: int) -> Keys:
+def validation_keys(joints: int, drives: int, names: tuple[str, ...] = ()) -> Keys:
     """Keys of [[validation]]."""
     own = {
         "name": Key(text, "what it is called in results", required=True),
         "log": Key(text, "its file, relative to the case"),
         "disturbance": Key(DISTURBANCE),
     }
-    return {**own, **log_keys(joints, drives)}
+    return {**own, **log_keys(joints, drives, names)}
 
 
 def actuator_keys(drives: int) -> Keys:
