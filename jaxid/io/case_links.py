@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.base_parameters import base_parameters
 from jaxid.io.case_places import check_places
 from jaxid.io.case_values import Value, read_value, read_values
 from jaxid.io.schema import Key, Keys, Spot, choice, number, read_table, several, text, whole
@@ -16,6 +15,7 @@ from jaxid.io.urdf import Urdf, read_urdf
 from jaxid.model import Plant, parameters_of
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg
 from jaxid.plants.geometry import JOINTS, Geometry
+from jaxid.regrouping import base_parameters_by_rules
 
 # Chosen: beyond any arm; what lies behind it is a slip.
 _MOST_LINKS = 50
@@ -34,6 +34,8 @@ _SHAFT: Keys = {
     "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
     "ratios": Key(several(number()), "by how much, a number a joint; 1 each where absent"),
 }
+# Below it the sine of an angle of a URDF file is nothing: 1.5708 stands there for a right angle.
+_ANGLE = 1e-4
 # What of the links that a URDF file describes is to be identified.
 UNKNOWN = ("none", "base", "all")
 # Keys of [plant] that only an arm has.
@@ -106,7 +108,10 @@ def read_links_of_urdf(
     if unknown == "base":
         weight = {name: given[name] for name in ("gravity_vector",) if name in given}
         plant = cls(**values, geometry=arm.geometry, **weight)
-        base = base_parameters(plant)
+        if not np.any(np.asarray(plant.gravity_vector)):
+            mend = 'state a gravity_vector other than zero, or unknown = "all"'
+            raise spot.at("unknown").refuse("base", "needs weight", mend)
+        base = base_parameters_by_rules(plant, _ANGLE)
         values = {name: np.zeros(len(arm.names)) for name in names}
         for (name, k), value in zip(base.places, base.of(plant), strict=True):
             values[name][k], free[name][k] = value, True
