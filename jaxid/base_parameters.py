@@ -170,7 +170,7 @@ def base_parameters(
     triangle = np.abs(np.diagonal(scipy.linalg.qr(scaled, mode="r", pivoting=True)[0]))
     rank = int(np.sum(triangle > _DEPENDENT))
     order = [*(names.index(n) for n in keep), *(k for k, n in enumerate(names) if n not in keep)]
-    chosen = tuple(sorted(_independent(scaled, order)))
+    chosen = tuple(sorted(independent(scaled, order)))
     if len(chosen) != rank:
         raise ValueError(
             f"{len(chosen)} columns are independent one by one, {rank} together: a length or an angle of the "
@@ -197,7 +197,7 @@ def _columns(plant: Plant, unknowns: int, rng: np.random.Generator) -> Float[np.
     return np.asarray(regressor).reshape(-1, unknowns)
 
 
-def _independent(columns: Float[np.ndarray, "rows standard"], order: Sequence[int]) -> list[int]:
+def independent(columns: Float[np.ndarray, "rows standard"], order: Sequence[int]) -> list[int]:
     """Columns, of norm one or zero, that are no sums of those before, by Gram and Schmidt's method, twice."""
     basis, chosen = np.zeros((len(columns), 0)), []
     for k in order:

@@ -32,6 +32,7 @@ from jaxid.io.case_tables import (
     TOP,
     actuator_keys,
     controller_keys,
+    design_keys,
     limits_keys,
     log_keys,
     preprocess_keys,
@@ -83,6 +84,7 @@ class Case:
         limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
         candidates: User's own effects that a search may name, from [discover].
+        design: [design], for `jaxid.excitation`.
         reference: [reference], for `jaxid.references.make_reference`, at its guesses.
         unknown_reference: What of it is unknown.
         input: [input], likewise.
@@ -105,6 +107,7 @@ class Case:
     limits: dict[str, Any] = field(default_factory=dict)
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
+    design: dict[str, Any] = field(default_factory=dict)
     reference: dict[str, Any] | None = None
     unknown_reference: dict[str, Value] = field(default_factory=dict)
     input: dict[str, Any] | None = None
@@ -192,6 +195,7 @@ def load_case(path: str | Path) -> Case:
         limits=read("limits", limits_keys(joints, drives)),
         validations=_validations(tables, plant, path),
         candidates=read_candidates(tables.get("discover", {}), path),
+        design=read("design", design_keys(joints)),
         reference=read_signal("reference", tables | followed, drives, file),
         unknown_reference=unknown,
         input=read_signal("input", tables, drives, file),

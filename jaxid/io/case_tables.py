@@ -43,6 +43,8 @@ METHODS = (
     "output_error",
     "didim",
 )
+# What a trajectory of `jaxid design` is improved for.
+CRITERIA = ("determinant", "condition")
 DERIVATIVES = ("central", "spectral", "parabolic")
 # Tables at the top of a case, in the order in which they are checked; [[ ]] where it may recur.
 TOP = {
@@ -59,6 +61,7 @@ TOP = {
     "limits": False,
     "validation": True,
     "discover": False,
+    "design": False,
     "reference": False,
     "input": False,
     "simulation": False,
@@ -94,6 +97,11 @@ OUTPUT_ERROR: Keys = {
     "starts": Key(whole(1), "how many, drawn within the prior"),
     "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),
     "profile": Key(flag, "profile likelihoods of what is fitted"),
+}
+DESIGN: Keys = {
+    "criterion": Key(choice(CRITERIA)),
+    "harmonics": Key(whole(2), "of the Fourier series, by joint"),
+    "base_frequency_hz": Key(number("positive"), "of the first one; default one over the duration"),
 }
 STUDY: Keys = {
     "estimators": Key(several(choice((*METHODS, "discover")))),
@@ -209,6 +217,12 @@ def limits_keys(joints: int, drives: int) -> Keys:
         "speed": Key(by_joint(number("positive"), joints), "largest speed"),
         "force": Key(by_joint(number("positive"), drives, "drive"), "largest command, in its units"),
     }
+
+
+def design_keys(joints: int) -> Keys:
+    """Keys of [design]."""
+    most = Key(by_joint(number("positive"), joints), "largest acceleration")
+    return {**DESIGN, "acceleration": most}
 
 
 def simulation_keys(joints: int) -> Keys:
