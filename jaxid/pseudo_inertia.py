@@ -53,3 +53,39 @@ def moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[np.nda
     """
     place = jnp.eye(4).at[:3, :3].set(axes).at[:3, 3].set(origin)
     return np.asarray(ten_parameters(place @ pseudo_inertia(jnp.eye(10)) @ place.T)).T
+
+
+def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
+    """Coordinates in which every body of positive density, and nothing else, is a point of all space.
+
+    Half the logarithm of the mass; the centre of mass x, y, z [m]; and of the upper triangular A with
+    A A' the spread about it (integral of r r' over the mass, by mass) the logarithms of the diagonal, and
+    entries 12, 13, 23.
+
+    Args:
+        ten: In the order of `TEN`, of a body.
+
+    Source:
+        Rucker & Wensing (2022), IEEE RA-L 7(2); their s is here an entry of A itself.
+    """
+    m = ten[0]
+    centre = ten[1:4] / m
+    s = pseudo_inertia(ten)[:3, :3] / m - centre[:, None] * centre
+    # Written out: a factorisation of LAPACK's does not go into loops and batches.
+    a33 = jnp.sqrt(s[2, 2])
+    a13, a23 = s[0, 2] / a33, s[1, 2] / a33
+    a22 = jnp.sqrt(s[1, 1] - a23**2)
+    a12 = (s[0, 1] - a13 * a23) / a22
+    a11 = jnp.sqrt(s[0, 0] - a12**2 - a13**2)
+    return jnp.concatenate([
+        0.5 * jnp.log(m)[None], centre, jnp.log(jnp.stack([a11, a22, a33])), jnp.stack([a12, a13, a23]),
+    ])
+
+
+def of_log_cholesky(x: Float[Array, " 10"]) -> Float[Array, " 10"]:
+    """The inverse of `log_cholesky`."""
+    zero = jnp.zeros(())
+    (a11, a22, a33), (a12, a13, a23) = jnp.exp(x[4:7]), x[7:]
+    a = jnp.stack([jnp.stack(row) for row in ([a11, a12, a13], [zero, a22, a23], [zero, zero, a33])])
+    whole = jnp.zeros((4, 4)).at[:3, :3].set(a).at[:3, 3].set(x[1:4]).at[3, 3].set(1.0)
+    return ten_parameters(jnp.exp(2 * x[0]) * jnp.sum(whole[:, None] * whole, axis=-1))

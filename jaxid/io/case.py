@@ -26,6 +26,7 @@ from jaxid.io.case_entries import (
 from jaxid.io.case_reference import read_signal, read_unknown_reference
 from jaxid.io.case_tables import (
     ALGEBRAIC,
+    IDENTIFICATION,
     OUTPUT_ERROR,
     PLANNED_CONTROLLERS,
     STUDY,
@@ -76,6 +77,7 @@ class Case:
         transmission: R, rows of numbers; joint = R^-1 motor.
         log: [log], as `jaxid.io.log.read_log` takes it; empty where it is absent.
         preprocess: [preprocess], for `jaxid.preprocess.choose_recipe`.
+        identification: [identification], for `jaxid.estimators`.
         algebraic: [algebraic], for the estimators of that name.
         output_error: [output_error], likewise.
         recursive: [recursive], likewise.
@@ -99,6 +101,7 @@ class Case:
     transmission: tuple[tuple[float, ...], ...] | None = None
     log: dict[str, Any] = field(default_factory=dict)
     preprocess: dict[str, Any] = field(default_factory=dict)
+    identification: dict[str, Any] = field(default_factory=dict)
     algebraic: dict[str, Any] = field(default_factory=dict)
     output_error: dict[str, Any] = field(default_factory=dict)
     recursive: dict[str, Any] = field(default_factory=dict)
@@ -185,6 +188,7 @@ def load_case(path: str | Path) -> Case:
         transmission=actuator.get("transmission"),
         log=_log(tables, plant, file),
         preprocess=_checked_preprocess(read("preprocess", preprocess_keys(joints)), file),
+        identification=read("identification", IDENTIFICATION),
         algebraic=read("algebraic", ALGEBRAIC),
         output_error=_checked_output_error(read("output_error", OUTPUT_ERROR), file),
         recursive=_apart(

@@ -53,6 +53,7 @@ TOP = {
     "actuator": False,
     "log": False,
     "preprocess": False,
+    "identification": False,
     "algebraic": False,
     "output_error": False,
     "recursive": False,
@@ -102,6 +103,9 @@ DESIGN: Keys = {
     "criterion": Key(choice(CRITERIA)),
     "harmonics": Key(whole(2), "of the Fourier series, by joint"),
     "base_frequency_hz": Key(number("positive"), "of the first one; default one over the duration"),
+}
+IDENTIFICATION: Keys = {
+    "physically_consistent": Key(flag, "whether links must be what bodies can be"),
 }
 STUDY: Keys = {
     "estimators": Key(several(choice((*METHODS, "discover")))),
