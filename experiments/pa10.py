@@ -351,8 +351,8 @@ def tracking(folder: Path) -> None:
 
 STUDIES: dict[str, Callable[[Path], None]] = {
     f.__name__: f for f in (
-        pa10_arm.dependencies, pa10_arm.excitation, frictions, situations, limit_cycle, dominant, same_logs,
-        tracking,
+        pa10_arm.dependencies, pa10_arm.excitation, pa10_arm.identification, frictions, situations,
+        limit_cycle, dominant, same_logs, tracking,
     )
 }
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxid.estimators.interior import inner_start
 from jaxid.parameters import Parameters
 from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky
 
@@ -186,6 +187,7 @@ def levenberg_marquardt(
         columns = jax.jacfwd(residual)(theta).reshape(-1, theta.size)
         rest = residual(theta).ravel() - columns @ theta
         residual = lambda theta: columns @ theta + rest
+        theta = inner_start(columns, rest, theta, transform.bodies, eliminated)
     if transform.bodies:
         tolerance = max(tolerance, _BODY_TOLERANCE)
     max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
