@@ -1,8 +1,8 @@
-"""The PA-10's first joint: friction compensation, the dominant-inertia method, and why it fails.
+"""The PA-10: what an arm's torques tell, friction compensation, the dominant-inertia method and its failure.
 
 "PA-10 traineeship": a joint is let go under a law that compensates its friction, K_p q is added, and the
-inertia is read off the period of what swings. The joint is an exact-friction simulator that shares no code
-with jaxid; its friction crosses the report's K_d = -12 at 1.2 rad/s, as theirs did.
+inertia is read off the period of what swings. The joint, the first, is an exact-friction simulator that
+shares no code with jaxid; its friction crosses the report's K_d = -12 at 1.2 rad/s, as theirs did.
 
     python experiments/pa10.py [-o FOLDER] [--only NAME]
 """
@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pa10_arm
 import pa10_figures
 from common import Table, parser_of
 
@@ -349,7 +350,10 @@ def tracking(folder: Path) -> None:
 
 
 STUDIES: dict[str, Callable[[Path], None]] = {
-    f.__name__: f for f in (frictions, situations, limit_cycle, dominant, same_logs, tracking)
+    f.__name__: f for f in (
+        pa10_arm.dependencies, pa10_arm.excitation, pa10_arm.identification, frictions, situations,
+        limit_cycle, dominant, same_logs, tracking,
+    )
 }
 
 

@@ -7,12 +7,12 @@ from jaxid import _platform
 _platform.configure()
 
 if TYPE_CHECKING:
-    from jaxid.design import design as design
     from jaxid.discovery.discover import discover as discover
     from jaxid.effects import EFFECTS as EFFECTS
     from jaxid.effects import register as register_effect  # noqa: F401
     from jaxid.errors import InputError as InputError
     from jaxid.estimators.real_time import RealTime as RealTime
+    from jaxid.experiment import design as design
     from jaxid.io.case import load_case as load_case
     from jaxid.io.log import Log as Log
     from jaxid.io.log import read_log as read_log
@@ -29,7 +29,7 @@ _HOMES = {
     "identify": ("jaxid.identification", "identify"),
     "simulate": ("jaxid.virtual", "simulate"),
     "check": ("jaxid.checks", "check"),
-    "design": ("jaxid.design", "design"),
+    "design": ("jaxid.experiment", "design"),
     "study": ("jaxid.studies.study", "study"),
     "load_case": ("jaxid.io.case", "load_case"),
     "read_log": ("jaxid.io.log", "read_log"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,21 +27,32 @@ class BaseParameters:
     """The base parameters of a plant.
 
     Args:
-        names: Of its standard parameters, as in results: "mass[1]".
+        standard: Its standard parameters: field of the plant, and entry from 0 (None: it is one number).
         chosen: Which of them stand for a base parameter; the others are regrouped into these.
         mapping: From standard to base parameters, (base, standard): base = mapping @ standard.
-        singular_values: Of the regressor on the random states, its columns normed, largest first.
+        singular_values: Of the regressor on the random states, its columns normed, largest first; None
+            where the base parameters come from rules.
     """
 
-    names: tuple[str, ...]
+    standard: tuple[tuple[str, int | None], ...]
     chosen: tuple[int, ...]
     mapping: Float[np.ndarray, "base standard"]
-    singular_values: Float[np.ndarray, " standard"]
+    singular_values: Float[np.ndarray, " standard"] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the standard parameters, as in results: "mass[1]"."""
+        return tuple(_name(place) for place in self.standard)
 
     @property
     def chosen_names(self) -> tuple[str, ...]:
         """Names of the standard parameters that stand for a base parameter."""
         return tuple(self.names[k] for k in self.chosen)
+
+    @property
+    def places(self) -> tuple[tuple[str, int | None], ...]:
+        """Field of the plant and entry of those that stand for a base parameter."""
+        return tuple(self.standard[k] for k in self.chosen)
 
     @property
     def without_effect(self) -> tuple[str, ...]:
@@ -50,7 +61,7 @@ class BaseParameters:
 
     def of(self, plant: Plant) -> Float[np.ndarray, " base"]:
         """Base parameters of a plant of this structure, in the units of those that stand for them."""
-        return self.mapping @ standard_parameters(plant)[1]
+        return self.mapping @ _values(plant, self.standard)
 
     def text(self, digits: int = 6) -> list[str]:
         """Each base parameter as a sum of standard ones, one line each."""
@@ -64,15 +75,22 @@ class BaseParameters:
 
 def standard_parameters(plant: Plant) -> tuple[tuple[str, ...], Float[np.ndarray, " standard"]]:
     """Names and values of all parameters of a plant that carry force, joint by joint from the base out."""
-    places = _places(plant)
-    names = tuple(name if k is None else f"{name}[{k + 1}]" for name, k in places)
-    values = [np.asarray(getattr(plant, name)) for name, _ in places]
-    values = [v if k is None else v[k] for v, (_, k) in zip(values, places, strict=True)]
-    return names, np.asarray(values, dtype=np.float64)
+    places = standard_places(plant)
+    return tuple(_name(place) for place in places), _values(plant, places)
 
 
-def _places(plant: Plant) -> list[tuple[str, int | None]]:
-    """Name and entry of each such parameter, those to leave out behind the others of their joint."""
+def _name(place: tuple[str, int | None]) -> str:
+    name, k = place
+    return name if k is None else f"{name}[{k + 1}]"
+
+
+def _values(plant: Plant, places: Iterable[tuple[str, int | None]]) -> Float[np.ndarray, " standard"]:
+    values = [(np.asarray(getattr(plant, name)), k) for name, k in places]
+    return np.asarray([v if k is None else v[k] for v, k in values], dtype=np.float64)
+
+
+def standard_places(plant: Plant) -> tuple[tuple[str, int | None], ...]:
+    """Field and entry of each such parameter, those to leave out behind the others of their joint."""
     infos = {
         name: info for name, info in parameters_of(type(plant)).items()
         if carries_force(info) and getattr(plant, name) is not None
@@ -81,10 +99,11 @@ def _places(plant: Plant) -> list[tuple[str, int | None]]:
     order = [*(n for n in infos if n not in last), *(n for n in last if n in infos)]
     single = [(name, None) for name in order if infos[name].more is None]
     longest = max((plant.joints + i.more for i in infos.values() if i.more is not None), default=0)
-    return single + [
+    listed = (
         (name, k) for k in range(longest) for name in order
         if infos[name].more is not None and k < plant.joints + infos[name].more
-    ]
+    )
+    return (*single, *listed)
 
 
 def inertial_regressor(
@@ -96,8 +115,7 @@ def inertial_regressor(
         plant: The plant; `inertial` must be linear in them.
         q, qd, qdd: States [rad or m, and per s and s^2].
     """
-    places = _places(plant)
-    return _regressor(plant, tuple(places), jnp.asarray(q), jnp.asarray(qd), jnp.asarray(qdd))
+    return _regressor(plant, standard_places(plant), jnp.asarray(q), jnp.asarray(qd), jnp.asarray(qdd))
 
 
 @eqx.filter_jit
@@ -113,7 +131,9 @@ def _regressor(plant: Plant, places: tuple, q: Array, qd: Array, qdd: Array) -> 
     return jnp.stack([own[n] if k is None else own[n][..., k] for n, k in places], axis=-1)
 
 
-def base_parameters(plant: Plant, seed: int = 0, keep: Sequence[str] = ()) -> BaseParameters:
+def base_parameters(
+    plant: Plant, seed: int = 0, keep: Sequence[str] = (), known: Sequence[str] = ()
+) -> BaseParameters:
     """Find the base parameters of a plant by the rank of its regressor on random states.
 
     Columns are taken in order from the base to the tip, and left out where they are sums of those
@@ -123,6 +143,8 @@ def base_parameters(plant: Plant, seed: int = 0, keep: Sequence[str] = ()) -> Ba
         plant: The plant; values of its parameters do not matter, its geometry does.
         seed: Of the random states.
         keep: Names to take before all others, so that they stand for a base parameter if they can.
+        known: Names of parameters whose values are known ("mass[1]", or "mass" for that of every link): the
+            base parameters are then sums of the others alone.
 
     Returns:
         The base parameters.
@@ -134,18 +156,21 @@ def base_parameters(plant: Plant, seed: int = 0, keep: Sequence[str] = ()) -> Ba
     Source:
         Gautier (1991), J. Robotic Systems 8(4), for the choice by QR; Khalil & Dombre (2002), chapter 9.
     """
-    names, _ = standard_parameters(plant)
-    unknown = [name for name in keep if name not in names]
-    if unknown:
-        raise ValueError(f"{unknown[0]} is none of the plant's parameters: {', '.join(names)}.")
+    places = standard_places(plant)
+    names = [_name(place) for place in places]
+    wrong = [n for n in (*keep, *known) if n not in names and (n in keep or n not in dict(places))]
+    if wrong:
+        raise ValueError(f"{wrong[0]} is none of the plant's parameters: {', '.join(names)}.")
     columns = _columns(plant, len(names), np.random.default_rng(seed))
+    left = [k for k, (name, _) in enumerate(places) if not {name, names[k]} & set(known)]
+    columns, places, names = columns[:, left], tuple(places[k] for k in left), [names[k] for k in left]
     norm = np.linalg.norm(columns, axis=0)
     norm[norm <= _DEPENDENT * norm.max()] = np.inf
     scaled = columns / norm
     triangle = np.abs(np.diagonal(scipy.linalg.qr(scaled, mode="r", pivoting=True)[0]))
     rank = int(np.sum(triangle > _DEPENDENT))
     order = [*(names.index(n) for n in keep), *(k for k, n in enumerate(names) if n not in keep)]
-    chosen = tuple(sorted(_independent(scaled, order)))
+    chosen = tuple(sorted(independent(scaled, order)))
     if len(chosen) != rank:
         raise ValueError(
             f"{len(chosen)} columns are independent one by one, {rank} together: a length or an angle of the "
@@ -153,11 +178,14 @@ def base_parameters(plant: Plant, seed: int = 0, keep: Sequence[str] = ()) -> Ba
         )
     mapping = np.linalg.lstsq(scaled[:, chosen], scaled, rcond=None)[0] * norm[list(chosen), None] ** -1
     mapping = mapping * np.where(np.isinf(norm), 0.0, norm)
-    # Rounding of what is nothing, or a whole number, such as 2 d m Z's first factor over d.
-    mapping[np.abs(mapping) < 1e-10 * np.abs(mapping).max()] = 0.0
+    return BaseParameters(places, chosen, tidied(mapping), np.linalg.svd(scaled, compute_uv=False))
+
+
+def tidied(mapping: Float[np.ndarray, "base standard"]) -> Float[np.ndarray, "base standard"]:
+    """A mapping without rounding of what is nothing, or a whole number, such as that of 2 d m Z over d."""
+    mapping = np.where(np.abs(mapping) < 1e-10 * np.abs(mapping).max(), 0.0, mapping)
     whole = np.round(mapping)
-    mapping = np.where(np.abs(mapping - whole) < 1e-10, whole, mapping)
-    return BaseParameters(names, chosen, mapping, np.linalg.svd(scaled, compute_uv=False))
+    return np.where(np.abs(mapping - whole) < 1e-10, whole, mapping)
 
 
 def _columns(plant: Plant, unknowns: int, rng: np.random.Generator) -> Float[np.ndarray, "rows standard"]:
@@ -169,7 +197,7 @@ def _columns(plant: Plant, unknowns: int, rng: np.random.Generator) -> Float[np.
     return np.asarray(regressor).reshape(-1, unknowns)
 
 
-def _independent(columns: Float[np.ndarray, "rows standard"], order: Sequence[int]) -> list[int]:
+def independent(columns: Float[np.ndarray, "rows standard"], order: Sequence[int]) -> list[int]:
     """Columns, of norm one or zero, that are no sums of those before, by Gram and Schmidt's method, twice."""
     basis, chosen = np.zeros((len(columns), 0)), []
     for k in order:

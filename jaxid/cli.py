@@ -233,7 +233,7 @@ def _run_design(args: argparse.Namespace) -> int:
 
     path = ready_file(Path(args.o), force=args.force)
     with _progress(args, 4) as tell:
-        from jaxid.design import design
+        from jaxid.experiment import design
 
         found = design(args.case, progress=tell)
     found.save(path)

@@ -51,10 +51,30 @@ class Free:
 
 
 @dataclass(frozen=True)
+class Body:
+    """Unknowns that are the ten parameters of a body, and are fitted as such.
+
+    Args:
+        places: Of each among the unknowns, in the order of `jaxid.pseudo_inertia.TEN`.
+        lower, upper: Bounds on the coordinates of `jaxid.pseudo_inertia.log_cholesky`.
+    """
+
+    places: tuple[int, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Parameters:
-    """The unknowns of a plant, in a fixed order: one scatter, one gather."""
+    """The unknowns of a plant, in a fixed order: one scatter, one gather.
+
+    Args:
+        free: The unknowns.
+        bodies: Those of them that must be what bodies can have.
+    """
 
     free: tuple[Free, ...]
+    bodies: tuple[Body, ...] = ()
 
     @property
     def names(self) -> list[str]:
@@ -89,13 +109,12 @@ class Parameters:
 
     def with_guess(self, theta: Sequence[float]) -> Parameters:
         """The same unknowns, starting elsewhere."""
-        return Parameters(
-            tuple(replace(f, guess=float(v)) for f, v in zip(self.free, theta, strict=True))
-        )
+        free = tuple(replace(f, guess=float(v)) for f, v in zip(self.free, theta, strict=True))
+        return Parameters(free, self.bodies)
 
     def extended(self, more: Sequence[Free]) -> Parameters:
         """These unknowns and more."""
-        return Parameters((*self.free, *more))
+        return Parameters((*self.free, *more), self.bodies)
 
 
 def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:

@@ -176,6 +176,9 @@ _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 # Methods that simulate, and can be told how.
 SIMULATING = ("output_error", "instrumental_variable", "didim")
 
+# Methods that can keep links to what bodies can be: they minimise by the same solver.
+CONSISTENT = ("inverse_dynamics", "power", "algebraic", "output_error")
+
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
     "inverse_dynamics": _inverse_dynamics,
@@ -203,7 +206,22 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
     """
     if method != "output_error":
         need_known_reference(session, f"{method} takes them as they are")
+    if session.case.identification.get("physically_consistent"):
+        return _consistent(method, session, options)
     return METHODS[method](session, **options)
+
+
+def _consistent(method: str, session: Session, options: dict[str, Any]) -> Steps[Estimate]:
+    """A fit of links that bodies can be."""
+    from jaxid.estimators.consistency import need_bodies, with_links
+
+    if method not in CONSISTENT or "prior" in session.case.output_error:
+        asked = f"{method} with a prior" if method in CONSISTENT else method
+        raise InputError(
+            f"physically_consistent does not go with {asked}", where=f"{session.case.path}, [identification]",
+            mend=f"use {', '.join(CONSISTENT)}, or leave it out",
+        )
+    return with_links(METHODS[method](need_bodies(session), **options))
 
 
 def need_known_reference(session: Session, why: str) -> None:

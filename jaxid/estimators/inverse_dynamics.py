@@ -6,6 +6,8 @@ is solved in one step and what is not (a Stribeck velocity, a lag) by a few more
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -206,7 +208,7 @@ def inverse_dynamics_steps(
         theta=np.asarray(fit.theta),
         precision=precision,
         converged=converged,
-        message="converged" if converged else "no convergence within 60 steps",
+        message="converged" if converged else f"no convergence within {int(fit.steps)} steps",
         residual=np.where(rows, e, np.nan),
         samples=int(rows.sum()),
         steps=int(fit.steps),
@@ -221,8 +223,10 @@ def linear_scale(machine: Machine, whole: bool = True) -> tuple[Transform, float
     of the motion has to be found, `whole` being false.
     """
     linear = linear_unknowns(machine) & whole
-    transform = Transform(Transform.of(machine.parameters).log & ~linear)
-    return transform, _UNDAMPED if np.all(linear) else DAMPING
+    transform = Transform.of(machine.parameters)
+    affine = bool(np.all(linear)) and bool(transform.bodies)
+    transform = replace(transform, log=transform.log & ~linear, affine=affine)
+    return transform, _UNDAMPED if np.all(linear) and not transform.bodies else DAMPING
 
 
 def linear_unknowns(machine: Machine) -> Bool[np.ndarray, " p"]:

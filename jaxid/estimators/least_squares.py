@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxid.estimators.interior import inner_start
 from jaxid.parameters import Parameters
+from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky
 
 # At the start, relative to the diagonal of the normal matrix.
 DAMPING = 1e-4
@@ -22,6 +24,10 @@ _TOLERANCE = 1e-12
 # Only a step that is damped by less than this says so: a short one promises little anywhere.
 _FLAT = 1e-8
 _WHOLE = 1e-2
+# Bodies take more evaluations, and have converged earlier: of what no force tells their coordinates go a long
+# way along curves.
+_BODY_STEPS = 500
+_BODY_TOLERANCE = 1e-9
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
 _ROUGH = 1e-6
 _STUCK = 1e3
@@ -34,27 +40,67 @@ class Transform(eqx.Module):
     """Physical values to the scale of the solver and back: one object, one inverse.
 
     What must be positive is fitted as its logarithm (in the force domain only what the balance is not in
-    proportion to); the rest as it is. Scaling to order one is
-    the solver's own (it scales by the columns of the Jacobian).
+    proportion to); the ten parameters of a body as its `log_cholesky`; the rest as it is. Scaling to order
+    one is the solver's own (it scales by the columns of the Jacobian).
+
+    Args:
+        log: Which are fitted as their logarithms, (p,).
+        lower, upper: Bounds on the coordinates of the bodies, (bodies, 10).
+        bodies: Places of their parameters.
+        affine: Whether the residual is known to be affine in the physical values.
     """
 
     log: Bool[Array, " p"]
+    lower: Float[Array, "bodies 10"] = eqx.field(default_factory=lambda: np.zeros((0, 10)))
+    upper: Float[Array, "bodies 10"] = eqx.field(default_factory=lambda: np.zeros((0, 10)))
+    bodies: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
+    affine: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def of(cls, parameters: Parameters) -> Transform:
         """The transform of a set of unknowns."""
-        return cls(np.asarray([f.sign == "positive" for f in parameters.free], dtype=bool))
+        log = np.asarray([f.sign == "positive" for f in parameters.free], dtype=bool)
+        bodies = parameters.bodies
+        bounds = (np.array([getattr(b, s) for b in bodies]).reshape(-1, 10) for s in ("lower", "upper"))
+        return cls(log, *bounds, tuple(b.places for b in bodies))
 
     def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
         """Physical to solver."""
-        return jnp.where(self.log, jnp.log(jnp.where(self.log, theta, 1.0)), theta)
+        return self._with_bodies(
+            jnp.where(self.log, jnp.log(jnp.where(self.log, theta, 1.0)), theta), log_cholesky, theta
+        )
 
     def outward(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Solver to physical."""
-        return jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x)
+        return self._with_bodies(
+            jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x), of_log_cholesky, x
+        )
+
+    def bounds(self, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> tuple[Array, Array]:
+        """Bounds on the physical values as those of the solver; bodies keep to their own."""
+        plain = Transform(self.log)
+        out = []
+        for bound, own in ((lower, self.lower), (upper, self.upper)):
+            bound = plain.inward(bound)
+            for places, values in zip(self.bodies, own, strict=True):
+                bound = bound.at[np.array(places)].set(values)
+            out.append(bound)
+        return out[0], out[1]
+
+    def physical(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
+        """A Jacobian in the solver's values as one in the physical ones, at some of these."""
+        out = jacobian / self.slope(theta)
+        for places in map(np.array, self.bodies):
+            out = out.at[:, places].set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
+        return out
+
+    def _with_bodies(self, out: Array, f: Callable[[Array], Array], values: Array) -> Array:
+        for places in map(np.array, self.bodies):
+            out = out.at[places].set(f(values[places]))
+        return out
 
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """D physical / d solver, for Jacobians."""
+        """D physical / d solver, for Jacobians; of what is part of no body."""
         return jnp.where(self.log, theta, 1.0)
 
 
@@ -123,7 +169,7 @@ class Progress(eqx.Module):
         theta = transform.outward(self.x)
         return Minimum(
             theta, self.cost, self.steps, self.done & jnp.isfinite(self.cost), self.kept[0],
-            self.kept[1] / transform.slope(theta),
+            transform.physical(self.kept[1], theta),
         )
 
 
@@ -134,7 +180,7 @@ def levenberg_marquardt(
     lower: Float[Array, " p"],
     upper: Float[Array, " p"],
     active: Bool[Array, " p"] | None = None,
-    max_steps: int = 60,
+    max_steps: int | None = None,
     keep: bool = True,
     damping: float = DAMPING,
     tolerance: float = _TOLERANCE,
@@ -152,7 +198,7 @@ def levenberg_marquardt(
         transform: Scale of the solver.
         lower, upper: Bounds on the physical values.
         active: Which unknowns may move; absent: all.
-        max_steps: Most evaluations.
+        max_steps: Most evaluations; absent: 60, or with bodies 500.
         keep: Return residual and Jacobian; without, batches need less memory.
         damping: At the start, relative to the diagonal. What is linear asks for none.
         tolerance: It has converged where the cost can fall by no more than this part of itself.
@@ -171,7 +217,15 @@ def levenberg_marquardt(
         )
     # Traced once, for its shape and for its Jacobian.
     residual = jax.jit(residual)
-    bounds = transform.inward(lower), transform.inward(upper)
+    if transform.affine:
+        columns = jax.jacfwd(residual)(theta).reshape(-1, theta.size)
+        rest = residual(theta).ravel() - columns @ theta
+        residual = lambda theta: columns @ theta + rest
+        theta = inner_start(columns, rest, theta, transform.bodies, eliminated)
+    if transform.bodies:
+        tolerance = max(tolerance, _BODY_TOLERANCE)
+    max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
+    bounds = transform.bounds(jnp.asarray(lower), jnp.asarray(upper))
     x0 = jnp.clip(transform.inward(theta), *bounds)
     own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
     size = jax.eval_shape(residual, theta).size if keep else 0

@@ -263,7 +263,8 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str)
     parameters, (measured, counts) = machine.parameters, measured_output(machine, log, on)
     lower, upper = parameters.bounds
     free = np.full(nuisance, np.inf)
-    transform = Transform(np.concatenate([Transform.of(parameters).log, np.zeros(nuisance, bool)]))
+    transform = Transform.of(parameters)
+    transform = replace(transform, log=np.concatenate([transform.log, np.zeros(nuisance, bool)]))
     return (
         replay, parameters.places, machine.plant, measured, np.tile(counts.astype(float), (len(measured), 1)),
         np.concatenate([parameters.guess, np.zeros(nuisance)]), transform,

@@ -27,11 +27,13 @@ from jaxid.io.case_reference import read_signal, read_unknown_reference
 from jaxid.io.case_sensors import read_inertial_sensors
 from jaxid.io.case_tables import (
     ALGEBRAIC,
+    IDENTIFICATION,
     OUTPUT_ERROR,
     STUDY,
     TOP,
     actuator_keys,
     controller_keys,
+    design_keys,
     limits_keys,
     log_keys,
     preprocess_keys,
@@ -75,6 +77,7 @@ class Case:
         transmission: R, rows of numbers; joint = R^-1 motor.
         log: [log], as `jaxid.io.log.read_log` takes it; empty where it is absent.
         preprocess: [preprocess], for `jaxid.preprocess.choose_recipe`.
+        identification: [identification], for `jaxid.estimators`.
         algebraic: [algebraic], for the estimators of that name.
         output_error: [output_error], likewise.
         recursive: [recursive], likewise.
@@ -84,6 +87,7 @@ class Case:
         limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
         candidates: User's own effects that a search may name, from [discover].
+        design: [design], for `jaxid.excitation`.
         reference: [reference], for `jaxid.references.make_reference`, at its guesses.
         unknown_reference: What of it is unknown.
         input: [input], likewise.
@@ -98,6 +102,7 @@ class Case:
     transmission: tuple[tuple[float, ...], ...] | None = None
     log: dict[str, Any] = field(default_factory=dict)
     preprocess: dict[str, Any] = field(default_factory=dict)
+    identification: dict[str, Any] = field(default_factory=dict)
     algebraic: dict[str, Any] = field(default_factory=dict)
     output_error: dict[str, Any] = field(default_factory=dict)
     recursive: dict[str, Any] = field(default_factory=dict)
@@ -107,6 +112,7 @@ class Case:
     limits: dict[str, Any] = field(default_factory=dict)
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
+    design: dict[str, Any] = field(default_factory=dict)
     reference: dict[str, Any] | None = None
     unknown_reference: dict[str, Value] = field(default_factory=dict)
     input: dict[str, Any] | None = None
@@ -184,6 +190,7 @@ def load_case(path: str | Path) -> Case:
         transmission=actuator.get("transmission"),
         log=_log(tables, plant, file),
         preprocess=_checked_preprocess(read("preprocess", preprocess_keys(joints)), file),
+        identification=read("identification", IDENTIFICATION),
         algebraic=read("algebraic", ALGEBRAIC),
         output_error=_checked_output_error(read("output_error", OUTPUT_ERROR), file),
         recursive=_apart(
@@ -195,6 +202,7 @@ def load_case(path: str | Path) -> Case:
         limits=read("limits", limits_keys(joints, drives)),
         validations=_validations(tables, plant, path),
         candidates=read_candidates(tables.get("discover", {}), path),
+        design=read("design", design_keys(joints)),
         reference=read_signal("reference", tables | followed, drives, file),
         unknown_reference=unknown,
         input=read_signal("input", tables, drives, file),
@@ -310,7 +318,7 @@ def _log(tables: Mapping[str, Any], plant: PlantEntry, file: str) -> dict[str, A
     if "log" not in tables:
         return {}
     spot = Spot(file, "[log]")
-    keys = log_keys(plant.joints, plant.drives)
+    keys = log_keys(plant.joints, plant.drives, plant.names)
     keys |= {name: Key(keys[name].read, keys[name].doc, True) for name in ("position", "force")}
     return _check_time(read_table(tables["log"], keys, spot), spot)
 
@@ -339,7 +347,7 @@ def _validations(tables: Mapping[str, Any], plant: PlantEntry, path: Path) -> tu
     found: list[Validation] = []
     for k, table in enumerate(tables.get("validation", []), start=1):
         spot = Spot(str(path), f"[[validation]] {k}")
-        given = read_table(table, validation_keys(plant.joints, plant.drives), spot)
+        given = read_table(table, validation_keys(plant.joints, plant.drives, plant.names), spot)
         if given["name"] in [v.name for v in found]:
             raise spot.at("name").refuse(given["name"], "is taken", "give each its own name")
         columns = {key: value for key, value in given.items() if key in LOG_KEYS}

@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.io.case_links import LINKED, count_links, read_links, read_shafts
+from jaxid.io.case_links import LINKED, check_links, read_links, read_links_of_urdf, read_shafts
 from jaxid.io.case_places import check_places, read_ports
 from jaxid.io.case_tables import PLANT
 from jaxid.io.case_values import Value, read_value, read_values
@@ -48,6 +48,7 @@ class PlantEntry:
         joints: How many there are.
         actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
         options: What else its class takes, by field: the geometry and the shafts of an arm.
+        names: Of its joints, where these have any: in a URDF file.
     """
 
     cls: type[Plant]
@@ -58,6 +59,7 @@ class PlantEntry:
     joints: int
     actuated: tuple[int, ...] | None = None
     options: dict[str, Any] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
 
     @property
     def drives(self) -> int:
@@ -127,18 +129,27 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
 
 
 def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot) -> PlantEntry:
-    """[plant] of an arm, which [[plant.links]] describe."""
-    joints = count_links(table, spot)
+    """[plant] of an arm, which [[plant.links]] or a URDF file describe."""
     # Weight is a vector there, and acts whichever way the arm stands.
     own = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
     given = read_table(table, {**own, **LINKED}, spot)
-    parameters, geometry = read_links(table["links"], cls, spot.file)
+    names: tuple[str, ...] = ()
+    if "urdf" in given:
+        parameters, arm = read_links_of_urdf(given, cls, spot)
+        geometry, names = arm.geometry, arm.names
+    else:
+        of_file = [name for name in ("tip", "unknown") if name in given]
+        if of_file:
+            raise spot.at(of_file[0]).fault("goes with urdf only", 'add urdf = "<its file>", or leave it out')
+        check_links(table, spot)
+        parameters, geometry = read_links(table["links"], cls, spot.file)
     options = {name: given[name] for name in ("gravity_vector",) if name in given}
     if "shafts" in table:
         options["shafts"] = read_shafts(table["shafts"], geometry, spot)
     units = Units(given.get("motion", cls.usual_motion), **given.get("units", {}))
     return PlantEntry(
-        cls, parameters, units, False, None, joints, cls.actuated, {"geometry": geometry, **options}
+        cls, parameters, units, False, None, len(geometry.joints), cls.actuated,
+        {"geometry": geometry, **options}, names,
     )
 
 

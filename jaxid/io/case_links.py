@@ -1,15 +1,21 @@
-"""[[plant.links]] of a case: the links of an arm, from the base to the tip."""
+"""The links of an arm, from the base to the tip: [[plant.links]] of a case, or a URDF file that it names."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from jaxid.io.case_places import check_places
 from jaxid.io.case_values import Value, read_value, read_values
-from jaxid.io.schema import Key, Keys, Spot, choice, number, read_table, several, whole
+from jaxid.io.schema import Key, Keys, Spot, choice, number, read_table, several, text, whole
+from jaxid.io.urdf import Urdf, read_urdf
 from jaxid.model import Plant, parameters_of
-from jaxid.plants.denavit_hartenberg import JOINTS, DenavitHartenberg
+from jaxid.plants.denavit_hartenberg import DenavitHartenberg
+from jaxid.plants.geometry import JOINTS, Geometry
+from jaxid.regrouping import base_parameters_by_rules
 
 # Chosen: beyond any arm; what lies behind it is a slip.
 _MOST_LINKS = 50
@@ -28,29 +34,35 @@ _SHAFT: Keys = {
     "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
     "ratios": Key(several(number()), "by how much, a number a joint; 1 each where absent"),
 }
+# Below it the sine of an angle of a URDF file is nothing: 1.5708 stands there for a right angle.
+_ANGLE = 1e-4
+# What of the links that a URDF file describes is to be identified.
+UNKNOWN = ("none", "base", "all")
 # Keys of [plant] that only an arm has.
 LINKED: Keys = {
-    "links": Key(lambda value, spot: value, "a table [[plant.links]] for each link", True),
+    "links": Key(lambda value, spot: value, "a table [[plant.links]] for each link"),
+    "urdf": Key(text, "file that describes the arm, relative to the case"),
+    "tip": Key(text, "name of its last link in that file"),
+    "unknown": Key(choice(UNKNOWN), "which parameters of its links"),
     "shafts": Key(lambda value, spot: value, "a table [[plant.shafts]] for each"),
     "gravity_vector": Key(several(number(), shortest=3, longest=3), "in the frame of the base [m/s^2]"),
 }
 
 
-def count_links(table: dict[str, Any], spot: Spot) -> int:
-    """How many links [plant] has.
+def check_links(table: dict[str, Any], spot: Spot) -> None:
+    """Refuse a [plant] without links.
 
     Raises:
         InputError: If there is none, or no table is where one should be.
     """
     links = table.get("links")
     if links is None:
-        mend = "add a table [[plant.links]] for each, from the base to the tip"
+        mend = 'add a table [[plant.links]] for each, from the base to the tip, or urdf = "<its file>"'
         raise spot.fault("'links' is missing", mend)
     if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
         raise spot.at("links").fault("is not a list of tables", "write [[plant.links]], in double brackets")
     if not 1 <= len(links) <= _MOST_LINKS:
         raise spot.at("links").fault(f"has {len(links)} entries", f"an arm has 1 to {_MOST_LINKS}")
-    return len(links)
 
 
 def read_links(
@@ -77,8 +89,40 @@ def read_links(
     return {name: tuple(values) for name, values in parameters.items()}, DenavitHartenberg.of_rows(rows)
 
 
+def read_links_of_urdf(
+    given: dict[str, Any], cls: type[Plant], spot: Spot
+) -> tuple[dict[str, tuple[Value, ...]], Urdf]:
+    """The same of the URDF file that [plant] names: parameters of the links, and what the file says.
+
+    Raises:
+        InputError: If [plant] describes the links as well, or the file no arm.
+    """
+    if "links" in given:
+        raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
+    arm = read_urdf(Path(spot.file).parent / given["urdf"], given.get("tip"))
+    if len(arm.names) > _MOST_LINKS:
+        raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {_MOST_LINKS}")
+    unknown, names = given.get("unknown", "none"), ("mass", *_LISTS["first_moment"], *_LISTS["inertia"])
+    values = dict(zip(names, arm.bodies.T, strict=True))
+    free = {name: np.full(len(arm.names), unknown == "all") for name in names}
+    if unknown == "base":
+        weight = {name: given[name] for name in ("gravity_vector",) if name in given}
+        plant = cls(**values, geometry=arm.geometry, **weight)
+        if not np.any(np.asarray(plant.gravity_vector)):
+            mend = 'state a gravity_vector other than zero, or unknown = "all"'
+            raise spot.at("unknown").refuse("base", "needs weight", mend)
+        base = base_parameters_by_rules(plant, _ANGLE)
+        values = {name: np.zeros(len(arm.names)) for name in names}
+        for (name, k), value in zip(base.places, base.of(plant), strict=True):
+            values[name][k], free[name][k] = value, True
+    return {
+        name: tuple(Value(float(v), bool(f)) for v, f in zip(values[name], free[name], strict=True))
+        for name in names
+    }, arm
+
+
 def read_shafts(
-    shafts: Any, geometry: DenavitHartenberg, spot: Spot
+    shafts: Any, geometry: Geometry, spot: Spot
 ) -> tuple[tuple[float, ...], ...]:
     """[[plant.shafts]]: by how much each turns with every joint.
 

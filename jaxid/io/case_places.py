@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from jaxid.errors import suggest
 from jaxid.io.schema import Spot, count, several, whole
 from jaxid.model import PLACES, Effect
 
@@ -59,7 +60,7 @@ def read_ports(
             raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", mend)
         return tuple(before + k for k in _places(table, name, there[name], spot)), name
     if "joint" in table:
-        chosen = _places(table, "joint", parts, spot)
+        chosen = _places(_numbered(table, plant.names, spot), "joint", parts, spot)
         undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]
         if cls.in_drive and undriven:
             driven = ", ".join(str(k + 1) for k in plant.actuated)
@@ -71,6 +72,21 @@ def read_ports(
     if cls.in_drive and plant.actuated is not None:
         return plant.actuated, "joint"
     return tuple(range(parts)), "joint"
+
+
+def _numbered(table: dict[str, Any], names: tuple[str, ...], spot: Spot) -> dict[str, Any]:
+    """The table with joints by number, of which a URDF file has told the names.
+
+    Raises:
+        InputError: If it names one that is not there.
+    """
+    given = table["joint"]
+    listed = given if isinstance(given, list) else [given]
+    for name in listed:
+        if names and isinstance(name, str) and name not in names:
+            raise spot.at("joint").refuse(name, "is no joint of the arm", suggest(name, names))
+    numbers = [names.index(j) + 1 if names and isinstance(j, str) else j for j in listed]
+    return table | {"joint": numbers if isinstance(given, list) else numbers[0] if numbers else given}
 
 
 def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[int, ...]:

@@ -40,6 +40,8 @@ METHODS = (
     "output_error",
     "didim",
 )
+# What a trajectory of `jaxid design` is improved for.
+CRITERIA = ("determinant", "condition")
 DERIVATIVES = ("central", "spectral", "parabolic")
 # Tables at the top of a case, in the order in which they are checked; [[ ]] where it may recur.
 TOP = {
@@ -48,6 +50,7 @@ TOP = {
     "actuator": False,
     "log": False,
     "preprocess": False,
+    "identification": False,
     "algebraic": False,
     "output_error": False,
     "recursive": False,
@@ -57,6 +60,7 @@ TOP = {
     "limits": False,
     "validation": True,
     "discover": False,
+    "design": False,
     "reference": False,
     "input": False,
     "simulation": False,
@@ -99,6 +103,14 @@ OUTPUT_ERROR: Keys = {
     "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),
     "profile": Key(flag, "profile likelihoods of what is fitted"),
 }
+DESIGN: Keys = {
+    "criterion": Key(choice(CRITERIA)),
+    "harmonics": Key(whole(2), "of the Fourier series, by joint"),
+    "base_frequency_hz": Key(number("positive"), "of the first one; default one over the duration"),
+}
+IDENTIFICATION: Keys = {
+    "physically_consistent": Key(flag, "whether links must be what bodies can be"),
+}
 STUDY: Keys = {
     "estimators": Key(several(choice((*METHODS, "discover")))),
     "hidden": Key(several(text)),
@@ -112,29 +124,29 @@ STUDY: Keys = {
 }
 
 
-def log_keys(joints: int, drives: int) -> Keys:
-    """Keys of [log]."""
-    names = Key(columns(joints), "name of its column")
-    of_drives = Key(columns(drives, "drive"), "name of its column")
+def log_keys(joints: int, drives: int, names: tuple[str, ...] = ()) -> Keys:
+    """Keys of [log]; columns may go by the names of the joints, where these have any."""
+    of_joints = Key(columns(joints, names=names), "name of its column")
+    of_drives = Key(columns(drives, "drive", names), "name of its column")
     return {
         "time": Key(text, "name of its column"),
         "sample_rate": Key(number("positive"), "samples per second"),
-        "position": names,
+        "position": of_joints,
         "force": of_drives,
         "hold": Key(choice(HOLDS)),
         "rows": Key(rows),
-        **{k: of_drives if k == "reference" else names for k in OPTIONAL_COLUMNS},
+        **{k: of_drives if k == "reference" else of_joints for k in OPTIONAL_COLUMNS},
     }
 
 
-def validation_keys(joints: int, drives: int) -> Keys:
+def validation_keys(joints: int, drives: int, names: tuple[str, ...] = ()) -> Keys:
     """Keys of [[validation]]."""
     own = {
         "name": Key(text, "what it is called in results", required=True),
         "log": Key(text, "its file, relative to the case"),
         "disturbance": Key(DISTURBANCE),
     }
-    return {**own, **log_keys(joints, drives)}
+    return {**own, **log_keys(joints, drives, names)}
 
 
 def actuator_keys(drives: int) -> Keys:
@@ -216,6 +228,12 @@ def limits_keys(joints: int, drives: int) -> Keys:
         "speed": Key(by_joint(number("positive"), joints), "largest speed"),
         "force": Key(by_joint(number("positive"), drives, "drive"), "largest command, in its units"),
     }
+
+
+def design_keys(joints: int) -> Keys:
+    """Keys of [design]."""
+    most = Key(by_joint(number("positive"), joints), "largest acceleration")
+    return {**DESIGN, "acceleration": most}
 
 
 def simulation_keys(joints: int) -> Keys:

@@ -268,16 +268,29 @@ def stretch(joints: int) -> Reader:
     return read_either
 
 
-def columns(joints: int, what: str = "joint") -> Reader:
-    """Names of columns: one (which may hold a matrix), or one a joint or drive; as they are written."""
+def columns(joints: int, what: str = "joint", names: tuple[str, ...] = ()) -> Reader:
+    """Names of columns: one (which may hold a matrix), or one a joint or drive; as they are written.
+
+    Where the joints have names, these may stand in front: { elbow = "q3", ... }, in any order.
+    """
 
     def read(value: Any, spot: Spot) -> str | list[str]:
+        if names and isinstance(value, dict):
+            lost = [name for name in names if name not in value]
+            if lost:
+                mend = f"add {lost[0]} = <its column>; the joints are {', '.join(names)}"
+                raise spot.fault(f"names no column for joint '{lost[0]}'", mend)
+            other = [name for name in value if name not in names]
+            if other:
+                raise spot.fault(f"names a joint '{other[0]}', which there is not", suggest(other[0], names))
+            value = [value[name] for name in names]
         if isinstance(value, list) and value:
-            names = several(text)(value, spot)
-            if len(names) not in (1, joints) or len(set(names)) < len(names):
-                mend = f"name {count(joints, 'column')}, one a {what}, each once"
+            given = several(text)(value, spot)
+            if len(given) not in (1, joints) or len(set(given)) < len(given):
+                listed = f" ({', '.join(names)})" if names else ""
+                mend = f"name {count(joints, 'column')}, one a {what}{listed}, each once"
                 raise spot.refuse(value, f"does not fit {count(joints, what)}", mend)
-            return list(names)
+            return list(given)
         if not isinstance(value, str) or not value:
             mend = f'give the name of a column: {spot.key} = "..."'
             raise spot.refuse(value, "names no column", mend)

@@ -9,6 +9,7 @@ from jaxid.plants.chain import Chain as Chain
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg as DenavitHartenberg
 from jaxid.plants.five_bar import FiveBar as FiveBar
 from jaxid.plants.flexible_axis import FlexibleAxis as FlexibleAxis
+from jaxid.plants.geometry import JointFrames as JointFrames
 from jaxid.plants.micropositioning_stage import MicropositioningStage as MicropositioningStage
 from jaxid.plants.micropositioning_stage import RigidMicropositioningStage as RigidMicropositioningStage
 from jaxid.plants.pa10 import pa10 as pa10

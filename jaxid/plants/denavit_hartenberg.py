@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.model import as_array
+from jaxid.plants.geometry import Geometry
 
-JOINTS = ("revolute", "prismatic")
 
-
-class DenavitHartenberg(eqx.Module):
+class DenavitHartenberg(Geometry):
     """Frame of each link in the one before it.
 
     Frame j is fixed to link j, z_j along the axis of joint j. From frame j - 1 it is reached by turning
@@ -42,16 +41,9 @@ class DenavitHartenberg(eqx.Module):
     theta: Array = eqx.field(converter=as_array)
 
     def __check_init__(self) -> None:
-        if not self.joints:
-            raise ValueError("an arm has at least one joint; give a row for each.")
-        for k, joint in enumerate(self.joints, start=1):
-            if joint not in JOINTS:
-                raise ValueError(f"joint {k} is {joint!r}; take one of {', '.join(JOINTS)}.")
+        self._check_joints()
         for name in ("alpha", "a", "d", "theta"):
-            shape = np.shape(getattr(self, name))
-            # Trees that JAX fills with markers of its own pass; arrays count.
-            if isinstance(getattr(self, name), (np.ndarray, Array)) and shape[-1:] != (len(self.joints),):
-                raise ValueError(f"{name} has shape {shape}; give {len(self.joints)}, one a joint.")
+            self._check_shape(name, ())
 
     @classmethod
     def of_rows(cls, rows: Sequence[Sequence]) -> DenavitHartenberg:
@@ -66,17 +58,7 @@ class DenavitHartenberg(eqx.Module):
         columns = list(zip(*rows, strict=True)) or [()] * 5
         return cls(columns[0], *(np.asarray(c, dtype=np.float64) for c in columns[1:]))
 
-    @property
-    def revolute(self) -> Float[np.ndarray, " n"]:
-        """One for a revolute joint, zero for a prismatic one."""
-        return np.asarray([float(joint == "revolute") for joint in self.joints])
-
     def frames(self, q: Float[Array, " n"]) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:
-        """Each frame in the one before: its axes, as columns, and its origin [m].
-
-        Args:
-            q: Joint coordinates [rad or m].
-        """
         theta = self.theta + self.revolute * q
         d = self.d + (1.0 - self.revolute) * q
         c, s, ca, sa = jnp.cos(theta), jnp.sin(theta), jnp.cos(self.alpha), jnp.sin(self.alpha)

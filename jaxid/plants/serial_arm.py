@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.model import Effect, Plant, as_array, parameter
-from jaxid.plants.denavit_hartenberg import DenavitHartenberg
+from jaxid.plants.geometry import Geometry
 
 _FIRST = ("inertia*position", "free")
 _SECOND = ("inertia", "free")
@@ -65,7 +65,7 @@ class SerialArm(Plant):
     rotor_inertia: Array | None = parameter(
         "inertia", "nonnegative", "of each drive, seen at the joint", optional=True, more=0
     )
-    geometry: DenavitHartenberg = eqx.field(kw_only=True)
+    geometry: Geometry = eqx.field(kw_only=True)
     shafts: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
     gravity_vector: Array = eqx.field(converter=as_array, default=(0.0, 0.0, -9.81), kw_only=True)
     effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)

@@ -19,6 +19,7 @@ from jaxid.discovery.separate import improved
 from jaxid.discovery.shapes import Shapes, basis
 from jaxid.errors import InputError
 from jaxid.estimators.directions_problem import Prior, residual_of, with_sensor
+from jaxid.excitation import Excitation, excite
 from jaxid.io.case import Case, load_case
 from jaxid.io.output import write_whole
 from jaxid.io.proposals import signal_csv
@@ -100,8 +101,13 @@ def _shown(values: np.ndarray) -> str:
     return ", ".join(f"{v:.3g}" for v in np.ravel(values))
 
 
-def design(case: Case | str | Path, *, progress: Callable[[str], None] = lambda text: None) -> Design:
+def design(
+    case: Case | str | Path, *, progress: Callable[[str], None] = lambda text: None
+) -> Design | Excitation:
     """Find the reference (in a loop) or the input that tells a case's unknowns best, at its guesses.
+
+    Of an arm, and of any case with [design], the reference is taken to be followed: see
+    `jaxid.excitation.excite`. Else:
 
     The logarithm of the information's determinant is raised through the simulation by gradients (D-optimal;
     Bayesian: each guess is a prior of the relative width `[output_error] prior`, 0.5 where absent), over sums
@@ -119,6 +125,9 @@ def design(case: Case | str | Path, *, progress: Callable[[str], None] = lambda 
         Chaloner and Verdinelli (1995), "Bayesian experimental design: a review".
     """
     case = case if isinstance(case, Case) else load_case(case)
+    _check(case)
+    if case.plant.cls.linked or case.design:
+        return excite(case, progress)
     bench = _Bench.of(case)
     progress("looking at sines and tours")
     starts = bench.starts
@@ -140,6 +149,17 @@ def design(case: Case | str | Path, *, progress: Callable[[str], None] = lambda 
     return bench.designed(*best, kept[0][0])
 
 
+def _check(case: Case) -> None:
+    """Refuse a case without what any design needs."""
+    where = str(case.path)
+    for table, key in (("simulation", "duration"), ("simulation", "sample_rate"), ("limits", "stroke"),
+                       ("limits", "speed")):
+        if key not in getattr(case, table):
+            raise InputError(f"[{table}] has no {key}", where=where, mend=f"add {key} = ... to [{table}]")
+    if not build_machine(case, period=1 / float(case.simulation["sample_rate"])).parameters.free:
+        raise InputError("nothing is unknown", where=where, mend="give a parameter as { guess = ... }")
+
+
 @dataclass(frozen=True)
 class _Bench:
     """What a design is tried on."""
@@ -155,15 +175,9 @@ class _Bench:
 
     @classmethod
     def of(cls, case: Case) -> _Bench:
-        setting, where = case.simulation, str(case.path)
-        for table, key in (("simulation", "duration"), ("simulation", "sample_rate"), ("limits", "stroke"),
-                           ("limits", "speed")):
-            if key not in getattr(case, table):
-                raise InputError(f"[{table}] has no {key}", where=where, mend=f"add {key} = ... to [{table}]")
+        setting = case.simulation
         rate, duration = float(setting["sample_rate"]), float(setting["duration"])
         machine = build_machine(case, period=1 / rate)
-        if not machine.parameters.free:
-            raise InputError("nothing is unknown", where=where, mend="give a parameter as { guess = ... }")
         limits = _limits(case, machine)
         period = machine.hold_period or 1 / rate
         every = max(1, round(1 / (rate * period)))

@@ -1,0 +1,60 @@
+"""Least squares among bodies, where the residual is affine: a convex problem, solved from inside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.pseudo_inertia import pseudo_inertia
+
+# Weights of the barrier, each with two Newton steps; the last over the first.
+_WEIGHTS, _LAST = 80, 1e-10
+
+
+def inner_start(
+    columns: Float[Array, "rows p"], rest: Float[Array, " rows"], theta: Float[Array, " p"],
+    bodies: tuple[tuple[int, ...], ...], solve: Callable[[Array, Array], Array],
+) -> Float[Array, " p"]:
+    """The least squares of columns @ theta + rest among bodies, from a body of any kind.
+
+    Minus the logarithms of the determinants of the pseudo-inertias, times a weight that falls, keep what is
+    sought inside. Newton's steps, damped by their own length, never leave it; of what the columns do not
+    tell the bodies nearest the middle are taken.
+
+    Args:
+        columns, rest: The residual.
+        theta: Values that are bodies where they must be.
+        bodies: Places of the ten parameters of each.
+        solve: Of a symmetric positive definite system, (p, p) and (p, k).
+
+    Source:
+        Boyd & Vandenberghe (2004), Convex Optimization, chapters 9.6 and 11, for path and damping.
+    """
+    normal, slope = columns.T @ columns, columns.T @ rest
+    places = np.array(bodies)
+    unit = pseudo_inertia(jnp.eye(10))
+    # What is in no body may stand anywhere, and has no barrier; a trace for what then has no effect.
+    loose = 1e-13 * (jnp.diag(normal) + 1e-300)
+
+    def advance(k: Array, theta: Array) -> Array:
+        weight = first * _LAST ** (k // 2 / _WEIGHTS)
+        gradient, hessian = normal @ theta + slope, normal + jnp.diag(loose)
+        for at in places:
+            inverse = solve(pseudo_inertia(theta[at]), jnp.eye(4))
+            turned = jnp.einsum("ij,ajk->aik", inverse, unit)
+            gradient = gradient.at[at].add(-weight * jnp.einsum("aii->a", turned))
+            hessian = hessian.at[np.ix_(at, at)].add(weight * jnp.einsum("aij,bji->ab", turned, turned))
+        scale = 1.0 / jnp.sqrt(jnp.diag(hessian))
+        step = -scale * solve(hessian * jnp.outer(scale, scale), (scale * gradient)[:, None])[:, 0]
+        fall = -gradient @ step
+        ahead = theta + step / (1.0 + jnp.sqrt(jnp.maximum(fall, 0.0) / weight))
+        # Rounding may spoil a step where the weight is small: what is there is good enough then.
+        return jnp.where(jnp.all(jnp.isfinite(ahead)) & (fall > 0), ahead, theta)
+
+    e = columns @ theta + rest
+    first = 0.5 * e @ e + 1e-300
+    return jax.lax.fori_loop(0, 2 * _WEIGHTS, advance, theta)

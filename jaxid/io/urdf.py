@@ -1,0 +1,327 @@
+"""Arms from URDF files: the chain of joints that such a file describes, and the bodies that they move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError, suggest
+from jaxid.plants.geometry import JointFrames
+
+# What a joint of each type does; None: it holds.
+_TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
+_TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """An open chain of joints.
+
+    Args:
+        names: Of the joints that move, from the base to the tip.
+        geometry: Their frames: the file's, turned such that z is the joint's axis. That of the base is
+            the frame of the file's first link.
+        bodies: Mass, first moments x y z, and inertia tensor xx xy xz yy yz zz about the frame's origin, of
+            what each joint moves up to the next, (n, 10) [kg, kg m, kg m^2].
+    """
+
+    names: tuple[str, ...]
+    geometry: JointFrames
+    bodies: Float[np.ndarray, "n 10"]
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """A joint of the file: what it does (None: it holds), and where in the link before it."""
+
+    name: str
+    motion: str | None
+    parent: str
+    child: str
+    place: np.ndarray
+    axis: np.ndarray
+    mimics: str | None
+
+
+def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
+    """Read an arm from a URDF file.
+
+    What fixed joints join is one body. Joints that do not lie between the first link and the tip are held at
+    zero, and what they carry is part of the body that they stand on. Shapes, limits, transmissions and
+    <dynamics> (friction is what effects are for) are passed over.
+
+    Args:
+        path: The file.
+        tip: Name of the last link; None: there is only one way to go.
+
+    Raises:
+        InputError: If the file cannot be read, is no URDF, describes anything but an open chain, or a body
+            that moves has no mass.
+
+    Source:
+        The URDF's XML specification of ROS; rpy turns about the fixed axes x, y, z in this order.
+    """
+    file = str(path)
+    robot = _tree(Path(path))
+    links = {name: link for name, link in _named(robot, "link", file)}
+    joints = [_joint(name, joint, links, file) for name, joint in _named(robot, "joint", file)]
+    root = _root(links, joints, file)
+    moving = _chain(root, links, joints, tip, file)
+    names, places, bodies, carriers = [], [], [np.zeros(10)], [root]
+    weighed = [False]
+    # Links yet to be visited, each with the body that it is part of, and its frame in the body's.
+    ahead = [(root, 0, np.eye(4))]
+    while ahead:
+        link, body, frame = ahead.pop()
+        inertial = links[link].find("inertial")
+        if inertial is not None:
+            bodies[body] += _inertial(inertial, frame, f"{file}, link '{link}'")
+            weighed[body] = True
+        for joint in (j for j in joints if j.parent == link):
+            if joint.name not in moving:
+                ahead.append((joint.child, body, frame @ joint.place))
+                continue
+            turn = np.eye(4)
+            turn[:3, :3] = _towards(joint.axis)
+            names.append(joint.name)
+            places.append((joint.motion, frame @ joint.place @ turn))
+            bodies.append(np.zeros(10))
+            carriers.append(joint.child)
+            weighed.append(False)
+            ahead.append((joint.child, len(names), turn.T))
+    for k, (body, carrier) in enumerate(zip(bodies, carriers, strict=True)):
+        if k and not body[0] > 0:
+            what = "has no mass" if weighed[k] else "has no <inertial>"
+            mend = "give it, or a link fixed to it, <inertial> with <mass> and <inertia>"
+            where = f"{file}, link '{carrier}'"
+            raise InputError(f"{what}, and joint '{names[k - 1]}' moves it", where=where, mend=mend)
+    geometry = JointFrames(
+        tuple(m for m, _ in places), np.array([p[:3, :3] for _, p in places]),
+        np.array([p[:3, 3] for _, p in places]),
+    )
+    return Urdf(tuple(names), geometry, np.array(bodies[1:]))
+
+
+def _tree(path: Path) -> Element:
+    """The file's root element. Documents that declare entities are refused, for these can fill all memory."""
+    where = str(path)
+
+    def refuse(*args: object) -> None:
+        mend = "take the line <!DOCTYPE ...> out"
+        raise InputError("has a document type declaration", where=where, mend=mend)
+
+    tree, parser = TreeBuilder(), expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = refuse
+    parser.StartElementHandler, parser.EndElementHandler = tree.start, tree.end
+    try:
+        parser.Parse(path.read_bytes(), True)
+    except FileNotFoundError as error:
+        beside = ", ".join(sorted(p.name for p in path.parent.glob("*.urdf"))[:8]) or "none"
+        mend = f"check the path, which starts at the case; URDF files in that folder: {beside}"
+        raise InputError("no such file", where=where, mend=mend) from error
+    except OSError as error:
+        mend = "name a URDF file that may be read"
+        raise InputError(f"cannot be read ({error.strerror})", where=where, mend=mend) from error
+    except (expat.ExpatError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"is not XML: {error}", where=where, mend="mend that line") from error
+    root = tree.close()
+    if root.tag != "robot":
+        mend = "name a URDF file, whose first element is <robot>"
+        raise InputError(f"is no URDF: its first element is <{root.tag}>", where=where, mend=mend)
+    expand = [e.tag for e in root.iter() if "xacro" in e.tag]
+    if expand:
+        mend = "expand it first: xacro arm.urdf.xacro > arm.urdf"
+        raise InputError(f"holds <{expand[0]}>, a macro", where=where, mend=mend)
+    return root
+
+
+def _named(robot: Element, tag: str, file: str) -> Iterator[tuple[str, Element]]:
+    """The links or joints with their names.
+
+    Raises:
+        InputError: If one has no name, or two have one.
+    """
+    taken = set()
+    for k, element in enumerate(robot.findall(tag), start=1):
+        name = element.get("name", "")
+        if not name or name in taken:
+            what = f"<{tag}> {k} has no name" if not name else f"two <{tag}> are named '{name}'"
+            raise InputError(what, where=file, mend="give each a name of its own")
+        taken.add(name)
+        yield name, element
+
+
+def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _Joint:
+    """One joint.
+
+    Raises:
+        InputError: If it is of a type that is no joint of an arm, or joins what is not there.
+    """
+    where = f"{file}, joint '{name}'"
+    kind = joint.get("type", "")
+    if kind not in _TYPES:
+        raise InputError(f"type '{kind}' is none of an arm's joints", where=where, mend=suggest(kind, _TYPES))
+    ends = []
+    for end in ("parent", "child"):
+        element = joint.find(end)
+        link = "" if element is None else element.get("link", "")
+        if link not in links:
+            what = f"<{end}> names no link" if not link else f"there is no link '{link}', its {end}"
+            raise InputError(what, where=where, mend=suggest(link, links))
+        ends.append(link)
+    given = joint.find("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if given is None else _numbers(given, "xyz", 3, where)
+    length = np.linalg.norm(axis)
+    if _TYPES[kind] and not length > 0:
+        raise InputError("<axis> has no length", where=where, mend='write a direction such as xyz="0 0 1"')
+    copied = joint.find("mimic")
+    return _Joint(
+        name, _TYPES[kind], *ends, _place(joint.find("origin"), where), axis / (length or 1.0),
+        None if copied is None else copied.get("joint", ""),
+    )
+
+
+def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
+    """The link that no joint moves, from which all others can be reached.
+
+    Raises:
+        InputError: If there is none, or more than one, or a loop.
+    """
+    if not links:
+        raise InputError("has no <link>", where=file, mend="name a file that describes an arm")
+    into: dict[str, str] = {}
+    for joint in joints:
+        if joint.child in into:
+            both = f"joints '{into[joint.child]}' and '{joint.name}' both carry it"
+            mend = "take one of them out; an arm is an open chain"
+            where = f"{file}, link '{joint.child}'"
+            raise InputError(f"{both}: the chain closes to a loop", where=where, mend=mend)
+        into[joint.child] = joint.name
+    roots = [name for name in links if name not in into]
+    if len(roots) > 1:
+        raise InputError(f"no joint joins '{roots[0]}' and '{roots[1]}'", where=file,
+                         mend="join them, or take out what is not part of the arm")
+    reached, ahead = set(), list(roots)
+    while ahead:
+        link = ahead.pop()
+        reached.add(link)
+        ahead += [j.child for j in joints if j.parent == link]
+    lost = [name for name in links if name not in reached]
+    if lost:
+        what = f"the joints from link '{lost[0]}' on lead back to it: a loop"
+        raise InputError(what, where=file, mend="take one of them out; an arm is an open chain")
+    return roots[0]
+
+
+def _chain(
+    root: str, links: dict[str, Element], joints: list[_Joint], tip: str | None, file: str
+) -> set[str]:
+    """Names of the joints that move: those on the way from the first link to the tip.
+
+    Raises:
+        InputError: If there are several ways and no tip says which, or none of the joints can move.
+    """
+    of_child = {j.child: j for j in joints}
+    if tip is not None and tip not in links:
+        raise InputError(f"there is no link '{tip}', the tip", where=file, mend=suggest(tip, links))
+    ways = []
+    for end in [tip] if tip is not None else links:
+        way, link = [], end
+        while link != root:
+            way.append(of_child[link])
+            link = of_child[link].parent
+        ways.append([j for j in reversed(way) if j.motion])
+    longest = max(ways, key=len)
+    for way in ways:
+        for one, other in zip(way, longest, strict=False):
+            if one is not other:
+                what = f"joints '{other.name}' and '{one.name}' branch: an arm is one chain"
+                mend = 'say which by tip = "<name of its last link>"; what branches off is then held at zero'
+                raise InputError(what, where=file, mend=mend)
+    if not longest:
+        raise InputError("no joint can move" + (f" up to link '{tip}'" if tip else ""), where=file,
+                         mend="give it a revolute, continuous or prismatic one, or name another tip")
+    for joint in longest:
+        if joint.mimics is not None:
+            what = f"it copies joint '{joint.mimics}' (<mimic>), and would not be free"
+            raise InputError(what, where=f"{file}, joint '{joint.name}'",
+                             mend="take <mimic> out, or name a tip before it")
+    return {j.name for j in longest}
+
+
+def _numbers(element: Element, name: str, count: int, where: str) -> np.ndarray:
+    """Numbers of an attribute.
+
+    Raises:
+        InputError: If these are not so many finite numbers.
+    """
+    text = element.get(name)
+    try:
+        values = [float(word) for word in (text or "").split()]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
+        shown = f"has no {name}" if text is None else f"has {name}=\"{text[:40]}\""
+        mend = f"give {'a number' if count == 1 else f'{count} numbers'}"
+        raise InputError(f"<{element.tag}> {shown}", where=where, mend=mend)
+    return np.array(values)
+
+
+def _place(origin: Element | None, where: str) -> Float[np.ndarray, "4 4"]:
+    """Homogeneous transform of an <origin>; where there is none, or a part is missing, nothing."""
+    out = np.eye(4)
+    if origin is None:
+        return out
+    if origin.get("xyz") is not None:
+        out[:3, 3] = _numbers(origin, "xyz", 3, where)
+    if origin.get("rpy") is not None:
+        roll, pitch, yaw = _numbers(origin, "rpy", 3, where)
+        (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+        out[:3, :3] = [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    return out
+
+
+def _inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndarray, " 10"]:
+    """Ten parameters of a link about the origin of its body's frame.
+
+    Raises:
+        InputError: If mass or inertia is missing, or no number.
+    """
+    parts = {}
+    for tag in ("mass", "inertia"):
+        parts[tag] = inertial.find(tag)
+        if parts[tag] is None:
+            raise InputError(f"<inertial> has no <{tag}>", where=where, mend=f"add <{tag} .../>")
+    (mass,) = _numbers(parts["mass"], "value", 1, where)
+    if mass < 0:
+        raise InputError(f"<mass> is negative: {mass:g} kg", where=where, mend="give the mass of a body")
+    xx, xy, xz, yy, yz, zz = (float(_numbers(parts["inertia"], name, 1, where)[0]) for name in _TENSOR)
+    place = frame @ _place(inertial.find("origin"), where)
+    turn, c = place[:3, :3], place[:3, 3]
+    tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+    tensor += mass * (c @ c * np.eye(3) - np.outer(c, c))
+    return np.array([mass, *(mass * c), *tensor[np.triu_indices(3)]])
+
+
+def _towards(axis: np.ndarray) -> Float[np.ndarray, "3 3"]:
+    """The axes of a link turned such that z is the joint's; as they are where it is."""
+    # Half a turn about x first where z would turn by more than a right angle: no division by what vanishes.
+    half = np.diag([1.0, -1.0, -1.0]) if axis[2] < 0 else np.eye(3)
+    x, y, z = half @ axis
+    # About the cross product of both, by Rodrigues' formula.
+    return half @ np.array([
+        [1 - x * x / (1 + z), -x * y / (1 + z), x], [-x * y / (1 + z), 1 - y * y / (1 + z), y], [-x, -y, z],
+    ])

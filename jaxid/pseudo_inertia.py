@@ -1,0 +1,91 @@
+"""Rigid bodies as 4 x 4 matrices: ten inertial parameters moved elsewhere, and what they may be."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# Fields of an arm in the order of the ten parameters.
+TEN = (
+    "mass", "first_moment_x", "first_moment_y", "first_moment_z",
+    "inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz",
+)
+
+
+def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
+    """Integral of (x y z 1)' (x y z 1) over the mass of a body.
+
+    Positive definite where, and only where, some body of positive density everywhere has these parameters.
+
+    Args:
+        ten: In the order of `TEN`; products of inertia are -sum m x y.
+
+    Source:
+        Wensing, Kim & Slotine (2018), IEEE RA-L 3(1). (2.9) of the PA-10 report holds the sums +sum m x y.
+    """
+    m, x, y, z, xx, xy, xz, yy, yz, zz = (ten[..., k] for k in range(10))
+    half = 0.5 * (xx + yy + zz)
+    rows = [
+        [half - xx, -xy, -xz, x], [-xy, half - yy, -yz, y], [-xz, -yz, half - zz, z], [x, y, z, m],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def ten_parameters(pseudo: Float[Array, "*n 4 4"]) -> Float[Array, "*n 10"]:
+    """The inverse of `pseudo_inertia`."""
+    s = lambda i, j: pseudo[..., i, j]
+    return jnp.stack([
+        s(3, 3), s(0, 3), s(1, 3), s(2, 3),
+        s(1, 1) + s(2, 2), -s(0, 1), -s(0, 2), s(0, 0) + s(2, 2), -s(1, 2), s(0, 0) + s(1, 1),
+    ], axis=-1)
+
+
+def moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[np.ndarray, "10 10"]:
+    """Matrix that takes a body's parameters from its frame into another.
+
+    Args:
+        axes: Axes of its frame in the other, as columns.
+        origin: Its origin there [m].
+
+    Source:
+        Khalil & Dombre (2002), section 9.3: its columns are lambda_1 to lambda_10.
+    """
+    place = jnp.eye(4).at[:3, :3].set(axes).at[:3, 3].set(origin)
+    return np.asarray(ten_parameters(place @ pseudo_inertia(jnp.eye(10)) @ place.T)).T
+
+
+def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
+    """Coordinates in which every body of positive density, and nothing else, is a point of all space.
+
+    Half the logarithm of the mass; the centre of mass x, y, z [m]; and of the upper triangular A with
+    A A' the spread about it (integral of r r' over the mass, by mass) the logarithms of the diagonal, and
+    entries 12, 13, 23.
+
+    Args:
+        ten: In the order of `TEN`, of a body.
+
+    Source:
+        Rucker & Wensing (2022), IEEE RA-L 7(2); their s is here an entry of A itself.
+    """
+    m = ten[0]
+    centre = ten[1:4] / m
+    s = pseudo_inertia(ten)[:3, :3] / m - centre[:, None] * centre
+    # Written out: a factorisation of LAPACK's does not go into loops and batches.
+    a33 = jnp.sqrt(s[2, 2])
+    a13, a23 = s[0, 2] / a33, s[1, 2] / a33
+    a22 = jnp.sqrt(s[1, 1] - a23**2)
+    a12 = (s[0, 1] - a13 * a23) / a22
+    a11 = jnp.sqrt(s[0, 0] - a12**2 - a13**2)
+    return jnp.concatenate([
+        0.5 * jnp.log(m)[None], centre, jnp.log(jnp.stack([a11, a22, a33])), jnp.stack([a12, a13, a23]),
+    ])
+
+
+def of_log_cholesky(x: Float[Array, " 10"]) -> Float[Array, " 10"]:
+    """The inverse of `log_cholesky`."""
+    zero = jnp.zeros(())
+    (a11, a22, a33), (a12, a13, a23) = jnp.exp(x[4:7]), x[7:]
+    a = jnp.stack([jnp.stack(row) for row in ([a11, a12, a13], [zero, a22, a23], [zero, zero, a33])])
+    whole = jnp.zeros((4, 4)).at[:3, :3].set(a).at[:3, 3].set(x[1:4]).at[3, 3].set(1.0)
+    return ten_parameters(jnp.exp(2 * x[0]) * jnp.sum(whole[:, None] * whole, axis=-1))
