@@ -133,6 +133,7 @@ def test_results_hold_the_links(fits, tmp_path):
     assert "links" not in json.loads((fits[False].save(tmp_path / "plain") / "result.json").read_text())
 
 
+@pytest.mark.slow
 def test_power_keeps_links_too(log, tmp_path):
     found = fitted(tmp_path, log, True, "power")
     assert found.estimate.converged
@@ -140,6 +141,7 @@ def test_power_keeps_links_too(log, tmp_path):
     assert left(found) < 1.1
 
 
+@pytest.mark.slow
 def test_output_error_keeps_links_too(tmp_path):
     """One link that swings; its moment about the joint, and its first moments, are told."""
     true = TRUE[0]

@@ -96,6 +96,7 @@ def test_each_criterion_is_best_at_its_own(found):
     assert np.sum(np.log(most.std)) < np.sum(np.log(least.std))
 
 
+@pytest.mark.slow
 def test_what_no_motion_tells_apart_is_left_out(tmp_path, found):
     """All twenty inertial parameters unknown: as telling as with the six that stand for sums."""
     links = (("{ guess = 1.0 }", "[{ guess = 0.0 }, { guess = 0.0 }, { guess = 0.0 }]",

@@ -123,6 +123,7 @@ def test_payload_is_told_by_the_tip_or_by_an_effect_on_the_tool(robot, tmp_path)
     np.testing.assert_allclose(*found.values(), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_lengths_and_centres_may_be_unknown(robot, log, tmp_path):
     """They enter the closure, and not in proportion: bounds keep the start within reach."""
     text = PLANT.replace("[0.18, 0.25, 0.25, 0.25, 0.25]", "[0.18, 0.25, 0.25, { guess = 0.255 }, 0.25]")

@@ -183,6 +183,7 @@ def suite_text(*, calibrated: bool = True, scale: float = 1.0, rate: str = "rate
     return "force_noise = 0.1\n" + "".join(parts)
 
 
+@pytest.mark.slow
 def test_a_loop_learns_by_inertial_sensors(tmp_path):
     """4 kHz, sensors at 1 kHz, exact sticking: all found; with 4 % of scale that nobody knows, not."""
     run = simulate(written(tmp_path, "", 2.0, suite_text(scale=1.04)))
