@@ -6,6 +6,7 @@ import argparse
 import os
 import shutil
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from jaxid.io.tables import aligned
@@ -23,6 +24,17 @@ def parser_of(doc: str, default: str) -> argparse.ArgumentParser:
 def arguments(doc: str, default: str) -> argparse.Namespace:
     """What was asked on the command line of an experiment."""
     return parser_of(doc, default).parse_args()
+
+
+def run_studies(doc: str, default: str, studies: Mapping[str, Callable[[Path], None]]) -> None:
+    """Run all studies of an experiment, each with the folder of its results, or the one that is asked for."""
+    parser = parser_of(doc, default)
+    parser.add_argument("--only", choices=studies, help="one of the studies")
+    args = parser.parse_args()
+    args.o.mkdir(parents=True, exist_ok=True)
+    for name, study in studies.items():
+        if args.only in (None, name):
+            study(args.o)
 
 
 def case_with_data(folder: Path, cases: tuple[str, ...], data: str, files: tuple[str, ...]) -> Path:

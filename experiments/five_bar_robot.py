@@ -18,7 +18,7 @@ import scipy.signal
 import jaxid
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from five_bar_oracle import Robot
+from five_bar_oracle import PLANT, Robot
 from five_bar_stepper import _advance, arrays
 
 REDUCTION = 20.0
@@ -95,16 +95,8 @@ def case_text(
 ) -> str:
     """A case: the model of the robot, a law for [controller], random targets."""
     gains = f"[{gain}, {gain}]" if isinstance(gain, str) else list(gain)
-    return f"""[plant]
-kind = "five_bar"
-[plant.parameters]
-length = [0.18, 0.25, 0.25, 0.25, 0.25]
-center = [[0.1254, 0.0009], [0.1303, 0.0006]]
-mass = [2.32, 2.78]
-inertia = [0.292, 0.292, 0.030, 0.036]
-tip_mass = {tip_mass}
-reduction = [{REDUCTION}, {REDUCTION}]
-[[effects]]
+    plant = PLANT.replace("tip_mass = 2.72", f"tip_mass = {tip_mass}")
+    return f"""{plant}[[effects]]
 kind = "actuator_gain"
 gain = {gains}
 {friction_text(3) if friction is None else friction}

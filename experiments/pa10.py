@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pa10_arm
 import pa10_figures
-from common import Table, parser_of
+from common import Table, run_studies
 
 import jaxid
 from jaxid.io.log import Log
@@ -357,15 +357,5 @@ STUDIES: dict[str, Callable[[Path], None]] = {
 }
 
 
-def main() -> None:
-    parser = parser_of(__doc__, "results/pa10")
-    parser.add_argument("--only", choices=STUDIES, help="one of the studies")
-    args = parser.parse_args()
-    args.o.mkdir(parents=True, exist_ok=True)
-    for name, study in STUDIES.items():
-        if args.only in (None, name):
-            study(args.o)
-
-
 if __name__ == "__main__":
-    main()
+    run_studies(__doc__, "results/pa10", STUDIES)

@@ -16,7 +16,7 @@ from pathlib import Path
 import five_bar_robot as robots
 import numpy as np
 import righettini_figures
-from common import Table, parser_of
+from common import Table, run_studies
 from five_bar_robot import LOOK, PERIOD, Ran, driven, robot
 
 import jaxid
@@ -307,15 +307,5 @@ STUDIES: dict[str, Callable[[Path], None]] = {
 }
 
 
-def main() -> None:
-    parser = parser_of(__doc__, "results/righettini_five_bar")
-    parser.add_argument("--only", choices=STUDIES, help="one of the studies")
-    args = parser.parse_args()
-    args.o.mkdir(parents=True, exist_ok=True)
-    for name, study in STUDIES.items():
-        if args.only in (None, name):
-            study(args.o)
-
-
 if __name__ == "__main__":
-    main()
+    run_studies(__doc__, "results/righettini_five_bar", STUDIES)

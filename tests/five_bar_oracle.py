@@ -16,6 +16,19 @@ TURNS = [0, 1, 4, 7]
 ORDERS = ("coulomb_friction", "viscous_friction", "quadratic_drag", "cubic_friction", "quartic_friction")
 
 
+# Of `Robot()`, as a case has it.
+PLANT = """[plant]
+kind = "five_bar"
+[plant.parameters]
+length = [0.18, 0.25, 0.25, 0.25, 0.25]
+center = [[0.1254, 0.0009], [0.1303, 0.0006]]
+mass = [2.32, 2.78]
+inertia = [0.292, 0.292, 0.030, 0.036]
+tip_mass = 2.72
+reduction = [20.0, 20.0]
+"""
+
+
 @dataclass(frozen=True)
 class Robot:
     """Five bars in SI units, as the tables of the paper have them.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from case_faults import message
 from cli_setup import run
-from five_bar_oracle import Robot
+from five_bar_oracle import PLANT, Robot
 from five_bar_stepper import followed
 from written_logs import write_csv
 
@@ -18,16 +18,6 @@ from jaxid.io.case import load_case
 from jaxid.machine import build_machine
 from jaxid.session import open_session
 
-PLANT = """[plant]
-kind = "five_bar"
-[plant.parameters]
-length = [0.18, 0.25, 0.25, 0.25, 0.25]
-center = [[0.1254, 0.0009], [0.1303, 0.0006]]
-mass = [2.32, 2.78]
-inertia = [0.292, 0.292, 0.030, 0.036]
-tip_mass = 2.72
-reduction = [20.0, 20.0]
-"""
 NAMES = {"actuator_gain": "gain", "coulomb_friction": "level", "viscous_friction": "coefficient"}
 LOG = """[log]
 time = "t"

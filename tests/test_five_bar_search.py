@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from five_bar_oracle import Robot
+from five_bar_oracle import PLANT, Robot
 from five_bar_stepper import followed
-from test_five_bar_case import LOG, NOISE, PLANT, effect, unknown
+from test_five_bar_case import LOG, NOISE, effect, unknown
 from written_logs import write_csv
 
 from jaxid.discovery.discover import discover
