@@ -10,6 +10,8 @@ import pytest
 
 import jaxid
 from jaxid.cli import main
+from jaxid.estimators.interior import inner_start
+from jaxid.estimators.least_squares import eliminated
 from jaxid.io.log import Log
 from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
 
@@ -43,6 +45,16 @@ def test_coordinates_go_there_and_back_and_cover_only_bodies():
         np.testing.assert_allclose(log_cholesky(ten), x, rtol=1e-5, atol=1e-5)
     slope = jax.jacfwd(log_cholesky)(ten) @ jax.jacfwd(of_log_cholesky)(jnp.asarray(x))
     np.testing.assert_allclose(slope, np.eye(10), atol=1e-5)
+
+
+def test_an_unknown_without_effect_does_not_stop_the_start_inside():
+    """A friction of a joint that never turns, say: the bodies beside it are found all the same."""
+    true, guess = arm_oracle.bodies(2, np.random.default_rng(0))
+    columns = np.column_stack([np.random.default_rng(0).normal(size=(50, 10)), np.zeros(50)])
+    theta = jnp.asarray(np.append(guess, 0.3))
+    found = inner_start(columns, -columns[:, :10] @ true, theta, (tuple(range(10)),), eliminated)
+    np.testing.assert_allclose(found[:10], true, rtol=0, atol=1e-6)
+    assert found[10] == 0.3
 
 
 def motion(seed: int) -> tuple[np.ndarray, ...]:
