@@ -140,13 +140,72 @@ harmonics = 3
     assert not (tmp_path / "s.csv").exists()
 
 
+AXIS = """[plant]
+kind = "axis"
+[plant.parameters]
+inertia = INERTIA
+[[effects]]
+kind = "viscous_friction"
+coefficient = { guess = GUESS }
+[limits]
+stroke = [0.0, 1.0]
+speed = 0.5
+[simulation]
+duration = 1.0
+sample_rate = 20.0
+[design]
+harmonics = 2
+"""
+
+
+@pytest.mark.parametrize(("inertia", "guess"), [("2.0", "3.0"), ("1e-300", "0.0")])
+def test_a_force_noise_of_zero_is_none_that_is_known(tmp_path, inertia, guess):
+    """No row has infinite weight, nor has one of a joint that needs no force at the guesses."""
+    path = tmp_path / "case.toml"
+    text = AXIS.replace("INERTIA", inertia).replace("GUESS", guess)
+    path.write_text(text + "[sensor]\nforce_noise = 0.0\n")
+    run = jaxid.design(path)
+    assert run.std is None
+    assert run.told == ("viscous_friction.coefficient",)
+    assert np.isfinite(run.nats)
+
+
+FIVE_BAR = """[plant]
+kind = "five_bar"
+[plant.parameters]
+length = [0.18, 0.25, 0.25, 0.25, 0.25]
+center = [[0.12, 0.0], [0.12, 0.0]]
+mass = [2.0, 2.0]
+inertia = [0.3, 0.3, 0.03, 0.03]
+tip_mass = { guess = 2.7 }
+[limits]
+stroke = [[2.0, 2.6], [0.5, 1.1]]
+speed = 3.0
+[simulation]
+duration = 1.0
+sample_rate = 20.0
+[design]
+harmonics = 2
+"""
+
+
+def test_a_stroke_that_the_plant_cannot_be_in_is_refused(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(FIVE_BAR)
+    with pytest.raises(jaxid.InputError, match=r"\[limits\]: .*cannot be in; narrow stroke"):
+        jaxid.design(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ("[design]\n", '[design]\ncriterion = "trace"\n', ["criterion", "trace", "determinant, condition"]),
-        ("[design]\n", "[design]\nbase_frequency_hz = 0.1\n", ["has no whole period", "0.1667"]),
+        ("[design]\n", "[design]\nbase_frequency_hz = 0.1\n", ["has no whole period", "duration to 10.01 s"]),
         ("[design]\n", "[design]\nharmonics = 400\n", ["harmonic 400 is beyond half the sample_rate"]),
         ("speed = [2.0, 3.0]", "", ["[limits] has no speed"]),
+        (text(), text((("{ guess = 1.0 }", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]"),
+                       ("0.0", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]")), viscous=""),
+         ["no force depends on what is unknown"]),
         ("[8.0, 20.0]", "[8.0]", ["acceleration", "1 entry"]),
     ],
 )
