@@ -10,8 +10,10 @@ import pytest
 
 import jaxid
 from jaxid.cli import main
+from jaxid.estimators import need_consistent
 from jaxid.estimators.interior import inner_start
 from jaxid.estimators.least_squares import eliminated
+from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
 
@@ -185,6 +187,15 @@ def test_output_error_keeps_links_too(tmp_path):
         assert found.estimate.std[at] < 0.01 * np.abs(true[9])
 
 
+def test_a_prior_is_in_the_way_of_output_error_only(tmp_path):
+    (tmp_path / "case.toml").write_text(case(True) + "[output_error]\nprior = 0.5\n")
+    prior = load_case(tmp_path / "case.toml")
+    for method in ("inverse_dynamics", "power", "algebraic"):
+        need_consistent(method, prior)
+    with pytest.raises(jaxid.InputError, match="output_error with a prior"):
+        need_consistent("output_error", prior)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "method", "words"),
     [
@@ -192,6 +203,8 @@ def test_output_error_keeps_links_too(tmp_path):
         ("mass = { guess = 1.0 }", "mass = { guess = 1.0, max = 2.0 }", "power", ["mass[1] has min or max"]),
         ("mass = { guess = 1.0 }", "mass = { guess = 0.1 }", "power", ["link 1", "its guess is no body"]),
         ("mass = { guess", "mass = { guess", "didim", ["does not go with didim", "inverse_dynamics, power"]),
+        ("[log]", "[output_error]\nprior = 0.5\n[log]", "output_error",
+         ["output_error with a prior", "leave one of them out"]),
         ("= true", "= 1", "power", ["physically_consistent", "true or false"]),
     ],
 )
