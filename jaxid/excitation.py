@@ -105,11 +105,14 @@ class _Series(eqx.Module):
 
     Args:
         basis: Position, velocity and acceleration of the functions, (3, time, k).
+        fine: Likewise over one period, as finely as its fastest harmonic asks: limits hold there, so that a
+            trajectory is the same, and keeps to them, whatever the instants.
         low, high: Ends of the stroke, (n,).
         speed, acceleration: Largest ones, (n,); infinite where there is no limit.
     """
 
     basis: Float[Array, "3 time k"]
+    fine: Float[Array, "3 fine k"]
     low: Array
     high: Array
     speed: Array
@@ -122,14 +125,19 @@ class _Series(eqx.Module):
         """A family at some instants; `bounds`: low, high, speed, acceleration."""
         k = np.arange(1, harmonics + 1)
         omega = 2 * np.pi * base_hz * k
-        s, c = np.sin(omega * time[:, None]), np.cos(omega * time[:, None])
-        # Each harmonic at the same peak speed; those sums that neither move nor push at the start.
-        first = [np.hstack(x) / np.tile(k, 2) for x in (
-            (s, c), (omega * c, -omega * s), (-(omega**2) * s, -(omega**2) * c))]
+        # Those sums that neither move nor push at the start.
         rest = np.zeros((2, 2 * harmonics))
         rest[0, :harmonics], rest[1, harmonics:] = 1.0, k
         kept = scipy.linalg.null_space(rest)
-        return cls(*(jnp.asarray(x, dtype=float) for x in (np.stack(first) @ kept, *bounds)))
+
+        def basis(time: np.ndarray) -> Array:
+            s, c = np.sin(omega * time[:, None]), np.cos(omega * time[:, None])
+            parts = ((s, c), (omega * c, -omega * s), (-(omega**2) * s, -(omega**2) * c))
+            # Each harmonic at the same peak speed.
+            return jnp.asarray(np.stack([np.hstack(x) / np.tile(k, 2) for x in parts]) @ kept)
+
+        fine = basis(_instants(base_hz, harmonics))
+        return cls(basis(time), fine, *(jnp.asarray(x, dtype=float) for x in bounds))
 
     @property
     def size(self) -> int:
@@ -139,13 +147,20 @@ class _Series(eqx.Module):
     def __call__(self, p: Float[Array, " p"]) -> tuple[Array, Array, Array]:
         """Position, velocity, acceleration, (time, n) each, of weights by joint and then centres."""
         n, k = self.low.size, self.basis.shape[2]
-        x, v, a = self.basis @ p[: n * k].reshape(n, k).T
+        weights = p[: n * k].reshape(n, k).T
+        x, v, a = self.fine @ weights
         half = 0.5 * (self.high - self.low)
         centre = self.low + half * (1 + 0.8 * jnp.tanh(p[n * k :]))
         parts = (x / (self.high - centre), x / (self.low - centre), v / self.speed, -v / self.speed,
                  a / self.acceleration, -a / self.acceleration)
         scale = (1 - _ROOM) / largest(jnp.concatenate(parts))
+        x, v, a = self.basis @ weights
         return centre + scale * x, scale * v, scale * a
+
+
+def _instants(base_hz: float, harmonics: int) -> np.ndarray:
+    """One period, sampled for its fastest harmonic."""
+    return np.arange(_FINE * harmonics) / (_FINE * harmonics * base_hz)
 
 
 class _Bench(eqx.Module):
@@ -202,7 +217,7 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     bounds = (low, high, speed, spread(setting.get("acceleration", np.inf)))
     plant = replace(machine.plant, velocity_scale=jnp.asarray(speed.max()), sharpness=jnp.asarray(_SHARPNESS))
     machine = machine.with_plant(plant, machine.parameters)
-    time = np.arange(_FINE * harmonics) / (_FINE * harmonics * base_hz)
+    time = _instants(base_hz, harmonics)
     series = _Series.within(time, base_hz, harmonics, bounds)
     force = np.abs(machine.gain) * np.broadcast_to(case.limits.get("force", np.inf), machine.gain.shape)
     noise = machine.sensor.force_noise

@@ -7,6 +7,7 @@ from test_serial_arm_case import text
 
 import jaxid
 from jaxid.cli import main
+from jaxid.excitation import _Series
 
 ROWS = [("revolute", 0.0, 0.0, 0.0, 0.0), ("revolute", 0.0, 0.5, 0.0, 0.0)]
 STROKE, SPEED, ACCELERATION, NOISE = ((-1.0, 2.0), (-2.0, 2.0)), (2.0, 3.0), (8.0, 20.0), (0.5, 0.1)
@@ -170,6 +171,21 @@ def test_a_force_noise_of_zero_is_none_that_is_known(tmp_path, inertia, guess):
     assert np.isfinite(run.nats)
 
 
+@pytest.mark.parametrize("rate", [2.0, 4.0, 1000.0])
+def test_a_trajectory_is_the_same_at_any_rate(rate):
+    """And keeps to its limits between the samples of a slow log."""
+    bounds = tuple(np.array([x]) for x in (-1.0, 1.0, 2.0, 8.0))
+    times = np.arange(round(6 * rate)) / rate, np.arange(30000) / 5000
+    slow, dense = (_Series.within(time, 1 / 6, 5, bounds) for time in times)
+    for seed in range(5):
+        p = np.random.default_rng(seed).normal(size=slow.size)
+        few, many = slow(p), dense(p)
+        for x, y in zip(few, many, strict=True):
+            np.testing.assert_allclose(x, y[:: round(5000 / rate)], rtol=0, atol=1e-9)
+        assert [np.abs(y).max() <= most for y, most in zip(many, (1.0, 2.0, 8.0), strict=True)] == [True] * 3
+        assert max(np.abs(many[1]).max() / 2.0, np.abs(many[2]).max() / 8.0, np.abs(many[0]).max()) > 0.9
+
+
 FIVE_BAR = """[plant]
 kind = "five_bar"
 [plant.parameters]
@@ -179,7 +195,7 @@ mass = [2.0, 2.0]
 inertia = [0.3, 0.3, 0.03, 0.03]
 tip_mass = { guess = 2.7 }
 [limits]
-stroke = [[2.0, 2.6], [0.5, 1.1]]
+stroke = [[2.6, 3.1], [0.0, 0.5]]
 speed = 3.0
 [simulation]
 duration = 1.0
