@@ -150,8 +150,8 @@ def base_parameters(
         The base parameters.
 
     Raises:
-        ValueError: If a name is none of the plant's, or rank and choice disagree: then the geometry has
-            a length or an angle that is nearly, but not quite, zero.
+        ValueError: If a name is none of the plant's, or in both `keep` and `known`, or rank and choice
+            disagree: then the geometry has a length or an angle that is nearly, but not quite, zero.
 
     Source:
         Gautier (1991), J. Robotic Systems 8(4), for the choice by QR; Khalil & Dombre (2002), chapter 9.
@@ -161,6 +161,9 @@ def base_parameters(
     wrong = [n for n in (*keep, *known) if n not in names and (n in keep or n not in dict(places))]
     if wrong:
         raise ValueError(f"{wrong[0]} is none of the plant's parameters: {', '.join(names)}.")
+    both = [n for n in keep if {n, n.partition("[")[0]} & set(known)]
+    if both:
+        raise ValueError(f"{both[0]} is in keep and known; take it out of one of them.")
     columns = _columns(plant, len(names), np.random.default_rng(seed))
     left = [k for k, (name, _) in enumerate(places) if not {name, names[k]} & set(known)]
     columns, places, names = columns[:, left], tuple(places[k] for k in left), [names[k] for k in left]

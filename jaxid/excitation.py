@@ -51,7 +51,8 @@ class Excitation:
             were drawn, and of this one.
         nats: Logarithm of the root of the information's determinant above that of the same one.
         told: Names of the unknowns that it counts; any others are sums of these in every motion.
-        std: Standard deviations to expect of these, (told,); None where the noise of the force is not known.
+        std: Standard deviations to expect of these, (told,); None where the noise of the force is not known,
+            or zero.
     """
 
     machine: Machine
@@ -104,11 +105,14 @@ class _Series(eqx.Module):
 
     Args:
         basis: Position, velocity and acceleration of the functions, (3, time, k).
+        fine: Likewise over one period, as finely as its fastest harmonic asks: limits hold there, so that a
+            trajectory is the same, and keeps to them, whatever the instants.
         low, high: Ends of the stroke, (n,).
         speed, acceleration: Largest ones, (n,); infinite where there is no limit.
     """
 
     basis: Float[Array, "3 time k"]
+    fine: Float[Array, "3 fine k"]
     low: Array
     high: Array
     speed: Array
@@ -121,14 +125,19 @@ class _Series(eqx.Module):
         """A family at some instants; `bounds`: low, high, speed, acceleration."""
         k = np.arange(1, harmonics + 1)
         omega = 2 * np.pi * base_hz * k
-        s, c = np.sin(omega * time[:, None]), np.cos(omega * time[:, None])
-        # Each harmonic at the same peak speed; those sums that neither move nor push at the start.
-        first = [np.hstack(x) / np.tile(k, 2) for x in (
-            (s, c), (omega * c, -omega * s), (-(omega**2) * s, -(omega**2) * c))]
+        # Those sums that neither move nor push at the start.
         rest = np.zeros((2, 2 * harmonics))
         rest[0, :harmonics], rest[1, harmonics:] = 1.0, k
         kept = scipy.linalg.null_space(rest)
-        return cls(*(jnp.asarray(x, dtype=float) for x in (np.stack(first) @ kept, *bounds)))
+
+        def basis(time: np.ndarray) -> Array:
+            s, c = np.sin(omega * time[:, None]), np.cos(omega * time[:, None])
+            parts = ((s, c), (omega * c, -omega * s), (-(omega**2) * s, -(omega**2) * c))
+            # Each harmonic at the same peak speed.
+            return jnp.asarray(np.stack([np.hstack(x) / np.tile(k, 2) for x in parts]) @ kept)
+
+        fine = basis(_instants(base_hz, harmonics))
+        return cls(basis(time), fine, *(jnp.asarray(x, dtype=float) for x in bounds))
 
     @property
     def size(self) -> int:
@@ -138,13 +147,20 @@ class _Series(eqx.Module):
     def __call__(self, p: Float[Array, " p"]) -> tuple[Array, Array, Array]:
         """Position, velocity, acceleration, (time, n) each, of weights by joint and then centres."""
         n, k = self.low.size, self.basis.shape[2]
-        x, v, a = self.basis @ p[: n * k].reshape(n, k).T
+        weights = p[: n * k].reshape(n, k).T
+        x, v, a = self.fine @ weights
         half = 0.5 * (self.high - self.low)
         centre = self.low + half * (1 + 0.8 * jnp.tanh(p[n * k :]))
         parts = (x / (self.high - centre), x / (self.low - centre), v / self.speed, -v / self.speed,
                  a / self.acceleration, -a / self.acceleration)
         scale = (1 - _ROOM) / largest(jnp.concatenate(parts))
+        x, v, a = self.basis @ weights
         return centre + scale * x, scale * v, scale * a
+
+
+def _instants(base_hz: float, harmonics: int) -> np.ndarray:
+    """One period, sampled for its fastest harmonic."""
+    return np.arange(_FINE * harmonics) / (_FINE * harmonics * base_hz)
 
 
 class _Bench(eqx.Module):
@@ -176,7 +192,8 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
         progress: Called with a line at every stage.
 
     Raises:
-        InputError: If the case lacks any of these, or no trajectory keeps within the force.
+        InputError: If the case lacks any of these, no force depends on an unknown, the plant cannot be in
+            its stroke, or no trajectory keeps within the force.
 
     Source:
         Swevers et al. (1997), IEEE Trans. Robotics and Automation 13(5), for the series and the determinant;
@@ -187,7 +204,7 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     rate, duration = float(case.simulation["sample_rate"]), float(case.simulation["duration"])
     base_hz, harmonics = setting.get("base_frequency_hz", 1 / duration), setting.get("harmonics", HARMONICS)
     if base_hz * duration < 1 - 1e-9:
-        mend = f"raise it to {1 / duration:.4g} Hz, or lengthen [simulation] duration"
+        mend = f"leave it out, or lengthen [simulation] duration to {1.001 / base_hz:.4g} s"
         what = "base_frequency_hz has no whole period in the experiment"
         raise InputError(what, where=f"{where}, [design]", mend=mend)
     if 2 * base_hz * harmonics >= rate:
@@ -200,11 +217,11 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     bounds = (low, high, speed, spread(setting.get("acceleration", np.inf)))
     plant = replace(machine.plant, velocity_scale=jnp.asarray(speed.max()), sharpness=jnp.asarray(_SHARPNESS))
     machine = machine.with_plant(plant, machine.parameters)
-    time = np.arange(_FINE * harmonics) / (_FINE * harmonics * base_hz)
+    time = _instants(base_hz, harmonics)
     series = _Series.within(time, base_hz, harmonics, bounds)
     force = np.abs(machine.gain) * np.broadcast_to(case.limits.get("force", np.inf), machine.gain.shape)
     noise = machine.sensor.force_noise
-    known = noise is not None and plant.actuated is None
+    known = noise is not None and bool(np.all(np.asarray(noise) > 0)) and plant.actuated is None
     p = len(machine.parameters.free)
     bench = _Bench(
         plant, jnp.asarray(machine.parameters.guess), series,
@@ -214,7 +231,7 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     )
     progress("drawing trajectories")
     draws = np.random.default_rng(0).normal(size=(_DRAWN, series.size))
-    bench = _scaled(bench, draws[0], known)
+    bench = _scaled(bench, draws, known, where)
     value = lambda p: tuple(np.asarray(x) for x in _loss(jnp.asarray(p), bench))
     both = lambda p: _sound(*value(p))
     valued = [both(p) for p in draws]
@@ -230,16 +247,35 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     return _judged(whole, machine, ticks, (draws[ranked[0]], best), known, where)
 
 
-def _scaled(bench: _Bench, p: np.ndarray, known: bool) -> _Bench:
-    """With columns of norm one, none that depends on others, and rows of like size if no noise is known."""
+def _scaled(bench: _Bench, draws: np.ndarray, known: bool, where: str) -> _Bench:
+    """With columns of norm one, none that depends on others, and rows of like size if no noise is known.
+
+    On the first of some trajectories that the plant can follow.
+
+    Raises:
+        InputError: If it can follow none, or no column is left.
+    """
+    forces = ((p, np.asarray(_along(bench, jnp.asarray(p))[1])) for p in draws)
+    p, force = next(((p, f) for p, f in forces if np.all(np.isfinite(f))), (None, None))
+    if p is None:
+        raise _out_of_reach(where)
     if not known:
-        size = np.sqrt(np.mean(np.asarray(_along(bench, jnp.asarray(p))[1]) ** 2, axis=0))
-        bench = eqx.tree_at(lambda b: b.weight, bench, jnp.asarray(1.0 / np.maximum(size, 1e-9 * size.max())))
+        size = np.sqrt(np.mean(force**2, axis=0))
+        size = np.where(size > 1e-9 * size.max(), size, size.max() or 1.0)
+        bench = eqx.tree_at(lambda b: b.weight, bench, jnp.asarray(1.0 / size))
     j = np.asarray(_along(bench, jnp.asarray(p))[0])
     norm = np.linalg.norm(j, axis=0)
     chosen = independent(j / np.where(norm > 1e-9 * norm.max(), norm, np.inf), range(j.shape[1]))
+    if not chosen:
+        mend = "let one be unknown that moves or resists, as [plant] stands"
+        raise InputError("no force depends on what is unknown", where=where, mend=mend)
     values = (jnp.asarray(norm[chosen]), jnp.asarray(chosen))
     return eqx.tree_at(lambda b: (b.scale, b.columns), bench, values)
+
+
+def _out_of_reach(where: str) -> InputError:
+    what = "trajectories meet positions that the plant cannot be in"
+    return InputError(what, where=f"{where}, [limits]", mend="narrow stroke")
 
 
 @eqx.filter_jit
@@ -289,14 +325,22 @@ def _judged(
     bench: _Bench, machine: Machine, ticks: np.ndarray, numbers: tuple[np.ndarray, np.ndarray], known: bool,
     where: str,
 ) -> Excitation:
-    """The trajectory at the rate of the log, beside the one that it began from."""
+    """The trajectory at the rate of the log, beside the one that it began from.
+
+    Raises:
+        InputError: If it takes more than the force, or meets positions that the plant cannot be in.
+    """
     told, logdets, condition = [], [], []
     for p in numbers:
         j, force, motion = _along(bench, jnp.asarray(p))
         j, force = np.asarray(j)[:, np.asarray(bench.columns)], np.asarray(force)
         told.append(j)
-        logdets.append(np.linalg.slogdet((j / np.asarray(bench.scale)).T @ (j / np.asarray(bench.scale)))[1])
+        scaled = j / np.asarray(bench.scale)
+        with np.errstate(invalid="ignore"):
+            logdets.append(np.linalg.slogdet(scaled.T @ scaled)[1])
         condition.append(float(np.exp(_condition(jnp.asarray(j)))))
+    if not np.all(np.isfinite(told[1])):
+        raise _out_of_reach(where)
     over = np.abs(np.asarray(bench.plant.at_drives(force))).max(axis=0) > np.asarray(bench.force)
     if np.any(over):
         what = f"every trajectory takes more than the force of drive {int(np.argmax(over)) + 1}"

@@ -106,7 +106,7 @@ def design(
 ) -> Design | Excitation:
     """Find the reference (in a loop) or the input that tells a case's unknowns best, at its guesses.
 
-    Of an arm, and of any case with [design], the reference is taken to be followed: see
+    Of an arm, and of any case with a key in [design], the reference is taken to be followed: see
     `jaxid.excitation.excite`. Else:
 
     The logarithm of the information's determinant is raised through the simulation by gradients (D-optimal;

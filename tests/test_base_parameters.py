@@ -116,6 +116,9 @@ def test_chosen_ones_may_be_asked_for():
     assert len(found.chosen) == 43
     with pytest.raises(ValueError, match=r"mass\[8\] is none"):
         base_parameters(plant, keep=("mass[8]",))
+    for known in ("mass[7]", "mass"):
+        with pytest.raises(ValueError, match=r"mass\[7\] is in keep and known"):
+            base_parameters(plant, keep=("mass[7]",), known=(known,))
 
 
 def test_an_axis_has_its_inertia():

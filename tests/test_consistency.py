@@ -10,6 +10,10 @@ import pytest
 
 import jaxid
 from jaxid.cli import main
+from jaxid.estimators import need_consistent
+from jaxid.estimators.interior import inner_start
+from jaxid.estimators.least_squares import eliminated
+from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
 
@@ -43,6 +47,16 @@ def test_coordinates_go_there_and_back_and_cover_only_bodies():
         np.testing.assert_allclose(log_cholesky(ten), x, rtol=1e-5, atol=1e-5)
     slope = jax.jacfwd(log_cholesky)(ten) @ jax.jacfwd(of_log_cholesky)(jnp.asarray(x))
     np.testing.assert_allclose(slope, np.eye(10), atol=1e-5)
+
+
+def test_an_unknown_without_effect_does_not_stop_the_start_inside():
+    """A friction of a joint that never turns, say: the bodies beside it are found all the same."""
+    true, guess = arm_oracle.bodies(2, np.random.default_rng(0))
+    columns = np.column_stack([np.random.default_rng(0).normal(size=(50, 10)), np.zeros(50)])
+    theta = jnp.asarray(np.append(guess, 0.3))
+    found = inner_start(columns, -columns[:, :10] @ true, theta, (tuple(range(10)),), eliminated)
+    np.testing.assert_allclose(found[:10], true, rtol=0, atol=1e-6)
+    assert found[10] == 0.3
 
 
 def motion(seed: int) -> tuple[np.ndarray, ...]:
@@ -173,6 +187,15 @@ def test_output_error_keeps_links_too(tmp_path):
         assert found.estimate.std[at] < 0.01 * np.abs(true[9])
 
 
+def test_a_prior_is_in_the_way_of_output_error_only(tmp_path):
+    (tmp_path / "case.toml").write_text(case(True) + "[output_error]\nprior = 0.5\n")
+    prior = load_case(tmp_path / "case.toml")
+    for method in ("inverse_dynamics", "power", "algebraic"):
+        need_consistent(method, prior)
+    with pytest.raises(jaxid.InputError, match="output_error with a prior"):
+        need_consistent("output_error", prior)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "method", "words"),
     [
@@ -180,6 +203,8 @@ def test_output_error_keeps_links_too(tmp_path):
         ("mass = { guess = 1.0 }", "mass = { guess = 1.0, max = 2.0 }", "power", ["mass[1] has min or max"]),
         ("mass = { guess = 1.0 }", "mass = { guess = 0.1 }", "power", ["link 1", "its guess is no body"]),
         ("mass = { guess", "mass = { guess", "didim", ["does not go with didim", "inverse_dynamics, power"]),
+        ("[log]", "[output_error]\nprior = 0.5\n[log]", "output_error",
+         ["output_error with a prior", "leave one of them out"]),
         ("= true", "= 1", "power", ["physically_consistent", "true or false"]),
     ],
 )

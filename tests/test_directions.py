@@ -12,9 +12,10 @@ import stages
 
 import jaxid
 from jaxid.cli import main
-from jaxid.estimators import _beside_the_guesses, steps_of
+from jaxid.estimators import _beside_the_guesses, directions, steps_of
 from jaxid.estimators.directions_precision import add_profiles
 from jaxid.estimators.directions_problem import Found, Prior, criterion_steps
+from jaxid.estimators.least_squares import Minimum
 from jaxid.estimators.steps import alone
 from jaxid.identification import identify_many
 from jaxid.io.log import Log
@@ -159,6 +160,25 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
     assert many["criterion_percent"] < 0.5 * few["criterion_percent"]
     assert many["starts"]["count"] == 16
     assert 1 <= many["starts"]["same_optimum"] < 16
+
+
+@pytest.mark.parametrize("unknowns", [2, 7])
+def test_a_point_whose_slopes_are_not_finite_is_kept(monkeypatch, unknowns):
+    """Cost and residual there are reported; of more unknowns than coordinates, too."""
+    minimum = Minimum(*[np.zeros(())] * 5, np.full((1, unknowns), np.nan))
+    monkeypatch.setattr(directions, "read", lambda *args: _returned(minimum))
+    problem = SimpleNamespace(prior=SimpleNamespace(base=np.ones(unknowns)), ladder=(1.0,))
+    problem.weighed = lambda found: (problem, found)
+    for w in (np.zeros(unknowns), np.arange(1.0, unknowns + 1)):
+        found = alone(directions._rounds(problem, w))
+        assert found.count == 0
+        np.testing.assert_allclose(found.point, w, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(unknowns), atol=1e-12)
+
+
+def _returned(value):
+    return value
+    yield
 
 
 def test_sensitivities_are_those_of_finite_differences(folder):

@@ -7,6 +7,7 @@ from test_serial_arm_case import text
 
 import jaxid
 from jaxid.cli import main
+from jaxid.excitation import _Series
 
 ROWS = [("revolute", 0.0, 0.0, 0.0, 0.0), ("revolute", 0.0, 0.5, 0.0, 0.0)]
 STROKE, SPEED, ACCELERATION, NOISE = ((-1.0, 2.0), (-2.0, 2.0)), (2.0, 3.0), (8.0, 20.0), (0.5, 0.1)
@@ -140,13 +141,87 @@ harmonics = 3
     assert not (tmp_path / "s.csv").exists()
 
 
+AXIS = """[plant]
+kind = "axis"
+[plant.parameters]
+inertia = INERTIA
+[[effects]]
+kind = "viscous_friction"
+coefficient = { guess = GUESS }
+[limits]
+stroke = [0.0, 1.0]
+speed = 0.5
+[simulation]
+duration = 1.0
+sample_rate = 20.0
+[design]
+harmonics = 2
+"""
+
+
+@pytest.mark.parametrize(("inertia", "guess"), [("2.0", "3.0"), ("1e-300", "0.0")])
+def test_a_force_noise_of_zero_is_none_that_is_known(tmp_path, inertia, guess):
+    """No row has infinite weight, nor has one of a joint that needs no force at the guesses."""
+    path = tmp_path / "case.toml"
+    text = AXIS.replace("INERTIA", inertia).replace("GUESS", guess)
+    path.write_text(text + "[sensor]\nforce_noise = 0.0\n")
+    run = jaxid.design(path)
+    assert run.std is None
+    assert run.told == ("viscous_friction.coefficient",)
+    assert np.isfinite(run.nats)
+
+
+@pytest.mark.parametrize("rate", [2.0, 4.0, 1000.0])
+def test_a_trajectory_is_the_same_at_any_rate(rate):
+    """And keeps to its limits between the samples of a slow log."""
+    bounds = tuple(np.array([x]) for x in (-1.0, 1.0, 2.0, 8.0))
+    times = np.arange(round(6 * rate)) / rate, np.arange(30000) / 5000
+    slow, dense = (_Series.within(time, 1 / 6, 5, bounds) for time in times)
+    for seed in range(5):
+        p = np.random.default_rng(seed).normal(size=slow.size)
+        few, many = slow(p), dense(p)
+        for x, y in zip(few, many, strict=True):
+            np.testing.assert_allclose(x, y[:: round(5000 / rate)], rtol=0, atol=1e-9)
+        assert [np.abs(y).max() <= most for y, most in zip(many, (1.0, 2.0, 8.0), strict=True)] == [True] * 3
+        assert max(np.abs(many[1]).max() / 2.0, np.abs(many[2]).max() / 8.0, np.abs(many[0]).max()) > 0.9
+
+
+FIVE_BAR = """[plant]
+kind = "five_bar"
+[plant.parameters]
+length = [0.18, 0.25, 0.25, 0.25, 0.25]
+center = [[0.12, 0.0], [0.12, 0.0]]
+mass = [2.0, 2.0]
+inertia = [0.3, 0.3, 0.03, 0.03]
+tip_mass = { guess = 2.7 }
+[limits]
+stroke = [[2.6, 3.1], [0.0, 0.5]]
+speed = 3.0
+[simulation]
+duration = 1.0
+sample_rate = 20.0
+[design]
+harmonics = 2
+"""
+
+
+def test_a_stroke_that_the_plant_cannot_be_in_is_refused(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(FIVE_BAR)
+    with pytest.raises(jaxid.InputError, match=r"\[limits\]: .*cannot be in; narrow stroke"):
+        jaxid.design(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ("[design]\n", '[design]\ncriterion = "trace"\n', ["criterion", "trace", "determinant, condition"]),
-        ("[design]\n", "[design]\nbase_frequency_hz = 0.1\n", ["has no whole period", "0.1667"]),
+        ("[design]\n", "[design]\nbase_frequency_hz = 0.1\n", ["has no whole period", "duration to 10.01 s"]),
         ("[design]\n", "[design]\nharmonics = 400\n", ["harmonic 400 is beyond half the sample_rate"]),
         ("speed = [2.0, 3.0]", "", ["[limits] has no speed"]),
+        (text(), text((("{ guess = 1.0 }", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]"),
+                       ("0.0", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]")), viscous=""),
+         ["no force depends on what is unknown"]),
         ("[8.0, 20.0]", "[8.0]", ["acceleration", "1 entry"]),
     ],
 )

@@ -391,6 +391,10 @@ FAULTS = {
     "no sensor": ("[sensor]\nposition_noise = 3e-5", "", "no noise to multiply"),
     "nothing unknown": ("{ guess = 1.4, true = 2.0 }", "1.4", None),
     "no simulation": ("duration = 2.0\n", "", "no duration"),
+    "an estimator that keeps no bodies": (
+        '[study]\nestimators = ["inverse_dynamics", "algebraic"]',
+        '[identification]\nphysically_consistent = true\n[study]\nestimators = ["algebraic", "recursive"]',
+        "does not go with recursive"),
     "an estimator that is not there": ('"algebraic"', '"recursion"', "did you mean 'recursive'?"),
 }
 

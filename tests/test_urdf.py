@@ -138,12 +138,13 @@ def test_base_parameters_and_friction_come_back(folder, position):
     (folder / "case.toml").write_text(case(position))
     log = write_csv(folder / "log.csv", followed(arm))
     estimate = jaxid.identify(folder / "case.toml", log, method="inverse_dynamics").estimate
-    assert set(arm.base) < set(estimate.names)
-    assert len(estimate.names) == len(arm.base) + 4
-    guess = dict(zip(estimate.names, estimate.machine.parameters.guess, strict=True))
+    pairs = (("viscous_friction", "coefficient", arm.viscous), ("coulomb_friction", "level", arm.coulomb))
+    true = arm.base | {
+        f"{kind}[{k}].{key}": v for kind, key, values in pairs for k, v in enumerate(values, start=1)
+    }
+    assert set(estimate.names) == set(true)
     for name, value, std in zip(estimate.names, estimate.theta, estimate.std, strict=True):
-        if name in arm.base:
-            assert abs(value - arm.base[name]) < 3 * std, name
+        assert abs(value - true[name]) < 3 * std, (name, value, true[name], std)
     start = build_machine(load_case(folder / "case.toml")).parameters
     guess = dict(zip(start.names, start.guess, strict=True))
     assert guess["first_moment_x[2]"] == pytest.approx(2 * arm.m2 * arm.x2)

@@ -29,7 +29,7 @@ from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import parameters_of
-from jaxid.parameters import Parameters, free_effect
+from jaxid.parameters import free_effect
 from jaxid.replay import TooStiffError
 from jaxid.session import Session, open_session
 
@@ -208,7 +208,7 @@ def _final_machine(
         effect = search.union.machine.plant.effects[cand.position(search.union, c)]
         values = dict(zip(_names(effect), search.theta[c.index], strict=True))
         plant, free = free_effect(plant, type(effect)(**values, port=c.port), machine.units)
-        parameters = Parameters((*parameters.free, *free))
+        parameters = parameters.extended(free)
         theta.extend(search.theta[c.index])
         score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
         names = tuple(f.name for f in free)

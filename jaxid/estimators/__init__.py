@@ -19,6 +19,7 @@ from jaxid.estimators.steps import Steps
 from jaxid.parameters import REFERENCE
 
 if TYPE_CHECKING:
+    from jaxid.io.case import Case
     from jaxid.replay import Numerics
     from jaxid.session import Session
 
@@ -202,26 +203,33 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         options: Of the method.
 
     Raises:
-        InputError: If the reference has unknowns, and the method does not simulate the loop for them.
+        InputError: If the reference has unknowns, and the method does not simulate the loop for them; or if
+            links must be what bodies can be, and the method or they cannot.
     """
     if method != "output_error":
         need_known_reference(session, f"{method} takes them as they are")
-    if session.case.identification.get("physically_consistent"):
-        return _consistent(method, session, options)
-    return METHODS[method](session, **options)
-
-
-def _consistent(method: str, session: Session, options: dict[str, Any]) -> Steps[Estimate]:
-    """A fit of links that bodies can be."""
+    if not session.case.identification.get("physically_consistent"):
+        return METHODS[method](session, **options)
     from jaxid.estimators.consistency import need_bodies, with_links
 
-    if method not in CONSISTENT or "prior" in session.case.output_error:
-        asked = f"{method} with a prior" if method in CONSISTENT else method
-        raise InputError(
-            f"physically_consistent does not go with {asked}", where=f"{session.case.path}, [identification]",
-            mend=f"use {', '.join(CONSISTENT)}, or leave it out",
-        )
+    need_consistent(method, session.case)
     return with_links(METHODS[method](need_bodies(session), **options))
+
+
+def need_consistent(method: str, case: Case) -> None:
+    """Refuse a method that cannot keep links to what bodies can be, where a case asks for it.
+
+    Raises:
+        InputError: If it is such a method.
+    """
+    if not case.identification.get("physically_consistent"):
+        return
+    mend = "" if method in CONSISTENT else f"use {', '.join(CONSISTENT)}, or leave it out"
+    if method == "output_error" and "prior" in case.output_error:
+        method, mend = "output_error with a prior", "leave one of them out"
+    if mend:
+        what, where = f"physically_consistent does not go with {method}", f"{case.path}, [identification]"
+        raise InputError(what, where=where, mend=mend)
 
 
 def need_known_reference(session: Session, why: str) -> None:

@@ -152,8 +152,10 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]
             problem, here = problem.weighed((yield from read(problem, sharpness, w)))
             spent += int(here.steps)
             if not np.all(np.isfinite(here.jacobian)):
-                still = np.zeros(columns(np.eye(size), 0).shape[1])
-                return Found(problem, np.eye(size), 0, replace(here, theta=still), spent, False)
+                # Coordinates are of the first few directions: one of them leads to where this was read.
+                whole = np.linalg.qr(np.column_stack([w, np.eye(size)]))[0]
+                here = replace(here, theta=columns(whole, 0).T @ w)
+                return Found(problem, whole, 0, here, spent, False)
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
         some = columns(vectors, count)

@@ -37,8 +37,8 @@ def inner_start(
     normal, slope = columns.T @ columns, columns.T @ rest
     places = np.array(bodies)
     unit = pseudo_inertia(jnp.eye(10))
-    # What is in no body may stand anywhere, and has no barrier; a trace for what then has no effect.
-    loose = 1e-13 * (jnp.diag(normal) + 1e-300)
+    # What is in no body may stand anywhere, and has no barrier: a trace keeps the matrix definite.
+    loose = 1e-13 * jnp.diag(normal)
 
     def advance(k: Array, theta: Array) -> Array:
         weight = first * _LAST ** (k // 2 / _WEIGHTS)
@@ -48,8 +48,12 @@ def inner_start(
             turned = jnp.einsum("ij,ajk->aik", inverse, unit)
             gradient = gradient.at[at].add(-weight * jnp.einsum("aii->a", turned))
             hessian = hessian.at[np.ix_(at, at)].add(weight * jnp.einsum("aij,bji->ab", turned, turned))
-        scale = 1.0 / jnp.sqrt(jnp.diag(hessian))
-        step = -scale * solve(hessian * jnp.outer(scale, scale), (scale * gradient)[:, None])[:, 0]
+        # What is without effect, and in no body, stays where it is.
+        size = jnp.diag(hessian)
+        without = size <= 0
+        scale = jnp.where(without, 0.0, 1.0 / jnp.sqrt(jnp.where(without, 1.0, size)))
+        scaled = hessian * jnp.outer(scale, scale) + jnp.diag(without.astype(float))
+        step = -scale * solve(scaled, (scale * gradient)[:, None])[:, 0]
         fall = -gradient @ step
         ahead = theta + step / (1.0 + jnp.sqrt(jnp.maximum(fall, 0.0) / weight))
         # Rounding may spoil a step where the weight is small: what is there is good enough then.

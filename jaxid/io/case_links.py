@@ -15,17 +15,13 @@ from jaxid.io.urdf import Urdf, read_urdf
 from jaxid.model import Plant, parameters_of
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg
 from jaxid.plants.geometry import JOINTS, Geometry
+from jaxid.pseudo_inertia import TEN
 from jaxid.regrouping import base_parameters_by_rules
 
 # Chosen: beyond any arm; what lies behind it is a slip.
 _MOST_LINKS = 50
 # Entries of a list of the case, by the plant's parameters that they are.
-_LISTS = {
-    "first_moment": ("first_moment_x", "first_moment_y", "first_moment_z"),
-    "inertia": (
-        "inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz",
-    ),
-}
+_LISTS = {"first_moment": TEN[1:4], "inertia": TEN[4:]}
 # Angles, which may be in degrees: a right angle in rad has no end.
 _ANGLES = ("alpha", "theta")
 
@@ -102,9 +98,9 @@ def read_links_of_urdf(
     arm = read_urdf(Path(spot.file).parent / given["urdf"], given.get("tip"))
     if len(arm.names) > _MOST_LINKS:
         raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {_MOST_LINKS}")
-    unknown, names = given.get("unknown", "none"), ("mass", *_LISTS["first_moment"], *_LISTS["inertia"])
-    values = dict(zip(names, arm.bodies.T, strict=True))
-    free = {name: np.full(len(arm.names), unknown == "all") for name in names}
+    unknown = given.get("unknown", "none")
+    values = dict(zip(TEN, arm.bodies.T, strict=True))
+    free = {name: np.full(len(arm.names), unknown == "all") for name in TEN}
     if unknown == "base":
         weight = {name: given[name] for name in ("gravity_vector",) if name in given}
         plant = cls(**values, geometry=arm.geometry, **weight)
@@ -112,12 +108,12 @@ def read_links_of_urdf(
             mend = 'state a gravity_vector other than zero, or unknown = "all"'
             raise spot.at("unknown").refuse("base", "needs weight", mend)
         base = base_parameters_by_rules(plant, _ANGLE)
-        values = {name: np.zeros(len(arm.names)) for name in names}
+        values = {name: np.zeros(len(arm.names)) for name in TEN}
         for (name, k), value in zip(base.places, base.of(plant), strict=True):
             values[name][k], free[name][k] = value, True
     return {
         name: tuple(Value(float(v), bool(f)) for v, f in zip(values[name], free[name], strict=True))
-        for name in names
+        for name in TEN
     }, arm
 
 

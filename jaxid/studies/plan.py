@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.estimators import need_consistent
 from jaxid.io.case import Case
 from jaxid.machine import Machine
 from jaxid.studies.levels import Level, levels_of
@@ -72,7 +73,7 @@ class Plan:
 
         Raises:
             InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has
-                nothing to act on.
+                nothing to act on, or links must be what bodies can be and an estimator cannot keep to it.
         """
         setting, where = case.study, str(case.path)
         if not 0 <= seed < 2**31:
@@ -85,6 +86,9 @@ class Plan:
                 "nothing is unknown", where=where, mend="give at least one parameter as { guess = ... }"
             )
         estimators = tuple(setting.get("estimators", ("output_error",)))
+        for method in estimators:
+            if method != DISCOVER:
+                need_consistent(method, case)
         runs = int(setting.get("runs", _RUNS) if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, mend="give one or more")
