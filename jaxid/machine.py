@@ -169,7 +169,11 @@ def _inertial(case: Case, controller: Controller | None, plant: Plant) -> Inerti
     out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
     zero = np.zeros(plant.joints)
     rng = np.random.default_rng(0)
-    for q in (plant.any_motion(rng)[0] for _ in range(3)):
+    try:
+        positions = [plant.any_motion(rng)[0] for _ in range(3)]
+    except InputError as error:
+        raise InputError(f"{case.path}, [plant.parameters]: {error}") from error
+    for q in positions:
         readings = out.read(plant, q, zero, zero)
         if not bool(_told(out, plant, q, readings, zero)):
             what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"
