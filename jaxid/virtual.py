@@ -30,12 +30,12 @@ class Virtual:
     Args:
         log: As a sensor would have recorded it.
         trajectory: The motion behind it, without noise, one row a tick.
-        columns: Names of the columns, as the case's [log] has them.
+        columns: Names of the columns, as the case's [log] has them; else q, u, ref, or q1, q2 and so on.
     """
 
     log: Log
     trajectory: Trajectory
-    columns: dict[str, str]
+    columns: dict[str, str | list[str]]
 
     def csv(self) -> str:
         """The log as a table with a header, every digit kept."""
@@ -313,8 +313,11 @@ def _log(
     )
 
 
-def _columns(case: Case, *, reference: bool) -> dict[str, str]:
-    names = {"time": "t", "position": "q", "force": "u", "reference": "ref"}
+def _columns(case: Case, *, reference: bool) -> dict[str, str | list[str]]:
+    joints, drives = case.plant.joints - (case.plant.cls.load is not None), case.plant.drives
+    names: dict[str, str | list[str]] = {"time": "t"}
+    for key, name, count in (("position", "q", joints), ("force", "u", drives), ("reference", "ref", drives)):
+        names[key] = name if count == 1 else [f"{name}{k + 1}" for k in range(count)]
     if case.plant.cls.load is not None and (not case.log or "load_position" in case.log):
         names["load_position"] = "q_load"
     names.update({k: v for k, v in case.log.items() if k in names})

@@ -207,6 +207,13 @@ def test_positions_that_cannot_be_are_refused(tmp_path, capsys, log):
     assert "\n" not in str(caught.value)
 
 
+def test_columns_are_counted_where_a_case_names_none(tmp_path, capsys):
+    text = PLANT + INPUT.format(0, 0, "[2.0, 1.1]").replace("duration = 2.0", "duration = 0.1")
+    ran = simulated(tmp_path, capsys, text)
+    assert (ran.status, ran.err) == (0, "")
+    assert (tmp_path / "sim.csv").read_text().startswith("t,q1,q2,u1,u2\n")
+
+
 def test_reduction_counts_in_the_gain(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(PLANT + "[actuator]\ngain = [0.5, 2.0]\n" + OPEN)
