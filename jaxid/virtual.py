@@ -129,7 +129,7 @@ class Scene:
         joints = case.plant.joints
         position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
         velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
-        _refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
+        refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
         _refuse_massless(machine.plant, position, where)
         if machine.controller is None:
             if not case.input:
@@ -150,7 +150,7 @@ class Scene:
         )
         reference = _by_drive(reference, machine)
         if reference.shape[1] == joints:
-            _refuse_impossible(machine.plant, reference, f"{where}, [reference]", period)
+            refuse_impossible(machine.plant, reference, f"{where}, [reference]", period)
         machine = _scaled(machine, reference, period)
         drive = _drive(case, machine, period, longer_delays)
         _refuse_coarse(case, machine, drive, reference, position)
@@ -242,7 +242,7 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
         )
 
 
-def _refuse_impossible(
+def refuse_impossible(
     plant: Plant, positions: np.ndarray, where: str, period: float | None = None
 ) -> None:
     """Refuse positions that the machine cannot take; `period` is the time from one to the next."""
