@@ -192,10 +192,12 @@ def tidied(mapping: Float[np.ndarray, "base standard"]) -> Float[np.ndarray, "ba
 
 
 def _columns(plant: Plant, unknowns: int, rng: np.random.Generator) -> Float[np.ndarray, "rows standard"]:
-    """The regressor on random states: half a turn or half a metre to each side."""
+    """The regressor on random states that are possible: half a turn or half a metre to each side."""
     states = rng.uniform(-1.0, 1.0, (3, _STATES * unknowns, plant.joints))
     turns = np.asarray([plant.motion(k) == "rotary" for k in range(plant.joints)])
     states[0] *= np.where(turns, np.pi, 0.5)
+    while (found := plant.impossible(states[0])) is not None:
+        states[0, found[0]] = plant.any_motion(rng)[0]
     regressor: Any = inertial_regressor(plant, *states)
     return np.asarray(regressor).reshape(-1, unknowns)
 

@@ -29,6 +29,7 @@ from jaxid.parameters import scatter
 from jaxid.replay import Replay
 from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, needed_substeps
+from jaxid.virtual import refuse_impossible
 
 # Relative width of the guesses where the case states none.
 _PRIOR = 0.5
@@ -190,15 +191,16 @@ class _Bench:
         looped = machine.controller is not None
         drive = Drive(machine.gain, period, "zero_order", 1, True)
         none = np.zeros((ticks, m))
-        still, undisturbed = np.zeros(n), np.zeros((ticks, 1))
+        start, undisturbed = np.broadcast_to(setting.get("initial_position", 0.0), n), np.zeros((ticks, 1))
+        refuse_impossible(plant, start[None], f"{case.path}, [simulation] initial_position")
         inputs = (none, undisturbed, None) if looped else (None, None, none)
         # While an experiment is sought the command may go beyond: a cost without slope leads nowhere.
         free = machine.controller
         if looped and free.limit is not None:
             free = replace(free, limit=_BEYOND * jnp.asarray(free.limit))
-        replay = Replay(drive, free, Sensor(), *inputs, still, still, None, every)
-        q = jnp.zeros((1, n))
-        steps = min(needed_substeps(plant, drive, q, q, jnp.zeros((1, m))), _STEPS)
+        replay = Replay(drive, free, Sensor(), *inputs, start.astype(float), np.zeros(n), None, every)
+        q = jnp.asarray(replay.position)[None]
+        steps = min(needed_substeps(plant, drive, q, jnp.zeros_like(q), jnp.zeros((1, m))), _STEPS)
         replay = replace(replay, drive=replace(drive, substeps=steps))
         on = case.output_error.get("on", "position")
         prior = Prior.of(machine, case.output_error.get("prior", _PRIOR), np.zeros(0))

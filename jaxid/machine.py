@@ -107,6 +107,9 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
     gain = np.asarray(case.gain, dtype=np.float64) * np.asarray(plant.gearing)
     gain = np.broadcast_to(gain, (case.plant.drives,)).copy()
     controller = _controller(case, period, gain)
+    sensor = _sensor(case, controller, plant)
+    if controller is not None and "renewal" in controller.of_machine and sensor.inertial is not None:
+        controller = replace(controller, renewal=sensor.inertial.hold)
     return Machine(
         plant=plant,
         parameters=Parameters((*free, *more)),
@@ -114,7 +117,7 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
         units=case.plant.units,
         controller=controller,
         disturbance=(case.controller or {}).get("disturbance"),
-        sensor=_sensor(case, controller, plant),
+        sensor=sensor,
         hold=case.log.get("hold", "zero_order"),
         course=course,
     )
@@ -169,7 +172,11 @@ def _inertial(case: Case, controller: Controller | None, plant: Plant) -> Inerti
     out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
     zero = np.zeros(plant.joints)
     rng = np.random.default_rng(0)
-    for q in (plant.any_motion(rng)[0] for _ in range(3)):
+    try:
+        positions = [plant.any_motion(rng)[0] for _ in range(3)]
+    except InputError as error:
+        raise InputError(f"{case.path}, [plant.parameters]: {error}") from error
+    for q in positions:
         readings = out.read(plant, q, zero, zero)
         if not bool(_told(out, plant, q, readings, zero)):
             what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"

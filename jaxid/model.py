@@ -363,14 +363,14 @@ class Plant(eqx.Module):
         """A position that it can take, a velocity and an acceleration, to ask what the balance depends on.
 
         Raises:
-            ValueError: If no position in a thousand is possible.
+            InputError: If no position in a thousand is possible.
         """
         motion = random.uniform(0.5, 1.5, (3, self.joints))
         for _ in range(1000):
             if self.impossible(motion[:1]) is None:
                 return motion
             motion[0] = random.uniform(-np.pi, np.pi, self.joints)
-        raise ValueError(f"this {self.kind} cannot take any position: check its lengths.")
+        raise InputError(f"kind = '{self.kind}' cannot take any position", mend="check its lengths")
 
     def along(self, port: int) -> tuple[int, ...]:
         """Coordinates, as entries of `ports`, along which an effect on a port acts, each for itself."""

@@ -30,12 +30,12 @@ class Virtual:
     Args:
         log: As a sensor would have recorded it.
         trajectory: The motion behind it, without noise, one row a tick.
-        columns: Names of the columns, as the case's [log] has them.
+        columns: Names of the columns, as the case's [log] has them; else q, u, ref, or q1, q2 and so on.
     """
 
     log: Log
     trajectory: Trajectory
-    columns: dict[str, str]
+    columns: dict[str, str | list[str]]
 
     def csv(self) -> str:
         """The log as a table with a header, every digit kept."""
@@ -129,7 +129,7 @@ class Scene:
         joints = case.plant.joints
         position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
         velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
-        _refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
+        refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
         _refuse_massless(machine.plant, position, where)
         if machine.controller is None:
             if not case.input:
@@ -150,7 +150,7 @@ class Scene:
         )
         reference = _by_drive(reference, machine)
         if reference.shape[1] == joints:
-            _refuse_impossible(machine.plant, reference, f"{where}, [reference]", period)
+            refuse_impossible(machine.plant, reference, f"{where}, [reference]", period)
         machine = _scaled(machine, reference, period)
         drive = _drive(case, machine, period, longer_delays)
         _refuse_coarse(case, machine, drive, reference, position)
@@ -242,7 +242,7 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
         )
 
 
-def _refuse_impossible(
+def refuse_impossible(
     plant: Plant, positions: np.ndarray, where: str, period: float | None = None
 ) -> None:
     """Refuse positions that the machine cannot take; `period` is the time from one to the next."""
@@ -313,8 +313,11 @@ def _log(
     )
 
 
-def _columns(case: Case, *, reference: bool) -> dict[str, str]:
-    names = {"time": "t", "position": "q", "force": "u", "reference": "ref"}
+def _columns(case: Case, *, reference: bool) -> dict[str, str | list[str]]:
+    joints, drives = case.plant.joints - (case.plant.cls.load is not None), case.plant.drives
+    names: dict[str, str | list[str]] = {"time": "t"}
+    for key, name, count in (("position", "q", joints), ("force", "u", drives), ("reference", "ref", drives)):
+        names[key] = name if count == 1 else [f"{name}{k + 1}" for k in range(count)]
     if case.plant.cls.load is not None and (not case.log or "load_position" in case.log):
         names["load_position"] = "q_load"
     names.update({k: v for k, v in case.log.items() if k in names})

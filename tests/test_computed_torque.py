@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from adaptive_arm import TRUTH, driven, written
+from adaptive_arm import TEXT, TRUTH, driven, written
 from two_links import TwoLinks
 
 from jaxid.controllers import Tick
@@ -202,10 +202,7 @@ def test_feedback_does_not_see_how_late_a_velocity_is():
     np.testing.assert_allclose(u, 0.0, atol=1e-9)
 
 
-def test_differences_and_commands_are_of_one_instant(tmp_path):
-    """A mass alone, pushed by what jumps: its second difference over 16 ticks is the commands' own mean."""
-    case = tmp_path / "case.toml"
-    case.write_text("""
+MASS = """
 [plant]
 kind = "axis"
 [plant.parameters]
@@ -226,7 +223,35 @@ jerk = 1000.0
 [simulation]
 duration = 1.0
 sample_rate = 1000.0
-""")
+"""
+
+
+@pytest.mark.parametrize(("rate", "apart"), [(None, 8), (250.0, 4)])
+def test_half_life_is_of_time_however_far_samples_are_apart(tmp_path, rate, apart):
+    case = tmp_path / "case.toml"
+    text = MASS.replace("reach = 8", "reach = 8\nhalf_life = 0.05")
+    if rate is None:
+        case.write_text(text)
+        live, more = Live(case), {}
+    else:
+        case.write_text(TEXT.replace("period = 0.00025", "period = 0.001\nhalf_life = 0.05").replace(
+            "sample_rate = 4000.0", "sample_rate = 1000.0") + "".join(
+            f'[[inertial_sensors]]\nkind = "{kind}"\nlink = {link}\nnoise = 1e-3\nrate = {rate}\n{place}'
+            for link in (1, 2)
+            for kind, place in (("gyroscope", ""), ("accelerometer", "position = [0.2, 0.0, 0.0]\n"))))
+        live, more = Live(case), {"velocity": np.ones(2), "acceleration": np.ones(2)}
+    n = live.machine.plant.joints
+    for k in range(800):
+        live.command(np.full(n, 0.1 * np.sin(0.02 * k)), **more)
+    # The sum of all weights, of samples that all count, where many half-lives have passed.
+    beta = 0.5 ** (apart * 0.001 / 0.05)
+    assert abs(float(live.estimate.effective) / (n / (1 - beta)) - 1) < 0.2
+
+
+def test_differences_and_commands_are_of_one_instant(tmp_path):
+    """A mass alone, pushed by what jumps: its second difference over 16 ticks is the commands' own mean."""
+    case = tmp_path / "case.toml"
+    case.write_text(MASS)
     found = simulate(case).trajectory.found
     # The start counts a thousandth of a sample, of a hundred: 1e-5 of what it is off.
     np.testing.assert_allclose(found.theta[-1], [2.5], rtol=1e-5)

@@ -11,7 +11,9 @@ import pytest
 from five_bar_oracle import HINGES, ORDERS, Robot, possible_states
 from five_bar_stepper import acceleration as stepped
 
+from jaxid.base_parameters import base_parameters, inertial_regressor
 from jaxid.effects import EFFECTS
+from jaxid.errors import InputError
 from jaxid.model import port_motion
 from jaxid.plants import FiveBar, righettini_five_bar
 from jaxid.readings import State, acceleration
@@ -284,6 +286,21 @@ def test_positions_that_cannot_be_are_named(q, words):
     assert row == 2
     assert words in what
     assert np.isnan(np.asarray(plant.inertial(jnp.asarray(q), jnp.ones(2), jnp.ones(2)))).all()
+
+
+def test_base_parameters_are_of_positions_that_can_be():
+    plant = plant_of(UNEVEN)
+    found, state = base_parameters(plant), jnp.array([[2.0, 1.1], [1.0, -2.0], [3.0, 1.0]])
+    # Not every pair of angles is possible; the masses and inertias all are.
+    assert len(found.chosen) == len(found.names) == 7
+    rows = np.asarray(inertial_regressor(plant, *state[:, None]))[0]
+    np.testing.assert_allclose(rows @ found.of(plant), plant.inertial(*state), rtol=1e-9)
+
+
+def test_lengths_that_close_nowhere_are_refused():
+    plant = plant_of(dataclasses.replace(UNEVEN, length=(3.0, 0.24, 0.27, 0.26, 0.23)))
+    with pytest.raises(InputError, match="five_bar' cannot take any position; check its lengths"):
+        plant.any_motion(np.random.default_rng(0))
 
 
 def test_condition_is_that_of_the_eigenvalues():

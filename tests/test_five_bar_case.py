@@ -14,6 +14,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.recursive import recursive_steps
 from jaxid.estimators.steps import alone
+from jaxid.experiment import _Bench
 from jaxid.io.case import load_case
 from jaxid.machine import build_machine
 from jaxid.session import open_session
@@ -195,6 +196,29 @@ def test_positions_that_cannot_be_are_refused(tmp_path, capsys, log):
     with pytest.raises(InputError, match=r"row \d+: joints at .* out of reach.*check the lengths") as caught:
         opened(tmp_path, short + UNKNOWN + LOG, log)
     assert "\n" not in str(caught.value)
+
+
+def test_columns_are_counted_where_a_case_names_none(tmp_path, capsys):
+    text = PLANT + INPUT.format(0, 0, "[2.0, 1.1]").replace("duration = 2.0", "duration = 0.1")
+    ran = simulated(tmp_path, capsys, text)
+    assert (ran.status, ran.err) == (0, "")
+    assert (tmp_path / "sim.csv").read_text().startswith("t,q1,q2,u1,u2\n")
+
+
+def test_an_experiment_is_designed_from_where_the_robot_starts(tmp_path):
+    """Lengths with which both joints at zero is no position."""
+    text = PLANT.replace("[0.18,", "[0.6,") + effect("coulomb_friction", unknown(1.0, 2)) + OPEN + (
+        "[sensor]\nposition_noise = 1e-5\n[limits]\nstroke = [0.0, 3.0]\nspeed = 3.0\nforce = 0.5\n"
+        "[simulation]\nduration = 0.2\nsample_rate = 250.0\n"
+    )
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"initial_position: joints at \[0, 0\] rad are out of reach"):
+        _Bench.of(load_case(path))
+    path.write_text(text + "initial_position = [1.1, 2.0]\n")
+    bench = _Bench.of(load_case(path))
+    peaks = bench.peaks(np.zeros((len(bench.shapes.signal(bench.starts[0])), 2)))
+    np.testing.assert_allclose([peaks.low, peaks.high], [[1.1, 2.0]] * 2)
 
 
 def test_reduction_counts_in_the_gain(tmp_path):

@@ -77,18 +77,20 @@ class Adaptive(FeedForward):
         regularization: As how many samples the start counts.
         tolerance: See above.
         reach: In ticks; 0: `velocity_average`.
+        renewal: Ticks between new readings of inertial sensors.
 
     Source:
         Righettini et al. (2025), Robotics 14, 36, 2 and figure 1; it states no criterion of convergence.
     """
 
-    of_machine: ClassVar[tuple[str, ...]] = ("model", "gain", "estimator")
+    of_machine: ClassVar[tuple[str, ...]] = ("model", "gain", "estimator", "renewal")
 
     friction: bool = eqx.field(static=True, default=True, kw_only=True)
     estimator: RealTime = eqx.field(kw_only=True)
     regularization: Array = eqx.field(default=1e-3, kw_only=True)
     tolerance: Array = eqx.field(default=0.02, kw_only=True)
     reach: int = eqx.field(static=True, default=0, kw_only=True)
+    renewal: int = eqx.field(static=True, default=1, kw_only=True)
 
     @property
     def stride(self) -> int:
@@ -130,8 +132,11 @@ class Adaptive(FeedForward):
         """What the estimator says, of the memory that `command` returns."""
         return self._recursion(memory[1].information).told(memory[1].recursion)
 
-    def _recursion(self, information: Array) -> Any:
-        return eqx.tree_at(lambda r: r.information, self.estimator.recursion, information)
+    def _recursion(self, information: Array, ticks: int = 1) -> Any:
+        """The recursion with its start, of samples so many ticks apart: what it forgets is by time."""
+        recursion = self.estimator.recursion
+        values = information, jnp.asarray(recursion.forgetting) ** ticks
+        return eqx.tree_at(lambda r: (r.information, r.forgetting), recursion, values)
 
     def _learn(self, tick: Tick, memory: Learning) -> Learning:
         """With this tick's sample; the newest of the commands is its own, until measured better."""
@@ -140,7 +145,8 @@ class Adaptive(FeedForward):
             memory = eqx.tree_at(lambda m: m.commands, memory, newest)
         sample, ready = self._sample(tick, memory)
         rows, target, counts = self.estimator.rows(*sample)
-        recursion = self._recursion(memory.information)
+        apart = self.stride if tick.acceleration is None else self.renewal
+        recursion = self._recursion(memory.information, apart)
         new, _ = recursion.update(memory.recursion, rows, target, counts & ready & tick.fresh)
         done, share = memory.found.closed, memory.share
         closed = jax.lax.cond(
