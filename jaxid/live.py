@@ -106,8 +106,10 @@ class Live:
         path = jax.tree.map(lambda x: x[self._tick], self._path)
         others = (None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured))
         tick = Tick(position, path, self._driven, fresh, *others, renewed)
-        if self._memory is None:
-            self.memory = self._controller.start(tick, np.zeros_like(position), self._path)
+        if self._tick == 0:
+            start, saved = self._controller.start(tick, np.zeros_like(position), self._path), self.memory
+            # Readings of an earlier run would be differenced with those of this one.
+            self.memory = start if saved is None else self._controller.resumed(start, saved)
         if self._online is not None and self.switched is None:
             self._identify(position)
         u, self._memory = self._law(tick, self._memory)
@@ -118,7 +120,10 @@ class Live:
 
     @property
     def memory(self) -> object:
-        """What the controller remembers, a tree of arrays; one that was saved may be put back."""
+        """What the controller remembers, a tree of arrays.
+
+        Of one that was saved, and put back before the first tick, what was identified is kept.
+        """
         return None if self._memory is None else jax.tree.unflatten(self._law.memory, self._memory)
 
     @memory.setter
