@@ -94,7 +94,7 @@ class Live:
             measured: Command that the drives report since the last tick; absent: as it was given.
 
         Raises:
-            InputError: If the reference has ended.
+            InputError: If the reference has ended, or there is not one reading a joint.
         """
         if self._tick >= len(self.reference):
             raise InputError(
@@ -102,6 +102,10 @@ class Live:
                 mend="let [simulation] duration be longer",
             )
         position = np.asarray(position, dtype=np.float64)
+        joints = self.machine.plant.joints
+        if position.shape != (joints,):
+            what = f"position has shape {position.shape}"
+            raise InputError(what, where="Live.command", mend=f"give one reading of each of {joints} joints")
         fresh, renewed = (np.asarray(self._tick % hold == 0) for hold in self._holds)
         path = jax.tree.map(lambda x: x[self._tick], self._path)
         others = (None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured))

@@ -120,6 +120,8 @@ def test_a_new_run_keeps_what_was_identified_and_no_readings(tmp_path):
     case = written(tmp_path, ENCODER, 1.5)
     first, second = driven(case), Live(case)
     before = first.live.estimate.theta
+    with pytest.raises(InputError, match=r"position has shape \(3,\); give one reading of each of 2 joints"):
+        second.command(np.zeros(3))
     second.memory = jax.tree.map(np.asarray, first.live.memory)
     ran = driven(case, live=second, ticks=60)
     assert first.live.switched > 0
