@@ -94,7 +94,7 @@ class Live:
             measured: Command that the drives report since the last tick; absent: as it was given.
 
         Raises:
-            InputError: If the reference has ended.
+            InputError: If the reference has ended, or there is not one reading a joint.
         """
         if self._tick >= len(self.reference):
             raise InputError(
@@ -102,12 +102,18 @@ class Live:
                 mend="let [simulation] duration be longer",
             )
         position = np.asarray(position, dtype=np.float64)
+        joints = self.machine.plant.joints
+        if position.shape != (joints,):
+            what = f"position has shape {position.shape}"
+            raise InputError(what, where="Live.command", mend=f"give one reading of each of {joints} joints")
         fresh, renewed = (np.asarray(self._tick % hold == 0) for hold in self._holds)
         path = jax.tree.map(lambda x: x[self._tick], self._path)
         others = (None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured))
         tick = Tick(position, path, self._driven, fresh, *others, renewed)
-        if self._memory is None:
-            self.memory = self._controller.start(tick, np.zeros_like(position), self._path)
+        if self._tick == 0:
+            start, saved = self._controller.start(tick, np.zeros_like(position), self._path), self.memory
+            # Readings of an earlier run would be differenced with those of this one.
+            self.memory = start if saved is None else self._controller.resumed(start, saved)
         if self._online is not None and self.switched is None:
             self._identify(position)
         u, self._memory = self._law(tick, self._memory)
@@ -118,7 +124,10 @@ class Live:
 
     @property
     def memory(self) -> object:
-        """What the controller remembers, a tree of arrays; one that was saved may be put back."""
+        """What the controller remembers, a tree of arrays.
+
+        Of one that was saved, and put back before the first tick, what was identified is kept.
+        """
         return None if self._memory is None else jax.tree.unflatten(self._law.memory, self._memory)
 
     @memory.setter

@@ -115,6 +115,21 @@ def test_a_saved_memory_goes_on(tmp_path):
     assert int(whole.memory[1].ticks) == 400
 
 
+def test_a_new_run_keeps_what_was_identified_and_no_readings(tmp_path):
+    """From another place: a difference to where the last run ended would be 1e5 rad/s^2."""
+    case = written(tmp_path, ENCODER, 1.5)
+    first, second = driven(case), Live(case)
+    before = first.live.estimate.theta
+    with pytest.raises(InputError, match=r"position has shape \(3,\); give one reading of each of 2 joints"):
+        second.command(np.zeros(3))
+    second.memory = jax.tree.map(np.asarray, first.live.memory)
+    ran = driven(case, live=second, ticks=60)
+    assert first.live.switched > 0
+    assert second.switched == 0
+    np.testing.assert_allclose(second.estimate.theta, before, rtol=0.01)
+    assert np.abs(ran.command).max() < 1.5 * np.abs(first.command).max()
+
+
 def test_simulation_and_live_are_one_law_and_readings_are_held(tmp_path):
     """Readings at 1 kHz in a loop at 4 kHz, exact sticking: live, on the same readings, commands the same."""
     sensor = "rate = 1000.0\nposition_noise = 1e-7\nforce_noise = 0.1"

@@ -123,6 +123,10 @@ class Adaptive(FeedForward):
         commands = jnp.concatenate([given[None], learnt.commands[:-1]])
         return u, eqx.tree_at(lambda m: (m.feedback, m.commands), learnt, (feedback, commands))
 
+    def resumed(self, start: Any, saved: Any) -> Any:
+        kept = lambda memory: (memory[1].recursion, memory[1].information, memory[1].found)
+        return eqx.tree_at(kept, start, kept(saved))
+
     def told(self, memory: Any) -> Found:
         """What has been found, of the memory that `command` returns."""
         return memory[1].found

@@ -116,6 +116,10 @@ class Controller(eqx.Module):
         """Memory of the law itself."""
         return None
 
+    def resumed(self, start: Any, saved: Any) -> Any:
+        """A memory at the start of a new run with what was identified in an earlier one."""
+        return start
+
     def told(self, memory: Any) -> Any:
         """What a law that identifies has found so far; None of one that does not."""
         return None
