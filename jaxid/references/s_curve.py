@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 from jaxtyping import Float
 
 
@@ -130,4 +129,6 @@ def _peak(distance: float, bounds: Bounds) -> float:
         return (-linear + np.sqrt(linear**2 - 4 * square * constant)) / (2 * square)
     if excess(low) >= 0:  # by rounding
         return low
+    import scipy.optimize  # only where no closed form serves
+
     return scipy.optimize.brentq(excess, low, high, xtol=1e-300, rtol=4 * np.finfo(float).eps)

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import scipy.spatial
 from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, Key
@@ -96,6 +95,8 @@ def _drawn(polygon: np.ndarray, seed: int, grid: Grid) -> Iterator[np.ndarray]:
 
 def _simplices(polygon: np.ndarray, grid: Grid) -> Float[np.ndarray, "k n1 n"]:
     """A polygon as triangles, by their corners."""
+    import scipy.spatial  # a third of a second, which no other kind of reference needs
+
     n = polygon.shape[1]
     if n == 1:
         if len(polygon) != 2 or polygon[0] == polygon[1]:
