@@ -10,8 +10,8 @@ import jaxid as jaxid
 
 os.environ["JAXID_CACHE"] = "off"
 
-# Each compiled function takes about a dozen memory maps, of which Linux gives a process 65 530: what the whole
-# suite compiles does not fit, and then the compiler dies.
+# Each compiled function takes about a dozen memory maps, of which Linux gives a process 65 530: what the
+# whole suite compiles does not fit, and then the compiler dies.
 _MAPS, _MANY = Path("/proc/self/maps"), 20_000
 
 

@@ -1,15 +1,16 @@
 """References for a loop and inputs for open loop: one family a file."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
-from jaxid.model import Plant
 from jaxid.references.bezier import BEZIER
 from jaxid.references.csv import CSV
 from jaxid.references.family import Family, Grid, Key
@@ -18,6 +19,9 @@ from jaxid.references.moves import POINT_TO_POINT, TRAPEZOID
 from jaxid.references.multisine import MULTISINE
 from jaxid.references.quarter_sine import QUARTER_SINE
 from jaxid.references.synchronized import SYNCHRONIZED
+
+if TYPE_CHECKING:
+    from jaxid.model import Plant
 
 __all__ = ["REFERENCES", "Family", "Key", "make_reference"]
 

@@ -1,15 +1,19 @@
 """What a family of references declares, and how a table of the case is read against it."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from jaxid.errors import InputError, suggest
-from jaxid.model import Plant
+
+if TYPE_CHECKING:
+    from jaxid.model import Plant
 
 REQUIRED = object()
 Shape = Literal["number", "whole", "flag", "text", "list", "range", "points"]
