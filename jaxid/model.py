@@ -392,7 +392,7 @@ class Plant(eqx.Module):
             InputError: If the plant has no links that move in space.
         """
         what = f"kind = '{self.kind}' has no links that move in space"
-        raise InputError(what, mend="put sensors on the links of kind = 'serial_arm'")
+        raise InputError(what, mend="put sensors on the links of a serial_arm or five_bar")
 
     @property
     def base_gravity(self) -> Float[Array, "3"]:
