@@ -56,7 +56,8 @@ def read_ports(
             what, mend = f"has no command for {cls.kind} to act on", "name the joint of the drive"
             raise spot.at(name).refuse(table[name], what, mend)
         if name == "tool" and not cls.any_direction:
-            mend = "name a joint; on a tool acts what is the same in all directions (added_mass, viscous_friction)"
+            alike = "what is the same in all directions (added_mass, viscous_friction)"
+            mend = f"name a joint; on a tool acts {alike}"
             raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", mend)
         return tuple(before + k for k in _places(table, name, there[name], spot)), name
     if "joint" in table:
