@@ -37,6 +37,8 @@ NOISY = dataclasses.replace(axes.SENSOR, force_noise=0.8)
 QUIET = dataclasses.replace(axes.SENSOR, force_noise=0.08)
 PUBLISHED = "[preprocess]\ncutoff_hz = 60.0\norder = 4\ndecimation = 12\n"
 SECONDS = 25.0
+# In noise of the published size as long as the friction split takes to be told to 5 %.
+LONG = 100.0
 FREQUENCY = float(np.sqrt(8e5 * (1 / 72.3 + 1 / 34.8)) / (2 * np.pi))  # Hz, free motor, free load
 # Of the paper: value, and half of the published 2 sigma.
 TABLE_2 = {
@@ -81,7 +83,7 @@ def frequency_of(session: Session, estimate: Estimate) -> float:
 
 def first_model(folder: Path) -> bool:
     """Table 2: both encoders, by the published filter and by the one that the log asks for."""
-    begin, log = time.perf_counter(), axes.record(duration=SECONDS, sensor=NOISY)
+    begin, log = time.perf_counter(), axes.record(duration=LONG, sensor=NOISY)
     found = {}
     for name, extra in (("published filter", PUBLISHED), ("chosen filter", "")):
         case, data = written(folder, f"table2_{name.split()[0]}", log, axes.text(sensor=NOISY) + extra)
@@ -142,11 +144,11 @@ def cell_of(estimate: Estimate, name: str) -> str:
 
 
 def _sound(found: jaxid.Identification) -> bool:
-    """Within three standard deviations, or within the aim where that is wider."""
+    """Within three standard deviations, and within the aims."""
     off = {n: abs(found.value(n) - v) for n, (v, _) in TABLE_2.items()}
     std = dict(zip(found.estimate.names, found.estimate.std, strict=True))
     return all(off[n] <= 3 * std[n] for n in off) and all(
-        off[n] <= max(part / 100 * TABLE_2[n][0], 3 * std[n]) for n, part in AIMS.items()
+        off[n] <= part / 100 * TABLE_2[n][0] for n, part in AIMS.items()
     )
 
 
@@ -179,10 +181,9 @@ def trajectories(folder: Path) -> bool:
 def added_mass(folder: Path) -> bool:
     """Tables 6 and 7: ten kilograms on the load, and `discover` with what was found before as known."""
     begin = time.perf_counter()
-    before = jaxid.identify(*written(
-        folder, "unladen", axes.record(duration=SECONDS, sensor=NOISY), axes.text(sensor=NOISY)
-    ), method="inverse_dynamics").estimate
-    laden = axes.record(axes.machine(load_inertia=44.8), duration=SECONDS, sensor=NOISY, seed=1)
+    files = written(folder, "unladen", axes.record(duration=LONG, sensor=NOISY), axes.text(sensor=NOISY))
+    before = jaxid.identify(*files, method="inverse_dynamics").estimate
+    laden = axes.record(axes.machine(load_inertia=44.8), duration=LONG, sensor=NOISY, seed=1)
     after = jaxid.identify(
         *written(folder, "laden", laden, axes.text(sensor=NOISY)), method="inverse_dynamics"
     ).estimate
@@ -193,7 +194,10 @@ def added_mass(folder: Path) -> bool:
         change, std = after.theta[k] - before.theta[k], float(np.hypot(after.std[k], before.std[k]))
         table.row(name, f"{change:.4g} ± {std:.2g}", f"{change / std:.1f}")
     table.show(time.perf_counter() - begin)
-    known = dict(zip(before.names, (float(v) for v in before.theta), strict=True))
+    # What is stated as known must be better known than by this log: inverse dynamics' values are not, and
+    # a static friction then makes up for their errors.
+    best = jaxid.identify(*files).estimate
+    known = dict(zip(best.names, (float(v) for v in best.theta), strict=True))
     found = jaxid.discover(*written(folder, "laden_known", laden, axes.text(sensor=NOISY, known=known)))
     print(found)
     k = before.names.index("load_inertia")
