@@ -76,6 +76,7 @@ def set_valued_step(
     sliding = _sliding(plant, x, free, mass, levels, end, t, h)
     moves = depends(lambda qd: [getattr(at(qd), n) for n in ("dry", "stick", "rising")], (midway,))
     at_rest = at(standing) if moves else levels
+
     found = sliding.answer(levels, at_rest)
     reaction = spread(found.reaction, levels.slides, none.size)
     if moves:
@@ -127,13 +128,23 @@ class _Sliding:
         """Of friction at given levels, and at those at rest."""
         dry = picked(levels.dry, self.ports)
         held = picked(at_rest.dry, self.ports) + picked(at_rest.stick, self.ports)
-        if self.mobility is None:
+        if levels.rises:
             rising = [
-                jnp.stack([picked(r, self.ports) for r in b.rising]) if b.rises else None
-                for b in (levels, at_rest)
+                jnp.stack([picked(r, self.ports) for r in b.rising]) for b in (levels, at_rest)
             ]
             return _own_reaction(self.own, self.speed, self.before, dry, held, *rising, self.corner)
-        return _shared_reaction(self.mobility, self.speed, self.before, dry, held)
+        drag = -jnp.sign(self.before) * dry
+        if self.mobility is None:
+            after = self.speed + self.own * drag
+            general = lambda: _own_reaction(self.own, self.speed, self.before, dry, held)
+        else:
+            after = self.speed + jnp.sum(self.mobility * drag, axis=1)
+            general = lambda: _shared_reaction(self.mobility, self.speed, self.before, dry, held)
+        no = jnp.zeros(drag.shape, bool)
+        # Nearly all steps only drag. A branch, not a choice between two results: the others cost more.
+        return jax.lax.cond(
+            jnp.all(self.before * after > 0.0), lambda: _Answer(drag, no, no, jnp.ones_like(drag)), general
+        )
 
 
 def _sliding(
