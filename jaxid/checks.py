@@ -67,7 +67,7 @@ class Check:
                 "peak_velocity": np.abs(seen(session.fit.data.qd)).max(axis=0),
                 "peak_force": np.abs(session.fit.data.force).max(axis=0),
                 "moving": float(session.fit.data.moving.mean()),
-                "position_noise": seen(signals.high_band_std(log.filled, log.rate_hz)),
+                "position_noise": seen(signals.high_band_std(log.filled)),
             },
             "preprocess": recipe_json(session),
             "noise_floor": self.noise_floor,

@@ -362,7 +362,7 @@ def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
     """
     stated = machine.sensor.position_std
     if stated is None:
-        stated = signals.high_band_std(log.filled, log.rate_hz)
+        stated = signals.high_band_std(log.filled)
     return np.broadcast_to(np.asarray(stated), log.position.shape[1]) * log.measured
 
 

@@ -248,7 +248,7 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     band = cutoff if literal else edge
     decimation = int(stated.get("decimation", _decimation(log, band)))
     q, qd, _ = differentiate(log.filled, log.period, cutoff, 4, how, reach=reach)
-    noise = signals.high_band_std(log.filled, rate)
+    noise = signals.high_band_std(log.filled)
     # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
     velocity_noise = noise * 2 * np.pi * np.sqrt(2 * cutoff**3 / (3 * rate))
     if parabolic:
@@ -319,7 +319,7 @@ def _noise_cutoff(log: Log) -> float:
     f, p = scipy.signal.welch(
         position, rate, window="hann", nperseg=length, detrend="linear", axis=0
     )
-    floor = 2 * signals.high_band_std(position, rate) ** 2 / rate
+    floor = 2 * signals.high_band_std(position) ** 2 / rate
     above = np.all(p > 4 * floor, axis=1) & (f < 0.3 * rate)
     first_lost = np.argmax(~above[1:]) + 1 if np.any(~above[1:]) else len(f) - 1
     lowest = 8.0 / (log.samples * log.period)

@@ -251,7 +251,7 @@ def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
     n = (log.samples - 1) * every + 1
     flags = np.zeros(n, bool)
     q, v = np.zeros((n, log.filled.shape[1])), np.zeros((n, log.filled.shape[1]))
-    noise = signals.high_band_std(log.filled, log.rate_hz)
+    noise = signals.high_band_std(log.filled)
     for k in range(0, log.samples, length):
         flags[k * every] = True
         q[k * every], v[k * every] = local_line(log, k, noise)
@@ -277,7 +277,7 @@ def local_line(
         k: The sample.
         noise: Standard deviation of a reading, by joint; absent: read off the log.
     """
-    noise = signals.high_band_std(log.filled, log.rate_hz) if noise is None else noise
+    noise = signals.high_band_std(log.filled) if noise is None else noise
     position = velocity = low = high = None
     for reach in _REACHES:
         q, v, size = _parabola(log, k, reach)

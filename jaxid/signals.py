@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import jax.numpy as jnp
 import numpy as np
@@ -77,7 +77,7 @@ def median_noise(width: int) -> float:
     Of noise that is larger than the signal's rise from sample to sample; found on Gaussian noise.
     """
     white = np.random.default_rng(0).standard_normal((1 << 18, 1))
-    return float(high_band_std(running_median(white, width), 1.0)[0])
+    return float(high_band_std(running_median(white, width))[0])
 
 
 def parabolic_derivatives(
@@ -314,13 +314,21 @@ def delayed(
     return _through(u, 200, response)
 
 
-def high_band_std(x: Float[np.ndarray, "time k"], rate_hz: float) -> Float[np.ndarray, " k"]:
+def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
     """Standard deviation of white noise that would fill the top of the spectrum as x does.
 
     The median of the periodogram between 0.6 and 0.95 of Nyquist, over the median of an
     exponential distribution: lines and a few bad frequencies do not move it.
     """
-    f, p = scipy.signal.periodogram(x, rate_hz, window="hann", detrend="linear", axis=0)
-    band = (f > 0.3 * rate_hz) & (f < 0.475 * rate_hz)
-    density = np.median(p[band], axis=0) / np.log(2.0)
-    return np.sqrt(density * rate_hz / 2)
+    window = _hann(len(x))
+    spectrum = scipy.fft.rfft(window[:, None] * scipy.signal.detrend(x, axis=0), axis=0)
+    f = np.arange(len(spectrum)) / len(x)
+    band = spectrum[(f > 0.3) & (f < 0.475)]
+    # `scipy.signal.periodogram` says the same, five times slower: studies ask it of every run, twice.
+    power = np.median(band.real**2 + band.imag**2, axis=0) / np.sum(window**2)
+    return np.sqrt(power / np.log(2.0))
+
+
+@lru_cache(maxsize=4)
+def _hann(size: int) -> np.ndarray:
+    return scipy.signal.get_window("hann", size)

@@ -152,7 +152,7 @@ def test_median_of_an_impossible_width_is_refused(width):
 @pytest.mark.parametrize("width", [3, 5, 9])
 def test_noise_behind_a_median_is_read_back(width):
     white = 0.3 * np.random.default_rng(8).standard_normal((50_000, 1))
-    seen = signals.high_band_std(signals.running_median(white, width), 1000.0)
+    seen = signals.high_band_std(signals.running_median(white, width))
     assert seen[0] < 0.5 * 0.3
     np.testing.assert_allclose(seen / signals.median_noise(width), 0.3, rtol=0.05)
 
@@ -241,4 +241,4 @@ def test_high_band_std_reads_the_noise_under_a_signal(sigma):
     t = PERIOD * np.arange(20_000)[:, None]
     x = 5 * sigma * np.sin(2 * np.pi * 400.0 * t) + 100 * np.sin(2 * np.pi * 3.0 * t) + noise
     # median of 7000 bins of the periodogram, neighbours alike under the window: 1 %
-    np.testing.assert_allclose(signals.high_band_std(x, 1000.0), sigma, rtol=0.05)
+    np.testing.assert_allclose(signals.high_band_std(x), sigma, rtol=0.05)

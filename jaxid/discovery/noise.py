@@ -38,7 +38,7 @@ def sensor_colour(machine: Machine, log: Log, data: Prepared) -> tuple[NoiseMode
         data: The same, prepared.
     """
     unstated = machine.sensor.force_noise is None
-    force_noise = signals.high_band_std(log.force, log.rate_hz) if unstated else None
+    force_noise = signals.high_band_std(log.force) if unstated else None
     if unstated and data.recipe.median:
         force_noise = force_noise / signals.median_noise(data.recipe.median)
     f, power = noise_density(machine, log, data, force_noise)

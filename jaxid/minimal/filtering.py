@@ -68,7 +68,7 @@ def spectrum_of(
     length = int(min(log.samples, max(256, 2 * rate)))
     force = log.force * machine.gain
     f, density = scipy.signal.welch(force, rate, nperseg=length, detrend="linear", axis=0)
-    white = signals.high_band_std(force, rate) / (signals.median_noise(median) if median else 1.0)
+    white = signals.high_band_std(force) / (signals.median_noise(median) if median else 1.0)
     floor = 2 * white**2 / rate
     own = 2 * position_noise(machine, log) ** 2 / rate
     row, lead = next((k[1].row, k[1]) for k in structure.leading if k is not None)
