@@ -137,6 +137,7 @@ def fit(run: Replay, base: Axis, theta: np.ndarray, measured: np.ndarray) -> Min
     measured = jnp.asarray(measured)[:, None]
     weight, active = jnp.ones(measured.shape), np.ones(len(PLACES), bool)
     minimum = _fit(
-        run, PLACES, base, measured, weight, jnp.asarray(theta), TRANSFORM, BOUNDS, active
+        run, PLACES, base, measured, weight, jnp.asarray(theta), TRANSFORM, BOUNDS, "position",
+        active,
     )
     return jax.block_until_ready(minimum)

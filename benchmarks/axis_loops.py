@@ -27,7 +27,7 @@ def acceleration(v, u, theta, width):
     return (u - c * v - f * math.tanh(v / width) + f0) / m
 
 
-@njit(cache=False)
+@njit(cache=False, nogil=True)
 def rk4_forward(theta, reference, loop, start, out):
     """Smoothed friction, classical Runge-Kutta, one step a tick; positions into `out`."""
     h, width = loop[4], loop[5]
@@ -60,9 +60,9 @@ def linear_flow(theta, h):
     return grow, h / m * p1, h * p1, h * h / m * p2
 
 
-@njit(cache=False)
+@njit(cache=False, nogil=True)
 def ideal_forward(theta, reference, loop, start, out):
-    """Set-valued friction: the linear flow, then friction that stops or drags."""
+    """Set-valued friction: the linear flow, then friction that stops, turns within the step or drags."""
     h = loop[4]
     vv, vf, qv, qf = linear_flow(theta, h)
     level, mobility = theta[2], h / theta[0]
@@ -72,11 +72,26 @@ def ideal_forward(theta, reference, loop, start, out):
         out[k] = q
         force = loop[0] * command(reference[k], q, past, loop) + theta[3]
         free = vv * v + vf * force
-        wanted = -free / mobility
-        reaction = min(max(wanted, -level), level)
+        ahead = v if v != 0.0 else free
+        drag = level if ahead > 0.0 else -level if ahead < 0.0 else 0.0
+        slid = free - mobility * drag
         past, last = last, q
-        q += qv * v + qf * (force + reaction)
-        v = free + vf * reaction if reaction != wanted else 0.0
+        if v * slid >= 0.0 and v != 0.0:
+            q += qv * v + qf * (force - drag)
+            v = free - vf * drag
+            continue
+        # At rest before, or within the step.
+        part = v / (v - slid) if v != 0.0 else 1.0
+        if abs(free - v) <= mobility * level:
+            reaction, after = -free / mobility, 0.0
+        else:
+            reaction = (1.0 - 2.0 * part) * drag
+            after = free + vf * reaction
+        if v != 0.0:
+            q += qv * v + qf * (force + reaction) - 0.5 * h * ((1.0 - part) * v + part * after)
+        elif after != 0.0:
+            q += qf * (force + reaction)
+        v = after
 
 
 @njit(cache=False)

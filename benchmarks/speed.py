@@ -125,6 +125,21 @@ class Sides:
     def scipy_fit(self, name: str) -> Callable:
         return lambda: rivals.lm_fit(name, self.reference, self.measured, LOOP, axis.START).x
 
+    def many_fits(self, name: str, *, scipy: bool) -> Callable:
+        """Fits from as many starts as there are sets, shared out between two threads."""
+        run = self.runs[name]
+
+        def one(start: np.ndarray) -> np.ndarray:
+            if scipy:
+                return rivals.lm_fit(name, self.reference, self.measured, LOOP, start).x
+            return np.asarray(axis.fit(run, self.base, start, self.measured).theta)
+
+        def all_of_them() -> np.ndarray:
+            with ThreadPoolExecutor(2) as pool:
+                return np.stack(list(pool.map(one, self.sets)))
+
+        return all_of_them
+
 
 def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
     """Every comparison; n repeats, fewer of what takes long."""
@@ -154,6 +169,8 @@ def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
                 None, n, 1e-3),
         compare("fit, warm, ideal", sides.fit("ideal"), lm, sides.scipy_fit("smooth"), None, n,
                 0.1),
+        compare("1024 fits, 2 threads, ideal", sides.many_fits("ideal", scipy=False), lm + ", ideal, 2 threads",
+                sides.many_fits("ideal", scipy=True), None, few, 1e-3),
         compare("1024 sets, one vmap", lambda: vmapped(sets, sides.seen), prange, sides.loop_sets,
                 None, few, 1e-6),
         compare("1024 sets, 2 threads", sides.two_threads("smooth"), prange, sides.loop_sets,

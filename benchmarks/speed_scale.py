@@ -1,4 +1,4 @@
-"""What fits cost against cores, length of the log and masses, and what commands cost from cold.
+"""What fits cost against cores, length of the log, masses and joints, and what commands cost from cold.
 
 Each number is of a fresh process: peak memory is a process's, and so are its cores.
 """
@@ -21,7 +21,8 @@ FITS, STAGE = (HERE / "cases" / f"{name}.toml" for name in ("fits", "stage"))
 # Studies: the axis, the stage read exactly, and by as many counts a turn as published.
 CASES = {"axis": (FITS, None), "stage": (STAGE, None), "stage, 500 counts": (STAGE, 2 * np.pi / 500)}
 LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
-MASSES = (1, 2, 4, 6, 10)
+# Kinds of what has several joints, and how many.
+JOINTS = {"chain": (1, 2, 4, 6, 10), "arm": (1, 2, 4, 7)}
 # Milliseconds a fit of studies and of one log that is warm; bytes of a log of a million samples;
 # seconds of `jaxid --help`.
 AIMS = {"axis": 10.0, "stage": 10.0, "fit": 30.0, "memory": 2 * 2**30, "help": 0.5}
@@ -86,8 +87,8 @@ def lasting(samples: int) -> str:
     return text.replace("duration = 25.0", f"duration = {seconds}")
 
 
-def chain(masses: int, samples: int, repeats: int) -> dict:
-    """A chain of so many masses in its loop, two unknowns each: a run, a Gauss-Newton step, compiling."""
+def joints(kind: str, count: int, samples: int, repeats: int) -> dict:
+    """So many masses or joints in their loop, two unknowns each: a run, a Gauss-Newton step, compiling."""
     import jax
     import jax.numpy as jnp
 
@@ -98,7 +99,7 @@ def chain(masses: int, samples: int, repeats: int) -> dict:
 
     with tempfile.TemporaryDirectory() as folder:
         case = Path(folder) / "case.toml"
-        case.write_text(chain_case(masses, samples / 1000))
+        case.write_text({"chain": chain_case, "arm": arm_case}[kind](count, samples / 1000))
         log = jaxid.simulate(case).log
         machine = open_session(case, log).machine
     replay = make_replay(machine, log, choose_numerics(machine, log))
@@ -109,7 +110,7 @@ def chain(masses: int, samples: int, repeats: int) -> dict:
         jacobian, e = jax.jacfwd(lambda x: (residual(x).ravel(),) * 2, has_aux=True)(theta)
         return jacobian.T @ jacobian, jacobian.T @ e
 
-    out = {"masses": masses, "unknowns": theta.size, "samples": log.samples}
+    out = {"kind": kind, "joints": count, "unknowns": theta.size, "samples": log.samples}
     for name, function in (("run", residual), ("step", normal)):
         compiled = jax.jit(function)
         seconds = _timed(lambda f=compiled: jax.block_until_ready(f(theta)), repeats + 1)
@@ -120,7 +121,7 @@ def chain(masses: int, samples: int, repeats: int) -> dict:
 def chain_case(masses: int, seconds: float) -> str:
     """A chain, every mass driven, its masses and friction unknown."""
     each = lambda value: f"[{', '.join([value] * masses)}]"
-    return f"""
+    plant = f"""
 [plant]
 kind = "chain"
 [plant.parameters]
@@ -131,19 +132,57 @@ stiffness = [{', '.join(['1500.0'] * (masses + 1))}]
 kind = "coulomb_friction"
 level = {each('{ guess = 2.0, true = 3.0 }')}
 joint = [{', '.join(str(k + 1) for k in range(masses))}]
+"""
+    return plant + LOOP.format(kp=3000.0, kd=80.0, targets="0.03, -0.02, 0.01, 0.04, 0.0", speed=0.2,
+                               acceleration=4.0, seconds=seconds)  # fmt: skip
+
+
+def arm_case(count: int, seconds: float) -> str:
+    """The first joints of the PA-10 with bodies and rotors of its size, the friction unknown."""
+    from jaxid.plants import pa10
+
+    table = pa10()
+    links = "".join(
+        f"""
+[[plant.links]]
+joint = "revolute"
+alpha = {float(table.alpha[k])!r}
+a = {float(table.a[k])!r}
+d = {float(table.d[k])!r}
+mass = 5.0
+first_moment = [0.1, 0.2, 0.3]
+inertia = [0.1, 0.0, 0.0, 0.1, 0.0, 0.1]
+rotor_inertia = 0.5
+"""
+        for k in range(count)
+    )
+    friction = """
+[[effects]]
+kind = "viscous_friction"
+coefficient = { guess = 4.0, true = 6.0 }
+[[effects]]
+kind = "coulomb_friction"
+level = { guess = 2.0, true = 4.0 }
+"""
+    return '[plant]\nkind = "serial_arm"\n' + links + friction + LOOP.format(
+        kp=4000.0, kd=200.0, targets="0.6, -0.4, 0.2, 0.8, 0.0", speed=1.0, acceleration=8.0, seconds=seconds
+    )  # fmt: skip
+
+
+LOOP = """
 [controller]
 kind = "pd"
-kp = 3000.0
-kd = 80.0
+kp = {kp}
+kd = {kd}
 period = 0.001
 [sensor]
 position_noise = 1e-6
 [reference]
 kind = "trapezoid"
 start = 0.0
-targets = [0.03, -0.02, 0.01, 0.04, 0.0]
-speed = 0.2
-acceleration = 4.0
+targets = [{targets}]
+speed = {speed}
+acceleration = {acceleration}
 [simulation]
 duration = {seconds}
 sample_rate = 1000.0
@@ -155,12 +194,14 @@ def commands() -> list[dict]:
     demo = HERE.parent / "jaxid" / "demo"
     case, log, other = (str(demo / name) for name in ("case.toml", "log.csv", "validation.csv"))
     words = {
-        "--help": ["--help"], "effects": ["effects"], "check": ["check", case, log],
+        "--help": ["--help"], "plants": ["plants"], "effects": ["effects"], "check": ["check", case, log],
         "identify": ["identify", case, log],
         "identify --method inverse_dynamics": ["identify", case, log, "--method", "inverse_dynamics"],
         "discover --validate": ["discover", case, log, "--validate", other],
         "simulate": ["simulate", str(FITS), "-o", "{out}/log.csv", "--force"],
+        "design": ["design", str(HERE / "cases" / "design.toml"), "-o", "{out}/reference.csv", "--force"],
         "study --runs 64": ["study", str(FITS), "--runs", "64"],
+        "demo": ["demo", "-o", "{out}/demo", "--force"],
     }
     rows = []
     for name, own in words.items():
@@ -182,7 +223,7 @@ def measured(*, quick: bool) -> dict:
     """All of it."""
     n = os.cpu_count() or 1
     runs, repeats = (128, 2) if quick else (1024, 5)
-    out = {"study": [], "lengths": [], "masses": []}
+    out = {"study": [], "lengths": [], "joints": []}
     for name in CASES:
         for cores in sorted({1, n}):
             found = {"case": name, "cores": cores} | child("study", name, runs, cores=cores)
@@ -191,9 +232,10 @@ def measured(*, quick: bool) -> dict:
     for samples in (25_000, *(LENGTHS[:-1] if quick else LENGTHS)):
         out["lengths"].append(child("fit", samples, repeats if samples < 1e6 else 1))
         print(f"{samples} samples: {out['lengths'][-1]}", flush=True)
-    for masses in MASSES[:3] if quick else MASSES:
-        out["masses"].append(child("chain", masses, 10_000, repeats))
-        print(f"{masses} mass(es): {out['masses'][-1]}", flush=True)
+    for kind, counts in JOINTS.items():
+        for count in counts[:3] if quick else counts:
+            out["joints"].append(child("joints", kind, count, 10_000, repeats))
+            print(f"{kind} of {count}: {out['joints'][-1]}", flush=True)
     out["commands"] = commands()
     return out
 
@@ -226,14 +268,14 @@ def tables(found: dict) -> list[str]:
     if longest["samples"] >= 1_000_000:
         lines += [f"A million samples: {megabytes(longest['memory'])} MB "
                   f"(aim 2048: {met(longest['memory'], AIMS['memory'])})."]  # fmt: skip
-    lines += ["", "## Against the number of masses", "",
-              "A chain in its loop, every mass driven, 10 000 samples.",
-              "", "| masses | unknowns | run, ms | Gauss-Newton step, ms | compiling both, s |",
-              "|---|---|---|---|---|"]  # fmt: skip
-    for r in found["masses"]:
+    lines += ["", "## Against the number of masses, of joints, of unknowns", "",
+              "A chain, every mass driven, and an arm, in their loops, 10 000 samples.",
+              "", "| | masses or joints | unknowns | run, ms | Gauss-Newton step, ms | compiling both, s |",
+              "|---|---|---|---|---|---|"]  # fmt: skip
+    for r in found["joints"]:
         compiling = r["run_compile_s"] + r["step_compile_s"]
         shown = " | ".join(f"{x:.1f}" for x in (r["run_ms"], r["step_ms"], compiling))
-        lines.append(f"| {r['masses']} | {r['unknowns']} | {shown} |")
+        lines.append(f"| {r['kind']} | {r['joints']} | {r['unknowns']} | {shown} |")
     lines += ["", "## Commands", "", "Seconds of a fresh process on the demo's log, nothing compiled before; "
               "and once more.", "", "| jaxid | first | again |", "|---|---|---|"]  # fmt: skip
     for r in found["commands"]:
@@ -260,7 +302,7 @@ def _memory() -> int:
 
 def main(what: str, *words: str) -> None:
     numbers = [int(w) if w.isdigit() else w for w in words]
-    print(json.dumps({"study": study, "fit": fit, "chain": chain}[what](*numbers)))
+    print(json.dumps({"study": study, "fit": fit, "joints": joints}[what](*numbers)))
 
 
 if __name__ == "__main__":
