@@ -6,7 +6,7 @@ take longer than all of the search.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -20,7 +20,7 @@ from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, forc
 from jaxid.estimators.least_squares import Transform
 from jaxid.machine import Machine
 from jaxid.model import Effect, Plant, parameters_of
-from jaxid.parameters import Free, Parameters, scatter
+from jaxid.parameters import Free, Parameters, scatter, seeds
 from jaxid.preprocess import Prepared
 
 # An effect with more starts than this is evaluated on a plant of its own, all starts at once.
@@ -29,6 +29,8 @@ _FEW = 8
 # pieces spread over it.
 _MOST = 8_000
 _PIECES = 4
+# A union with more columns than this is differentiated in so many at once, and only in those asked for.
+_WIDE, _COLUMNS = 48, 24
 # Strength at which the columns of an added force are taken, relative to the log's force.
 _FAINT = 1e-6
 
@@ -142,21 +144,48 @@ def _noisier(arrays: ForceData, force_noise: np.ndarray) -> ForceData:
 
 
 def evaluate(
-    union: Union, samples: Samples, theta: Float[np.ndarray, " p"]
+    union: Union, samples: Samples, theta: Float[np.ndarray, " p"], wanted: Sequence[int] | None = None
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
-    """Residual of the union and its Jacobian in all unknowns."""
-    return evaluate_on(union, samples.arrays, theta)
+    """Residual of the union and its Jacobian in all unknowns, or at least in those wanted."""
+    return evaluate_on(union, samples.arrays, theta, wanted)
 
 
 def evaluate_on(
-    union: Union, logs: list[ForceData], theta: Float[np.ndarray, " p"]
+    union: Union, logs: list[ForceData], theta: Float[np.ndarray, " p"], wanted: Sequence[int] | None = None
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """The same on several logs or pieces, one after the other."""
+    colours = np.asarray(union.colours, int)
+    directions = seeds(union.colours)
+    ask = np.arange(directions.shape[1])
+    if len(ask) > _WIDE:
+        some = colours if wanted is None else colours[np.asarray(wanted, int)]
+        # Which are asked is data: one number of columns, and one compiled function.
+        ask = np.unique(some)
+        parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]
+    else:
+        parts = [ask]
+    residuals, columns = [], []
+    for log in logs:
+        found = [_asked(union, log, theta, directions, part) for part in parts]
+        residuals.append(found[0][0])
+        columns.append(np.concatenate([c for _, c in found], axis=-1))
+    e, own = np.concatenate(residuals), np.concatenate(columns)
+    jacobian = np.zeros((*e.shape, directions.shape[1]))
+    jacobian[..., ask] = own
+    jacobian = jacobian[..., colours]
+    return e, jacobian if directions.shape[1] == len(theta) else jacobian * union.enters
+
+
+def _asked(
+    union: Union, log: ForceData, theta: np.ndarray, directions: np.ndarray, part: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residual and derivatives in some directions, filled up to one number of them."""
+    count = directions.shape[1] if directions.shape[1] <= _WIDE else _COLUMNS
+    own = np.zeros((len(theta), count))
+    own[:, : len(part)] = directions[:, part]
     plant, places = union.machine.plant, union.machine.parameters.places
-    colours = union.colours if max(union.colours, default=-1) + 1 < len(theta) else None
-    found = [force_and_columns(plant, places, a, jnp.asarray(theta), colours) for a in logs]
-    e, jacobian = (np.concatenate([np.asarray(f[i]) for f in found]) for i in range(2))
-    return e, jacobian if colours is None else jacobian[..., list(colours)] * union.enters
+    e, columns = force_and_columns(plant, places, log, jnp.asarray(theta), own)
+    return np.asarray(e), np.asarray(columns)[..., : len(part)]
 
 
 def refine(
@@ -190,7 +219,7 @@ def refine(
             latest.clear()
             at = theta.copy()
             at[moving] = np.asarray(transform.outward(jnp.asarray(x)))
-            e, jacobian = evaluate(union, data, at)
+            e, jacobian = evaluate(union, data, at, moving)
             slope = np.asarray(transform.slope(jnp.asarray(at[moving])))
             with np.errstate(invalid="ignore", over="ignore"):  # what diverged is made finite below
                 rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))
@@ -240,7 +269,7 @@ def points(
             at = theta.copy()
             for c in group:
                 at[c.index] = c.probe(k)
-            e, jacobian = evaluate(union, data, at)
+            e, jacobian = evaluate(union, data, at, np.concatenate([c.index for c in group]))
             for c in group:
                 shift = np.zeros_like(e)
                 if not group[0].amplitude.any():

@@ -173,7 +173,7 @@ def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
 def where_of(search: Search, baseline: Step, log: Log) -> Where:
     """Where the baseline's residual lies, on the whole log."""
     whole = [ForceData.of(search.data)]
-    e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta)
+    e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta, baseline.active)
     wanted = None
     if log.reference is not None:
         # A mass that is not driven has no wanted motion but its own.
@@ -256,6 +256,6 @@ def _round(search: Search, step: Step) -> Round:
 
 
 def _rms(search: Search, samples: cand.Samples, theta: np.ndarray) -> np.ndarray:
-    e, _ = cand.evaluate(search.union, samples, theta)
+    e, _ = cand.evaluate(search.union, samples, theta, ())
     return np.sqrt(np.nanmean(np.where(samples.moving, e, np.nan) ** 2, axis=0))
 

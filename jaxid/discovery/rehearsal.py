@@ -125,7 +125,7 @@ def compared(union: cand.Union, pair: Pair, samples: cand.Samples, *, refit: boo
     found = []
     for theta, active in zip((*pair.thetas, none), (*pair.active, base), strict=True):
         at = cand.refine(union, samples, theta, active)[0] if refit else theta
-        e, jacobian = cand.evaluate(union, samples, at)
+        e, jacobian = cand.evaluate(union, samples, at, active)
         found.append((e, jacobian[..., active]))
     whitener = ev.Whitener.of(found[0][0], counts)
     screen = Screen.of(whitener, *found[0])

@@ -105,7 +105,7 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
         search: Where the search stands.
         ahead: Score every two candidates together too.
     """
-    e, jacobian = cand.evaluate(search.union, search.samples, search.theta)
+    e, jacobian = cand.evaluate(search.union, search.samples, search.theta, search.active)
     rest = search.rest()
     points = cand.points(search.union, rest, search.samples, search.theta, e)
     base = jacobian[..., search.active]

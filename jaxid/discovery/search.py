@@ -184,7 +184,7 @@ class Search:
         """Two effects to add at once, where they explain far more than one with any partner."""
         c = one.candidate if one else None
         reached = screened.pairs.with_partner(c.kind, c.port) if c else screened.threshold
-        e, jacobian = cand.evaluate(self.union, self.samples, self.theta)
+        e, jacobian = cand.evaluate(self.union, self.samples, self.theta, self.active)
         for *pair, gained in screened.pairs.best(broken):
             if gained < reached + max(_CLEARLY * screened.threshold, _MUCH * gained):
                 return ()
@@ -276,7 +276,7 @@ class Search:
                 theta[s.candidate.index] = guess
             fits.append(self._fit(theta, active))
         theta = min(fits, key=self.worth.squares)
-        e, jacobian = cand.evaluate(self.union, self.samples, theta)
+        e, jacobian = cand.evaluate(self.union, self.samples, theta, active)
         after = screened.held_out(e, jacobian[..., active])
         drive = any(not s.candidate.amplitude.any() for s in new)
         if drive:
@@ -300,9 +300,9 @@ class Search:
 
     def _costs(self, theta: np.ndarray, active: np.ndarray, limit: float) -> bool:
         """Whether a smaller model is worse by more than noise and by what is relevant."""
-        e, jacobian = cand.evaluate(self.union, self.samples, self.theta)
+        e, jacobian = cand.evaluate(self.union, self.samples, self.theta, self.active)
         now = Screen.of(ev.Whitener.of(e, self.samples.moving, self.colour), e, jacobian[..., self.active])
-        less, jacobian = cand.evaluate(self.union, self.samples, theta)
+        less, jacobian = cand.evaluate(self.union, self.samples, theta, active)
         after = now.held_out(less, jacobian[..., active])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
         return lost > limit and self.worth.closed(less, e) > _SUPERFLUOUS

@@ -183,7 +183,7 @@ def _bench(session: Session, search: Search, pair: Pair) -> tuple[Pair, Bench]:
         needed_substeps(of.model(k), drive, q, jnp.zeros_like(q), u) for k in range(2)
     )
     rounded = pair.rounder(max(1.0, asked(pair) / _SMOOTH))
-    e, _ = cand.evaluate(search.union, search.samples, pair.thetas[0])
+    e, _ = cand.evaluate(search.union, search.samples, pair.thetas[0], ())
     noise = [NoiseModel.fit(x, c, _ORDER) for x, c in zip(e.T, search.samples.moving.T, strict=True)]
     whiten = np.zeros((len(noise), 1 + max(len(n.coefficients) for n in noise)))
     for row, n in zip(whiten, noise, strict=True):
@@ -205,7 +205,7 @@ def _stage(session: Session, search: Search, pair: Pair, bench: Bench) -> Stage:
     if sensor.position_std is None:
         noise = jnp.asarray(position_noise(machine, log))
         sensor = Sensor(position_noise=noise, force_noise=sensor.force_noise)
-    e, _ = cand.evaluate(search.union, search.samples, search.theta)
+    e, _ = cand.evaluate(search.union, search.samples, search.theta, ())
     counts = search.samples.moving
     rms = np.sqrt(np.nanmean(np.where(counts, e, np.nan) ** 2, axis=0))
     more = machine.plant.at_drives(np.sqrt(np.maximum(rms**2 - search.floor**2, 0.0)))

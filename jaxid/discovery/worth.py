@@ -59,7 +59,7 @@ class Worth:
 
     def residual(self, theta: np.ndarray) -> Float[np.ndarray, "kept n"]:
         """Residual of a model on the log."""
-        return cand.evaluate(self.union, self.samples, theta)[0]
+        return cand.evaluate(self.union, self.samples, theta, ())[0]
 
     def squares(self, theta: np.ndarray) -> float:
         """Sum of squares of that, infinite where it diverged."""
@@ -73,7 +73,7 @@ class Worth:
         """
         part = self.data.recipe.independent
         for samples in (self.samples, *self.others):
-            e, moving = cand.evaluate(self.union, samples, theta)[0], samples.moving
+            e, moving = cand.evaluate(self.union, samples, theta, ())[0], samples.moving
             for x, counts, floor in zip(e.T, moving.T, self.floor, strict=True):
                 scatter = np.sqrt(0.5 / max(part * counts.sum(), 1))
                 if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
@@ -106,8 +106,8 @@ class Worth:
         whitener = ev.Whitener(self.colour, samples.moving)
         squares = []
         for theta in (old, new):
-            e, _ = cand.evaluate(self.union, samples, theta)
-            noisier, _ = cand.evaluate_on(self.union, samples.noisier, theta)
+            e, _ = cand.evaluate(self.union, samples, theta, ())
+            noisier, _ = cand.evaluate_on(self.union, samples.noisier, theta, ())
             squares.append(float(np.mean(whitener((noisier - e)[..., None]) ** 2)))
         return min(squares[0] - squares[1], 0.9)
 
@@ -129,7 +129,7 @@ class Worth:
         total, worst = 0.0, np.inf
         for samples in self.others:
             before, after = (
-                np.where(samples.moving, cand.evaluate(self.union, samples, theta)[0], 0.0)
+                np.where(samples.moving, cand.evaluate(self.union, samples, theta, ())[0], 0.0)
                 for theta in (old, new)
             )
             whitener = ev.Whitener.of(after, samples.moving, self.colour)
@@ -144,7 +144,7 @@ class Worth:
         """Gain in log-likelihood by which one of two models, being true, should beat the other [nats]."""
         total = 0.0
         for samples in (self.samples, *self.others):
-            e, other = (cand.evaluate(self.union, samples, theta)[0] for theta in (one, two))
+            e, other = (cand.evaluate(self.union, samples, theta, ())[0] for theta in (one, two))
             whitener = ev.Whitener.of(e, samples.moving, self.colour)
             total += 0.5 * float(np.sum(whitener((e - other)[..., None]) ** 2))
         return total

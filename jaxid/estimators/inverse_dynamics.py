@@ -20,7 +20,7 @@ from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.machine import Machine
 from jaxid.model import Effect, ParameterInfo, Plant, carries_force, parameters_of
-from jaxid.parameters import Free, scatter, seeds
+from jaxid.parameters import Free, scatter
 from jaxid.precision import Precision, assess
 from jaxid.preprocess import Prepared
 from jaxid.residuals import residual_along
@@ -84,7 +84,7 @@ def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array,
 
 @eqx.filter_jit
 def force_and_columns(
-    plant: Plant, places: tuple, data: ForceData, theta: Array, colours: tuple[int, ...] | None = None
+    plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array | None = None
 ) -> tuple[Float[Array, "kept n"], Float[Array, "kept n c"]]:
     """Force residual of a plant and its Jacobian in the unknowns at some places.
 
@@ -93,17 +93,16 @@ def force_and_columns(
         places: Of the unknowns.
         data: The log.
         theta: The unknowns.
-        colours: Column of the result in which each unknown's is; those that share one must not enter
-            the balance of the same joint. Absent: each has its own.
+        directions: In which the derivatives are taken, (unknowns, c). Absent: each unknown has its own.
     """
-    shared = seeds(tuple(range(theta.size)) if colours is None else colours)
 
     def residual(step: Array) -> tuple[Array, Array]:
-        moved = theta + (step if colours is None else shared @ step)
+        moved = theta + (step if directions is None else directions @ step)
         e = force_residual(scatter(places, plant, moved), data)
         return e, e
 
-    jacobian, e = jax.jacfwd(residual, has_aux=True)(jnp.zeros(shared.shape[1]))
+    count = theta.size if directions is None else directions.shape[1]
+    jacobian, e = jax.jacfwd(residual, has_aux=True)(jnp.zeros(count))
     return e, jacobian
 
 
