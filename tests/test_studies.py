@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 import xarray as xr
+from adaptive_arm import TRUTH, written
 from cli_setup import run
 from search_setup import write_case
 
@@ -233,6 +234,41 @@ def test_a_chain_in_its_loop(tmp_path):
     assert all(r["rmse"] < 0.05 * abs(r["true"]) for r in study.summary)
     # Three runs tell a deviation within a factor of two.
     assert all(0 < r["bound"] < 2 * r["rmse"] for r in study.summary)
+
+
+def test_what_a_law_found_in_its_loop_is_a_row(tmp_path):
+    """As `simulate` has it of the same machine; beside it how far the loop is off its reference."""
+    case = written(tmp_path, "velocity_average = 4\nreach = 8", duration=1.2)
+    case.write_text(case.read_text() + '[study]\nestimators = ["in_loop"]\nruns = 2\n')
+    study = jaxid.study(case)
+    run = jaxid.simulate(case)
+    last = np.asarray(run.trajectory.found.theta)[-1]
+    np.testing.assert_allclose(study.table["estimate"][0, 0, 1], last, rtol=1e-9)
+    assert np.abs(last / TRUTH - 1).max() < 0.02
+    error = (run.log.reference - np.asarray(run.trajectory.position))[-1200:]
+    rms = study.table["tracking_rms"][0]
+    np.testing.assert_allclose(rms[0], np.sqrt(np.mean(error**2, axis=0)), rtol=1e-6)
+    np.testing.assert_allclose(study.table["tracking_peak"][0, 0], np.abs(error).max(axis=0), rtol=1e-6)
+    assert [r["drive"] for r in study.tracking] == [1, 2]
+    assert study.tracking[0]["rms"]["worst"] == pytest.approx(rms[:, 0].max().item())
+    assert "off the reference" in str(study)
+    # In a tenth of a second nothing is learnt that could be trusted.
+    case.write_text(case.read_text().replace("duration = 1.2", "duration = 0.1"))
+    early = jaxid.study(case)
+    assert [f["why"] for f in early.failures] == ["the law never trusted what it found"]
+    assert np.isfinite(early.tracking[0]["rms"]["median"])
+
+
+def test_a_law_that_does_not_identify_is_not_asked(tmp_path):
+    for text in (AXIS + STUDY, CHAIN):
+        text = text[: text.index("[study]")] + '[study]\nestimators = ["in_loop"]\n'
+        with pytest.raises(InputError, match="no law identifies in this case"):
+            jaxid.study(write_case(tmp_path, text))
+    case = written(tmp_path)
+    hides = '[study]\nestimators = ["in_loop"]\nhidden = ["viscous_friction"]\n'
+    case.write_text(case.read_text() + hides)
+    with pytest.raises(InputError, match="leave hidden out"):
+        jaxid.study(case)
 
 
 CHAIN = """

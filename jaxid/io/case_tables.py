@@ -112,7 +112,7 @@ IDENTIFICATION: Keys = {
     "physically_consistent": Key(flag, "whether links must be what bodies can be"),
 }
 STUDY: Keys = {
-    "estimators": Key(several(choice((*METHODS, "discover")))),
+    "estimators": Key(several(choice((*METHODS, "discover", "in_loop")))),
     "hidden": Key(several(text)),
     "noise": Key(several(number("nonnegative"))),
     "sample_rate": Key(several(number("positive"))),

@@ -184,6 +184,13 @@ def study_table(result: Study) -> str:
     runs, settings = result.table.sizes["run"], int(np.prod([result.table.sizes[k] for k in own]))
     lines = [f"{result.title}: {runs} runs under {settings} setting(s), {result.seconds:.3g} s of work"]
     lines += ["", aligned(rows)]
+    if result.tracking:
+        sizes = [f"{what} {n}" for what in ("RMS", "peak") for n in ("median", "95 %", "worst")]
+        rows = [[*own, "drive", *sizes, "unit"]]
+        for r in result.tracking:
+            sizes = [_number(x) for name in ("rms", "peak") for x in r[name].values()]
+            rows.append([*[f"{r[k]:g}" for k in own], str(r["drive"]), *sizes, r["unit"]])
+        lines += ["", "off the reference, last quarter of each run:", aligned(rows)]
     for k, n in enumerate(result.named):
         lines += ["", "named:"] if k == 0 else []
         lines += [f"  {words_of(n)}: {n['runs']} of {runs}: {n['what']}"]

@@ -53,8 +53,15 @@ def study_report(result: Study) -> str:
         failures=[f | {"where": words_of(f)} for f in result.failures],
         named=[n | {"where": words_of(n)} for n in result.named],
         runs=table.sizes["run"], seconds=short(result.seconds, 3), figures=figures,
-        tried=tried, answer=_answer(result),
+        tried=tried, answer=_answer(result), tracking=[_followed(r) for r in result.tracking],
     )
+
+
+def _followed(row: dict) -> dict:
+    return {
+        **row, "unit": pretty_unit(row["unit"]), "settings": [f"{x:g}" for x in setting_of(row).values()],
+        "sizes": [short(x, 3) for name in ("rms", "peak") for x in row[name].values()],
+    }
 
 
 def _line(row: dict) -> dict:

@@ -20,7 +20,8 @@ from jaxid.machine import Machine
 from jaxid.studies.levels import Level, levels_of
 from jaxid.virtual import Scene
 
-DISCOVER = "discover"
+# What may stand among the estimators beside the methods: the search, and what a law found by itself.
+DISCOVER, IN_LOOP = "discover", "in_loop"
 _RUNS = 100
 # Part of the memory that the chunks in work may take together.
 _MEMORY = 0.25
@@ -31,6 +32,8 @@ _LARGEST, _SAMPLES, _LANES = 8, 6400, 16
 # Likewise on an accelerator; and memory of a device that does not state it [bytes].
 _RUNS_OF_DEVICE = 4096
 _UNSTATED = 2**32
+# Of the arrays in a chunk; counted up where they change.
+_LAYOUT = 2
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
 
@@ -42,7 +45,7 @@ class Plan:
     Args:
         case: The case.
         levels: Under what it runs.
-        estimators: Names of methods, or "discover".
+        estimators: Names of methods, "discover", or "in_loop".
         draw: Relative spread of the true values: each is multiplied by exp(draw * N(0, 1)).
         start_spread: Likewise of the values that a fit starts from.
         runs: At each level.
@@ -73,7 +76,8 @@ class Plan:
 
         Raises:
             InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has
-                nothing to act on, or links must be what bodies can be and an estimator cannot keep to it.
+                nothing to act on, what the law found is asked of one that does not identify, or links must
+                be what bodies can be and an estimator cannot keep to it.
         """
         setting, where = case.study, str(case.path)
         if not 0 <= seed < 2**31:
@@ -87,7 +91,9 @@ class Plan:
             )
         estimators = tuple(setting.get("estimators", ("output_error",)))
         for method in estimators:
-            if method != DISCOVER:
+            if method == IN_LOOP:
+                _need_learner(case, levels[0].scene)
+            elif method != DISCOVER:
                 need_consistent(method, case)
         runs = int(setting.get("runs", _RUNS) if runs is None else runs)
         if runs < 1:
@@ -166,8 +172,19 @@ class Plan:
             **self.settings, "draw": self.draw,
             "start_spread": self.start_spread, "runs": self.runs, "chunk": self.chunk,
             "seed": self.seed, "parameters": self.names,
-            "versions": {p: version(p) for p in packages},
+            "layout": _LAYOUT, "versions": {p: version(p) for p in packages},
         }
+
+
+def _need_learner(case: Case, scene: Scene) -> None:
+    """Refuse to ask a law what it found that does not identify, or that knows what is to be hidden."""
+    law, where = scene.machine.controller, f"{case.path}, [study] estimators"
+    if law is None or "estimator" not in law.of_machine:
+        mend = 'take [controller] kind = "adaptive", or leave in_loop out'
+        raise InputError("in_loop: no law identifies in this case", where=where, mend=mend)
+    if case.study.get("hidden"):
+        what = "in_loop: the law has the whole case for its model, and nothing is hidden from it"
+        raise InputError(what, where=where, mend="leave hidden out")
 
 
 def _without(case: Case, hidden: tuple[str, ...]) -> Case:

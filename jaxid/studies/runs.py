@@ -17,7 +17,8 @@ from jaxid.estimators.steps import Steps, alone, together
 from jaxid.preprocess import Recipe
 from jaxid.replay import Numerics
 from jaxid.session import Session, session_around
-from jaxid.studies.plan import DISCOVER, Plan
+from jaxid.simulation import Trajectory
+from jaxid.studies.plan import DISCOVER, IN_LOOP, Plan
 
 Arrays = dict[str, np.ndarray]
 
@@ -65,8 +66,8 @@ class Runner:
 
         Returns:
             `estimate` and `std` (method, run, p), NaN where there is none; `converged` and
-            `identifiable`; `steps`; `message` and `named` (method, run); `truth` and `start` (run, p);
-            `seconds` that the chunk took.
+            `identifiable`; `steps`; `message` and `named` (method, run); `tracking` (method, run, drives,
+            2), see `_tracking`; `truth` and `start` (run, p); `seconds` that the chunk took.
         """
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
@@ -74,7 +75,7 @@ class Runner:
         found = together([self._run(level, k, ways) for k in runs], self.plan.lanes)
         # Whatever ends a run, in a library too, ends that run only.
         found = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
-        out = {name: np.stack([row[name] for row in found], axis=1) for name in _BY_METHOD}
+        out = {name: np.stack([row[name] for row in found], axis=1) for name in (*_BY_METHOD, "tracking")}
         drawn = [self.plan.drawn(k) for k in runs]
         out["truth"] = np.stack([truth[self.plan.own] for truth, _, _ in drawn])
         out["start"] = np.stack([start for _, start, _ in drawn])
@@ -93,6 +94,9 @@ class Runner:
         for method in plan.estimators:
             options = {"numerics": ways.numerics} if method in SIMULATING else {}
             try:
+                if method == IN_LOOP:
+                    rows.append(_told(plan, virtual.trajectory))
+                    continue
                 if method == DISCOVER:
                     aligned = replace(ways.recipe, align_hold=True)
                     whole = session_around(at.model, machine, log, aligned)
@@ -101,10 +105,14 @@ class Runner:
                 rows.append(_row((yield from steps_of(method, session, **options))))
             except Exception as error:
                 rows.append(_failed(plan, _words(error)))
-        return _stacked(rows)
+        driven = machine.plant.driven(virtual.trajectory.position.shape[1])
+        followed = np.asarray(virtual.trajectory.position)[:: at.scene.every, list(driven)]
+        return _stacked(rows, _tracking(virtual.log.reference, followed))
 
     def _all_failed(self, error: Exception) -> Arrays:
-        return _stacked([_failed(self.plan, _words(error)) for _ in self.plan.estimators])
+        drives = 0 if self.plan.machine.controller is None else self.plan.machine.gain.size
+        rows = [_failed(self.plan, _words(error)) for _ in self.plan.estimators]
+        return _stacked(rows, np.full((drives, 2), np.nan))
 
 
 _BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message", "named")
@@ -118,6 +126,28 @@ def _row(estimate: Estimate) -> Arrays:
         "steps": np.asarray(estimate.steps), "message": np.asarray(estimate.message),
         "named": np.asarray(""),
     }
+
+
+def _told(plan: Plan, run: Trajectory) -> Arrays:
+    """What a law that identifies had found when the run ended; of its own certainty nothing is kept."""
+    theta, closed = np.asarray(run.found.theta)[-1], bool(np.asarray(run.found.closed)[-1])
+    row = _failed(plan, "" if closed else "the law never trusted what it found")
+    told = np.full(len(theta), closed) & np.isfinite(theta)
+    return row | {
+        "estimate": np.where(told, theta, np.nan), "identifiable": told, "converged": np.asarray(closed),
+    }
+
+
+# Part of a run, from its end, over which tracking errors are counted: what a law learns it has learnt.
+_SETTLED = 0.25
+
+
+def _tracking(reference: np.ndarray | None, followed: np.ndarray) -> np.ndarray:
+    """Root mean square and peak of what a loop's drives are off the reference at the end, (drives, 2)."""
+    if reference is None:
+        return np.zeros((0, 2))
+    error = (reference - followed)[-max(1, round(_SETTLED * len(followed))) :]
+    return np.stack([np.sqrt(np.mean(error**2, axis=0)), np.abs(error).max(axis=0)], axis=1)
 
 
 def _found(plan: Plan, session: Session) -> Arrays:
@@ -144,5 +174,7 @@ def _failed(plan: Plan, why: str) -> Arrays:
     }
 
 
-def _stacked(rows: list[Arrays]) -> Arrays:
-    return {name: np.stack([row[name] for row in rows]) for name in _BY_METHOD}
+def _stacked(rows: list[Arrays], tracking: np.ndarray) -> Arrays:
+    """Of one run, by method; its tracking is the same for all."""
+    out = {name: np.stack([row[name] for row in rows]) for name in _BY_METHOD}
+    return out | {"tracking": np.stack([tracking] * len(rows))}
