@@ -90,15 +90,15 @@ def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str]
 
 
 def case_text(
-    law: str, *, friction: str | None = None, gain: str | Sequence[float] = "{ guess = 1.0 }", seed: int = 0,
+    law: str, *, friction: str | None = None, gain: str | Sequence = "{ guess = 1.0 }", seed: int = 0,
     duration: float = 40.0, more: str = "", tip_mass: str = "2.72", inertial: bool = True,
 ) -> str:
     """A case: the model of the robot, a law for [controller], random targets."""
-    gains = f"[{gain}, {gain}]" if isinstance(gain, str) else list(gain)
+    gains = ", ".join(map(str, (gain, gain) if isinstance(gain, str) else gain))
     plant = PLANT.replace("tip_mass = 2.72", f"tip_mass = {tip_mass}")
     return f"""{plant}[[effects]]
 kind = "actuator_gain"
-gain = {gains}
+gain = [{gains}]
 {friction_text(3) if friction is None else friction}
 [controller]
 kp = [{KP}, {KP}]

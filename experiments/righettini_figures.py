@@ -55,17 +55,89 @@ def histories(path: Path, runs: dict[str, tuple[list[str], np.ndarray, Ran]]) ->
     plt.close(figure)
 
 
-def frictions(path: Path, runs: dict, found: Callable, true: Callable) -> None:
-    """Friction against velocity, found and true, cold and warm (figures 6 and 12)."""
+def frictions(path: Path, clouds: dict[str, tuple[np.ndarray, np.ndarray]], curve: Callable) -> None:
+    """Friction against velocity (figures 6 and 12).
+
+    Args:
+        path: Where to.
+        clouds: By name velocities and friction, (time, 2) each.
+        curve: True friction of both joints at some velocities above zero.
+    """
     v = np.linspace(0.02, 3.6, 100)
     figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
-    for (state, (names, _, ran)), color in zip(runs.items(), ("C0", "C3"), strict=True):
-        last, exact = found(names, ran.estimates[-1], v), true(v, 1.0 if state == "cold" else 0.7)
-        for k, ax in enumerate(axes):
-            ax.plot(v, last[:, k], color=color, label=f"{state}, found")
-            ax.plot(v, exact[:, k], ":", color="black", label=f"{state}, true")
-            ax.set_xlabel(f"velocity of joint {k + 1} [rad/s]")
+    for k, ax in enumerate(axes):
+        for (name, (speed, friction)), color in zip(clouds.items(), ("C0", "C3"), strict=True):
+            ax.plot(speed[:, k], friction[:, k], ".", ms=1.5, alpha=0.4, color=color, label=name)
+        for side in (-1, 1):
+            label = "true, cold" if side > 0 else None
+            ax.plot(side * v, side * curve(v)[:, k], ":", color="black", label=label)
+        ax.set_xlabel(f"velocity of joint {k + 1} [rad/s]")
     axes[0].set_ylabel("friction [N m]")
-    axes[0].legend()
+    axes[0].legend(markerscale=6)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def torques(path: Path, time: np.ndarray, measured: np.ndarray, predicted: np.ndarray) -> None:
+    """Torque of the motors at the joints, and what dynamics and friction found say (figure 7)."""
+    figure, axes = plt.subplots(2, 1, figsize=(9, 6), sharex=True, layout="constrained")
+    for k, ax in enumerate(axes):
+        ax.plot(time, measured[:, k], color="C0", label="given")
+        ax.plot(time, predicted[:, k], color="C3", lw=0.9, label="dynamics and friction, as found")
+        ax.set_ylabel(f"torque of joint {k + 1} [N m]")
+    axes[0].legend(loc="upper right")
+    axes[-1].set_xlabel("time [s]")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def workspace(
+    path: Path, polygon: np.ndarray, paths: list[np.ndarray], tool: Callable, period: float
+) -> None:
+    """Condition of the robot, the polygon of targets and some motions, by joints and by tool (figure 4).
+
+    Args:
+        path: Where to.
+        polygon: Corners [rad], (corners, 2).
+        paths: Joint positions of motions [rad], (time, 2) each.
+        tool: Position of the tool [m] at joint positions, (k, 2) from (k, 2), and the condition index, (k,).
+        period: Of the paths [s].
+    """
+    sides = np.meshgrid(np.linspace(0.6, 3.2, 200), np.linspace(-0.2, 2.4, 200))
+    grid = np.stack(sides, -1).reshape(-1, 2)
+    at, index = tool(grid)
+    good = np.isfinite(index)
+    figure, axes = plt.subplots(1, 2, figsize=(11, 5), layout="constrained")
+    edge = np.concatenate([polygon, polygon[:1]])
+    edge = np.concatenate([np.linspace(a, b, 30) for a, b in zip(edge[:-1], edge[1:], strict=True)])
+    for ax, where in zip(axes, (lambda q: q, lambda q: tool(q)[0]), strict=True):
+        shown = ax.scatter(
+            *where(grid[good]).T, c=index[good], s=2, cmap="Reds", vmin=0, vmax=1, linewidths=0
+        )
+        ax.plot(*where(edge).T, color="black")
+        for q in paths:
+            x = where(q)
+            speed = np.linalg.norm(np.gradient(x, period, axis=0), axis=1)
+            line = ax.scatter(*x.T, c=speed, s=3, cmap="Blues", vmin=0, linewidths=0)
+        unit = "rad/s" if ax is axes[0] else "m/s"
+        figure.colorbar(line, ax=ax, label=f"speed [{unit}]", shrink=0.7)
+    figure.colorbar(shown, ax=axes, label="condition index", shrink=0.7)
+    axes[0].set(xlabel="joint 1 [rad]", ylabel="joint 2 [rad]")
+    axes[1].set(xlabel="x of the tool [m]", ylabel="y of the tool [m]", aspect="equal")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def bars(path: Path, groups: dict[str, dict[str, np.ndarray]], label: str) -> None:
+    """A bar for each name and joint, a panel for each group (figures 5, 8, 9 and 11)."""
+    size = (4.5 * len(groups), 3.6)
+    figure, axes = plt.subplots(1, len(groups), figsize=size, layout="constrained", squeeze=False)
+    for ax, (group, values) in zip(axes[0], groups.items(), strict=True):
+        places = np.arange(len(values))
+        for k in range(2):
+            ax.bar(places + 0.4 * (k - 0.5), [v[k] for v in values.values()], 0.38, label=f"joint {k + 1}")
+        ax.set_xticks(places, list(values))
+        ax.set(title=group, ylabel=label)
+    axes[0][0].legend()
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -14,6 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import five_bar_robot as robots
+import jax
+import jax.numpy as jnp
 import numpy as np
 import righettini_figures
 from common import Table, run_studies
@@ -64,7 +66,7 @@ def controllers(folder: Path) -> None:
     warm, first = warmed(folder)
     table.row("steady", "adaptive, cold, first 2 s", *(pair(x) for x in sizes(first, 0.0, 2.0)), *[""] * 4)
     laws = {"PD": PD, "computed torque": TORQUE, "adaptive": ADAPTIVE}
-    split = {}
+    split, sizes_of = {}, {}
     for friction in ("steady", "fluctuating"):
         drift = robots.fluctuating(40.0, 7) if friction == "fluctuating" else None
         runs, before = {}, None
@@ -81,10 +83,14 @@ def controllers(folder: Path) -> None:
                 over = before[0] / rms, before[1] / peak
                 shown = [pair(over[0]), pair(published[0]), pair(over[1]), pair(published[1])]
             table.row(friction, name, pair(rms), pair(peak), *shown)
-            before = (rms, peak)
+            before = sizes_of[friction, name] = (rms, peak)
         split[friction] = torques(runs["adaptive"])
         righettini_figures.errors(folder / f"errors_{friction}.png", runs)
     table.show(time.perf_counter() - begin)
+    for k, what in enumerate(("rms", "peak")):
+        groups = {f"{f} friction": {n: sizes_of[f, n][k] for n in laws} for f in split}
+        righettini_figures.bars(folder / f"{what}.png", groups, f"{what} error [mrad]")
+    righettini_figures.bars(folder / "split.png", split, "RMS torque [N m]")
     published = {"dynamics": (45, 48), "friction": (40, 33), "feedback": (15, 19)}
     table = Table("RMS torque by its part, % of the sum (figure 11)", ["part", *split, "published"])
     for part, values in published.items():
@@ -157,7 +163,51 @@ def convergence(folder: Path) -> None:
             kept["cold" if scale == 1.0 else "warm"] = (names, times, ran)
     table.show(time.perf_counter() - begin)
     righettini_figures.histories(folder / "histories.png", kept)
-    righettini_figures.frictions(folder / "frictions.png", kept, friction_of, true_friction)
+    clouds = {state: seen(ran) for state, (_, _, ran) in kept.items()}
+    names, _, ran = kept["cold"]
+    speed, inferred, predicted, given, modelled, at = clouds["cold"]
+    pairs = {"from torque and dynamics": (speed, inferred), "of the model found": (speed, predicted)}
+    righettini_figures.frictions(folder / "friction_found.png", pairs, true_friction)
+    pairs = {state: c[:2] for state, c in clouds.items()}
+    righettini_figures.frictions(folder / "friction_by_temperature.png", pairs, true_friction)
+    some = at < at[0] + 10.0
+    righettini_figures.torques(folder / "torques.png", at[some], given[some], modelled[some])
+    drawn_workspace(folder / "workspace.png", ran)
+
+
+def seen(ran: Ran, every: int = 20) -> tuple[np.ndarray, ...]:
+    """What a run that has learnt tells of friction, at 200 Hz from its tenth second on.
+
+    Returns:
+        Velocities; friction, from torque given and dynamics without friction; that of the model found; torque
+        given; that of dynamics and friction found, (time, 2) each; and the times.
+    """
+    machine = ran.live.machine.with_estimate(ran.live.estimate.theta)
+    gains = robots.REDUCTION * ran.live.estimate.theta[:2]
+    # A torque acts from its tick to the next; acceleration is the mean over that interval.
+    rows = np.arange(round(10.0 / PERIOD), len(ran.q) - 1, every)
+    middle = lambda x: 0.5 * (x[rows] + x[rows + 1])
+    q, v, given = middle(ran.q), middle(ran.v), gains * ran.command[rows]
+    parts = jax.jit(jax.vmap(lambda *x: inverse_dynamics(machine.plant, *x, 2)))(q, v, ran.a[rows + 1])
+    smooth, friction = (np.asarray(x) for x in parts)
+    return v, given - smooth, friction, given, smooth + friction, ran.time[rows]
+
+
+def drawn_workspace(path: Path, ran: Ran) -> None:
+    """Figure 4: the condition index is the ratio of the singular values of the tool's Jacobian, squared."""
+    plant = ran.live.machine.plant
+
+    def one(q: jax.Array) -> tuple[jax.Array, jax.Array]:
+        values = jnp.linalg.svd(jax.jacfwd(plant.tool)(q), compute_uv=False)
+        return plant.tool(q), (values[1] / values[0]) ** 2
+
+    both = jax.jit(jax.vmap(one))
+    tool = lambda q: tuple(np.asarray(x) for x in both(q))
+    r = ran.live.reference
+    rests = np.flatnonzero(np.all(np.diff(r, axis=0) == 0, axis=1))
+    starts = np.concatenate([[0], rests[1:][np.diff(rests) > 1], [len(r) - 1]])
+    paths = [r[a:b:20] for a, b in zip(starts[:4], starts[1:5], strict=True)]
+    righettini_figures.workspace(path, np.array(robots.POLYGON), paths, tool, 20 * PERIOD)
 
 
 def temperature(folder: Path) -> None:
@@ -215,6 +265,7 @@ def orders(folder: Path) -> None:
         "What models leave of the torque of the joints (figure 5)",
         ["model", "joints", "order", "unknowns", "left [N m]", "running residual, end [N m]"],
     )
+    residuals = {}
     for number, (where, order) in MODELS.items():
         friction = robots.friction_text(order)
         if where == "all":
@@ -222,13 +273,14 @@ def orders(folder: Path) -> None:
         path = folder / f"model{number}.toml"
         path.write_text(robots.case_text(PD, friction=friction, inertial=False, more=RECURSIVE))
         found = jaxid.identify(path, log, method="recursive")
-        left = found.gaps[0].force.rms
+        left = residuals[f"({number})"] = found.gaps[0].force.rms
         running = found.estimate.details["recursive"]["running_residual"]
         table.row(
             number, where, order, len(found.estimate.names), ", ".join(f"{x:.3f}" for x in left),
             ", ".join(f"{x:.3f}" for x in np.ravel(running)),
         )
     table.show(time.perf_counter() - begin)
+    righettini_figures.bars(folder / "orders.png", {"model": residuals}, "RMS residual [N m]")
     path = folder / "chooses.toml"
     path.write_text(robots.case_text(PD, friction=robots.friction_text(1), inertial=False))
     found = jaxid.discover(path, log)
@@ -302,8 +354,32 @@ def sensors(folder: Path) -> None:
     table.show(time.perf_counter() - begin)
 
 
+# By how much drive gains and friction differ from robot to robot, as a standard deviation; noise of the
+# measured torque at the motor [N m].
+TOLERANCE, TORQUE_NOISE = 0.05, 0.5 / robots.REDUCTION
+
+
+def tolerances(folder: Path) -> None:
+    """A thousand robots, drive gains and friction drawn, in jaxid's own simulation: how they end."""
+    begin = time.perf_counter()
+    true = lambda kind, k: f"{{ guess = 0.0, true = {robots.FRICTION[kind][k]} }}"
+    more = (
+        f"substeps = 1\n[sensor]\nposition_resolution = {robots.COUNTS}\nforce_noise = {TORQUE_NOISE}\n"
+        f'[study]\nestimators = ["in_loop"]\nruns = 1000\ndraw = {TOLERANCE}\n'
+    )
+    path = folder / "tolerances.toml"
+    path.write_text(robots.case_text(
+        ADAPTIVE, friction=robots.friction_text(3, guess=true), seed=8, duration=8.0, more=more,
+        gain=[f"{{ guess = 1.0, true = {g} }}" for g in robots.GAINS],
+    ))
+    out = folder / "tolerances"
+    study = jaxid.study(path, folder=out, resume=out.exists())
+    print(f"{study}\n{time.perf_counter() - begin:.0f} s")
+
+
 STUDIES: dict[str, Callable[[Path], None]] = {
-    f.__name__: f for f in (controllers, convergence, temperature, orders, payload, hidden, sensors)
+    f.__name__: f
+    for f in (controllers, convergence, temperature, orders, payload, hidden, sensors, tolerances)
 }
 
 
