@@ -36,8 +36,21 @@ def child(what: str, *words: object, cores: int | None = None) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def study(name: str, runs: int) -> dict:
-    """Milliseconds a run of a study: of a second one in the same process, whole; the first compiles."""
+def study(name: str, runs: int, processes: int = 0) -> dict:
+    """Milliseconds a run of a study: of a second one in the same process, whole; the first compiles.
+
+    On threads, or on so many processes of a thread each, behind a scheduler of their own.
+    """
+    if processes:
+        from distributed import LocalCluster
+
+        options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None}
+        with LocalCluster(processes, **options, worker_dashboard_address=None) as cluster:
+            return {"processes": processes} | _study(name, runs, cluster.scheduler_address)
+    return {"processes": 0} | _study(name, runs)
+
+
+def _study(name: str, runs: int, scheduler: str | None = None) -> dict:
     import jaxid
     from jaxid.studies.plan import Plan, cores
 
@@ -46,9 +59,10 @@ def study(name: str, runs: int) -> dict:
     if counts is not None:
         case = replace(case, sensor={**case.sensor, "position_resolution": counts})
     chunk = Plan.of(case, runs=runs).chunk
-    first = _timed(lambda: jaxid.study(case, runs=chunk * cores()), 1)[0]
+    # Two chunks a core: whichever worker takes them, all compile.
+    first = _timed(lambda: jaxid.study(case, runs=2 * chunk * cores(), scheduler=scheduler), 1)[0]
     begin = time.perf_counter()
-    result = jaxid.study(case, runs=runs, seed=1)
+    result = jaxid.study(case, runs=runs, seed=1, scheduler=scheduler)
     ms = 1e3 * (time.perf_counter() - begin) / runs
     failed = sum(f["runs"] for f in result.failures)
     return {"ms": ms, "runs": runs, "failed": failed, "first_s": first, "memory": _memory()}
@@ -226,9 +240,10 @@ def measured(*, quick: bool) -> dict:
     out = {"study": [], "lengths": [], "joints": []}
     for name in CASES:
         for cores in sorted({1, n}):
-            found = {"case": name, "cores": cores} | child("study", name, runs, cores=cores)
-            out["study"].append(found)
-            print(f"study of the {name}, {cores} core(s): {found['ms']:.1f} ms a fit", flush=True)
+            out["study"].append({"case": name, "cores": cores} | child("study", name, runs, cores=cores))
+        out["study"].append({"case": name, "cores": n} | child("study", name, runs, n, cores=n))
+        for found in out["study"][-3:]:
+            print(f"study: {found}", flush=True)
     for samples in (25_000, *(LENGTHS[:-1] if quick else LENGTHS)):
         out["lengths"].append(child("fit", samples, repeats if samples < 1e6 else 1))
         print(f"{samples} samples: {out['lengths'][-1]}", flush=True)
@@ -244,15 +259,17 @@ def tables(found: dict) -> list[str]:
     """In Markdown."""
     met = lambda value, aim: "yes" if value <= aim else "**no**"
     megabytes = lambda x: f"{x / 2**20:.0f}"
-    lines = ["## Fits by the study", "", "| of | cores | ms a fit | aim | met | of one core | peak MB |",
-             "|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = ["## Fits by the study", "", "| of | cores | as | ms a fit | aim | met | of one core | peak MB |",
+             "|---|---|---|---|---|---|---|---|"]  # fmt: skip
     one = {s["case"]: s["ms"] for s in found["study"] if s["cores"] == 1}
     most = max(s["cores"] for s in found["study"])
     for s in found["study"]:
         aim = AIMS.get(s["case"]) if s["cores"] == most else None
         shown = "|" if aim is None else f"{aim:g} | {met(s['ms'], aim)}"
-        part, memory = s["ms"] / one[s["case"]], megabytes(s["memory"])
-        lines.append(f"| {s['case']} | {s['cores']} | {s['ms']:.1f} | {shown} | {part:.2f} | {memory} |")
+        part = s["ms"] / one[s["case"]]
+        # Of a cluster only the memory of the process that asks it is known.
+        memory, way = ("", "processes") if s["processes"] else (megabytes(s["memory"]), "threads")
+        lines.append(f"| {s['case']} | {s['cores']} | {way} | {s['ms']:.1f} | {shown} | {part:.2f} | {memory} |")
     lines += ["", "## Against the length of the log", "",
               "| samples | prepare s | inverse dynamics, warm s | output error, cold s | warm s | peak MB |",
               "|---|---|---|---|---|---|"]  # fmt: skip

@@ -5,7 +5,11 @@ With `identify` it finds the unknowns in the first instants, algebraically, and 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.controllers import Controller, Tick
+from jaxid.controllers import Controller, Tick, base
 from jaxid.errors import InputError
 from jaxid.estimators.online import Memory, Online, Told
 from jaxid.estimators.recursion import Told as Estimate
@@ -62,12 +66,13 @@ class Live:
         self._path = jax.tree.map(np.asarray, path)
         self._driven = self.machine.plant.driven(case.plant.joints)
         self._tick = 0
-        self._law = _Law(self._controller)
-        self._memory: list[Array] | None = None
+        self._law = _Law(self._controller, scene.signal.shape[1], path, self._driven)
+        self._memory: np.ndarray | None = None
         sensor = self.machine.sensor
         self._holds = sensor.hold, 1 if sensor.inertial is None else sensor.inertial.hold
         self.adapts = "estimator" in self._controller.of_machine
         self._last: np.ndarray | None = None
+        self._as_given = np.full(self.machine.gain.size, np.nan)
         self._online, self._rows = None, None
         if identify:
             if "model" not in self._controller.of_machine or self.adapts:
@@ -106,20 +111,22 @@ class Live:
         if position.shape != (joints,):
             what = f"position has shape {position.shape}"
             raise InputError(what, where="Live.command", mend=f"give one reading of each of {joints} joints")
-        fresh, renewed = (np.asarray(self._tick % hold == 0) for hold in self._holds)
-        path = jax.tree.map(lambda x: x[self._tick], self._path)
-        others = (None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured))
-        tick = Tick(position, path, self._driven, fresh, *others, renewed)
+        if measured is None and self.adapts:
+            measured = self._as_given
+        others = [None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured)]
+        fresh = tuple(self._tick % hold == 0 for hold in self._holds)
         if self._tick == 0:
+            path = jax.tree.map(lambda x: x[0], self._path)
+            tick = Tick(position, path, self._driven, np.asarray(fresh[0]), *others, np.asarray(fresh[1]))
             start, saved = self._controller.start(tick, np.zeros_like(position), self._path), self.memory
             # Readings of an earlier run would be differenced with those of this one.
             self.memory = start if saved is None else self._controller.resumed(start, saved)
         if self._online is not None and self.switched is None:
             self._identify(position)
-        u, self._memory = self._law(tick, self._memory)
-        if self.adapts and self.switched is None and self._controller.told(self.memory).closed:
+        u, self._memory, closed = self._law(self._tick, position, fresh, others, self._memory)
+        if self.adapts and self.switched is None and closed:
             self.switched = self._tick
-        self._tick, self._last = self._tick + 1, np.asarray(u)
+        self._tick, self._last = self._tick + 1, u
         return self._last
 
     @property
@@ -128,12 +135,11 @@ class Live:
 
         Of one that was saved, and put back before the first tick, what was identified is kept.
         """
-        return None if self._memory is None else jax.tree.unflatten(self._law.memory, self._memory)
+        return None if self._memory is None else self._law.memory.unpacked(self._memory)
 
     @memory.setter
     def memory(self, memory: object) -> None:
-        leaves, self._law.memory = jax.tree.flatten(memory)
-        self._memory = [jnp.asarray(x) for x in leaves]
+        self._memory = self._law.remembers(memory)
 
     @property
     def estimate(self) -> Estimate:
@@ -189,37 +195,113 @@ def _followed(online: Online, position: Array, command: Array) -> Told:
 
 
 class _Law:
-    """A controller's command, compiled as a function of leaves, and of one array for the tick.
+    """A controller's command, compiled as a function of one vector: its own values, the tick, its memory.
 
-    To walk through the trees of controller and memory at every tick takes twice as long as all else.
+    To build trees at every tick, and to hand over an array for each of their leaves, takes five times as long
+    as the law itself.
+
+    Args:
+        controller: The law.
+        drives: How many commands it gives.
+        path: Its path, one row a tick.
+        driven: Joints that are driven.
     """
 
-    def __init__(self, controller: Controller):
+    def __init__(self, controller: Controller, drives: int, path: base.Path, driven: tuple[int, ...]):
         self.take(controller)
-        self.memory: object = None
-        self._tick: object = None
+        self._drives, self._driven = drives, driven
+        leaves, self._path = jax.tree.flatten(path)
+        self._rows = [np.asarray(x, float).reshape(len(x), -1) for x in leaves]
+        self._shapes = tuple(x.shape[1:] for x in leaves)
+        self._compiled: dict[tuple[bool, ...], Callable] = {}
+        self._once = jnp.asarray(1)
 
     def take(self, controller: Controller) -> None:
         """Go on with a controller of the same structure."""
         arrays, self._static = eqx.partition(controller, eqx.is_array)
-        leaves, self._arrays = jax.tree.flatten(arrays)
-        self._leaves = [jnp.asarray(x) for x in leaves]
+        self._own = _Packed.of(arrays)
+        self._leaves = self._own.packed(arrays)
 
-    def __call__(self, tick: Tick, memory: list[Array]) -> tuple[Array, list[Array]]:
-        leaves, structure = jax.tree.flatten(tick)
-        if self._tick is None or structure != self._tick:
-            self._tick, self._compiled = structure, jax.jit(self._command)
-            self._shapes = [(x.shape, x.dtype) for x in leaves]
-        return self._compiled(self._leaves, np.concatenate([x.ravel() for x in leaves]), memory)
+    def remembers(self, memory: object) -> np.ndarray:
+        """A memory as the law takes it."""
+        self.memory = _Packed.of(memory)
+        return self.memory.packed(memory)
 
-    def _command(self, own: list, tick: Array, memory: list) -> tuple[Array, list[Array]]:
-        controller = eqx.combine(jax.tree.unflatten(self._arrays, own), self._static)
-        ends = np.cumsum([int(np.prod(shape)) for shape, _ in self._shapes])[:-1]
-        parts = zip(jnp.split(tick, ends), self._shapes, strict=True)
-        tick = jax.tree.unflatten(self._tick, [x.reshape(shape).astype(d) for x, (shape, d) in parts])
-        memory = jax.tree.unflatten(self.memory, memory)
-        u, memory = controller.command(tick, memory, jnp.zeros(1))
-        return u, jax.tree.leaves(memory)
+    def __call__(
+        self, k: int, position: np.ndarray, fresh: tuple[bool, bool], others: Sequence[np.ndarray | None],
+        memory: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, bool]:
+        """The command, the new memory, and whether what the law found takes part in the command.
+
+        Args:
+            k: The tick.
+            position: Readings.
+            fresh: Whether they are new, and those of inertial sensors.
+            others: Velocity, acceleration and command, as measured.
+            memory: Of the tick before.
+        """
+        given = tuple(x is not None for x in others)
+        if given not in self._compiled:
+            self._compiled[given] = jax.jit(functools.partial(self._command, len(position), given))
+        rows = (x[k] for x in self._rows)
+        now = (position, *rows, fresh, *(x for x in others if x is not None), np.zeros(1 + self._drives))
+        before = np.concatenate([self._leaves, memory, *now])
+        after = np.asarray(self._compiled[given](before, self._once))
+        first = len(self._leaves)
+        end = first + self.memory.size
+        return after[-self._drives :], after[first:end], bool(after[-1 - self._drives])
+
+    def _command(self, joints: int, given: tuple[bool, ...], before: Array, once: Array) -> Array:
+        sizes = [self._own.size, self.memory.size, joints, *(x.shape[1] for x in self._rows), 2]
+        sizes += [size for size, there in zip((joints, joints, self._drives), given, strict=True) if there]
+        ends = [int(x) for x in np.cumsum(sizes)]
+
+        def body(_: Array, before: Array) -> Array:
+            own, memory, position, *now, _ = jnp.split(before, ends)
+            path = [now.pop(0).reshape(shape) for shape in self._shapes]
+            fresh = now.pop(0) != 0
+            others = [now.pop(0) if there else None for there in given]
+            path = jax.tree.unflatten(self._path, path)
+            tick = Tick(position, path, self._driven, fresh[0], *others, fresh[1])
+            controller = eqx.combine(self._own.unpacked(own), self._static)
+            u, memory = controller.command(tick, self.memory.unpacked(memory), jnp.zeros(1))
+            told = controller.told(memory)
+            closed = jnp.zeros(1) if told is None else told.closed.astype(float)[None]
+            memory = self.memory.packed(memory, jnp)
+            return jnp.concatenate([own, memory, before[ends[1] : ends[-1]], closed, u])
+
+        # A loop of one turn, whose number the compiler does not know, is one kernel (see `jaxid._platform`).
+        # All in one vector, or what the turn does not change would be taken out of it: else there are a
+        # hundred kernels, started one by one.
+        return jax.lax.fori_loop(0, once, body, before)
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A tree of arrays as one vector of float64: truths and whole numbers below 2^53 stay exact."""
+
+    structure: object
+    shapes: tuple
+
+    @classmethod
+    def of(cls, tree: object) -> _Packed:
+        leaves, structure = jax.tree.flatten(tree)
+        return cls(structure, tuple((np.shape(x), np.asarray(x).dtype.str) for x in leaves))
+
+    @functools.cached_property
+    def size(self) -> int:
+        return sum(int(np.prod(shape)) for shape, _ in self.shapes)
+
+    def packed(self, tree: object, xp: Any = np) -> Any:
+        parts = [xp.ravel(x).astype(np.float64) for x in jax.tree.leaves(tree)]
+        return xp.concatenate(parts) if parts else xp.zeros(0)
+
+    def unpacked(self, vector: Any) -> object:
+        leaves, end = [], 0
+        for shape, dtype in self.shapes:
+            first, end = end, end + int(np.prod(shape))
+            leaves.append(vector[first:end].reshape(shape).astype(dtype))
+        return jax.tree.unflatten(self.structure, leaves)
 
 
 def _learn(online: Online, memory: Memory, position: Array, command: Array) -> tuple[Memory, Told]:

@@ -348,3 +348,13 @@ sample_rate = 1000.0
         Live(case)
 
 
+def test_a_command_that_is_not_measured_is_taken_as_given(tmp_path):
+    """At the first tick there is none to report, and a drive may skip one: nothing is compiled anew for it."""
+    case = written(tmp_path, ENCODER, duration=0.1)
+    plain, told = Live(case), Live(case)
+    last = None
+    for k, q in enumerate(plain.reference + 1e-4 * np.random.default_rng(0).standard_normal((400, 2))):
+        measured = last if k % 3 else np.full(2, np.nan) if k else None
+        last = plain.command(q)
+        np.testing.assert_array_equal(told.command(q, measured=measured), last)
+    assert len(told._law._compiled) == 1

@@ -145,7 +145,8 @@ class Adaptive(FeedForward):
     def _learn(self, tick: Tick, memory: Learning) -> Learning:
         """With this tick's sample; the newest of the commands is its own, until measured better."""
         if tick.measured is not None:
-            newest = jnp.concatenate([tick.measured[None], memory.commands[1:]])
+            newest = jnp.where(jnp.isnan(tick.measured), memory.commands[0], tick.measured)
+            newest = jnp.concatenate([newest[None], memory.commands[1:]])
             memory = eqx.tree_at(lambda m: m.commands, memory, newest)
         sample, ready = self._sample(tick, memory)
         rows, target, counts = self.estimator.rows(*sample)

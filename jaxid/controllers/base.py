@@ -35,7 +35,7 @@ class Tick(eqx.Module):
         velocity, acceleration: Of all joints, where sensors measure them; acceleration is the mean since
             the tick before. None: positions are to be differenced.
         renewed: Whether these are new.
-        measured: Command that the drives report for the interval just past; None: as it was given.
+        measured: Command that the drives report for the interval just past; None, or NaN: as it was given.
     """
 
     joints: Float[Array, " n"]
