@@ -269,7 +269,8 @@ def tables(found: dict) -> list[str]:
         part = s["ms"] / one[s["case"]]
         # Of a cluster only the memory of the process that asks it is known.
         memory, way = ("", "processes") if s["processes"] else (megabytes(s["memory"]), "threads")
-        lines.append(f"| {s['case']} | {s['cores']} | {way} | {s['ms']:.1f} | {shown} | {part:.2f} | {memory} |")
+        cells = (s["case"], s["cores"], way, f"{s['ms']:.1f}", shown, f"{part:.2f}", memory)
+        lines.append(f"| {' | '.join(map(str, cells))} |")
     lines += ["", "## Against the length of the log", "",
               "| samples | prepare s | inverse dynamics, warm s | output error, cold s | warm s | peak MB |",
               "|---|---|---|---|---|---|"]  # fmt: skip

@@ -190,7 +190,10 @@ def _followed(case: Case, log: Log) -> Log:
     if case.unknown_reference:
         return log
     rate, plant = 1 / log.period, build_machine(at_joints(case), period=log.period).plant
-    reference = make_reference(case.reference, rate, log.samples / rate, case.folder, plant=plant)
+    where = f"{case.path}, [reference]"
+    reference = make_reference(
+        case.reference, rate, log.samples / rate, case.folder, where=where, plant=plant
+    )
     return replace(log, reference=np.broadcast_to(reference, (log.samples, case.plant.drives)))
 
 

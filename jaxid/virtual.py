@@ -138,7 +138,7 @@ class Scene:
                     mend="add an [input], or a [reference] and a [controller]",
                 )
             command = make_reference(
-                case.input, rate, duration, case.folder, where="input", plant=machine.plant
+                case.input, rate, duration, case.folder, where=f"{where}, [input]", plant=machine.plant
             )
             drive = _drive(case, machine, 1 / rate, longer_delays)
             return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
@@ -146,7 +146,8 @@ class Scene:
             raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
         period = machine.controller.period
         reference = make_reference(
-            case.true_reference, 1 / period, duration, case.folder, plant=machine.plant
+            case.true_reference, 1 / period, duration, case.folder, where=f"{where}, [reference]",
+            plant=machine.plant,
         )
         reference = _by_drive(reference, machine)
         if reference.shape[1] == joints:

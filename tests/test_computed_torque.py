@@ -349,7 +349,7 @@ sample_rate = 1000.0
 
 
 def test_a_command_that_is_not_measured_is_taken_as_given(tmp_path):
-    """At the first tick there is none to report, and a drive may skip one: nothing is compiled anew for it."""
+    """At the first tick there is none to report, and a drive may skip one; nothing is compiled anew."""
     case = written(tmp_path, ENCODER, duration=0.1)
     plain, told = Live(case), Live(case)
     last = None

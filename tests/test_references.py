@@ -60,7 +60,7 @@ def test_required_unknown_and_kind(table):
     first = next(iter(keys))
     refuse({**table, first + "s_": 1.0}, f"unknown key '{first}s_'; did you mean '{first}'")
     refuse({**table, "kind": table["kind"] + "e"}, f"did you mean '{table['kind']}'")
-    refuse({k: v for k, v in table.items() if k != "kind"}, r"\[input\]: kind", where="input")
+    refuse({k: v for k, v in table.items() if k != "kind"}, r"\[input\]: kind", where="[input]")
 
 
 @pytest.mark.parametrize("table", VALID, ids=lambda table: table["kind"])

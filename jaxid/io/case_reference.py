@@ -23,7 +23,7 @@ def read_signal(
     table, spot = tables[name], Spot(file, f"[{name}]")
     kind = read_kind(table, REFERENCES, spot)
     try:
-        read = REFERENCES[kind].read(table, name)
+        read = REFERENCES[kind].read(table, f"[{name}]")
     except InputError as error:
         raise InputError(f"{file}, {error}") from error
     if len(read) not in (1, drives):

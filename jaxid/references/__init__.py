@@ -39,7 +39,7 @@ def make_reference(
     duration: float | int,
     base_dir: str | Path = ".",
     *,
-    where: str = "reference",
+    where: str = "[reference]",
     plant: Plant | None = None,
 ) -> Float[np.ndarray, "samples joints"]:
     """Sample the reference that a table of a case describes.
@@ -49,7 +49,7 @@ def make_reference(
         rate_hz: Samples per second [Hz].
         duration: Length [s]; round(duration * rate_hz) samples, the first at time zero.
         base_dir: Folder that relative file names start from: the case's own.
-        where: Name of the table, for messages.
+        where: File and table, for messages.
         plant: What is to follow; needed where points are those of its tool.
 
     Returns:
@@ -58,15 +58,14 @@ def make_reference(
     Raises:
         InputError: If the table cannot be met.
     """
-    place = f"[{where}]"
     kind = table.get("kind")
     if kind not in REFERENCES:
         mend = suggest(str(kind), REFERENCES)
         what = "kind is missing" if kind is None else f"kind = {kind!r} is unknown"
-        raise InputError(what, where=place, mend=mend)
+        raise InputError(what, where=where, mend=mend)
     samples = _samples(rate_hz, duration)
     family = REFERENCES[kind]
-    grids = lambda joint: Grid(rate_hz, samples, Path(base_dir), joint, place, plant)
+    grids = lambda joint: Grid(rate_hz, samples, Path(base_dir), joint, where, plant)
     if family.together:
         return family.sample(family.read(table, where), grids(0))
     columns = [

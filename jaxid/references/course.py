@@ -35,7 +35,7 @@ class Course(eqx.Module):
     def of(cls, table: Mapping[str, Any], unknown: Mapping[str, float]) -> Course:
         """Of a table of a case, and values for what it leaves unknown."""
         family = REFERENCES[table["kind"]]
-        (values,) = family.read({**table, **unknown}, REFERENCE)
+        (values,) = family.read({**table, **unknown}, f"[{REFERENCE}]")
         lists = {k: tuple(v.tolist()) for k, v in values.items() if family.keys[k].shape == "list"}
         numbers = jnp.asarray(list(unknown.values()), dtype=jnp.float64)
         rest = tuple((k, v) for k, v in (values | lists).items() if k not in unknown)

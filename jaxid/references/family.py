@@ -55,7 +55,7 @@ class Grid:
         samples: Number of samples; the first is at time zero.
         base_dir: Folder that relative file names start from.
         joint: 0-based joint, so that random ones differ.
-        where: Name of the table, for messages.
+        where: File and table, for messages.
         plant: What is to follow, for a family that asks for its kinematics; None where it is not known.
     """
 
@@ -109,7 +109,7 @@ class Family:
 
         Args:
             table: The table of the case; `kind` is passed over.
-            where: Name of the table, for messages.
+            where: File and table, for messages.
 
         Returns:
             The values of each joint, defaults filled in.
@@ -118,7 +118,7 @@ class Family:
             InputError: If a key is unknown, missing or has a value that cannot be.
         """
         given = {name: value for name, value in table.items() if name != "kind"}
-        place = f"[{where}] kind = '{self.kind}'"
+        place = f"{where} kind = '{self.kind}'"
         for name in given:
             if name not in self.keys:
                 mend = suggest(name, self.keys)

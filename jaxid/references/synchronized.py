@@ -112,7 +112,7 @@ def _simplices(polygon: np.ndarray, grid: Grid) -> Float[np.ndarray, "k n1 n"]:
         raise grid.fault("polygon has no area", "give corners that do not lie on a line") from error
     inner = sorted(set(range(len(polygon))) - set(hull.vertices.tolist()))
     if inner:
-        what = f"corner {inner[0] + 1} of polygon lies within the others"
+        what = f"corner {inner[0] + 1} of polygon lies within the others, or on an edge"
         raise grid.fault(what, "a straight line between targets must stay inside: give a convex polygon")
     return polygon[triangles]
 
