@@ -6,6 +6,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from common import Table
@@ -14,9 +15,11 @@ import jaxid
 from jaxid.base_parameters import base_parameters, inertial_regressor
 from jaxid.estimators import steps_of
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
 from jaxid.excitation import Excitation
 from jaxid.io.log import Log
+from jaxid.parameters import scatter
 from jaxid.plants import SerialArm, pa10
 from jaxid.regrouping import base_parameters_by_rules
 from jaxid.residuals import balance_along
@@ -130,6 +133,9 @@ def identification(folder: Path) -> None:
             left = _left(found.machine.plant, motions["condition"], logs["condition"].force) / NOISE
             table.row(what, method, found.converged, found.steps, *[f"{x:.3f}" for x in left],
                       f"{time.perf_counter() - start:.0f}")
+            if text is base and method != "reweighted":
+                expected = np.sqrt(1 + _spread(found, motions["condition"]) / NOISE**2)
+                table.row(what, f"{method}, as its σ says", "", "", *[f"{x:.3f}" for x in expected], "")
     table.show(time.perf_counter() - begun)
 
 
@@ -150,6 +156,20 @@ def torque(bodies: np.ndarray, m: Excitation) -> np.ndarray:
     rows = zip(m.position, m.velocity, m.acceleration, strict=True)
     rigid = np.array([pinocchio.rnea(model, data, *x) for x in rows])
     return rigid + VISCOUS * m.velocity + COULOMB * np.sign(m.velocity)
+
+
+def _spread(found: Estimate, m: Excitation) -> np.ndarray:
+    """Variance of predicted torques that the estimate's covariance makes, mean over a motion, by joint."""
+    machine, none = found.machine, jnp.zeros(m.position.shape)
+    motion = [jnp.asarray(x[::10]) for x in (m.position, m.velocity, m.acceleration, none)]
+
+    def told(theta: jnp.ndarray) -> jnp.ndarray:
+        plant = scatter(machine.parameters.places, machine.plant, theta)
+        return balance_along(plant, *motion, jnp.asarray(m.time[1]))[0]
+
+    w = np.asarray(jax.jacfwd(told)(jnp.asarray(found.theta)))
+    c = np.nan_to_num(found.precision.covariance)
+    return np.mean(np.einsum("tjp,pq,tjq->tj", w, c, w), axis=0)
 
 
 def _left(plant: SerialArm, m: Excitation, measured: np.ndarray) -> np.ndarray:

@@ -155,6 +155,10 @@ def _discover(commands: argparse._SubParsersAction) -> None:
     _logs(parser)
     _validate(parser)
     parser.add_argument("--max-effects", metavar="N", type=int, default=5, help="default: 5")
+    parser.add_argument(
+        "--experiments", action=argparse.BooleanOptionalAction, default=None,
+        help="design experiments that tell rivals apart; default: not of arms, where it takes minutes",
+    )
 
 
 def _study(commands: argparse._SubParsersAction) -> None:
@@ -286,7 +290,7 @@ def _run_discover(args: argparse.Namespace) -> int:
 
         result = discover(
             args.case, args.log, validate=args.validate, max_effects=args.max_effects,
-            progress=tell,
+            experiments=args.experiments, progress=tell,
         )
     print(result)
     from jaxid.io.results import discovery_files

@@ -49,6 +49,7 @@ def discover(
     validate: Sequence[Log | str | Path] = (),
     max_effects: int = 5,
     refit: bool = True,
+    experiments: bool | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
     """Find the effects that a case's model is missing, on a log.
@@ -59,24 +60,28 @@ def discover(
         validate: Logs that must confirm each effect, beside the case's own.
         max_effects: Most effects to add.
         refit: Refit the parameters in simulation too; without, they are inverse dynamics'.
+        experiments: Whether experiments are designed that tell rivals apart. Absent: not where joints push
+            one another, as of an arm, whose simulation takes minutes to compile for it.
         progress: Called with a line at every stage.
 
     Raises:
         InputError: If case or log are unsound.
     """
     session = open_session(case, log, validate, align_hold=True, method="discover")
-    return explore(session, max_effects=max_effects, refit=refit, progress=progress)
+    return explore(
+        session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress
+    )
 
 
 def explore(
-    session: Session, *, max_effects: int = 5, refit: bool = True,
+    session: Session, *, max_effects: int = 5, refit: bool = True, experiments: bool | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
     """`discover` on what is open already.
 
     Args:
         session: Case and logs, prepared with the hold aligned.
-        max_effects, refit, progress: As there.
+        max_effects, refit, experiments, progress: As there.
 
     Raises:
         InputError: If the reference has unknowns.
@@ -102,7 +107,8 @@ def explore(
         progress("refitting in simulation")
         before = _refit(session.with_machine(before.machine), before)
         after = _refit(session.with_machine(after.machine), after) if effects else before
-    separating = proposals(session, search, effects, progress)
+    designs = not session.machine.plant.coupled if experiments is None else experiments
+    separating = proposals(session, search, effects, progress) if designs else ()
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
     missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]
     while missing:

@@ -154,7 +154,7 @@ def _found(plan: Plan, session: Session) -> Arrays:
     """What `discover` makes of a run: the model's own parameters, and what it names beside them."""
     from jaxid.discovery.discover import explore
 
-    found = explore(session, refit=False)
+    found = explore(session, refit=False, experiments=False)
     at = [found.after.names.index(name) for name in plan.names]
     row = {name: x[at] if np.ndim(x) else x for name, x in _row(found.after).items()}
     named = " + ".join(sorted(e.label for e in found.effects)) or found.verdict
