@@ -336,8 +336,8 @@ def sensors(folder: Path) -> None:
     begin = time.perf_counter()
     table = Table(
         "The adaptive law by what measures motion, last 20 of 40 s",
-        ["sensors", "RMS [mrad]", "peak [mrad]", "trusted after [s]", "friction in 5 % after [s]", "gains off",
-         "friction off"],
+        ["sensors", "RMS [mrad]", "peak [mrad]", "trusted after [s]", "friction in 5 % after [s]",
+         "gains off", "friction off"],
     )  # fmt: skip
     pair = lambda x: ", ".join(f"{v:.3g}" for v in x)
     for name, inertial, more in (
