@@ -107,21 +107,21 @@ def workspace(
     grid = np.stack(sides, -1).reshape(-1, 2)
     at, index = tool(grid)
     good = np.isfinite(index)
-    figure, axes = plt.subplots(1, 2, figsize=(11, 5), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(12, 6), layout="constrained")
     edge = np.concatenate([polygon, polygon[:1]])
     edge = np.concatenate([np.linspace(a, b, 30) for a, b in zip(edge[:-1], edge[1:], strict=True)])
     for ax, where in zip(axes, (lambda q: q, lambda q: tool(q)[0]), strict=True):
-        shown = ax.scatter(
-            *where(grid[good]).T, c=index[good], s=2, cmap="Reds", vmin=0, vmax=1, linewidths=0
-        )
+        corners = np.where(good[:, None], where(grid), 0.0).reshape(*sides[0].shape, 2)
+        index_of = np.ma.masked_invalid(index.reshape(sides[0].shape))
+        shown = ax.contourf(*np.moveaxis(corners, -1, 0), index_of, 20, cmap="Reds", vmin=0, vmax=1)
         ax.plot(*where(edge).T, color="black")
         for q in paths:
             x = where(q)
             speed = np.linalg.norm(np.gradient(x, period, axis=0), axis=1)
             line = ax.scatter(*x.T, c=speed, s=3, cmap="Blues", vmin=0, linewidths=0)
         unit = "rad/s" if ax is axes[0] else "m/s"
-        figure.colorbar(line, ax=ax, label=f"speed [{unit}]", shrink=0.7)
-    figure.colorbar(shown, ax=axes, label="condition index", shrink=0.7)
+        figure.colorbar(line, ax=ax, label=f"speed [{unit}]", location="bottom", shrink=0.8)
+        figure.colorbar(shown, ax=ax, label="condition index", shrink=0.8)
     axes[0].set(xlabel="joint 1 [rad]", ylabel="joint 2 [rad]")
     axes[1].set(xlabel="x of the tool [m]", ylabel="y of the tool [m]", aspect="equal")
     figure.savefig(path, dpi=110)
