@@ -44,7 +44,9 @@ HOME = [1.5, 0.5]
 STEP = 5e-5  # of the exact robot [s]
 # Friction of a joint that no model has: part by which it fluctuates about its mean, and for how long [s].
 FLUCTUATION, MEMORY = 0.25, 0.05
-ORDERS = {"coulomb_friction": "level"}
+# Kinds of friction by their order in the velocity, from zero on; their parameter where it is no coefficient.
+KINDS = ("coulomb_friction", "viscous_friction", "quadratic_drag", "cubic_friction", "quartic_friction")
+PARAMETER = {"coulomb_friction": "level"}
 
 
 SENSORS = "".join(
@@ -82,10 +84,10 @@ def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str]
     count = 3 if where else 2
     guess = guess or (lambda kind, k: "{ guess = 0.0 }")
     out = []
-    kinds = ("coulomb_friction", "viscous_friction", "quadratic_drag", "cubic_friction", "quartic_friction")
-    for kind in kinds[: orders + 1]:
+    for kind in KINDS[: orders + 1]:
         values = ", ".join(guess(kind, k) for k in range(count))
-        out.append(f'[[effects]]\nkind = "{kind}"\n{where}\n{ORDERS.get(kind, "coefficient")} = [{values}]\n')
+        name = PARAMETER.get(kind, "coefficient")
+        out.append(f'[[effects]]\nkind = "{kind}"\n{where}\n{name} = [{values}]\n')
     return "".join(out)
 
 

@@ -97,7 +97,7 @@ def test_a_candidate_of_the_case_is_found_and_no_other_case_knows_it(tmp_path, l
 
 def union(path, log):
     session = open_session(path, log)
-    return build_union(session.machine, session.fit.data, session.case.own_effects)
+    return build_union(session.machine, session.fit.data, session.case.searched)
 
 
 def test_candidates_stand_beside_the_registered_and_leave_the_model_alone(tmp_path, log):
@@ -108,6 +108,17 @@ def test_candidates_stand_beside_the_registered_and_leave_the_model_alone(tmp_pa
     assert found == {*EFFECTS, "my_effects.py:Hum"} - {VISCOUS[0], COULOMB[0]} - elsewhere
     effects = open_session(path, log).machine.plant.effects
     assert [e.kind for e in effects] == [VISCOUS[0], COULOMB[0]]
+
+
+def test_a_search_may_be_kept_to_some_kinds(tmp_path, log):
+    """Beside them only the case's own; a kind that is none is refused, with what there is."""
+    path = case(tmp_path, "Hum")
+    text = path.read_text().replace("[discover]", '[discover]\nkinds = ["cogging", "quadratic_drag"]')
+    path.write_text(text)
+    assert [c.kind for c in union(path, log).candidates] == ["quadratic_drag", "cogging", "my_effects.py:Hum"]
+    path.write_text(text.replace('"cogging"', '"coging"'))
+    with pytest.raises(InputError, match="discover.*kinds.*coging.*cogging"):
+        open_session(path, log)
 
 
 FAULTS = {

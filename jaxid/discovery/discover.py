@@ -143,7 +143,7 @@ def start_search(
     baseline = inverse_dynamics(machine, data)
     floor = noise_floor(baseline.machine, log, data)
     colour = sensor_colour(baseline.machine, log, data)
-    union = build_union(baseline.machine, data, session.case.own_effects)
+    union = build_union(baseline.machine, data, session.case.searched)
     others = tuple(v.data for v in session.validations)
     return baseline, Search(union, data, floor, colour, others, progress)
 

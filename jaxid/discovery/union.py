@@ -54,13 +54,15 @@ def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
     return jax.vmap(lambda *now: port_motion(plant, *now))(*motion)
 
 
-def build_union(machine: Machine, data: Prepared, own: Sequence[type[Effect]] = ()) -> Union:
+def build_union(
+    machine: Machine, data: Prepared, effects: Sequence[type[Effect]] = tuple(EFFECTS.values())
+) -> Union:
     """Add every effect that the plant does not have yet, at every joint and spring that suits it.
 
     Args:
         machine: The baseline.
         data: The log to be searched, for scales.
-        own: Effects of the case beside those that are registered.
+        effects: Those that it might be missing.
 
     Raises:
         InputError: If an effect that is not jaxid's own cannot be searched for.
@@ -70,7 +72,7 @@ def build_union(machine: Machine, data: Prepared, own: Sequence[type[Effect]] = 
     base = np.arange(len(parameters.free))
     candidates = []
     # Kind by kind, so that the effects of one kind are traced as one.
-    for cls in (*EFFECTS.values(), *own):
+    for cls in effects:
         ports = [i for i, s in enumerate(scales) if s.velocity > 0.0 and _missing(machine, cls, i, data)]
         if ports and is_foreign(cls):
             check_foreign(cls, machine, data, scales[ports[0]], ports[0])

@@ -18,10 +18,10 @@ from jaxid.io.case_entries import (
     EffectEntry,
     PlantEntry,
     check_kinds,
-    read_candidates,
     read_effects,
     read_kind,
     read_plant,
+    read_search,
 )
 from jaxid.io.case_reference import read_signal, read_unknown_reference
 from jaxid.io.case_sensors import read_inertial_sensors
@@ -87,6 +87,7 @@ class Case:
         limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
         candidates: User's own effects that a search may name, from [discover].
+        kinds: Of those that are registered, what it may name, from there; empty: all.
         design: [design], for `jaxid.excitation`.
         reference: [reference], for `jaxid.references.make_reference`, at its guesses.
         unknown_reference: What of it is unknown.
@@ -112,6 +113,7 @@ class Case:
     limits: dict[str, Any] = field(default_factory=dict)
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
+    kinds: tuple[str, ...] = ()
     design: dict[str, Any] = field(default_factory=dict)
     reference: dict[str, Any] | None = None
     unknown_reference: dict[str, Value] = field(default_factory=dict)
@@ -136,6 +138,12 @@ class Case:
         """User's effects that the case knows: those it declares, and the candidates."""
         classes = (*(entry.cls for entry in self.effects), *self.candidates)
         return tuple(dict.fromkeys(c for c in classes if EFFECTS.get(c.kind) is not c))
+
+    @property
+    def searched(self) -> tuple[type[Effect], ...]:
+        """Effects that `discover` may name."""
+        registered = [cls for kind, cls in EFFECTS.items() if not self.kinds or kind in self.kinds]
+        return (*registered, *self.own_effects)
 
     @property
     def load_column(self) -> bool:
@@ -182,6 +190,7 @@ def load_case(path: str | Path) -> Case:
     actuator = _checked_transmission(
         read("actuator", actuator_keys(drives)), plant, file, "controller" in tables
     )
+    search = read_search(tables.get("discover", {}), path)
     case = Case(
         path=path,
         plant=plant,
@@ -201,7 +210,8 @@ def load_case(path: str | Path) -> Case:
         inertial_sensors=read_inertial_sensors(tables, plant.cls.links(joints), file),
         limits=read("limits", limits_keys(joints, drives)),
         validations=_validations(tables, plant, path),
-        candidates=read_candidates(tables.get("discover", {}), path),
+        candidates=search.get("candidates", ()),
+        kinds=search.get("kinds", ()),
         design=read("design", design_keys(joints)),
         reference=read_signal("reference", tables | followed, drives, file),
         unknown_reference=unknown,

@@ -272,11 +272,11 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
     return EffectEntry(cls, parameters, ports)
 
 
-def read_candidates(table: Any, path: Path) -> tuple[type[Effect], ...]:
-    """Read [discover]: the user's own effects that a search may name.
+def read_search(table: Any, path: Path) -> dict[str, tuple]:
+    """Read [discover]: `kinds` and `candidates` of effects that a search may name, where it has them.
 
     Raises:
-        InputError: If one is no class of a file.
+        InputError: If a kind is unknown, or a candidate no class of a file.
     """
     def own(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
@@ -284,8 +284,11 @@ def read_candidates(table: Any, path: Path) -> tuple[type[Effect], ...]:
             raise spot.refuse(kind, "takes part in every search", "leave it out")
         return user_effect(kind, path.parent, spot)
 
-    keys = {"candidates": Key(several(own), 'a list such as ["my_effects.py:MyEffect"]')}
-    return read_table(table, keys, Spot(str(path), "[discover]")).get("candidates", ())
+    keys = {
+        "candidates": Key(several(own), 'a list such as ["my_effects.py:MyEffect"]'),
+        "kinds": Key(several(choice(tuple(EFFECTS))), "what `jaxid effects` lists; default: all of it"),
+    }
+    return read_table(table, keys, Spot(str(path), "[discover]"))
 
 
 def check_kinds(classes: Iterable[type[Effect]], file: str) -> None:
