@@ -232,7 +232,12 @@ def temperature(folder: Path) -> None:
     table.show(time.perf_counter() - begin)
 
 
-def log_of(ran: Ran, name: str, noise: float = 0.02, every: int = 4) -> Log:
+# Noise of the torque in a log, at the motor [N m].
+LOGGED = 0.02
+SENSOR = f"[sensor]\nposition_resolution = {robots.COUNTS}\nforce_noise = {LOGGED}\n"
+
+
+def log_of(ran: Ran, name: str, noise: float = LOGGED, every: int = 4) -> Log:
     """What an encoder and the drives would log of a run, at 1 kHz."""
     rng = np.random.default_rng(5)
     q = np.round(ran.q / robots.COUNTS) * robots.COUNTS
@@ -283,8 +288,8 @@ def orders(folder: Path) -> None:
     righettini_figures.bars(folder / "orders.png", {"model": residuals}, "RMS residual [N m]")
     # The paper's future work, by machine: of friction of any order in any hinge, what made the log?
     path = folder / "chooses.toml"
-    kinds = f"[discover]\nkinds = {list(robots.KINDS)}\n"
-    path.write_text(robots.case_text(PD, friction=robots.friction_text(1), inertial=False, more=kinds))
+    more = f"{SENSOR}[discover]\nkinds = {list(robots.KINDS)}\n"
+    path.write_text(robots.case_text(PD, friction=robots.friction_text(1), inertial=False, more=more))
     active = {k: np.array(v) * [1, 1, 0, 0, 0] for k, v in robots.FRICTION.items()}
     first = {k: v * (k in robots.KINDS[:2]) for k, v in active.items()}
     hinge = {k: v + [0, 0, 0, 0, 0.5 * (k == "viscous_friction")] for k, v in active.items()}
@@ -332,7 +337,7 @@ def hidden(folder: Path) -> None:
     for name, hid in (("passive", machine), ("payload", robot(tip_mass=3.52))):
         log = logged(folder, name, hid)
         path = folder / f"hidden_{name}.toml"
-        path.write_text(robots.case_text(PD, friction=stated, gain=robots.GAINS, inertial=False))
+        path.write_text(robots.case_text(PD, friction=stated, gain=robots.GAINS, inertial=False, more=SENSOR))
         found = jaxid.discover(path, log)
         found.save(folder / f"hidden_{name}", force=True)
         print(f"\nhidden: {name} ({time.perf_counter() - begin:.0f} s)\n{found}", flush=True)
