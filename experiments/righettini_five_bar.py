@@ -372,7 +372,7 @@ def sensors(folder: Path) -> None:
 
 # By how much drive gains and friction differ from robot to robot, as a standard deviation; noise of the
 # measured torque at the motor [N m].
-TOLERANCE, TORQUE_NOISE = 0.05, 0.5 / robots.REDUCTION
+TOLERANCE, TORQUE_NOISE = 0.05, 0.25 / robots.REDUCTION
 
 
 def tolerances(folder: Path) -> None:

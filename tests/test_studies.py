@@ -236,6 +236,7 @@ def test_a_chain_in_its_loop(tmp_path):
     assert all(0 < r["bound"] < 2 * r["rmse"] for r in study.summary)
 
 
+@pytest.mark.slow
 def test_what_a_law_found_in_its_loop_is_a_row(tmp_path):
     """As `simulate` has it of the same machine; beside it how far the loop is off its reference."""
     case = written(tmp_path, "velocity_average = 4\nreach = 8", duration=1.2)
@@ -252,8 +253,7 @@ def test_what_a_law_found_in_its_loop_is_a_row(tmp_path):
     assert [r["drive"] for r in study.tracking] == [1, 2]
     assert study.tracking[0]["rms"]["worst"] == pytest.approx(rms[:, 0].max().item())
     assert "off the reference" in str(study)
-    # In a tenth of a second nothing is learnt that could be trusted.
-    case.write_text(case.read_text().replace("duration = 1.2", "duration = 0.1"))
+    case.write_text(case.read_text().replace("velocity_average = 4", "tolerance = 1e-9\nvelocity_average = 4"))
     early = jaxid.study(case)
     assert [f["why"] for f in early.failures] == ["the law never trusted what it found"]
     assert np.isfinite(early.tracking[0]["rms"]["median"])

@@ -113,6 +113,11 @@ class Plan:
         return self.levels[0].machine
 
     @property
+    def fits(self) -> bool:
+        """Whether anything is fitted to the logs."""
+        return set(self.estimators) != {IN_LOOP}
+
+    @property
     def settings(self) -> dict[str, list[float]]:
         """Values of each setting, in the order of the levels."""
         return {

@@ -71,7 +71,7 @@ class Runner:
         """
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
-        ways = self.ways(level)
+        ways = self.ways(level) if self.plan.fits else None
         found = together([self._run(level, k, ways) for k in runs], self.plan.lanes)
         # Whatever ends a run, in a library too, ends that run only.
         found = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
@@ -82,7 +82,7 @@ class Runner:
         out["seconds"] = np.asarray(time.perf_counter() - began)
         return out
 
-    def _run(self, level: int, number: int, ways: Ways) -> Steps[Arrays]:
+    def _run(self, level: int, number: int, ways: Ways | None) -> Steps[Arrays]:
         plan, at = self.plan, self.plan.levels[level]
         truth, start, rng = plan.drawn(number)
         machine = at.machine.with_estimate(start)
@@ -90,7 +90,7 @@ class Runner:
         virtual = yield from at.scene.virtual(at.scene.machine.with_estimate(truth), rng)
         # What is unknown of a reference is not in the log.
         log = virtual.log if machine.course is None else replace(virtual.log, reference=None)
-        session = session_around(at.model, machine, log, ways.recipe)
+        session = None if ways is None else session_around(at.model, machine, log, ways.recipe)
         for method in plan.estimators:
             options = {"numerics": ways.numerics} if method in SIMULATING else {}
             try:

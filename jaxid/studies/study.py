@@ -192,10 +192,11 @@ def _bound(plan: Plan, level: Level) -> np.ndarray:
     Of an unbiased estimate from the readings of one log, their noise white, the start and the command
     known exactly: in a loop too the readings so far give the command, so that what counts is the
     derivative of the position under a given command. NaN where the case states no noise of the
-    readings, or where the log cannot tell. Where true values are drawn it is that of their middle.
+    readings, where nothing is fitted to logs, or where the log cannot tell. Where true values are drawn it
+    is that of their middle.
     """
     none, scene, machine = np.full(len(plan.names), np.nan), level.scene, level.scene.machine
-    if machine.sensor.position_std is None:
+    if machine.sensor.position_std is None or not plan.fits:
         return none
     silent = replace(machine, sensor=replace(machine.sensor, position_noise=None, force_noise=None))
     virtual = alone(scene.virtual(silent, np.random.default_rng(0)))
