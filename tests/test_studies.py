@@ -253,7 +253,8 @@ def test_what_a_law_found_in_its_loop_is_a_row(tmp_path):
     assert [r["drive"] for r in study.tracking] == [1, 2]
     assert study.tracking[0]["rms"]["worst"] == pytest.approx(rms[:, 0].max().item())
     assert "off the reference" in str(study)
-    case.write_text(case.read_text().replace("velocity_average = 4", "tolerance = 1e-9\nvelocity_average = 4"))
+    strict = case.read_text().replace("velocity_average = 4", "tolerance = 1e-9\nvelocity_average = 4")
+    case.write_text(strict)
     early = jaxid.study(case)
     assert [f["why"] for f in early.failures] == ["the law never trusted what it found"]
     assert np.isfinite(early.tracking[0]["rms"]["median"])

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.io import results
-from jaxid.minimal.report import minimal_rows
 from jaxid.report.numbers import with_std
 from jaxid.report.tables import SLIGHT, place_words, within_prior_words
 
@@ -79,6 +78,9 @@ def _told_together(directions: Sequence[dict[str, Any]]) -> list[str]:
 
 def _minimal(content: dict[str, Any]) -> list[str]:
     """Coefficients and statistics of a minimal model."""
+    # With scipy.stats behind it: a second, which no other table needs.
+    from jaxid.minimal.report import minimal_rows
+
     rows, lines = minimal_rows(content)
     return ["", aligned(rows), *lines]
 
