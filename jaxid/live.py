@@ -30,6 +30,8 @@ from jaxid.virtual import Scene
 # standard deviations of a difference of two readings.
 _REST = 5e-3
 _NOISE = 5.0
+# What may be measured beside positions.
+_OTHERS = ("velocity", "acceleration", "measured")
 
 
 class Live:
@@ -99,7 +101,7 @@ class Live:
             measured: Command that the drives report since the last tick; absent: as it was given.
 
         Raises:
-            InputError: If the reference has ended, or there is not one reading a joint.
+            InputError: If the reference has ended, or there is not one reading a joint, or command a drive.
         """
         if self._tick >= len(self.reference):
             raise InputError(
@@ -114,6 +116,11 @@ class Live:
         if measured is None and self.adapts:
             measured = self._as_given
         others = [None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured)]
+        # All go into one vector, in which one of another length would push the next aside.
+        for name, x, like in zip(_OTHERS, others, (position, position, self._as_given), strict=True):
+            if x is not None and x.shape != like.shape:
+                what = f"{name} has shape {x.shape}"
+                raise InputError(what, where="Live.command", mend=f"give {like.size} numbers")
         fresh = tuple(self._tick % hold == 0 for hold in self._holds)
         if self._tick == 0:
             path = jax.tree.map(lambda x: x[0], self._path)

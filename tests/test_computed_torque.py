@@ -358,3 +358,10 @@ def test_a_command_that_is_not_measured_is_taken_as_given(tmp_path):
         last = plain.command(q)
         np.testing.assert_array_equal(told.command(q, measured=measured), last)
     assert len(told._law._compiled) == 1
+
+
+def test_what_is_measured_must_have_a_number_for_each(tmp_path):
+    live = Live(written(tmp_path, ENCODER, duration=0.1))
+    for name in ("velocity", "acceleration", "measured"):
+        with pytest.raises(InputError, match=rf"Live.command: {name} has shape \(3,\); give 2 numbers"):
+            live.command(live.reference[0], **{name: np.zeros(3)})
