@@ -18,7 +18,7 @@ import scipy.signal
 import jaxid
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from five_bar_oracle import PLANT, Robot
+from five_bar_oracle import ORDERS, PLANT, Robot
 from five_bar_stepper import _advance, arrays
 
 REDUCTION = 20.0
@@ -31,6 +31,8 @@ FRICTION = {
     "quadratic_drag": (-1.2, -0.9, 0.0, 0.0, 0.0), "cubic_friction": (0.17, 0.13, 0.0, 0.0, 0.0),
 }
 KP, KD = 150.0, 4.0  # at the motors [N m/rad], [N m s/rad]
+# PD law of the paper: nothing of the model fed forward.
+PD = 'kind = "computed_torque"\ndynamics = false'
 PERIOD, UPDATE, LOOK = 2.5e-4, 1e-3, 2e-2
 COUNTS = 2 * np.pi / (4 * 65536)  # of the virtual encoder, at the joint [rad]
 # Of a gyroscope and of the acceleration that an accelerometer 0.1 m from the joint tells.
@@ -44,8 +46,7 @@ HOME = [1.5, 0.5]
 STEP = 5e-5  # of the exact robot [s]
 # Friction of a joint that no model has: part by which it fluctuates about its mean, and for how long [s].
 FLUCTUATION, MEMORY = 0.25, 0.05
-# Kinds of friction by their order in the velocity, from zero on; their parameter where it is no coefficient.
-KINDS = ("coulomb_friction", "viscous_friction", "quadratic_drag", "cubic_friction", "quartic_friction")
+# Of a kind of friction, where it is no coefficient.
 PARAMETER = {"coulomb_friction": "level"}
 
 
@@ -84,7 +85,7 @@ def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str]
     count = 3 if where else 2
     guess = guess or (lambda kind, k: "{ guess = 0.0 }")
     out = []
-    for kind in KINDS[: orders + 1]:
+    for kind in ORDERS[: orders + 1]:
         values = ", ".join(guess(kind, k) for k in range(count))
         name = PARAMETER.get(kind, "coefficient")
         out.append(f'[[effects]]\nkind = "{kind}"\n{where}\n{name} = [{values}]\n')

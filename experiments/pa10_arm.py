@@ -98,7 +98,9 @@ def identification(folder: Path) -> None:
     Hypothesis: of every method it is below 1.05. The fit's motion is the design for the determinant, the
     other that for the condition number; torques are Pinocchio's, friction is exact.
 
-    Of base parameters it holds for inverse_dynamics but at joint 5 (1.055), and not for power (1.7 to 6.6).
+    Of either kind of unknowns it holds for inverse_dynamics but at joint 5 (1.056), and not for power (1.8 to
+    3.8), whose own deviations say so (3 to 6): one balance of all joints' power hardly tells the small ones
+    apart. Within bodies it does not converge.
     """
     begun = time.perf_counter()
     if not (folder / "condition.csv").exists():

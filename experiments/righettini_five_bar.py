@@ -19,15 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 import righettini_figures
 from common import Table, run_studies
-from five_bar_robot import LOOK, PERIOD, Ran, driven, robot
+from five_bar_robot import LOOK, PD, PERIOD, Ran, driven, robot
+from righettini_logs import hidden, orders, payload
 
 import jaxid
 from jaxid.controllers.computed_torque import inverse_dynamics
-from jaxid.io.log import Log
 
 ADAPTIVE = 'kind = "adaptive"\ngate_velocity = 0.05\nhalf_life = 600.0'
 TORQUE = 'kind = "computed_torque"'
-PD = TORQUE + "\ndynamics = false"
 # Factors by which errors shrink from law to law, joints 1 and 2: RMS and peak.
 PUBLISHED = {
     "computed torque": ((2.44, 2.04), (3.88, 3.78)), "adaptive": ((5.05, 3.68), (1.40, 1.97)),
@@ -113,7 +112,7 @@ def torques(ran: Ran) -> dict[str, np.ndarray]:
 
 def friction_of(names: list[str], theta: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Friction of both joints at some velocities above zero, (velocities, 2) [N m]."""
-    kinds = ("coulomb_friction", "viscous_friction", "quadratic_drag", "cubic_friction")
+    kinds = robots.ORDERS[:4]
     entry = lambda kind, joint: names.index(f"{kind}[{joint}].{robots.PARAMETER.get(kind, 'coefficient')}")
     return sum(theta[[entry(kind, j) for j in (1, 2)]] * v[:, None] ** k for k, kind in enumerate(kinds))
 
@@ -230,117 +229,6 @@ def temperature(folder: Path) -> None:
         off = np.sqrt(np.mean((found / true - 1) ** 2))
         table.row(f"{half_life:g}", f"{off:.2%}", ", ".join(f"{x:.3g}" for x in sizes(ran, 30.0)[0]))
     table.show(time.perf_counter() - begin)
-
-
-# Noise of the torque in a log, at the motor [N m].
-LOGGED = 0.02
-SENSOR = f"[sensor]\nposition_resolution = {robots.COUNTS}\nforce_noise = {LOGGED}\n"
-
-
-def log_of(ran: Ran, name: str, noise: float = LOGGED, every: int = 4) -> Log:
-    """What an encoder and the drives would log of a run, at 1 kHz."""
-    rng = np.random.default_rng(5)
-    q = np.round(ran.q / robots.COUNTS) * robots.COUNTS
-    u = ran.command + noise * rng.standard_normal(ran.command.shape)
-    pick = slice(None, None, every)
-    reference = ran.live.reference[: len(q)]
-    return Log(time=ran.time[pick], position=q[pick], force=u[pick], reference=reference[pick], source=name)
-
-
-def logged(folder: Path, name: str, machine: object, seconds: float = 15.0, seed: int = 4) -> Log:
-    """A log under the PD law at 1 kHz, whose commands a log at that rate holds whole."""
-    text = robots.case_text(PD, friction="", gain=(1.0, 1.0), seed=seed, duration=seconds, inertial=False)
-    path = folder / f"{name}.toml"
-    path.write_text(text.replace(f"period = {PERIOD}", "period = 0.001").replace("4000.0", "1000.0"))
-    live = jaxid.Live(path)
-    ran = driven(live, machine, seed=seed, inertial=False, period=1e-3)
-    return log_of(ran, name, every=1)
-
-
-MODELS = {
-    1: ("all", 4), 2: ("active", 4), 3: ("active", 3), 4: ("active", 2), 5: ("active", 1),
-}
-
-
-def orders(folder: Path) -> None:
-    """Table 4: what each model leaves (figure 5), and which one `discover` chooses by itself."""
-    begin = time.perf_counter()
-    log = logged(folder, "orders", robot())
-    table = Table(
-        "What models leave of the torque of the joints (figure 5)",
-        ["model", "joints", "order", "unknowns", "left [N m]", "running residual, end [N m]"],
-    )
-    residuals = {}
-    for number, (where, order) in MODELS.items():
-        friction = robots.friction_text(order)
-        if where == "all":
-            friction += robots.friction_text(order, "passive = [1, 2, 3]")
-        path = folder / f"model{number}.toml"
-        path.write_text(robots.case_text(PD, friction=friction, inertial=False, more=RECURSIVE))
-        found = jaxid.identify(path, log, method="recursive")
-        left = residuals[f"({number})"] = found.gaps[0].force.rms
-        running = found.estimate.details["recursive"]["running_residual"]
-        table.row(
-            number, where, order, len(found.estimate.names), ", ".join(f"{x:.3f}" for x in left),
-            ", ".join(f"{x:.3f}" for x in np.ravel(running)),
-        )
-    table.show(time.perf_counter() - begin)
-    righettini_figures.bars(folder / "orders.png", {"model": residuals}, "RMS residual [N m]")
-    # The paper's future work, by machine: of friction of any order in any hinge, what made the log?
-    path = folder / "chooses.toml"
-    more = f"{SENSOR}[discover]\nkinds = {list(robots.KINDS)}\n"
-    path.write_text(robots.case_text(PD, friction=robots.friction_text(1), inertial=False, more=more))
-    active = {k: np.array(v) * [1, 1, 0, 0, 0] for k, v in robots.FRICTION.items()}
-    first = {k: v * (k in robots.KINDS[:2]) for k, v in active.items()}
-    hinge = {k: v + [0, 0, 0, 0, 0.5 * (k == "viscous_friction")] for k, v in active.items()}
-    for name, friction in (("third", active), ("first", first), ("hinge", hinge)):
-        log = logged(folder, name, robot(friction=friction))
-        found = jaxid.discover(path, log, max_effects=8)
-        found.save(folder / f"chosen_{name}", force=True)
-        print(f"\nfriction of the log: {name} ({time.perf_counter() - begin:.0f} s)\n{found}", flush=True)
-
-
-RECURSIVE = "[recursive]\nhalf_life = 600.0\ngate_velocity = 0.05\n"
-
-
-def payload(folder: Path) -> None:
-    """A mass at the tool, found while it moves: with gains of an unloaded run, and with gains free."""
-    begin = time.perf_counter()
-    extra = 0.8
-    bare = logged(folder, "bare", robot())
-    loaded = logged(folder, "load", robot(tip_mass=2.72 + extra))
-    path = folder / "unloaded.toml"
-    path.write_text(robots.case_text(PD, inertial=False))
-    gains = jaxid.identify(path, bare, method="inverse_dynamics").estimate.theta[:2].tolist()
-    table = Table(
-        f"A payload of {extra} kg", ["drive gains", "found [kg]", "sigma [kg]", "gains"]
-    )
-    for name, gain in (("of the unloaded run", gains), ("free", "{ guess = 1.0 }")):
-        path = folder / "loaded.toml"
-        path.write_text(robots.case_text(PD, gain=gain, tip_mass="{ guess = 2.0 }", inertial=False))
-        estimate = jaxid.identify(path, loaded, method="inverse_dynamics").estimate
-        at = estimate.names.index("tip_mass")
-        free = isinstance(gain, str)
-        shown = [estimate.value(f"actuator_gain[{k}].gain") for k in (1, 2)] if free else gain
-        table.row(name, f"{estimate.theta[at] - 2.72:.4f}", f"{estimate.std[at]:.4f}",
-                  ", ".join(f"{g:.4f}" for g in shown))
-    table.show(time.perf_counter() - begin)
-
-
-def hidden(folder: Path) -> None:
-    """What `discover` names of friction on a passive joint, and of a payload."""
-    begin = time.perf_counter()
-    stated = robots.friction_text(3)
-    passive = {k: list(v) for k, v in robots.FRICTION.items()}
-    passive["viscous_friction"][3] = 0.5
-    machine = robot(friction={k: np.array(v) for k, v in passive.items()})
-    for name, hid in (("passive", machine), ("payload", robot(tip_mass=3.52))):
-        log = logged(folder, name, hid)
-        path = folder / f"hidden_{name}.toml"
-        path.write_text(robots.case_text(PD, friction=stated, gain=robots.GAINS, inertial=False, more=SENSOR))
-        found = jaxid.discover(path, log)
-        found.save(folder / f"hidden_{name}", force=True)
-        print(f"\nhidden: {name} ({time.perf_counter() - begin:.0f} s)\n{found}", flush=True)
 
 
 def sensors(folder: Path) -> None:

@@ -242,3 +242,13 @@ def test_high_band_std_reads_the_noise_under_a_signal(sigma):
     x = 5 * sigma * np.sin(2 * np.pi * 400.0 * t) + 100 * np.sin(2 * np.pi * 3.0 * t) + noise
     # median of 7000 bins of the periodogram, neighbours alike under the window: 1 %
     np.testing.assert_allclose(signals.high_band_std(x), sigma, rtol=0.05)
+
+
+@pytest.mark.parametrize("samples", [100, 101, 5000])
+def test_high_band_std_is_that_of_a_periodogram(samples):
+    """Of coloured noise on a drift, whose spectrum is no constant anywhere."""
+    walk = np.cumsum(np.random.default_rng(1).standard_normal((samples, 2)), axis=0)
+    x = walk + np.arange(samples)[:, None]
+    f, p = scipy.signal.periodogram(x, 50.0, window="hann", detrend="linear", axis=0)
+    density = np.median(p[(f > 15.0) & (f < 23.75)], axis=0) / np.log(2.0)
+    np.testing.assert_allclose(signals.high_band_std(x), np.sqrt(density * 25.0), rtol=1e-9)

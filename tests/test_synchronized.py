@@ -5,6 +5,7 @@ import pytest
 import scipy.interpolate
 import scipy.optimize
 import scipy.stats
+from adaptive_arm import written
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,6 +13,7 @@ from jaxid.errors import InputError
 from jaxid.references import make_reference
 from jaxid.references.s_curve import Bounds, plan_s_curve
 from jaxid.references.synchronized import plan_line
+from jaxid.virtual import simulate
 
 RATE = 4000.0
 # Table 3 of the five-bar's paper, in degrees: 210/s, 1680/s^2, 25200/s^3, lower bounds negative.
@@ -195,3 +197,9 @@ def test_neither_points_nor_polygon():
     # Nowhere to go, without a rest: it stands.
     table = {**POINTS, "points": [[0.0, 0.0]]}
     np.testing.assert_array_equal(make_reference(table, RATE, 1.0), 0.0)
+
+
+def test_what_cannot_be_made_is_told_with_its_file(tmp_path):
+    case = written(tmp_path, **{"polygon = [[0.3, 0.2], [1.6, 0.2], [1.6, 1.2], [0.3, 1.2]]\n": ""})
+    with pytest.raises(InputError, match=r"case\.toml, \[reference\].*: neither points nor polygon"):
+        simulate(case)
