@@ -72,7 +72,7 @@ class Plan:
             case: The case; its [study] may be left out.
             runs: In place of the case's.
             seed: Of everything drawn, from 0 to 2^31 - 1.
-            workers: Chunks that are run at once; absent: one a core.
+            workers: Chunks that are run at once; absent: one a core, or one on an accelerator, which it fills.
 
         Raises:
             InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has
@@ -98,7 +98,7 @@ class Plan:
         runs = int(setting.get("runs", _RUNS) if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, mend="give one or more")
-        chunk = int(setting.get("chunk", _fitting(levels, runs, workers or cores())))
+        chunk = int(setting.get("chunk", _fitting(levels, runs, workers or at_once())))
         start_spread = float(setting.get("start_spread", 0.0))
         return cls(case, levels, estimators, draw, start_spread, runs, chunk, seed)
 
@@ -231,6 +231,11 @@ def _memory() -> float:
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def at_once() -> int:
+    """Chunks in work at once: one a core; on an accelerator one, which fills it."""
+    return 1 if _accelerator() else cores()
 
 
 def fingerprint(case: Case) -> str:

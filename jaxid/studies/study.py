@@ -23,7 +23,7 @@ from jaxid.io.output import check_folder, mark_folder, write_json, write_whole
 from jaxid.machine import position_noise
 from jaxid.replay import TooStiffError
 from jaxid.studies.levels import Level
-from jaxid.studies.plan import Plan, cores, digest_of, same
+from jaxid.studies.plan import Plan, at_once, digest_of, same
 from jaxid.studies.remote import Bundle, Remote
 from jaxid.studies.result import FILES, Study, gathered
 from jaxid.studies.runs import Arrays, Runner
@@ -113,11 +113,11 @@ def study(
 
 
 def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
-    """Chunks as they end, one a core at once: compiled code leaves Python's lock alone.
+    """Chunks as they end, as many at once as the device takes: compiled code leaves Python's lock alone.
 
     Linear algebra keeps to one thread meanwhile: its own would wait for each other in a loop.
     """
-    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(cores()) as pool:
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(at_once()) as pool:
         left: dict[Future, int] = {pool.submit(runner.chunk, number): number for number in numbers}
         try:
             while left:

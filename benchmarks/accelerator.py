@@ -1,0 +1,168 @@
+"""Batches on an accelerator against all cores of the same machine: many sets at once, and whole studies.
+
+    python benchmarks/accelerator.py [--quick] [--no-write]
+
+prints the table and writes results/accelerator.json and .md beside this file. Needs a machine with an accelerator that
+JAX sees, and a JAX that can use it.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+# Sets in a call, and runs of a study.
+SETS, RUNS = (1024, 8192, 65536), {"axis": (1024, 4096), "stage": (1024, 8192)}
+# On cores: sets in a vmapped call.
+GROUP = 64
+KINDS = ("cost", "Gauss-Newton step")
+
+
+def child(kind: str, *words: object) -> dict:
+    """What a fresh process prints of itself, on a kind of device."""
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+    environment = os.environ | dict.fromkeys(names, "1") | {"JAX_PLATFORMS": kind}
+    # Without it jaxlib 0.11 waits for itself where threads run compiled code on a processor at once.
+    environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"
+    line = [sys.executable, __file__, "--child", *map(str, words)]
+    done = subprocess.run(line, capture_output=True, text=True, env=environment)
+    if done.returncode:
+        raise RuntimeError(f"{kind}, {words}: {done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def sets(kind: str, count: int, numerics: str) -> dict:
+    """Cost, or normal equations too, of so many sets of the axis' four parameters; 25 000 samples."""
+    import axis
+    import jax
+
+    from jaxid.replay import Numerics
+
+    reference, measured = axis.log()
+    run = axis.replay(reference, Numerics(set_valued=numerics == "ideal"))
+    spread = np.random.default_rng(0).uniform(0.8, 1.2, (count, 4))
+    thetas, seen = axis.TRUTH * spread, jax.numpy.asarray(measured)
+
+    def step(run: object, base: object, thetas: jax.Array, seen: jax.Array) -> jax.Array:
+        return jax.vmap(lambda theta: axis.gauss_newton(run, base, theta, seen)[1])(thetas)
+
+    function = axis.Compiled({"cost": axis.costs, "Gauss-Newton step": step}[kind], run, axis.plant(axis.TRUTH))
+    alone = jax.default_backend() != "cpu"
+    groups = [thetas] if alone else np.split(thetas, count // GROUP)
+    groups = [jax.numpy.asarray(group) for group in groups]
+
+    def whole() -> np.ndarray:
+        with ThreadPoolExecutor(1 if alone else os.cpu_count()) as pool:
+            return np.concatenate(list(pool.map(lambda g: np.asarray(function(g, seen)), groups)))
+
+    begin = time.perf_counter()
+    found = whole()
+    first, seconds = time.perf_counter() - begin, []
+    for _ in range(3):
+        begin = time.perf_counter()
+        whole()
+        seconds.append(time.perf_counter() - begin)
+    return {"s": float(np.median(seconds)), "first_s": first, "found": found[:1024].tolist()}
+
+
+def study(name: str, runs: int) -> dict:
+    """A study whole, the second of its kind in the process; and the first, which compiles."""
+    import jaxid
+    from jaxid.studies.plan import Plan
+
+    case = jaxid.load_case(HERE / "cases" / f"{dict(axis='fits', stage='stage')[name]}.toml")
+    seconds = []
+    for seed in (0, 1):
+        begin = time.perf_counter()
+        result = jaxid.study(case, runs=runs, seed=seed)
+        seconds.append(time.perf_counter() - begin)
+    estimate = result.table["estimate"].values.reshape(runs, -1)
+    told = dict(found=np.nan_to_num(estimate).tolist(), chunk=Plan.of(case, runs=runs).chunk)
+    failed = sum(f["runs"] for f in result.failures)
+    return {"s": seconds[1], "first_s": seconds[0], "failed": failed} | told
+
+
+def device() -> dict:
+    """What JAX sees, and the machine around it."""
+    import jax
+
+    around = {"cores": os.cpu_count(), "python": platform.python_version(), "jax": jax.__version__}
+    return {"kind": jax.local_devices()[0].device_kind} | around
+
+
+def row(what: str, count: int, *words: object) -> dict:
+    """Both sides, and how far apart they are."""
+    sides = {p: child(p, *words) for p in ("cpu", "cuda")}
+    cpu, cuda = (np.asarray(side.pop("found")) for side in sides.values())
+    scale = np.maximum(np.abs(cpu).max(axis=0), 1e-300)
+    differ = np.abs(cpu - cuda) / scale
+    out = {"what": what, "count": count, "differ": float(np.max(differ)),
+           "differ_median": float(np.median(differ))} | sides  # fmt: skip
+    print(json.dumps(out), flush=True)
+    return out
+
+
+def measured(quick: bool) -> list[dict]:
+    """All rows."""
+    rows = []
+    for kind in KINDS:
+        for numerics in ("smooth", "ideal"):
+            for count in SETS[: 1 if quick else None]:
+                if kind == KINDS[0] or count < SETS[-1]:
+                    rows.append(row(f"{kind}, {numerics}", count, "sets", kind, count, numerics))
+    for name, counts in RUNS.items():
+        for count in counts[: 1 if quick else None]:
+            rows.append(row(f"study of the {name}", count, "study", name, count))
+    return rows
+
+
+def table(rows: list[dict], seen: dict) -> str:
+    """In Markdown."""
+    lines = [
+        "# Batches on an accelerator", "",
+        "Written by `python benchmarks/accelerator.py`; what is measured is in `benchmarks/README.md`.", "",
+        "{kind} against {cores} cores of the same machine, python {python}, jax {jax}.".format(**seen), "",
+        "| of | sets or runs | cores s | accelerator s | ratio | first, cores s | accelerator s | differ |",
+        "|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for r in rows:
+        a, b = r["cpu"], r["cuda"]
+        cells = (r["what"], r["count"], f"{a['s']:.3g}", f"{b['s']:.3g}", f"{b['s'] / a['s']:.3g}",
+                 f"{a['first_s']:.3g}", f"{b['first_s']:.3g}", f"{r['differ']:.0e}")  # fmt: skip
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"
+
+
+def write(found: dict) -> None:
+    """What was measured, and its table."""
+    (HERE / "results" / "accelerator.json").write_text(json.dumps(found, indent=1) + "\n")
+    (HERE / "results" / "accelerator.md").write_text(table(found["rows"], found["seen"]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="the smallest batches only")
+    parser.add_argument("--no-write", action="store_true", help="only print")
+    parser.add_argument("--child", nargs="+", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.child:
+        what, *words = args.child
+        numbers = [int(w) if w.isdigit() else w for w in words]
+        print(json.dumps({"sets": sets, "study": study, "device": device}[what](*numbers)))
+        return
+    found = {"seen": child("cuda", "device"), "rows": measured(args.quick)}
+    print(table(found["rows"], found["seen"]))
+    if not args.no_write:
+        write(found)
+
+
+if __name__ == "__main__":
+    main()
