@@ -369,11 +369,20 @@ def _fastest(plant: Plant, q: Array, u: Array) -> Array:
         def acc(q: Array, v: Array) -> Array:
             return acceleration(plant, State(q, v, own), u, jnp.zeros(()), none)
 
-        stiffness, damping = jax.jacfwd(acc, argnums=(0, 1))(q, zero)
-        motion = jnp.maximum(jnp.sqrt(jnp.abs(stiffness).max()), jnp.abs(damping).max())
+        stiffness, damping = (_slope(of) for of in jax.jacfwd(acc, argnums=(0, 1))(q, zero))
+        motion = jnp.maximum(jnp.sqrt(stiffness), damping)
         return jnp.maximum(motion, _swing(plant, State(q, zero, own), u, none))
 
     return jax.vmap(rate)(q, u).max()
+
+
+def _slope(matrix: Array) -> Array:
+    """Largest entry of a matrix of slopes, what joint acts on what other and back taken together.
+
+    Joints may be in different units, and one light beside the other: k R / J alone is no rate of a motor
+    behind a screw, only with k R / M is it one.
+    """
+    return jnp.sqrt(jnp.abs(matrix * matrix.T)).max()
 
 
 def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:

@@ -1,6 +1,7 @@
 """The micropositioning stage: its motion against the independent chain, what its places are called."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.machine import build_machine
 from jaxid.parameters import label
-from jaxid.replay import Numerics, make_replay
+from jaxid.plants.chain import Chain
+from jaxid.plants.micropositioning_stage import MicropositioningStage
+from jaxid.replay import Numerics, make_replay, needed_steps
 
 
 def replayed(case, log: dict, columns: tuple[str, ...], substeps: int):
@@ -90,3 +93,21 @@ def test_a_coupling_that_there_is_not_is_refused(tmp_path):
         load_case(tmp_path / "case.toml")
     (tmp_path / "case.toml").write_text(stages.text(1).replace("pitch", "stiffness = 1e7\npitch"))
     assert main(["check", str(tmp_path / "case.toml"), str(tmp_path / "log.csv")]) == 2
+
+
+def test_it_asks_for_as_many_steps_as_the_same_masses_in_one_unit():
+    """Motor by its angle, or as the mass J / R^2 that it is to the table: the same oscillator."""
+    p, n = stages.TRUTH[1], 10
+    at_the_table = p["motor_inertia"] / stages.R**2
+    screw = [p[k] for k in ("motor_inertia", "table_mass")]
+    stage = MicropositioningStage(*screw, pitch=stages.PITCH, stiffness=p["stiffness"])
+    chain = Chain(
+        mass=[at_the_table, p["table_mass"]], damping=[0.0, 0.0], stiffness=[0.0, p["stiffness"], 0.0]
+    )
+    log = SimpleNamespace(period=5e-3, samples=n, filled=np.zeros((n, 2)), force=np.zeros((n, 1)), source="")
+    steps = {}
+    for plant, inputs in ((stage, 1), (chain, 2)):
+        driven = SimpleNamespace(plant=plant, controller=None, gain=np.ones(inputs))
+        log.force = np.zeros((n, inputs))
+        steps[plant.kind] = needed_steps(driven, log)
+    assert steps["micropositioning_stage"] == steps["chain"]
