@@ -2,8 +2,8 @@
 
     python benchmarks/accelerator.py [--quick] [--no-write]
 
-prints the table and writes results/accelerator.json and .md beside this file. Needs a machine with an accelerator that
-JAX sees, and a JAX that can use it.
+prints the table and writes results/accelerator.json and .md beside this file. Needs a machine with an
+accelerator that JAX sees, and a JAX that can use it.
 """
 
 import argparse
@@ -54,7 +54,8 @@ def sets(kind: str, count: int, numerics: str) -> dict:
     def step(run: object, base: object, thetas: jax.Array, seen: jax.Array) -> jax.Array:
         return jax.vmap(lambda theta: axis.gauss_newton(run, base, theta, seen)[1])(thetas)
 
-    function = axis.Compiled({"cost": axis.costs, "Gauss-Newton step": step}[kind], run, axis.plant(axis.TRUTH))
+    of_sets = {"cost": axis.costs, "Gauss-Newton step": step}[kind]
+    function = axis.Compiled(of_sets, run, axis.plant(axis.TRUTH))
     alone = jax.default_backend() != "cpu"
     groups = [thetas] if alone else np.split(thetas, count // GROUP)
     groups = [jax.numpy.asarray(group) for group in groups]

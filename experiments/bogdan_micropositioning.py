@@ -112,7 +112,7 @@ def published(folder: Path, runs: int) -> None:
         table = Table(
             f"Data {data}: criterion {estimate.details['criterion_percent']:.2f} % "
             f"(published {stages.CRITERION[data]} %), {estimate.steps} evaluations, starts alike: "
-            "{same_optimum} of {count}".format(**estimate.details["starts"]),
+            "{same_optimum} of {count}, {flat} never move".format(**estimate.details["starts"]),
             ["parameter", "truth", "guess", "found", "sigma %", "published P %"],
         )
         guesses = stages.drawn(data, data=data)

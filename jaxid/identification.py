@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS, steps_of
 from jaxid.estimators.output_error import OUTPUTS, SHORT
 from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Steps, alone, together
+from jaxid.estimators.steps import Soon, Steps, alone, together
 from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
 from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
@@ -121,7 +122,7 @@ def identify(
             mend="give at least one parameter as { guess = ... }",
         )
     progress(f"fitting by {method}")
-    estimate = alone(steps_of(method, session, **options))
+    estimate = alone(steps_of(method, session, **options), _gaps_of(session))
     progress("simulating")
     return Identification(
         session, estimate, gaps(estimate.machine, session.runs),
@@ -166,6 +167,19 @@ def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
     if value not in known:
         raise InputError(f"{option} {value!r} is not known", mend=suggest(value, known))
     return value
+
+
+# Samples up to which compiling costs more than the gap itself; more would take memory beside the fit.
+_COMPILED_BESIDE = 100_000
+
+
+def _gaps_of(session: Session) -> Soon | None:
+    """What a fit is followed by."""
+    machine, samples = session.machine, tuple(r.log.samples for r in session.runs)
+    if sum(samples) > _COMPILED_BESIDE:
+        return None
+    key = (gaps, jax.tree.structure((machine.plant, machine.controller)), samples)
+    return Soon(gaps, (machine, session.runs), key)
 
 
 def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxid.estimators.directions_precision import (
     Told,
@@ -21,7 +22,9 @@ from jaxid.estimators.directions_precision import (
     told_of,
 )
 from jaxid.estimators.directions_problem import (
+    AT_ONCE,
     FAR,
+    NEAR,
     NO_PULL,
     SETTLED,
     Found,
@@ -31,7 +34,7 @@ from jaxid.estimators.directions_problem import (
     fit_each,
     read,
 )
-from jaxid.estimators.directions_rounding import covariance_with_rounding, rounds
+from jaxid.estimators.directions_rounding import covariance_with_rounding, draws_soon, rounds
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -45,6 +48,8 @@ _TOLD_TWICE, _STAYS = 0.5, 0.6
 # Directions change with the point at which they are read: most rounds, in how many of them they are read
 # anew.
 _ROUNDS, _READ = 6, 3
+# Starts where the guesses tell nothing.
+_WHERE_NOTHING_SHOWS = 32
 # Two starts end at one optimum where their costs differ by less than this.
 _SAME = 1e-3
 
@@ -82,18 +87,30 @@ def directions_steps(
     """
     numerics = numerics or choose_numerics(machine, log)
     problem = Problem.of(machine, log, prior, on, numerics)
-    found = yield from _rounds(problem, np.zeros(problem.prior.base.size))
+    # What rounding does leaves few directions told in the end: the best of them come first.
+    most = problem.prior.base.size
+    if rounds(machine, problem):
+        most = AT_ONCE
+        yield draws_soon(machine, problem)
+    found = yield from _rounds(problem, np.zeros(problem.prior.base.size), most)
     many: dict[str, Any] = {}
-    if starts > 1 or len(others):
-        given = [problem.prior.inward(problem.padded(t)) for t in others]
-        points = np.array([*given, *_drawn(problem, starts)])
-        found = yield from _elsewhere(problem, found, points)
-        found, many = yield from _many_starts(found, points)
+    given = [problem.prior.inward(problem.padded(t)) for t in others]
+    if starts > 1 or given:
+        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
     found, told = yield from _sifted(machine, found)
+    if told is None and not many:
+        # A machine that sticks at the guesses, or nearly, shows nothing.
+        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
+        found, told = yield from _sifted(machine, found)
+    while found.count == most and found.more:
+        most += AT_ONCE
+        spent = found.evaluations
+        found = yield from _rounds(found.problem, found.point, most, last=True)
+        found, told = yield from _sifted(machine, replace(found, evaluations=found.evaluations + spent))
     p = len(machine.parameters.free)
     r, z = found.count, np.asarray(found.minimum.theta)
     remarks: list[str] = []
-    if hessian and told is not None and rounds(machine, found):
+    if hessian and told is not None and rounds(machine, problem):
         remarks.append("rounding was simulated: the Hessian says nothing beside it")
     elif hessian and told is not None:
         args = (*found.problem.args, found.problem.ladder[-1], found.first, z)
@@ -136,14 +153,16 @@ def _drawn(problem: Problem, starts: int) -> np.ndarray:
     return w
 
 
-def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]:
-    """Read the directions, fit along them, and again, each time sharper, until they stay.
+def _rounds(problem: Problem, w: np.ndarray, most: int, *, last: bool = False) -> Steps[Found]:
+    """Read the directions, fit along them, so many at most, and again, each time sharper, until they stay.
 
     `last`: at the sharpest only, from a point that is near.
     """
     size, spent = problem.prior.base.size, 0
+    # Where rounding will let go of most of them it is enough to be near.
+    enough = NEAR if most < size else SETTLED
     ladder = problem.ladder[-1:] if last else problem.ladder
-    count, cost, settled = 0, np.inf, False
+    count, more, cost, settled = 0, False, np.inf, False
     for rung in range(len(ladder) + _ROUNDS):
         sharpness, before = ladder[min(rung, len(ladder) - 1)], count
         # Between the first rung and the last they hardly turn; those that change places with one another for
@@ -155,22 +174,25 @@ def _rounds(problem: Problem, w: np.ndarray, last: bool = False) -> Steps[Found]
                 # Coordinates are of the first few directions: one of them leads to where this was read.
                 whole = np.linalg.qr(np.column_stack([w, np.eye(size)]))[0]
                 here = replace(here, theta=columns(whole, 0).T @ w)
-                return Found(problem, whole, 0, here, spent, False)
+                return Found(problem, whole, 0, here, spent, False, False)
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
+            more, count = count > most, min(count, most)
         some = columns(vectors, count)
         fitted = np.arange(some.shape[1]) < count
         start = np.where(fitted, np.clip(some.T @ w, -FAR, FAR), 0.0)
         pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
-        minimum = yield from descent(problem, sharpness, pull, np.zeros(size), some, start, fitted)
+        # A rung above the last is only to lead near.
+        left = enough if sharpness is ladder[-1] else NEAR
+        minimum = yield from descent(problem, sharpness, pull, np.zeros(size), some, start, fitted, left)
         spent += int(minimum.steps)
         w = some @ np.asarray(minimum.theta)
         moved = abs(float(minimum.cost) - cost)
-        close = before == count and moved <= SETTLED / len(problem.measured) * cost
+        close = before == count and moved <= enough / len(problem.measured) * cost
         settled, cost = close and sharpness is ladder[-1], float(minimum.cost)
         if settled or not np.isfinite(cost):
             break
-    return Found(problem, vectors, count, minimum, spent, settled)
+    return Found(problem, vectors, count, minimum, spent, settled, more)
 
 
 def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
@@ -179,13 +201,14 @@ def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
     A residual's colour, and above all what rounding of the readings does in the loop, moves an estimate
     farther along them than its prior would let it.
     """
+    ended = not rounds(machine, found.problem)
     while found.count and np.all(np.isfinite(found.minimum.jacobian)):
         told = told_of(found)
-        if rounds(machine, found):
+        if rounds(machine, found.problem):
             covariance = yield from covariance_with_rounding(machine, found, told.std)
             told = replace(told, covariance=covariance)
         stays = told.std <= _STAYS
-        if np.all(stays):
+        if ended and np.all(stays):
             return found, told
         rest = np.arange(found.count, len(found.vectors))
         order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
@@ -198,6 +221,7 @@ def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
         minimum = yield from descent(found.problem, last, NO_PULL, origin, some, z, fitted)
         spent = found.evaluations + int(minimum.steps)
         found = replace(found, vectors=vectors, count=count, minimum=minimum, evaluations=spent)
+        ended = True
     return found, None
 
 
@@ -215,25 +239,29 @@ def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     return rows.T * np.sign(rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]), count
 
 
-def _elsewhere(problem: Problem, found: Found, points: np.ndarray) -> Steps[Found]:
+def _elsewhere(found: Found, points: np.ndarray, most: int) -> Steps[Found]:
     """The rounds from the best of some points too: a machine that sticks at the guesses shows nothing."""
-    nothing = np.zeros(points.shape[1])
+    problem, nothing = found.problem, np.zeros(points.shape[1])
     still = (nothing, np.eye(points.shape[1]), points, np.zeros(points.shape, bool))
     _, costs, _, _ = yield Solve(fit_each, (*problem.args, problem.ladder[0], NO_PULL, *still))
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-    other = yield from _rounds(problem, points[best])
+    other = yield from _rounds(problem, points[best], most)
     better = float(other.minimum.cost) < float(found.minimum.cost) * (1 - _SAME)
     return replace(other if better else found, evaluations=found.evaluations + other.evaluations)
 
 
-def _many_starts(found: Found, points: np.ndarray) -> Steps[tuple[Found, dict[str, Any]]]:
+def _many_starts(
+    found: Found, points: np.ndarray, most: int
+) -> Steps[tuple[Found, dict[str, Any]]]:
     """The best of many starts, and how many end there."""
+    found = yield from _elsewhere(found, points, most)
     spent = found.evaluations
     for again in (True, False):
         some, origin = found.first, np.zeros(points.shape[1])
         fitted = np.arange(some.shape[1]) < found.count
         z = np.where(fitted, np.clip(points @ some, -FAR, FAR), 0.0)
         active = np.tile(fitted, (len(z), 1))
+        flat = yield from _flat(found, z, active)
         noise = found.problem.noise(found.minimum, found.count)
         ladder = found.problem.ladder
         for sharpness in ladder:
@@ -245,7 +273,7 @@ def _many_starts(found: Found, points: np.ndarray) -> Steps[tuple[Found, dict[st
         if not again or costs[best] >= cost * (1 - _SAME):
             break
         # Other directions may be told from there.
-        other = yield from _rounds(found.problem, some @ z[best], last=True)
+        other = yield from _rounds(found.problem, some @ z[best], most, last=True)
         spent += other.evaluations
         if float(other.minimum.cost) >= cost:
             break
@@ -253,5 +281,16 @@ def _many_starts(found: Found, points: np.ndarray) -> Steps[tuple[Found, dict[st
     cost = float(found.minimum.cost)
     # A start that ended lower, where other directions are told and the fit was worse, is not alike.
     same = np.abs(np.append(costs, cost) - cost) <= cost * _SAME
-    stated = {"count": len(same), "same_optimum": int(same.sum())}
+    stated = {"count": len(same), "same_optimum": int(same.sum()), "flat": int(flat.sum())}
     return replace(found, evaluations=spent), {"starts": stated}
+
+
+def _flat(
+    found: Found, z: Float[np.ndarray, "starts k"], active: Bool[np.ndarray, "starts k"]
+) -> Steps[Bool[np.ndarray, " starts"]]:
+    """Which starts show no slope: a machine that sticks throughout tells nothing but where it stands."""
+    origin, own = np.zeros(len(found.vectors)), found.first.copy()
+    own[len(found.problem.places) :] = 0.0
+    args = (*found.problem.args, found.problem.ladder[0], NO_PULL, origin, own, z, active)
+    ended = np.asarray((yield Solve(fit_each, args))[0])
+    return np.all(ended == z, axis=1)

@@ -24,12 +24,12 @@ from jaxid.sensors import Sensor
 # In parts of the variance of one sample: where a fit has settled, and where it is near enough to go on
 # sharper.
 SETTLED = 0.02
-_NEAR = 1.0
+NEAR = 1.0
 # Farther from its guess than so many priors no unknown is taken.
 FAR = 8.0
 # Coordinates of a compiled fit come in multiples of this: few directions are told, and each costs as much
 # as the simulation itself.
-_TOGETHER = 4
+AT_ONCE = 4
 # No pull towards the guesses.
 NO_PULL = np.zeros(())
 # Friction that rises with speeding up lets a velocity stand, and costs have a kink wherever it does: such
@@ -37,7 +37,7 @@ NO_PULL = np.zeros(())
 _LADDER = (1.0, 0.3, 0.1)
 _A_RUNG = 25
 # Evaluations in a compiled call.
-_AT_ONCE = 4
+_A_CALL = 4
 
 
 class Prior(eqx.Module):
@@ -182,7 +182,7 @@ def _rises(plant: Plant, q: Array, u: Array) -> bool:
 
 def columns(vectors: Float[np.ndarray, "q q"], count: int) -> Float[np.ndarray, "q k"]:
     """The first directions, so many at least, in a number that compiled code is made for."""
-    return vectors[:, : _TOGETHER * max(1, -(-count // _TOGETHER))]
+    return vectors[:, : AT_ONCE * max(1, -(-count // AT_ONCE))]
 
 
 def residual_of(
@@ -210,7 +210,7 @@ _go_on = eqx.filter_jit(_goes_on)
 
 def descent(
     problem: Problem, sharpness: np.ndarray, pull: np.ndarray, origin: np.ndarray, vectors: np.ndarray,
-    z: Float[np.ndarray, " k"], active: Bool[np.ndarray, " k"],
+    z: Float[np.ndarray, " k"], active: Bool[np.ndarray, " k"], settled: float = SETTLED,
 ) -> Steps[Minimum]:
     """Fit from one start, a few evaluations at a time: side by side no run then waits long for another.
 
@@ -222,14 +222,13 @@ def descent(
         vectors: Directions, as columns.
         z: Coordinates along them.
         active: Which are fitted.
+        settled: In parts of a sample's variance, what the cost may still fall.
     """
     progress = _begun(z, problem.measured.size)
-    # A rung above the last is only to lead near.
-    settled = SETTLED if sharpness is problem.ladder[-1] else _NEAR
     tolerance = np.asarray(0.1 * settled / len(problem.measured))
     args = (*problem.args, sharpness, pull, origin, vectors, active, tolerance)
     while not progress.done and progress.steps < _A_RUNG:
-        stop = np.minimum(progress.steps + _AT_ONCE, _A_RUNG)
+        stop = np.minimum(progress.steps + _A_CALL, _A_RUNG)
         progress = yield Solve(_go_on, (*args, stop, progress))
     return _compared(progress)
 
@@ -252,7 +251,7 @@ def read(problem: Problem, sharpness: np.ndarray, w: Float[np.ndarray, " q"]) ->
 
     By the compiled fit, a few columns at a time: code of its own would take as long again to compile.
     """
-    size, width = w.size, min(w.size, _TOGETHER)
+    size, width = w.size, min(w.size, AT_ONCE)
     vectors = np.eye(size, -(-size // width) * width)
     still = (np.zeros(width), np.zeros(width, bool))
     found = []
@@ -283,7 +282,8 @@ def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
 class Found:
     """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum.
 
-    The minimum is in the coordinates of the first few directions; the others' are zero.
+    The minimum is in the coordinates of the first few directions; the others' are zero. Evaluations are those
+    that it took; `more`: other directions are told too, beyond the most that were asked for.
     """
 
     problem: Problem
@@ -292,6 +292,7 @@ class Found:
     minimum: Minimum
     evaluations: int
     settled: bool
+    more: bool
 
     @property
     def first(self) -> np.ndarray:

@@ -11,11 +11,13 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.estimators.directions_problem import Found, residual_of
-from jaxid.estimators.steps import Solve, Steps
+from jaxid.estimators.directions_problem import Found, Problem, residual_of
+from jaxid.estimators.steps import Solve, Soon, Steps
 from jaxid.machine import Machine
 from jaxid.replay import with_sensor
 
@@ -34,19 +36,29 @@ _OWN = 0.1
 
 @eqx.filter_jit
 def _each(*args: Any) -> Array:
-    *problem, sharpness, vectors, z, starts = args
+    *problem, sharpness, w, starts = args
     replay, places, plant, *rest = problem
     plant = replace(plant, sharpness=sharpness)
     moved = lambda start: eqx.tree_at(lambda r: r.position, replay, replay.position + start)
-    at = lambda z, start: residual_of(moved(start), places, plant, *rest, vectors)(z)
-    return eqx.filter_vmap(at)(z, starts)
+    at = lambda w, start: residual_of(moved(start), places, plant, *rest, jnp.eye(w.size))(w)
+    return eqx.filter_vmap(at)(w, starts)
 
 
-def rounds(machine: Machine, found: Found) -> bool:
+def rounds(machine: Machine, problem: Problem) -> bool:
     """Whether the loop reads by counts that its simulation left out."""
-    problem = found.problem
     coarse = machine.sensor.position_resolution is not None and problem.on != "position"
     return coarse and problem.replay.controller is not None
+
+
+def draws_soon(machine: Machine, problem: Problem) -> Soon:
+    """What `covariance_with_rounding` will ask for."""
+    n, size = problem.replay.position.size, problem.prior.base.size
+    args = (*_args(machine, problem), np.zeros((_DRAWS, size)), np.zeros((_DRAWS, n)))
+    return Soon(_each, args, (_each, jax.tree.structure(args), problem.measured.shape))
+
+
+def _args(machine: Machine, problem: Problem) -> tuple:
+    return with_sensor(problem.replay, machine.sensor), *problem.args[1:], problem.ladder[-1]
 
 
 def covariance_with_rounding(
@@ -87,8 +99,9 @@ def _within(
     off = rng.uniform(-1.0, 1.0, (_DRAWS, r)) * reach
     z = np.tile(best, (_DRAWS, 1))
     z[:, :r] += off
-    args = (with_sensor(problem.replay, machine.sensor), *problem.args[1:], problem.ladder[-1])
-    e = np.asarray((yield Solve(_each, (*args, found.first, z, starts))))
+    # In units of the prior, not of the directions: one compiled call, however many of them there are.
+    w = z @ found.first.T
+    e = np.asarray((yield Solve(_each, (*_args(machine, problem), w, starts))))
     # Of data drawn, less what the estimate says: what a fit of them would begin with.
     shape = problem.measured.shape
     apart = (np.asarray(found.minimum.residual).reshape(shape) - e).reshape(_DRAWS, -1)

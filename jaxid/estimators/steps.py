@@ -6,8 +6,10 @@ those that ask for the same solver at the same shapes are stacked and solved in 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -29,18 +31,65 @@ class Solve(NamedTuple):
     args: tuple
 
 
-Steps = Generator[Solve, Any, T]
+class Soon(NamedTuple):
+    """What will be asked for later, with other values: it may be compiled beside what runs until then.
+
+    Args:
+        function: As it will be called; what it returns or raises now nobody sees.
+        args: Of the kind and of the shapes that it will get.
+        key: What its compiled code depends on: asked for once a process.
+    """
+
+    function: Callable
+    args: tuple
+    key: Any
 
 
-def alone(steps: Steps[T]) -> T:
-    """Run steps one after the other."""
+Steps = Generator[Solve | Soon, Any, T]
+
+
+def alone(steps: Steps[T], behind: Soon | None = None) -> T:
+    """Run steps one after the other.
+
+    Args:
+        steps: The steps.
+        behind: What will be asked for after them.
+    """
     answer = None
     while True:
         try:
             asked = steps.send(answer)
         except StopIteration as end:
             return end.value
+        if isinstance(asked, Soon):
+            _prepare(asked)
+            answer = None
+            continue
+        if behind is not None:
+            _prepare(behind)
+            behind = None
         answer = asked.function(*asked.args)
+
+
+_PREPARED: set = set()
+
+
+def _prepare(soon: Soon) -> None:
+    """Call it in a thread of its own: compiling leaves Python's lock alone."""
+    if soon.key not in _PREPARED:
+        _PREPARED.add(soon.key)
+        _beside().submit(_called, soon)
+
+
+@functools.cache
+def _beside() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="jaxid-compile")
+
+
+def _called(soon: Soon) -> None:
+    # Who asks for it in earnest gets the error.
+    with contextlib.suppress(Exception):
+        soon.function(*soon.args)
 
 
 def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
@@ -60,7 +109,10 @@ def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
 
     def advance(k: int, answer: Any) -> None:
         try:
-            key, arrays = _parted(many[k].send(answer))
+            asked = many[k].send(answer)
+            while isinstance(asked, Soon):
+                asked = many[k].send(None)
+            key, arrays = _parted(asked)
         except StopIteration as end:
             ended[k] = end.value
         except Exception as error:  # it ends its own run only

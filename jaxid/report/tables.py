@@ -177,7 +177,10 @@ def within_prior_words(content: Mapping) -> list[str]:
     lines = [f"criterion: {short(content['criterion_percent'], 3)} % of the squared deviation from the mean"]
     starts = content.get("starts")
     if starts:
-        lines.append(f"starts: {starts['same_optimum']} of {starts['count']} end at the same cost")
+        shown = f"starts: {starts['same_optimum']} of {starts['count']} end at the same cost"
+        if starts["flat"]:
+            shown += f"; of {starts['flat']} the simulation does not move, so that they cannot be fitted"
+        lines.append(shown)
     return lines
 
 

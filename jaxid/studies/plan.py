@@ -72,7 +72,7 @@ class Plan:
             case: The case; its [study] may be left out.
             runs: In place of the case's.
             seed: Of everything drawn, from 0 to 2^31 - 1.
-            workers: Chunks that are run at once; absent: one a core, or one on an accelerator, which it fills.
+            workers: Chunks that are run at once; absent: one a core, or one on an accelerator.
 
         Raises:
             InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has

@@ -1,0 +1,52 @@
+"""Estimators as steps: what is to be compiled beside does its work, and touches nothing else."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from jaxid.estimators.steps import Solve, Soon, alone, together
+
+
+def double(x):
+    return 2.0 * x
+
+
+def estimator(x, soon=()):
+    yield from soon
+    found = yield Solve(double, (np.asarray(x),))
+    return float(found)
+
+
+@pytest.fixture
+def seen():
+    """Threads in which a function was called, and an event that says it was."""
+    threads, called = [], threading.Event()
+
+    def function(x):
+        threads.append(threading.current_thread())
+        called.set()
+        raise ValueError(x)
+
+    return function, threads, called
+
+
+def test_what_comes_soon_is_called_beside_once_and_its_error_is_nobodys(seen):
+    function, threads, called = seen
+    soon = Soon(function, (1.0,), (function, "a"))
+    assert alone(estimator(3.0, [soon])) == 6.0
+    assert called.wait(10)
+    assert alone(estimator(4.0, [soon])) == 8.0
+    other = Soon(function, (2.0,), (function, "b"))
+    called.clear()
+    assert alone(estimator(5.0), other) == 10.0
+    assert called.wait(10)
+    assert len(threads) == 2
+    assert all(t is not threading.main_thread() for t in threads)
+
+
+def test_many_together_do_without(seen):
+    function, threads, _ = seen
+    many = [estimator(x, [Soon(function, (x,), (function, x))]) for x in (1.0, 2.0, 3.0)]
+    assert together(many, 2) == [2.0, 4.0, 6.0]
+    assert not threads
