@@ -315,9 +315,46 @@ def hidden(folder: Path, runs: int) -> None:
     print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")
 
 
+def named(case: Path, log: Log) -> str:
+    """What `discover` names, or its verdict, or that it refuses the log."""
+    try:
+        found = jaxid.discover(case, log)
+    except jaxid.InputError:
+        return "refused"
+    return " + ".join(e.label for e in found.effects) or found.verdict
+
+
+def short(folder: Path, runs: int) -> None:
+    """The same in a hundred samples: by how much the whole model is likelier, and what `discover` names."""
+    table = Table(
+        f"Plain friction fitted to {runs} logs of 100 samples: nats by which the true model is likelier",
+        ["data", "encoder", "median", "most", "verdicts of discover on the first 8"],
+    )
+    start = time.perf_counter()
+    for data in (1, 2):
+        for name, resolution in (("exact", 0.0), ("500 counts", stages.COUNT)):
+            logs, _ = logs_of(data, runs, resolution=resolution)
+            whole = case_of(folder, f"short{data}", data, resolution=resolution)
+            text = whole.read_text()
+            hidden = text[text.index('[[effects]]\nkind = "velocity_hysteresis"') : text.index("[actuator]")]
+            plain = folder / f"short{data}_plain.toml"
+            plain.write_text(text.replace(hidden, ""))
+            # The whole model's guesses are the truth: an oracle's.
+            criteria = [
+                np.array([e.details["criterion_percent"] for e in identify_many(case, logs)])
+                for case in (plain, whole)
+            ]
+            nats = 0.5 * logs[0].samples * np.log(criteria[0] / criteria[1])
+            said = [named(plain, log) for log in logs[:8]]
+            verdicts = ", ".join(f"{said.count(v)} {v}" for v in dict.fromkeys(said))
+            table.row(data, name, f"{np.median(nats):.1f}", f"{np.max(nats):.1f}", verdicts)
+            print(f"  data {data}, {name}: {time.perf_counter() - start:.0f} s", flush=True)
+    table.show(time.perf_counter() - start)
+
+
 STUDIES: dict[str, Callable[[Path, int], None]] = {
     f.__name__: f
-    for f in (published, begun, unrecorded, scatter, position, designed, needles, frictions, hidden)
+    for f in (published, begun, unrecorded, scatter, position, designed, needles, frictions, hidden, short)
 }
 
 

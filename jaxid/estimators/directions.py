@@ -160,7 +160,7 @@ def _rounds(problem: Problem, w: np.ndarray, most: int, *, last: bool = False) -
     """
     size, spent = problem.prior.base.size, 0
     # Where rounding will let go of most of them it is enough to be near.
-    enough = NEAR if most < size else SETTLED
+    enough = NEAR if most < size and not last else SETTLED
     ladder = problem.ladder[-1:] if last else problem.ladder
     count, more, cost, settled = 0, False, np.inf, False
     for rung in range(len(ladder) + _ROUNDS):
@@ -259,9 +259,11 @@ def _many_starts(
     for again in (True, False):
         some, origin = found.first, np.zeros(points.shape[1])
         fitted = np.arange(some.shape[1]) < found.count
-        z = np.where(fitted, np.clip(points @ some, -FAR, FAR), 0.0)
+        # The fit itself is the last of them: it may only be near its own optimum.
+        z = np.concatenate([np.clip(points @ some, -FAR, FAR), [np.asarray(found.minimum.theta)]])
+        z = np.where(fitted, z, 0.0)
         active = np.tile(fitted, (len(z), 1))
-        flat = yield from _flat(found, z, active)
+        flat = yield from _flat(found, z[:-1], active[:-1])
         noise = found.problem.noise(found.minimum, found.count)
         ladder = found.problem.ladder
         for sharpness in ladder:
@@ -270,6 +272,8 @@ def _many_starts(
             z, costs, _, _ = (np.asarray(x) for x in (yield Solve(fit_each, args)))
         costs = np.where(np.isfinite(costs), costs, np.inf)
         best, cost = int(np.argmin(costs)), float(found.minimum.cost)
+        if abs(costs[-1] - cost) <= NEAR / len(found.problem.measured) * cost:
+            cost = float(costs[-1])
         if not again or costs[best] >= cost * (1 - _SAME):
             break
         # Other directions may be told from there.
@@ -278,9 +282,8 @@ def _many_starts(
         if float(other.minimum.cost) >= cost:
             break
         found = other
-    cost = float(found.minimum.cost)
     # A start that ended lower, where other directions are told and the fit was worse, is not alike.
-    same = np.abs(np.append(costs, cost) - cost) <= cost * _SAME
+    same = np.abs(np.append(costs[:-1], cost) - cost) <= cost * _SAME
     stated = {"count": len(same), "same_optimum": int(same.sum()), "flat": int(flat.sum())}
     return replace(found, evaluations=spent), {"starts": stated}
 

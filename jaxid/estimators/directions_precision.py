@@ -64,8 +64,9 @@ def told_of(found: Found, hessian: np.ndarray | None = None) -> Told:
         [f"direction {k + 1}" for k in range(r)], jacobian, e, counts,
         signal, np.ones(r), hessian, crossed=problem.on == "both",
     )
-    flat = jacobian.reshape(-1, r)
-    white = problem.noise(found.minimum, r) * np.sqrt(np.diag(np.linalg.inv(flat.T @ flat)))
+    # Of the triangle: some directions are told a million times better than others.
+    triangle = np.linalg.qr(jacobian.reshape(-1, r), mode="r")
+    white = problem.noise(found.minimum, r) * np.linalg.norm(np.linalg.inv(triangle), axis=1)
     # A colour read off a hundred samples is itself uncertain: never less than white noise would leave.
     larger = np.maximum(1.0, white / told.std)
     of_seen = told.covariance * np.outer(larger, larger)
