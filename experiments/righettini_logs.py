@@ -27,11 +27,16 @@ def log_of(ran: Ran, name: str) -> Log:
     return Log(time=ran.time, position=q, force=u, reference=ran.live.reference[: len(q)], source=name)
 
 
+def case_text(**stated: object) -> str:
+    """A case of the loop that made the logs: it holds a command for a millisecond."""
+    text = robots.case_text(PD, inertial=False, **stated)
+    return text.replace(f"period = {PERIOD}", "period = 0.001").replace("4000.0", "1000.0")
+
+
 def logged(folder: Path, name: str, machine: object, seconds: float = 15.0, seed: int = 4) -> Log:
     """A log under the PD law at 1 kHz, whose commands a log at that rate holds whole."""
-    text = robots.case_text(PD, friction="", gain=(1.0, 1.0), seed=seed, duration=seconds, inertial=False)
     path = folder / f"{name}.toml"
-    path.write_text(text.replace(f"period = {PERIOD}", "period = 0.001").replace("4000.0", "1000.0"))
+    path.write_text(case_text(friction="", gain=(1.0, 1.0), seed=seed, duration=seconds))
     live = jaxid.Live(path)
     ran = driven(live, machine, seed=seed, inertial=False, period=1e-3)
     return log_of(ran, name)
@@ -56,7 +61,7 @@ def orders(folder: Path) -> None:
         if where == "all":
             friction += robots.friction_text(order, "passive = [1, 2, 3]")
         path = folder / f"model{number}.toml"
-        path.write_text(robots.case_text(PD, friction=friction, inertial=False, more=RECURSIVE))
+        path.write_text(case_text(friction=friction, more=RECURSIVE))
         found = jaxid.identify(path, log, method="recursive")
         left = residuals[f"({number})"] = found.gaps[0].force.rms
         running = found.estimate.details["recursive"]["running_residual"]
@@ -69,7 +74,7 @@ def orders(folder: Path) -> None:
     # The paper's future work, by machine: of friction of any order in any hinge, what made the log?
     path = folder / "chooses.toml"
     more = f"{SENSOR}[discover]\nkinds = {list(robots.ORDERS)}\n"
-    path.write_text(robots.case_text(PD, friction=robots.friction_text(1), inertial=False, more=more))
+    path.write_text(case_text(friction=robots.friction_text(1), more=more))
     active = {k: np.array(v) * [1, 1, 0, 0, 0] for k, v in robots.FRICTION.items()}
     first = {k: v * (k in robots.ORDERS[:2]) for k, v in active.items()}
     hinge = {k: v + [0, 0, 0, 0, 0.5 * (k == "viscous_friction")] for k, v in active.items()}
@@ -90,14 +95,14 @@ def payload(folder: Path) -> None:
     bare = logged(folder, "bare", robot())
     loaded = logged(folder, "load", robot(tip_mass=2.72 + extra))
     path = folder / "unloaded.toml"
-    path.write_text(robots.case_text(PD, inertial=False))
+    path.write_text(case_text())
     gains = jaxid.identify(path, bare, method="inverse_dynamics").estimate.theta[:2].tolist()
     table = Table(
         f"A payload of {extra} kg", ["drive gains", "found [kg]", "sigma [kg]", "gains"]
     )
     for name, gain in (("of the unloaded run", gains), ("free", "{ guess = 1.0 }")):
         path = folder / "loaded.toml"
-        path.write_text(robots.case_text(PD, gain=gain, tip_mass="{ guess = 2.0 }", inertial=False))
+        path.write_text(case_text(gain=gain, tip_mass="{ guess = 2.0 }"))
         estimate = jaxid.identify(path, loaded, method="inverse_dynamics").estimate
         at = estimate.names.index("tip_mass")
         free = isinstance(gain, str)
@@ -117,7 +122,7 @@ def hidden(folder: Path) -> None:
     for name, hid in (("passive", machine), ("payload", robot(tip_mass=3.52))):
         log = logged(folder, name, hid)
         path = folder / f"hidden_{name}.toml"
-        path.write_text(robots.case_text(PD, friction=stated, gain=robots.GAINS, inertial=False, more=SENSOR))
+        path.write_text(case_text(friction=stated, gain=robots.GAINS, more=SENSOR))
         found = jaxid.discover(path, log)
         found.save(folder / f"hidden_{name}", force=True)
         print(f"\nhidden: {name} ({time.perf_counter() - begin:.0f} s)\n{found}", flush=True)
