@@ -292,6 +292,27 @@ def designed(folder: Path, runs: int) -> None:
     table.show(time.perf_counter() - start)
 
 
+# Of the scale that reads the table, where one does [m].
+SCALE = 1e-7
+
+
+def load(folder: Path, runs: int) -> None:
+    """(b) What `designed` wrote, run again: the table's position logged, the elastic screw in the model."""
+    start = time.perf_counter()
+    reference = np.loadtxt(folder / "design.csv", delimiter=",", skiprows=1)[:, 1]
+    made = stages.record(
+        stages.machine(1), reference, noise=noise_of(1, stages.COUNT), step=2e-6, start=0.3 * stages.COUNT
+    )
+    table = np.round(made["x"] / SCALE) * SCALE
+    log = Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
+              reference=reference[:, None], load_position=table[:, None], source="the designed log")
+    case = case_of(folder, "load", 1, guess=1, coupling="elastic", more=ON_FORCE.replace('"force"', '"both"'))
+    counts = f"position_resolution = {stages.COUNT!r}"
+    case.write_text(case.read_text().replace(counts, f"position_resolution = [{stages.COUNT!r}, {SCALE!r}]"))
+    found = jaxid.identify(case, log)
+    print(f"\nload: {found.estimate.message} ({time.perf_counter() - start:.0f} s)\n{found}", flush=True)
+
+
 def needles(folder: Path, runs: int) -> None:
     """What simulating the encoder's rounding makes of the cost: a bed of needles."""
     start = time.perf_counter()
@@ -354,7 +375,9 @@ def short(folder: Path, runs: int) -> None:
 
 STUDIES: dict[str, Callable[[Path, int], None]] = {
     f.__name__: f
-    for f in (published, begun, unrecorded, scatter, position, designed, needles, frictions, hidden, short)
+    for f in (
+        published, begun, unrecorded, scatter, position, designed, load, needles, frictions, hidden, short,
+    )
 }
 
 

@@ -95,6 +95,7 @@ def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str]
 def case_text(
     law: str, *, friction: str | None = None, gain: str | Sequence = "{ guess = 1.0 }", seed: int = 0,
     duration: float = 40.0, more: str = "", tip_mass: str = "2.72", inertial: bool = True,
+    period: float = PERIOD,
 ) -> str:
     """A case: the model of the robot, a law for [controller], random targets."""
     gains = ", ".join(map(str, (gain, gain) if isinstance(gain, str) else gain))
@@ -106,7 +107,7 @@ gain = [{gains}]
 [controller]
 kp = [{KP}, {KP}]
 kd = [{KD}, {KD}]
-period = {PERIOD}
+period = {period}
 {law}
 [log]
 time = "t"
@@ -125,7 +126,7 @@ seed = {seed}
 {SENSORS if inertial else ""}
 [simulation]
 duration = {duration}
-sample_rate = {1 / PERIOD}
+sample_rate = {1 / period}
 initial_position = {HOME}
 {more}"""
 

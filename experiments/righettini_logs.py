@@ -9,13 +9,13 @@ import five_bar_robot as robots
 import numpy as np
 import righettini_figures
 from common import Table
-from five_bar_robot import PD, PERIOD, Ran, driven, robot
+from five_bar_robot import PD, Ran, driven, robot
 
 import jaxid
 from jaxid.io.log import Log
 
-# Noise of the torque in a log, at the motor [N m].
-LOGGED = 0.02
+# Noise of the torque in a log, at the motor [N m]; for how long the loop holds a command [s].
+LOGGED, HELD = 0.02, 1e-3
 SENSOR = f"[sensor]\nposition_resolution = {robots.COUNTS}\nforce_noise = {LOGGED}\n"
 
 
@@ -28,9 +28,8 @@ def log_of(ran: Ran, name: str) -> Log:
 
 
 def case_text(**stated: object) -> str:
-    """A case of the loop that made the logs: it holds a command for a millisecond."""
-    text = robots.case_text(PD, inertial=False, **stated)
-    return text.replace(f"period = {PERIOD}", "period = 0.001").replace("4000.0", "1000.0")
+    """A case of the loop that made the logs: it holds a command as long."""
+    return robots.case_text(PD, inertial=False, period=HELD, **stated)
 
 
 def logged(folder: Path, name: str, machine: object, seconds: float = 15.0, seed: int = 4) -> Log:
@@ -38,7 +37,7 @@ def logged(folder: Path, name: str, machine: object, seconds: float = 15.0, seed
     path = folder / f"{name}.toml"
     path.write_text(case_text(friction="", gain=(1.0, 1.0), seed=seed, duration=seconds))
     live = jaxid.Live(path)
-    ran = driven(live, machine, seed=seed, inertial=False, period=1e-3)
+    ran = driven(live, machine, seed=seed, inertial=False, period=HELD)
     return log_of(ran, name)
 
 

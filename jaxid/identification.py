@@ -18,9 +18,10 @@ from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulatio
 from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.replay import TooStiffError, exact_numerics, from_rest, make_replay, with_fitted_start
+from jaxid.replay import exact_numerics, from_rest, make_replay, with_fitted_start
 from jaxid.session import Run, Session, open_session
 from jaxid.solvers import SOLVERS
+from jaxid.stiffness import TooStiffError
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
     return value
 
 
-# Samples up to which compiling costs more than the gap itself; more would take memory beside the fit.
+# Samples beyond which the gap would take memory beside the fit that a fit may need.
 _COMPILED_BESIDE = 100_000
 
 

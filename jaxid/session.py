@@ -16,7 +16,7 @@ from jaxid.io.soundness import FEWEST_LEVELS, Finding, check_log, plausible_iner
 from jaxid.machine import Machine, build_machine
 from jaxid.preprocess import Prepared, Recipe, choose_recipe, prepare
 from jaxid.references import make_reference
-from jaxid.replay import needed_steps
+from jaxid.stiffness import needed_steps
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from jaxid.machine import build_machine
 from jaxid.parameters import label
 from jaxid.plants.chain import Chain
 from jaxid.plants.micropositioning_stage import MicropositioningStage
-from jaxid.replay import Numerics, make_replay, needed_steps
+from jaxid.replay import Numerics, make_replay
+from jaxid.stiffness import needed_steps
 
 
 def replayed(case, log: dict, columns: tuple[str, ...], substeps: int):

@@ -17,6 +17,7 @@ from search_setup import write_case
 import jaxid
 from jaxid.errors import InputError
 from jaxid.estimators.steps import Solve, alone, together
+from jaxid.studies import plan as planned
 from jaxid.studies.plan import Plan
 from jaxid.studies.result import summarised
 
@@ -457,3 +458,16 @@ def test_the_command_prints_and_writes(capsys, tmp_path):
     assert "inverse_dynamics" in ran.out
     assert {"study.nc", "summary.json", "report.html"} <= {p.name for p in ran.folder.iterdir()}
     assert run(capsys, "study", case, "--runs", 0).status == 2
+
+
+def test_an_accelerator_is_filled_by_one_chunk(tmp_path, monkeypatch):
+    """Where cores share the runs out."""
+    case = write_case(tmp_path, AXIS + STUDY.replace("chunk = 3\n", ""))
+    monkeypatch.setattr(planned, "cores", lambda: 4)
+    shared = Plan.of(jaxid.load_case(case), runs=64)
+    monkeypatch.setattr(planned, "_accelerator", lambda: True)
+    monkeypatch.setattr(planned, "_memory", lambda: 8e10)
+    whole = Plan.of(jaxid.load_case(case), runs=64)
+    assert planned.at_once() == 1
+    assert shared.chunk == 16
+    assert (whole.chunk, whole.lanes) == (64, 64)

@@ -10,8 +10,8 @@ from written_logs import write_csv
 from jaxid.discovery.breakaway import break_away
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.identification import gaps
-from jaxid.replay import TooStiffError, needed_steps
 from jaxid.session import open_session
+from jaxid.stiffness import TooStiffError, needed_steps
 
 
 @pytest.fixture(scope="module")

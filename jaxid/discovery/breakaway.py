@@ -24,9 +24,9 @@ from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import scatter
 from jaxid.preprocess import Prepared
-from jaxid.replay import TooStiffError, needed_steps
 from jaxid.session import Run
 from jaxid.simulation import Drive, open_loop
+from jaxid.stiffness import TooStiffError, needed_steps
 
 # Fewest starts that can tell a level from a chance.
 _FEWEST = 3

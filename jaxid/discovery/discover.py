@@ -30,8 +30,8 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import parameters_of
 from jaxid.parameters import free_effect
-from jaxid.replay import TooStiffError
 from jaxid.session import Session, open_session
+from jaxid.stiffness import TooStiffError
 
 # A refit in simulation may cost this factor in the force domain, not more: then it has bent the
 # parameters around something else, such as a reference that is not known between samples.

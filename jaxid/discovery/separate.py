@@ -22,10 +22,10 @@ from jaxid.discovery.shapes import Shapes, basis
 from jaxid.estimators.inverse_dynamics import ForceData
 from jaxid.machine import position_noise
 from jaxid.precision import NoiseModel
-from jaxid.replay import TooStiffError, needed_steps
 from jaxid.sensors import Sensor
 from jaxid.session import Session
 from jaxid.simulation import Drive, needed_substeps
+from jaxid.stiffness import TooStiffError, needed_steps
 
 if TYPE_CHECKING:
     from jaxid.discovery.result import Found

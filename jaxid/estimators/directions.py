@@ -87,26 +87,8 @@ def directions_steps(
     """
     numerics = numerics or choose_numerics(machine, log)
     problem = Problem.of(machine, log, prior, on, numerics)
-    # What rounding does leaves few directions told in the end: the best of them come first.
-    most = problem.prior.base.size
-    if rounds(machine, problem):
-        most = AT_ONCE
-        yield draws_soon(machine, problem)
-    found = yield from _rounds(problem, np.zeros(problem.prior.base.size), most)
-    many: dict[str, Any] = {}
     given = [problem.prior.inward(problem.padded(t)) for t in others]
-    if starts > 1 or given:
-        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
-    found, told = yield from _sifted(machine, found)
-    if told is None and not many:
-        # A machine that sticks at the guesses, or nearly, shows nothing.
-        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
-        found, told = yield from _sifted(machine, found)
-    while found.count == most and found.more:
-        most += AT_ONCE
-        spent = found.evaluations
-        found = yield from _rounds(found.problem, found.point, most, last=True)
-        found, told = yield from _sifted(machine, replace(found, evaluations=found.evaluations + spent))
+    found, told, many = yield from _searched(machine, problem, starts, given)
     p = len(machine.parameters.free)
     r, z = found.count, np.asarray(found.minimum.theta)
     remarks: list[str] = []
@@ -143,6 +125,32 @@ def directions_steps(
         notes=(*notes_of(machine, numerics, log, on), *remarks),
         details={"directions": stated, "criterion_percent": found.problem.criterion(found.minimum), **many},
     )
+
+
+def _searched(
+    machine: Machine, problem: Problem, starts: int, given: Sequence[np.ndarray]
+) -> Steps[tuple[Found, Told | None, dict[str, Any]]]:
+    """Where the fit ends, how well its directions are told, and what is to be stated of its starts."""
+    # What rounding does leaves few directions told in the end: the best of them come first.
+    most = problem.prior.base.size
+    if rounds(machine, problem):
+        most = AT_ONCE
+        yield draws_soon(machine, problem)
+    found = yield from _rounds(problem, np.zeros(problem.prior.base.size), most)
+    many: dict[str, Any] = {}
+    if starts > 1 or given:
+        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
+    found, told = yield from _sifted(machine, found)
+    if told is None and not many:
+        # A machine that sticks at the guesses, or nearly, shows nothing.
+        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
+        found, told = yield from _sifted(machine, found)
+    while found.count == most and found.more:
+        most += AT_ONCE
+        spent = found.evaluations
+        found = yield from _rounds(found.problem, found.point, most, last=True)
+        found, told = yield from _sifted(machine, replace(found, evaluations=found.evaluations + spent))
+    return found, told, many
 
 
 def _drawn(problem: Problem, starts: int) -> np.ndarray:

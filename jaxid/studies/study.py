@@ -21,7 +21,7 @@ from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
 from jaxid.io.output import check_folder, mark_folder, write_json, write_whole
 from jaxid.machine import position_noise
-from jaxid.replay import TooStiffError
+from jaxid.stiffness import TooStiffError
 from jaxid.studies.levels import Level
 from jaxid.studies.plan import Plan, at_once, digest_of, same
 from jaxid.studies.remote import Bundle, Remote

@@ -1,0 +1,93 @@
+"""How finely a machine must be integrated: its fastest rate, and what is too stiff to be simulated."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxid.errors import InputError
+from jaxid.io.log import Log
+from jaxid.machine import Machine
+from jaxid.model import Plant
+from jaxid.readings import State, acceleration, derivative
+
+# Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
+_FINE = 0.2
+# More integration steps a sample than that no machine asks for: a fit or a guess has run away.
+_MOST_STEPS = 2000
+
+
+class TooStiffError(InputError):
+    """A machine so stiff, or so light, that simulating it would not end."""
+
+
+def needed_steps(machine: Machine, log: Log) -> int:
+    """Integration steps a sample that the smooth part of the plant asks for along a log.
+
+    Raises:
+        TooStiffError: If that is more than any sound machine asks for.
+    """
+    period = machine.controller.period if machine.controller is not None else log.period
+    picks = np.linspace(0, log.samples - 1, 50).astype(int)
+    q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    steps = float(_fastest(machine.plant, q, u)) * period / _FINE
+    if not np.isfinite(steps):
+        raise TooStiffError(
+            "the plant's forces have no finite slope where the log begins to move", where=log.source,
+            mend="check the guesses, and effects of your own at velocity zero",
+        )
+    if steps > _MOST_STEPS:
+        raise TooStiffError(
+            f"the plant would need {steps:.2g} integration steps every {period:.3g} s", where=log.source,
+            mend="an inertia that is far too small, or a stiffness or damping far too large, does "
+            "that: check the guesses, or declare less",
+        )
+    return max(1, int(np.ceil(steps)))
+
+
+@eqx.filter_jit
+def _fastest(plant: Plant, q: Array, u: Array) -> Array:
+    """Fastest rate of the plant without dry friction, linearised at rest at some positions."""
+
+    def rate(q: Array, u: Array) -> Array:
+        zero = jnp.zeros_like(q)
+        own = plant.initial_states(u)
+        none = jnp.zeros_like(plant.ports(q))
+
+        def acc(q: Array, v: Array) -> Array:
+            return acceleration(plant, State(q, v, own), u, jnp.zeros(()), none)
+
+        stiffness, damping = (_slope(of) for of in jax.jacfwd(acc, argnums=(0, 1))(q, zero))
+        motion = jnp.maximum(jnp.sqrt(stiffness), damping)
+        return jnp.maximum(motion, _swing(plant, State(q, zero, own), u, none))
+
+    return jax.vmap(rate)(q, u).max()
+
+
+def _slope(matrix: Array) -> Array:
+    """Largest entry of a matrix of slopes, what joint acts on what other and back taken together.
+
+    Joints may be in different units, and one light beside the other: k R / J alone is no rate of a motor
+    behind a screw, only with k R / M is it one.
+    """
+    return jnp.sqrt(jnp.abs(matrix * matrix.T)).max()
+
+
+def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
+    """Fastest rate of the effects that are oscillators: what steps cannot take exactly."""
+    worst = jnp.zeros(())
+    for i, z in enumerate(x.own):
+        if z is None or z.ndim == 0:
+            continue
+
+        def rates(value: Array, i: int = i) -> Array:
+            own = (*x.own[:i], value, *x.own[i + 1 :])
+            return derivative(plant, State(x.q, x.qd, own), u, jnp.zeros(()), reaction).own[i]
+
+        slope = jax.jacfwd(rates)(z)
+        frequency = jnp.sqrt(jnp.abs(slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]))
+        worst = jnp.maximum(worst, jnp.maximum(frequency, jnp.abs(jnp.trace(slope))))
+    return worst
