@@ -158,16 +158,17 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
     session = jaxid.open_session(tmp_path / "case.toml", log)
     machine, guessed = session.machine, session.machine.parameters.guess
     stuck = alone(criterion_steps(machine, session.fit.log, guessed, on="force"))
-    # Where the guesses tell nothing others are tried unasked; what sticks cannot be fitted.
+    # Where the guesses tell nothing others are tried unasked; what sticks is led to where it moves.
     for asked, details in found.items():
         assert details["directions"]
         assert details["criterion_percent"] < 0.5 * stuck
         starts = details["starts"]
         assert starts["count"] == {1: 32, 16: 16}[asked]
         assert 1 <= starts["flat"] < starts["count"]
-        moving = starts["count"] - starts["flat"]
-        assert moving - 1 <= starts["same_optimum"] <= moving
-        assert f"of {starts['flat']} the simulation does not move" in " ".join(within_prior_words(details))
+        # More than those that move by themselves.
+        assert 0.75 * starts["count"] < starts["same_optimum"] <= starts["count"]
+        assert starts["count"] - starts["flat"] < 0.5 * starts["count"]
+        assert f"{starts['flat']} from which the simulation does not" in " ".join(within_prior_words(details))
 
 
 @pytest.mark.parametrize(("told", "fitted"), [(3, 3), (4, 4), (7, 7), (12, 8)])

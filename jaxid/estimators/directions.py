@@ -50,6 +50,8 @@ _TOLD_TWICE, _STAYS = 0.5, 0.6
 _ROUNDS, _READ = 6, 3
 # Starts where the guesses tell nothing.
 _WHERE_NOTHING_SHOWS = 32
+# Where along the best told direction a start is led from which the simulation does not move [priors].
+_LOOK = np.linspace(-3.0, 3.0, 13)
 # Two starts end at one optimum where their costs differ by less than this.
 _SAME = 1e-3
 
@@ -272,6 +274,8 @@ def _many_starts(
         z = np.where(fitted, z, 0.0)
         active = np.tile(fitted, (len(z), 1))
         flat = yield from _flat(found, z[:-1], active[:-1])
+        if np.any(flat):
+            z[:-1][flat] = (yield from _led(found, z))[:-1][flat]
         noise = found.problem.noise(found.minimum, found.count)
         ladder = found.problem.ladder
         for sharpness in ladder:
@@ -296,10 +300,25 @@ def _many_starts(
     return replace(found, evaluations=spent), {"starts": stated}
 
 
+def _led(found: Found, z: Float[np.ndarray, "starts k"]) -> Steps[Float[np.ndarray, "starts k"]]:
+    """Each start led along the best told direction to where, at a coarse look, its cost is lowest.
+
+    What keeps a simulation from moving is the level of its friction, and that is what is told best.
+    """
+    args = (*found.problem.args, found.problem.ladder[0], NO_PULL, np.zeros(len(found.vectors)), found.first)
+    looked = np.tile(z, (len(_LOOK), 1, 1))
+    looked[:, :, 0] = _LOOK[:, None]
+    costs = []
+    for there in looked:
+        costs.append(np.asarray((yield Solve(fit_each, (*args, there, np.zeros(z.shape, bool))))[1]))
+    best = np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0)
+    return looked[best, np.arange(len(z))]
+
+
 def _flat(
     found: Found, z: Float[np.ndarray, "starts k"], active: Bool[np.ndarray, "starts k"]
 ) -> Steps[Bool[np.ndarray, " starts"]]:
-    """Which starts show no slope: a machine that sticks throughout tells nothing but where it stands."""
+    """Which starts show no slope: a machine that sticks throughout says nothing of where to go."""
     origin, own = np.zeros(len(found.vectors)), found.first.copy()
     own[len(found.problem.places) :] = 0.0
     args = (*found.problem.args, found.problem.ladder[0], NO_PULL, origin, own, z, active)

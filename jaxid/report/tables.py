@@ -179,7 +179,7 @@ def within_prior_words(content: Mapping) -> list[str]:
     if starts:
         shown = f"starts: {starts['same_optimum']} of {starts['count']} end at the same cost"
         if starts["flat"]:
-            shown += f"; of {starts['flat']} the simulation does not move, so that they cannot be fitted"
+            shown += f"; {starts['flat']} from which the simulation does not move were led on first"
         lines.append(shown)
     return lines
 
