@@ -132,13 +132,13 @@ def identify(
 
 
 def identify_many(
-    case: Case | str | Path, logs: Sequence[Log | str | Path], *, method: str = "output_error",
-    lanes: int = 16,
+    case: Case | str | Path | Sequence[Case | str | Path], logs: Sequence[Log | str | Path], *,
+    method: str = "output_error", lanes: int = 16,
 ) -> list[Estimate | Exception]:
     """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
 
     Args:
-        case: The case, or its file.
+        case: The case, or its file; or one for each log, which may differ in their guesses.
         logs: Logs, or their files.
         method: One of `jaxid.estimators.METHODS`.
         lanes: Logs in a compiled call.
@@ -147,16 +147,22 @@ def identify_many(
         The estimate of each log, or what kept it from one: no log fails for another.
 
     Raises:
-        InputError: If the case or the method is unsound.
+        InputError: If a case or the method is unsound, or cases are not as many as logs.
     """
     if method not in METHODS:
         raise InputError(f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}")
-    case = case if isinstance(case, Case) else load_case(case)
+    loaded = lambda c: c if isinstance(c, Case) else load_case(c)
+    if isinstance(case, Case | str | Path):
+        cases = [loaded(case)] * len(logs)
+    elif len(case) == len(logs):
+        cases = [loaded(c) for c in case]
+    else:
+        raise InputError(f"{len(case)} cases for {len(logs)} logs", mend="give one case, or one for each log")
 
-    def steps(log: Log | str | Path) -> Steps[Estimate]:
+    def steps(case: Case, log: Log | str | Path) -> Steps[Estimate]:
         return (yield from steps_of(method, open_session(case, log, method=method)))
 
-    return together([steps(log) for log in logs], lanes)
+    return together([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
 
 def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
