@@ -48,6 +48,8 @@ _TOLD_TWICE, _STAYS = 0.5, 0.6
 # Directions change with the point at which they are read: most rounds, in how many of them they are read
 # anew.
 _ROUNDS, _READ = 6, 3
+# A direction that changes so small a part of what another does is not felt.
+_UNFELT = 1e-6
 # Starts where the guesses tell nothing.
 _WHERE_NOTHING_SHOWS = 32
 # Where along the best told direction a start is led from which the simulation does not move [priors].
@@ -213,12 +215,14 @@ def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
     """
     ended = not rounds(machine, found.problem)
     while found.count and np.all(np.isfinite(found.minimum.jacobian)):
-        told = told_of(found)
-        if rounds(machine, found.problem):
-            covariance = yield from covariance_with_rounding(machine, found, told.std)
-            told = replace(told, covariance=covariance)
-        stays = told.std <= _STAYS
-        if ended and np.all(stays):
+        stays, told = _felt(found), None
+        if np.all(stays):
+            told = told_of(found)
+            if rounds(machine, found.problem):
+                covariance = yield from covariance_with_rounding(machine, found, told.std)
+                told = replace(told, covariance=covariance)
+            stays = told.std <= _STAYS
+        if ended and told is not None and np.all(stays):
             return found, told
         rest = np.arange(found.count, len(found.vectors))
         order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
@@ -233,6 +237,13 @@ def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
         found = replace(found, vectors=vectors, count=count, minimum=minimum, evaluations=spent)
         ended = True
     return found, None
+
+
+def _felt(found: Found) -> Bool[np.ndarray, " r"]:
+    """Which fitted directions still change anything: not those that end where an unknown is at its bound."""
+    triangle = np.linalg.qr(np.asarray(found.minimum.jacobian)[:, : found.count], mode="r")
+    size = np.abs(np.diag(triangle))
+    return size > _UNFELT * size.max()
 
 
 def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
