@@ -85,7 +85,8 @@ def open_session(
         log: The log to fit, or its file.
         validate: More logs to validate on, beside the case's own.
         align_hold: See `jaxid.preprocess.Recipe`; absent: what the case's recipe implies.
-        method: That is to fit the log: only `output_error` can do with a short one, within a prior.
+        method: That is to fit the log: only `output_error` can do with a short one, within a prior, and
+            "discover" by it.
 
     Raises:
         InputError: If anything in case or logs is unsound.
@@ -95,7 +96,7 @@ def open_session(
     case = at_joints(case)
     fit = read(log)
     machine = build_machine(case, period=fit.period)
-    held = method == "output_error" and "prior" in case.output_error
+    held = method in ("output_error", "discover") and "prior" in case.output_error
     findings = _check(case, fit, machine, held)
     recipe = choose_recipe(fit, case.preprocess)
     if align_hold is not None:

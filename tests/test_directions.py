@@ -171,6 +171,20 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
         assert f"{starts['flat']} from which the simulation does not" in " ".join(within_prior_words(details))
 
 
+def test_an_unknown_at_its_bound_does_not_take_the_others_with_it(tmp_path):
+    """Plain friction on a log that shows more: the viscous part ends at zero, and no slope is left of it."""
+    log = stages.record(STAGE, REFERENCE, noise=0.0005, resolution=0.0, seed=3)
+    log = Log(
+        time=log["t"], position=log["q"][:, None], force=log["i"][:, None], reference=REFERENCE[:, None]
+    )
+    text = stages.text(1, guess=stages.drawn(4), resolution=0.0, more=STATED)
+    start = text.index('[[effects]]\nkind = "velocity_hysteresis"')
+    (tmp_path / "case.toml").write_text(text[:start] + text[text.index("[actuator]") :])
+    details = jaxid.identify(tmp_path / "case.toml", log).estimate.details
+    assert len(details["directions"]) == 2
+    assert details["criterion_percent"] < 1.0
+
+
 @pytest.mark.parametrize(("told", "fitted"), [(3, 3), (4, 4), (7, 7), (12, 8)])
 def test_more_directions_are_fitted_as_long_as_all_of_them_stay(monkeypatch, told, fitted):
     """By four at a time where readings round; of twelve that are told rounding leaves eight."""

@@ -18,6 +18,7 @@ from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separate import proposals
 from jaxid.discovery.union import build_union
 from jaxid.discovery.where import Where, locate
+from jaxid.discovery.within_prior import explore_within
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators import need_known_reference
 from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
@@ -87,6 +88,8 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "what it is would be taken for an effect")
+    if "prior" in session.case.output_error:
+        return explore_within(session, max_effects=max_effects, progress=progress)
     data = session.fit.data
     progress("fitting what is there")
     baseline, search = start_search(session, progress)

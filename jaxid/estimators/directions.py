@@ -7,7 +7,7 @@ the log tells better than that are fitted, the others are held.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -61,7 +61,7 @@ _SAME = 1e-3
 def directions_steps(
     machine: Machine, log: Log, *, prior: float, on: str = "position", starts: int = 1,
     others: Sequence[np.ndarray] = (), hessian: bool = False, profile: bool = False,
-    numerics: Numerics | None = None,
+    numerics: Numerics | None = None, widths: Mapping[str, float] | None = None,
 ) -> Steps[Estimate]:
     """Fit what a log tells of the unknowns in the loop, and hold the rest at the guesses.
 
@@ -77,6 +77,7 @@ def directions_steps(
         hessian: Take the curvature from the full Hessian in place of Gauss-Newton's.
         profile: Also take profile likelihoods of the fitted directions.
         numerics: How to integrate.
+        widths: Standard deviations of single guesses, by name; of what must be positive of its logarithm.
 
     Returns:
         The estimate. Standard deviations hold what is left of the prior along held directions;
@@ -90,7 +91,7 @@ def directions_steps(
         (27) lacks the inverse of B: 100 (sigma^2 diag B^-1)^(1/2) / theta.
     """
     numerics = numerics or choose_numerics(machine, log)
-    problem = Problem.of(machine, log, prior, on, numerics)
+    problem = Problem.of(machine, log, prior, on, numerics, widths)
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     found, told, many = yield from _searched(machine, problem, starts, given)
     p = len(machine.parameters.free)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -67,15 +68,19 @@ class Prior(eqx.Module):
         return np.where(self.log, theta, 1.0) * self.scale
 
     @classmethod
-    def of(cls, machine: Machine, width: float, nuisance: Float[np.ndarray, " k"]) -> Prior:
-        """Of a machine's guesses, a relative width around each, and of nuisances about zero.
+    def of(
+        cls, machine: Machine, width: float, nuisance: Float[np.ndarray, " k"],
+        own: Mapping[str, float] | None = None,
+    ) -> Prior:
+        """Of a machine's guesses, a relative width around each or its own, and of nuisances about zero.
 
         Raises:
             InputError: If a guess is zero, of which nothing can be a part.
         """
         free = machine.parameters.free
+        own = own or {}
         for f in free:
-            if f.guess == 0.0:
+            if f.guess == 0.0 and f.name not in own:
                 raise InputError(
                     f"{f.name} has a guess of zero, which a relative prior says nothing of",
                     where="[output_error] prior", mend="give it a guess of its natural size",
@@ -83,9 +88,10 @@ class Prior(eqx.Module):
         guess, (lower, upper) = machine.parameters.guess, machine.parameters.bounds
         log = Transform.of(machine.parameters).log
         none = np.zeros(nuisance.size)
+        scale = np.where(log, width, width * np.abs(guess))
+        scale = np.array([own.get(f.name, s) for f, s in zip(free, scale, strict=True)])
         return cls(
-            np.concatenate([guess, none]),
-            np.concatenate([np.where(log, width, width * np.abs(guess)), nuisance]),
+            np.concatenate([guess, none]), np.concatenate([scale, nuisance]),
             np.concatenate([log, none.astype(bool)]),
             np.concatenate([lower, none - np.inf]), np.concatenate([upper, none + np.inf]),
         )
@@ -119,7 +125,10 @@ class Problem:
         return (self.replay, self.places, self.plant, self.measured, self.weight, self.prior, self.on)
 
     @classmethod
-    def of(cls, machine: Machine, log: Log, prior: float, on: str, numerics: Numerics) -> Problem:
+    def of(
+        cls, machine: Machine, log: Log, prior: float, on: str, numerics: Numerics,
+        widths: Mapping[str, float] | None = None,
+    ) -> Problem:
         """Of a machine and its log, from rest; see `jaxid.estimators.directions.directions_steps`.
 
         Raises:
@@ -132,7 +141,7 @@ class Problem:
         std = machine.sensor.position_std
         n = log.position.shape[1]
         start = np.zeros(0) if std is None else np.broadcast_to(np.asarray(std), n)
-        whole = Prior.of(machine, prior, start)
+        whole = Prior.of(machine, prior, start, widths)
         weight = np.tile(counts.astype(float), (len(measured), 1))
         plant, m = machine.plant, log.force.shape[1]
         ladder = _LADDER if _rises(plant, np.zeros(n), np.zeros(m)) else (plant.sharpness,)

@@ -61,6 +61,30 @@ def _args(machine: Machine, problem: Problem) -> tuple:
     return with_sensor(problem.replay, machine.sensor), *problem.args[1:], problem.ladder[-1]
 
 
+def drawn_roundings(
+    machine: Machine, problem: Problem, draws: int
+) -> Float[np.ndarray, "draws rows"] | None:
+    """What rounding does to a residual at the guesses, the start anywhere within its first count.
+
+    Args:
+        machine: Its sensor rounds.
+        problem: At whose guesses.
+        draws: How many, at least.
+
+    Returns:
+        Residuals less their mean; None where the loop's readings are not rounded.
+    """
+    if not rounds(machine, problem):
+        return None
+    rng, size = np.random.default_rng(2), problem.prior.base.size
+    shape, still = (_DRAWS, problem.replay.position.size), np.zeros((_DRAWS, size))
+    count, args = np.asarray(machine.sensor.position_resolution), _args(machine, problem)
+    parts = -(-draws // _DRAWS)
+    e = [_each(*args, still, rng.uniform(-0.5, 0.5, shape) * count) for _ in range(parts)]
+    e = np.concatenate([np.asarray(x).reshape(_DRAWS, -1) for x in e])[:draws]
+    return e - e.mean(axis=0)
+
+
 def covariance_with_rounding(
     machine: Machine, found: Found, std: Float[np.ndarray, " r"]
 ) -> Steps[Float[np.ndarray, "r r"]]:

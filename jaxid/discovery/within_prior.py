@@ -1,0 +1,335 @@
+"""What a model within a prior lacks, judged in its simulated loop: its log may tell no forces.
+
+Each effect that the machine might lack is added to the simulated loop next to no strength, and its column is
+laid through what the fit leaves, the unknowns free to give way within their priors. What noise alone would
+gain by the best of them, rounding in the loop included, is drawn; what gains more is fitted for good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.discovery.candidates import Candidate, Union
+from jaxid.discovery.result import Discovery, Found, Round
+from jaxid.discovery.screen import Score
+from jaxid.discovery.search import Step
+from jaxid.discovery.union import build_union
+from jaxid.discovery.where import Where
+from jaxid.effects.coupling import Backlash, JointFlexibility
+from jaxid.effects.friction import StaticFriction
+from jaxid.estimators import steps_of
+from jaxid.estimators.directions import directions_steps
+from jaxid.estimators.directions_problem import Problem, read
+from jaxid.estimators.directions_rounding import drawn_roundings
+from jaxid.estimators.output_error import choose_numerics, output_residual
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import alone
+from jaxid.gap import noise_floor
+from jaxid.identification import gaps
+from jaxid.model import Plant, parameters_of
+from jaxid.parameters import free_effect
+from jaxid.precision import NoiseModel
+from jaxid.replay import Replay
+from jaxid.session import Session
+
+# A smooth loop of fixed steps cannot take these in.
+_LEFT_OUT = (StaticFriction, Backlash, JointFlexibility)
+# Draws of noise; the best that the luckiest of them gains is the threshold.
+_DRAWS = 1024
+# So many candidates are fitted for good, the most promising first: those that a linear look gives this part
+# of the threshold; the second where something is seen, for the look knows an effect at few shapes only.
+_FEW, _PROMISING = 4, (0.5, 0.1)
+# What is that near to the best [nats] cannot be told from it.
+_AS_GOOD = 2.0
+# Lags whose correlation says whether a residual is noise.
+_LAGS = 10
+# Columns in a compiled call.
+_COLUMNS = 4
+UNSEEN = "a fit within a prior looks at the loop alone"
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A candidate at one start, in the loop: what it adds to the residual, over the noise.
+
+    Args:
+        candidate, start: Which.
+        offset: Change of the residual, (rows,); zero for an added force.
+        columns: Directions in which it may go from there, (rows, k).
+        positive: Whether only forwards.
+    """
+
+    candidate: Candidate
+    start: int
+    offset: Float[np.ndarray, " rows"]
+    columns: Float[np.ndarray, "rows k"]
+    positive: bool
+
+
+def explore_within(
+    session: Session, *, max_effects: int, progress: Callable[[str], None]
+) -> Discovery:
+    """`discover` for a case with `[output_error] prior`.
+
+    Args:
+        session: Case and log.
+        max_effects: Most effects to add.
+        progress: Called with a line at every stage.
+
+    Raises:
+        InputError: If the loop cannot be simulated, or a guess is zero.
+    """
+    progress("fitting what is there")
+    before = after = alone(steps_of("output_error", session))
+    effects: list[Found] = []
+    rounds = []
+    added: Score | None = None
+    while True:
+        loop = _Loop.of(session, after)
+        progress(f"screening {len(loop.union.candidates)} effects in the loop")
+        looks = loop.looks()
+        threshold, noisy = loop.threshold(looks)
+        screened = loop.scored(looks)
+        step = Step(added, None, tuple(screened), threshold, loop.theta, loop.union.base)
+        rounds.append(Round(step, loop.rms, None))
+        if len(effects) >= max_effects:
+            break
+        refitted = []
+        least = _PROMISING[0 if noisy else 1] * threshold
+        for score in [s for s in screened if s.evidence > least][:_FEW]:
+            progress(f"refitting with {score.candidate.label}")
+            refitted.append(_refitted(session, loop, after, score))
+        good = sorted((r for r in refitted if r[0].evidence > threshold), key=lambda r: -r[0].evidence)
+        if not good:
+            break
+        added, after, found = good[0]
+        near = [s for s, *_ in good[1:] if s.evidence > added.evidence - _AS_GOOD]
+        effects.append(replace(found, alternatives=tuple(near)))
+    verdict = "found" if effects else "nothing_missing" if noisy else "unexplained"
+    progress("simulating")
+    old = gaps(before.machine, session.runs)
+    new = gaps(after.machine, session.runs) if effects else old
+    floor = noise_floor(before.machine, session.fit.log, session.fit.data)
+    where = None if verdict == "nothing_missing" else _Loop.of(session, before).where()
+    return Discovery(
+        session, verdict, where, tuple(effects), tuple(rounds), before, after, old, new, floor, (), UNSEEN
+    )
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A fitted machine in its loop, with every effect that it might lack doing nothing yet.
+
+    Args:
+        session, estimate: Of the machine.
+        union: With the effects.
+        problem: What the fit compared.
+        residual: What it left, over the noise, by row.
+        base: Derivatives of that in units of the prior, (rows, unknowns and starts).
+    """
+
+    session: Session
+    estimate: Estimate
+    union: Union
+    problem: Problem
+    residual: Float[np.ndarray, " rows"]
+    base: Float[np.ndarray, "rows q"]
+    sigma: float
+
+    @classmethod
+    def of(cls, session: Session, estimate: Estimate) -> _Loop:
+        """Of what a fit within a prior found."""
+        stated, log, machine = session.case.output_error, session.fit.log, estimate.machine
+        numerics = choose_numerics(machine, log)
+        problem = Problem.of(machine, log, stated["prior"], stated.get("on", "position"), numerics)
+        here = alone(read(problem, problem.ladder[-1], np.zeros(problem.prior.base.size)))
+        problem, here = problem.weighed(here)
+        sigma = problem.noise(here, len(estimate.details["directions"]))
+        # Sizes of motion from all samples: those of a short log may hardly leave its rest.
+        data = replace(session.fit.data, moving=np.ones_like(session.fit.data.moving))
+        searched = [e for e in session.case.searched if e not in _LEFT_OUT]
+        union = build_union(machine, data, searched)
+        return cls(
+            session, estimate, union, problem, np.asarray(here.residual).ravel() / sigma,
+            np.asarray(here.jacobian) / sigma, sigma,
+        )
+
+    @property
+    def theta(self) -> np.ndarray:
+        """All unknowns of the union, the effects doing nothing."""
+        return self.union.neutral
+
+    @property
+    def rms(self) -> np.ndarray:
+        """RMS of the residual, by column that counts, in its own units."""
+        weight = self.problem.weight
+        counts = weight[0] > 0
+        e = self.sigma * self.residual.reshape(weight.shape)[:, counts] / weight[:, counts]
+        return np.sqrt(np.mean(e**2, axis=0))
+
+    def looks(self) -> list[_Look]:
+        """Every candidate at each of its starts; what cannot be simulated there is left out."""
+        out = []
+        free = self.union.machine.parameters.free
+        for c in self.union.candidates:
+            drive = not c.amplitude.any()
+            positive = all(free[i].sign != "any" for i in c.index[c.amplitude])
+            for k in range(len(c.starts)):
+                e, columns = self._at(c, c.starts[k] if drive else c.probe(k))
+                if drive:
+                    scale = np.where(c.starts[k] != 0, np.abs(c.starts[k]), 1.0)
+                    look = _Look(c, k, e - self.residual, columns * scale, False)
+                else:
+                    strength = columns @ np.where(c.amplitude, c.starts[k], 0.0)
+                    look = _Look(c, k, np.zeros_like(e), strength[:, None], positive)
+                if np.all(np.isfinite(look.columns)) and np.all(np.isfinite(look.offset)):
+                    out.append(look)
+        return out
+
+    def _at(self, c: Candidate, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residual with a candidate at some values, and its derivatives in them, over the noise."""
+        theta = self.theta.copy()
+        theta[c.index] = values
+        directions = np.zeros((len(theta), _COLUMNS))
+        directions[c.index, np.arange(len(c.index))] = 1.0
+        plant = replace(self.union.machine.plant, sharpness=self.problem.ladder[-1])
+        p = self.problem
+        args = (p.replay, self.union.machine.parameters.places, plant, p.measured, p.weight, p.on)
+        e, columns = _columns(*args, theta, directions)
+        return np.asarray(e) / self.sigma, np.asarray(columns)[:, : len(c.index)] / self.sigma
+
+    def scored(self, looks: list[_Look]) -> list[Score]:
+        """Best start of every candidate by what it gains, the most first."""
+        best: dict[int, Score] = {}
+        for look, (gain, step) in zip(looks, self._gains(looks, self.residual[:, None]), strict=True):
+            c, start = look.candidate, look.candidate.starts[look.start]
+            guess = np.where(c.amplitude, start * step[0, 0], start)
+            score = Score(c, look.start, guess, float(gain[0]))
+            if id(c) not in best or score.evidence > best[id(c)].evidence:
+                best[id(c)] = score
+        return sorted(best.values(), key=lambda s: -s.evidence)
+
+    def threshold(self, looks: list[_Look]) -> tuple[float, bool]:
+        """Evidence that noise alone reaches once in a thousand searches; whether the residual is noise."""
+        white, left = self._white(), lambda e: e - self.base @ self._giving_way(e)
+        most = _correlation(left(white)).max()
+        noisy = bool(_correlation(left(self.residual[:, None]))[0] <= most)
+        if not looks:
+            return 0.0, noisy
+        # Colour that the best of them explains is none of the noise's.
+        found = self._gains(looks, self.residual[:, None])
+        look, (_, steps) = max(zip(looks, found, strict=True), key=lambda x: float(x[1][0][0]))
+        beside = left(self.residual + look.offset + look.columns @ steps[:, 0])
+        draws = np.concatenate([self._coloured(beside), white], axis=1)
+        return max(float(gain.max()) for gain, _ in self._gains(looks, draws)), noisy
+
+    def _coloured(self, e: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows draws"]:
+        """Noise of the colour of a residual."""
+        rng, shape = np.random.default_rng(0), self.problem.weight.shape
+        columns = e.reshape(shape)
+        drawn = np.zeros((_DRAWS, *shape))
+        for k in np.flatnonzero(self.problem.weight[0] > 0):
+            model = NoiseModel.fit(columns[:, k], np.ones(shape[0], bool))
+            drawn[:, :, k] = model.sample(rng, shape[0], _DRAWS)
+        return drawn.reshape(_DRAWS, -1).T
+
+    def _white(self) -> Float[np.ndarray, "rows draws"]:
+        """What a residual may be that is nothing but white noise, and rounding in the loop where there is."""
+        rng = np.random.default_rng(1)
+        white = rng.standard_normal((_DRAWS, self.residual.size))
+        rounded = drawn_roundings(self.session.machine, self.problem, _DRAWS)
+        if rounded is not None:
+            e = (rounded - rounded.mean(axis=0)) / self.sigma
+            share = min(float(np.mean(e**2)), 1.0)
+            white = e + np.sqrt(1.0 - share) * white
+        counts = np.tile(self.problem.weight[0] > 0, self.problem.weight.shape[0])
+        return (white * counts).T
+
+    def _giving_way(self, e: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, "q k"]:
+        """What the unknowns take of some residuals, each held within its prior; their columns times that."""
+        gram = self.base.T @ self.base + np.eye(self.base.shape[1])
+        return np.linalg.solve(gram, self.base.T @ e)
+
+    def _gains(
+        self, looks: list[_Look], residuals: Float[np.ndarray, "rows k"]
+    ) -> list[tuple[Float[np.ndarray, " k"], Float[np.ndarray, "own k"]]]:
+        """Gain in log-likelihood of each look on some residuals, and its own steps."""
+        n = residuals.shape[0]
+        squares = lambda e: np.sum((e - self.base @ self._giving_way(e)) * e, axis=0)
+        before = squares(residuals)
+        out = []
+        for look in looks:
+            e, x = residuals + look.offset[:, None], look.columns
+            y = x - self.base @ self._giving_way(x)
+            gram = x.T @ y
+            gram = gram + 1e-9 * np.trace(gram) * np.eye(len(gram)) + 1e-300 * np.eye(len(gram))
+            step = -np.linalg.solve(gram, y.T @ e)
+            if look.positive:
+                step = np.maximum(step, 0.0)
+            after = squares(e) + 2 * np.sum((y.T @ e) * step, axis=0) + np.sum((gram @ step) * step, axis=0)
+            out.append((0.5 * n * np.log(before / np.maximum(after, 1e-12 * before)), step))
+        return out
+
+    def where(self) -> Where:
+        """When the residual is largest; of a curve so few samples tell nothing."""
+        log, e = self.session.fit.log, self.residual.reshape(self.problem.weight.shape)
+        power = np.convolve(np.sum(e**2, axis=1), np.ones(_LAGS), "valid")
+        k = int(np.argmax(power))
+        times = log.time[[k, k + _LAGS - 1]] - log.time[0]
+        region, none = (float(times[0]), float(times[1])), np.zeros(0)
+        text = f"the loop's residual is largest between {region[0]:.3g} and {region[1]:.3g} s"
+        part = float(power[k] / np.sum(e**2))
+        return Where(1, "time", region, (region,), text, part, 0.0, 0.0, True, none, none, none, none)
+
+
+@eqx.filter_jit
+def _columns(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, on: str, theta: Array,
+    directions: Array,
+) -> tuple[Array, Array]:
+    residual = lambda t: output_residual(replay, places, plant, measured, weight, on)(t).ravel()
+    slope = jax.vmap(lambda d: jax.jvp(residual, (theta,), (d,))[1], out_axes=1)
+    return residual(theta), slope(jnp.asarray(directions).T)
+
+
+def _correlation(e: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " k"]:
+    """Sum of the squared autocorrelations at the first lags, of each column."""
+    e = e - e.mean(axis=0)
+    lags = range(1, _LAGS + 1)
+    return sum((np.sum(e[k:] * e[:-k], axis=0) / np.sum(e**2, axis=0)) ** 2 for k in lags)
+
+
+def _refitted(
+    session: Session, loop: _Loop, base: Estimate, score: Score
+) -> tuple[Score, Estimate, Found]:
+    """The fit within the prior with an effect beside the rest, and what it gains."""
+    c, plant = score.candidate, base.machine.plant
+    effect = loop.union.machine.plant.effects[loop.union.machine.parameters.free[c.index[0]].path[1]]
+    names = [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
+    values = dict(zip(names, score.guess, strict=True))
+    plant, free = free_effect(plant, type(effect)(**values, port=c.port), base.machine.units)
+    machine = base.machine.with_plant(plant, base.machine.parameters.extended(free))
+    widths = {
+        f.name: 1.0 if f.sign == "positive" else float(max(np.abs(c.starts[:, k]).max(), abs(f.guess)))
+        for k, f in enumerate(free)
+    }
+    stated = session.case.output_error
+    after = alone(directions_steps(
+        machine, session.fit.log, prior=stated["prior"], on=stated.get("on", "position"), widths=widths
+    ))
+    old, new = (e.details["criterion_percent"] for e in (base, after))
+    gained = 0.5 * loop.residual.size * np.log(old / new)
+    if not after.converged or not np.isfinite(gained):
+        gained = 0.0
+    refitted = replace(score, evidence=float(gained))
+    found = Found(
+        c.kind, c.label, plant.place(c.port), tuple(f.name for f in free), refitted, ()
+    )
+    return refitted, after, found
