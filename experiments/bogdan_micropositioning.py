@@ -379,8 +379,8 @@ def short(folder: Path, runs: int) -> None:
             nats = 0.5 * logs[0].samples * np.log(criteria[0] / criteria[1])
             said = [named(plain, log) for log in logs[:8]]
             verdicts = ", ".join(f"{said.count(v)} {v}" for v in dict.fromkeys(said))
-            told = noise_of(data, resolution) if noise is None else noise
-            table.row(data, name, f"{1e3 * told:.1f}", f"{np.median(nats):.1f}", f"{np.max(nats):.1f}", verdicts)
+            size = 1e3 * (noise_of(data, resolution) if noise is None else noise)
+            table.row(data, name, f"{size:.1f}", f"{np.median(nats):.1f}", f"{np.max(nats):.1f}", verdicts)
             print(f"  data {data}, {name}: {time.perf_counter() - start:.0f} s", flush=True)
     table.show(time.perf_counter() - start)
 
