@@ -25,7 +25,8 @@ def _table(registry: dict[str, type], what: str) -> str:
     linear, rotary = Units("linear"), Units("rotary")
     rows = [[what, "parameter", "sign", "linear", "rotary", "what it is"]]
     for kind, cls in registry.items():
-        rows.append([kind, "", "", "", "", (cls.__doc__ or "").strip().splitlines()[0]])
+        asked = " `discover` looks for it on request." if getattr(cls, "on_request", False) else ""
+        rows.append([kind, "", "", "", "", (cls.__doc__ or "").strip().splitlines()[0] + asked])
         for name, info in parameters_of(cls).items():
             shown = f"{name}?" if info.optional else name
             units = [either.label(info.dimension, info.motion) for either in (linear, rotary)]

@@ -215,6 +215,8 @@ class Effect(eqx.Module):
     any_direction: ClassVar[bool] = False
     # Whether a search looks for it on stages only: elsewhere what differs by direction is taken for it.
     of_stages: ClassVar[bool] = False
+    # Whether a search looks for it only where [discover] asks: elsewhere a simpler effect is taken for it.
+    on_request: ClassVar[bool] = False
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:

@@ -122,10 +122,16 @@ ROWS: dict[str, Row] = {
         affine=False,
     ),
     "actuator_gain": Row("actuator_gain", {"gain": 1.2}, lambda x: 1.2 * x.u),
+    "actuator_offset": Row("actuator_offset", {"level": 25.0}, lambda x: x.u + 25.0),
     "actuator_lag": Row("actuator_lag", {"time_constant": 5e-3}, lambda x: x.z, own=70.0),
     # the delay is in the look-up of u, which tests of `interval_forces` cover
     "input_delay": Row("input_delay", {"delay": 2.4e-3}, lambda x: x.u),
     "saturation": Row("saturation", {"limit": 150.0}, lambda x: clip(x.u, 150.0)),
+    "voltage_limit": Row(
+        "voltage_limit",
+        {"stall": 350.0, "velocity": 0.5},
+        lambda x: max(min(x.u, 350.0 * (1 - x.v / 0.5)), -350.0 * (1 + x.v / 0.5)),
+    ),
     "added_mass": Row("added_mass", {"mass": 20.0}, lambda x: x.u - 20.0 * x.a),
     # own state: elongation times the spring's frequency of 200 rad/s, and its velocity
     "joint_flexibility": Row(

@@ -27,6 +27,7 @@ class SearchCase:
         also: Kinds that this log cannot tell from it; then `alternatives` must hold the true one.
         tolerance: Of the parameters, relative; they may also be within three deviations.
         extra: More hidden effects.
+        asked: Whether the search looks for it only because the case asks.
     """
 
     kind: str
@@ -39,6 +40,7 @@ class SearchCase:
     also: tuple[str, ...] = ()
     tolerance: float = 0.05
     extra: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    asked: bool = False
 
     def setup(self, seed: int, *, hidden: bool = True) -> Setup:
         """The machine with its hidden effect, and one reference."""
@@ -52,10 +54,11 @@ class SearchCase:
 
     def text(self, off: float = 1.4) -> str:
         """The case file that does not know the effect."""
-        return case_text(
+        text = case_text(
             self.setup(0), self.declared, off=off, inertia_known=self.inertia_known,
             orientation=self.orientation,
         )
+        return text + (f'[discover]\ncandidates = ["{self.kind}"]\n' if self.asked else "")
 
 
 def _rows() -> dict[str, SearchCase]:
@@ -76,9 +79,11 @@ def _rows() -> dict[str, SearchCase]:
         SearchCase("hysteresis", {"stiffness": 5000.0, "level": 20.0}, declared=(VISCOUS,)),
         # With friction unknown too, a gain is a mass by another name.
         SearchCase("actuator_gain", {"gain": 0.85}, inertia_known=True, also=("added_mass",)),
+        SearchCase("actuator_offset", {"level": 6.0}, also=("constant_force",), asked=True),
         SearchCase("actuator_lag", {"time_constant": 3e-3}),
         SearchCase("input_delay", {"delay": 2e-3}),
         SearchCase("saturation", {"limit": 75.0}),
+        SearchCase("voltage_limit", {"stall": 110.0, "velocity": 0.25}, asked=True),
         SearchCase("added_mass", {"mass": 15.0}, inertia_known=True, also=("actuator_gain",)),
         SearchCase("friction_drift", {"rate": 0.05}),
     ]

@@ -5,7 +5,7 @@ controller through a quantised noisy encoder. It shares no line with the
 package, so that agreement between the two means something.
 
 Conventions:
-    The drive acts in the order delay, gain, lag, saturation.
+    The drive acts in the order delay, gain, offset, lag, saturation, limit by the supply's voltage.
     A command u[k] acts from t[k] to t[k+1]; the reading at t[k] already gave it.
     Before the log starts the command is zero and the actuator has settled there.
     Units are SI; read kg m^2, rad and N m for a rotary axis.
@@ -40,9 +40,11 @@ EFFECTS = {
     },
     "hysteresis": {"stiffness": "dahl_stiffness", "level": "dahl_level"},
     "actuator_gain": {"gain": "gain"},
+    "actuator_offset": {"level": "offset"},
     "actuator_lag": {"time_constant": "lag"},
     "input_delay": {"delay": "delay"},
     "saturation": {"limit": "clip"},
+    "voltage_limit": {"stall": "stall", "velocity": "no_load"},
     "added_mass": {"mass": "mass"},
     "friction_drift": {"rate": "drift"},
 }

@@ -21,9 +21,12 @@ class Physics(NamedTuple):
     mass: float  # kg, added mass included
     weight: float = 0.0  # N, constant
     gain: float = 1.0  # N per unit of command, every gain multiplied in
+    offset: float = 0.0  # N, behind the gain
     lag: float = 0.0  # s
     delay: float = 0.0  # s
     clip: float = math.inf  # N
+    stall: float = math.inf  # N at rest, all that the supply's voltage allows
+    no_load: float = 1.0  # m/s, where it allows nothing
     viscous: float = 0.0  # N s/m
     absolute: float = 0.0  # N s/m, force -c |v|
     quadratic: float = 0.0  # N s^2/m^2
@@ -85,6 +88,14 @@ def velocity_force(p, v):
     """Force that is a continuous function of velocity v [m/s], zero at rest [N]."""
     w = abs(v)
     return -(p.viscous + p.quadratic * w + (p.cubic + p.quartic * w) * w * w) * v - p.absolute * w
+
+
+@njit(cache=True)
+def supplied(p, drive, v):
+    """What the supply's voltage leaves of a wanted force [N] at velocity v [m/s]."""
+    if p.stall == math.inf:
+        return drive
+    return max(min(drive, p.stall * (1.0 - v / p.no_load)), -p.stall * (1.0 + v / p.no_load))
 
 
 @njit(cache=True)
@@ -165,7 +176,7 @@ def outside_force(p, bursts, t, h):
 
 @njit(cache=True)
 def advance(p, bursts, q, v, z, lagged, target, t, h):
-    """One step of h [s] from t; `target` is gain times the delayed command [N]."""
+    """One step of h [s] from t; `target` is gain times the delayed command, and the offset [N]."""
     half = 0.5 * h
     scale = drift_scale(p, t + half)
     z = dahl(p, z, half * v, scale)
@@ -173,9 +184,11 @@ def advance(p, bursts, q, v, z, lagged, target, t, h):
     decay = math.exp(-half / p.lag) if p.lag > 0.0 else 0.0
     middle = target + (lagged - target) * decay
     lagged = target + (middle - target) * decay
-    force = min(max(middle, -p.clip), p.clip) + p.weight
-    force += outside_force(p, bursts, t, h) + position_force(p, q, z)
+    drive = min(max(middle, -p.clip), p.clip)
+    rest = outside_force(p, bursts, t, h) + position_force(p, q, z)
+    force = supplied(p, drive, v) + p.weight + rest
     middle = kick(p, v, abs(v), half, force + velocity_force(p, v), scale)
+    force = supplied(p, drive, middle) + p.weight + rest
     v = kick(p, v, abs(middle), h, force + velocity_force(p, middle), scale)
     z = dahl(p, z, half * v, scale)
     q += half * v
@@ -285,7 +298,7 @@ def run(
     rest = p.delay - whole * period
     if rest < 1e-9 * period:
         rest = 0.0
-    z, lagged = 0.0, 0.0
+    z, lagged = 0.0, p.offset
     for k in range(u.size):
         reading[k] = q + noise[k]
         if resolution > 0.0:
@@ -294,8 +307,8 @@ def run(
             u[k] = command(law, k, reference, reading, memory, period)
         older = 1 if rest > 0.0 else 0
         start = looked_up(u, k - whole - older, (older * period - rest) / period, linear)
-        drive = lagged if p.lag > 0.0 else p.gain * start
-        drive = min(max(drive, -p.clip), p.clip)
+        drive = lagged if p.lag > 0.0 else p.gain * start + p.offset
+        drive = supplied(p, min(max(drive, -p.clip), p.clip), v)
         truth[k, 0], truth[k, 1], truth[k, 3] = q, v, drive
         truth[k, 2] = acceleration(p, bursts, q, v, z, drive, k * period)
         for part in range(2):
@@ -307,4 +320,5 @@ def run(
                 inside = begin + (j + 0.5) * h - rest + (1 - part) * period
                 value = looked_up(u, k - whole - 1 + part, inside / period, linear)
                 t = k * period + begin + j * h
-                q, v, z, lagged = advance(p, bursts, q, v, z, lagged, p.gain * value, t, h)
+                target = p.gain * value + p.offset
+                q, v, z, lagged = advance(p, bursts, q, v, z, lagged, target, t, h)

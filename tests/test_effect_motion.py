@@ -110,8 +110,9 @@ def distance(name: str, substeps: int) -> float:
 
 # Of the stroke. Dry friction turns exactly within a step where its level is constant; one that moves with
 # speed is taken halfway (second order), one that drifts at the step's start (first). A delay off the
-# grid is averaged over a tick (second order in it). |v| is rounded over 1 mm/s. All else is smooth: the
-# stepper's second order at 5 us.
+# grid is averaged over a tick (second order in it). |v| is rounded over 1 mm/s, the corners of the limit by
+# voltage, which speed crosses within a tick, over a thousandth of it. All else is smooth: the stepper's
+# second order at 5 us.
 CLOSE = {
     "input_delay": 1e-5,
     "asymmetric_viscous": 1e-6,
@@ -120,6 +121,7 @@ CLOSE = {
     "stribeck_friction": 2e-8,
     "velocity_hysteresis": 2e-8,
     "friction_drift": 1e-6,
+    "voltage_limit": 2e-8,
 }
 
 

@@ -107,6 +107,19 @@ def test_residual_is_in_declared_units():
     np.testing.assert_allclose(e, expected, atol=1e-10)  # rounding of a thousand N
 
 
+def test_an_offset_acts_before_what_limits_the_drive():
+    """Behind it a saturation cuts off more on one side; before it, it would not."""
+    offset, limit = ("actuator_offset", {"level": 25.0}), ("saturation", {"limit": 150.0})
+    told = {}
+    for order in ((offset, limit), (limit, offset)):
+        plant = plant_of(order)
+        at = [balance(plant, Instant(0.0, 0.1, 0.0, u, 0.0), (None, None)) for u in (-160.0, 50.0, 140.0)]
+        told[order[0][0]] = [float(now.drive[0]) for now in at]
+    # the rounding of the corner 10 N, sixty of its widths, away from it
+    assert told["actuator_offset"] == pytest.approx([-135.0, 75.0, 150.0], abs=1e-9)
+    assert told["saturation"] == pytest.approx([-125.0, 75.0, 165.0], abs=1e-9)
+
+
 @each_row
 def test_balance_is_affine_in_the_acceleration_and_rates_in_their_states(row):
     plant, own = plant_of(row.effects), own_of(row)

@@ -103,8 +103,8 @@ def union(path, log):
 def test_candidates_stand_beside_the_registered_and_leave_the_model_alone(tmp_path, log):
     path = case(tmp_path, "Hum")
     found = {c.kind for c in union(path, log).candidates}
-    # An axis has no spring that could have clearance, and no stages apart.
-    elsewhere = {"backlash", "velocity_hysteresis"}
+    # An axis has no spring that could have clearance, and no stages apart; the drive's are not asked for.
+    elsewhere = {"backlash", "velocity_hysteresis", "actuator_offset", "voltage_limit"}
     assert found == {*EFFECTS, "my_effects.py:Hum"} - {VISCOUS[0], COULOMB[0]} - elsewhere
     effects = open_session(path, log).machine.plant.effects
     assert [e.kind for e in effects] == [VISCOUS[0], COULOMB[0]]
@@ -118,6 +118,20 @@ def test_a_search_may_be_kept_to_some_kinds(tmp_path, log):
     assert [c.kind for c in union(path, log).candidates] == ["quadratic_drag", "cogging", "my_effects.py:Hum"]
     path.write_text(text.replace('"cogging"', '"coging"'))
     with pytest.raises(InputError, match="discover.*kinds.*coging.*cogging"):
+        open_session(path, log)
+
+
+def test_some_of_the_registered_are_searched_for_on_request(tmp_path, log):
+    path = case(tmp_path, "Hum")
+    text = path.read_text()
+    path.write_text(text.replace("'my_effects.py:Hum'", '"voltage_limit"'))
+    found = {c.kind for c in union(path, log).candidates}
+    assert {"voltage_limit", "saturation"} < found
+    assert "actuator_offset" not in found
+    path.write_text(text.replace("[discover]", '[discover]\nkinds = ["actuator_offset"]'))
+    assert [c.kind for c in union(path, log).candidates] == ["actuator_offset", "my_effects.py:Hum"]
+    path.write_text(text.replace("'my_effects.py:Hum'", '"cogging"'))
+    with pytest.raises(InputError, match="candidates.*cogging.*takes part in every search.*leave it out"):
         open_session(path, log)
 
 

@@ -137,6 +137,23 @@ def test_delay_off_the_grid_shifts_the_response_exactly():
     )
 
 
+def test_a_supply_lets_speed_settle_where_it_says():
+    """From rest, under more: v0 (1 - exp(-t stall / (m v0))); an offset leaves less on one side."""
+    values = {"stall": 400.0, "velocity": 0.7}
+    t, u = np.arange(2000) * 1e-3, np.full(2000, 900.0)
+    for side in (1.0, -1.0):
+        machine = Machine(100.0, {"voltage_limit": values})
+        v = simulate(machine, Loop(input=side * u), Sensor(), rate=1e3, duration=2.0)["true_velocity"]
+        # second order at 5 us: (5e-6 / 0.175)^2
+        np.testing.assert_allclose(v, side * 0.7 * -np.expm1(-t * 400.0 / 70.0), atol=1e-9)
+    machine = machine.with_effect("saturation", limit=150.0).with_effect("actuator_offset", level=20.0)
+    force = [
+        simulate(machine, Loop(input=c * u), Sensor(), rate=1e3, duration=1e-3)["true_force"][0]
+        for c in (-0.16, 0.1, 0.16)
+    ]
+    np.testing.assert_allclose(force, [-124.0, 110.0, 150.0], rtol=1e-14)
+
+
 def test_lag_and_saturation_of_a_step():
     force, tau = 6.0, 4e-3
     log = free_run(Machine(2.0, {"actuator_lag": {"time_constant": tau}}), 0.05, force)

@@ -55,18 +55,20 @@ def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
 
 
 def build_union(
-    machine: Machine, data: Prepared, effects: Sequence[type[Effect]] = tuple(EFFECTS.values())
+    machine: Machine, data: Prepared, effects: Sequence[type[Effect]] | None = None
 ) -> Union:
     """Add every effect that the plant does not have yet, at every joint and spring that suits it.
 
     Args:
         machine: The baseline.
         data: The log to be searched, for scales.
-        effects: Those that it might be missing.
+        effects: Those that it might be missing; default all but those on request.
 
     Raises:
         InputError: If an effect that is not jaxid's own cannot be searched for.
     """
+    if effects is None:
+        effects = [cls for cls in EFFECTS.values() if not cls.on_request]
     scales = scales_of(machine.plant, data)
     plant, parameters = machine.plant, machine.parameters
     base = np.arange(len(parameters.free))

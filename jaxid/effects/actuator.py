@@ -46,6 +46,35 @@ class ActuatorGain(Effect):
         return [{"gain": 1.0}]
 
 
+@register("actuator_offset")
+class ActuatorOffset(Effect):
+    """The force is the declared one plus a constant, before what follows in the drive.
+
+    Behind it a saturation, or a limit by the supply's voltage, cuts off more on one side. Where neither acts
+    it is `constant_force` by another name.
+
+    Source:
+        "PA-10 traineeship", section 5.2: an amplifier adds an offset to the command that it receives.
+    """
+
+    adds_force = False
+    in_drive = True
+    on_request = True
+
+    level: Array = parameter("force", "free", "added to the declared force")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(drive=x.u + self.level)
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"level": 0.0}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"level": 0.0}]
+
+
 @register("actuator_lag")
 class ActuatorLag(Effect):
     """First-order lag between declared and applied force: T df/dt = u - f."""
@@ -117,3 +146,50 @@ class Saturation(Effect):
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         return [{"limit": scales.peak_force * s} for s in (0.97, 0.9, 0.8, 0.65, 0.5, 0.35)]
+
+
+@register("voltage_limit")
+class VoltageLimit(Effect):
+    """The supply's voltage limits the force, the less is left the faster it moves.
+
+    A current that would take more than the supply has, |R i + k v| > U, is what it does have: with the stall
+    force k U / R and the no-load velocity U / k, and u the force of the wanted current,
+
+        force = clip(u + stall v / velocity, -stall, stall) - stall v / velocity.
+
+    It falls in a line from `stall` at rest to nothing at `velocity`, beyond which the supply brakes; against
+    the motion it is as much larger. k is the motor's constant times its reduction, in N or N m per A and
+    V per m/s or rad/s alike; the inductance is left out.
+
+    Source:
+        "PA-10 traineeship", (5.4)-(5.5), without the inductance, as there.
+    """
+
+    adds_force = False
+    in_drive = True
+    on_request = True
+
+    stall: Array = parameter("force", "positive", "largest force at rest, k U / R")
+    velocity: Array = parameter("position/time", "positive", "without load, U / k")
+
+    def act(self, x: Signals, state: None) -> Action:
+        lost = self.stall * x.yd / self.velocity
+        return Action(drive=smooth.clip(x.u + lost, self.stall, _CORNER * self.stall) - lost)
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"stall": 10 * scales.peak_force, "velocity": 4 * scales.peak_velocity}
+
+    @classmethod
+    def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
+        # What falls no further over the log's speeds is a saturation.
+        return {"stall": (0.0, 20 * scales.peak_force), "velocity": (0.0, 5 * scales.peak_velocity)}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        # Lines that cut off corners of the log's plane of velocity and force. A loop commands more than a
+        # supply has: they begin below the largest force.
+        steep = [(0.6, 1.1), (1.0, 1.05), (3.0, 1.02)]
+        flat = [(0.3, 1.5), (0.3, 3.0), (0.6, 2.0), (1.2, 1.5), (3.0, 1.3)]
+        force, velocity = scales.peak_force, scales.peak_velocity
+        return [{"stall": f * force, "velocity": v * velocity} for f, v in (*steep, *flat)]

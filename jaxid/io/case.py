@@ -86,7 +86,7 @@ class Case:
         inertial_sensors: [[inertial_sensors]], see `jaxid.io.case_sensors`.
         limits: [limits], for `jaxid.discovery.limits`.
         validations: What [[validation]] say.
-        candidates: User's own effects that a search may name, from [discover].
+        candidates: Effects that a search may name because [discover] asks: user's own, some of jaxid's.
         kinds: Of those that are registered, what it may name, from there; empty: all.
         design: [design], for `jaxid.excitation`.
         reference: [reference], for `jaxid.references.make_reference`, at its guesses.
@@ -142,7 +142,11 @@ class Case:
     @property
     def searched(self) -> tuple[type[Effect], ...]:
         """Effects that `discover` may name."""
-        registered = [cls for kind, cls in EFFECTS.items() if not self.kinds or kind in self.kinds]
+        asked = {*self.kinds, *(cls.kind for cls in self.candidates)}
+        registered = [
+            cls for kind, cls in EFFECTS.items()
+            if kind in asked or not (self.kinds or cls.on_request)
+        ]
         return (*registered, *self.own_effects)
 
     @property

@@ -276,10 +276,12 @@ def read_search(table: Any, path: Path) -> dict[str, tuple]:
     """Read [discover]: `kinds` and `candidates` of effects that a search may name, where it has them.
 
     Raises:
-        InputError: If a kind is unknown, or a candidate no class of a file.
+        InputError: If a kind is unknown, or a candidate no class of a file, or in every search as it is.
     """
     def own(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
+        if kind in EFFECTS and EFFECTS[kind].on_request:
+            return EFFECTS[kind]
         if kind in EFFECTS:
             raise spot.refuse(kind, "takes part in every search", "leave it out")
         return user_effect(kind, path.parent, spot)
