@@ -19,76 +19,37 @@ import numpy as np
 import pa10_arm
 import pa10_figures
 from common import Table, run_studies
+from pa10_joint import (
+    COULOMB,
+    CROSSING,
+    EXACT,
+    FAST,
+    FASTEST,
+    INERTIA,
+    JOINT,
+    NOISE,
+    RATE,
+    SITUATIONS,
+    VISCOUS,
+    law,
+    released,
+    settled,
+    swinging,
+)
 
 import jaxid
+from jaxid.dominant_inertia import of_swing
 from jaxid.io.log import Log
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from chain_stepper import ChainMachine, simulate_chain
 from stepper import Loop, Machine, Sensor, simulate
 
-# Illustrative, for the report has none of the first joint but 14.4 N m at 1.2 rad/s: inertia [kg m^2],
-# Coulomb [N m] and viscous friction [N m s/rad].
-INERTIA, COULOMB, VISCOUS = 2.0, 9.6, 4.0
-JOINT = Machine(
-    INERTIA, {"viscous_friction": {"coefficient": VISCOUS}, "coulomb_friction": {"level": COULOMB}}
-)
-# Where friction and what compensates it cross [rad/s], and the largest velocity of the joint.
-CROSSING, FASTEST = 0.5, 1.2
-# Coulomb and viscous friction that are compensated; the last two cross the joint's own.
-SITUATIONS = {
-    "s1": (9.0, 3.6), "s2": (10.2, 4.4), "s3": (9.1, 4.0 + 0.5 / CROSSING),
-    "s4": (10.1, 4.0 - 0.5 / CROSSING),
-}
-RATE, FAST = 1000.0, 20_000.0
 # Table C.I: joint, and viscous and Coulomb friction forwards and backwards.
 TABLE = {
     2: (3.57, 14.26, 7.64, 18.25), 3: (1.64, 3.27, 1.70, 4.15), 4: (2.58, 6.93, 2.89, 4.95),
     5: (1.61, 3.75, 1.64, 3.64), 7: (0.27, 0.82, 0.21, 1.23),
 }
-EXACT = Sensor()
-NOISE = Sensor(position_noise=1e-5, force_noise=0.2)
-
-
-def law(situation: str, **more: float) -> Loop:
-    """What lets the joint go in one of the situations."""
-    coulomb, viscous = SITUATIONS[situation]
-    return Loop("friction_compensation", coulomb=coulomb, viscous=viscous, **more)
-
-
-def released(
-    situation: str, velocity: float, *, duration: float = 20.0, rate: float = FAST
-) -> dict[str, np.ndarray]:
-    """The joint let go with a velocity and no spring."""
-    loop = replace(law(situation), reference=np.zeros(round(duration * rate)))
-    return simulate(
-        JOINT, loop, EXACT, rate=rate, duration=duration, step=5e-5, initial_velocity=velocity,
-        log_rate=RATE,
-    )
-
-
-def swinging(
-    kp: float, start: float, *, machine: Machine = JOINT, duration: float = 40.0, rate: float = RATE,
-    situation: str = "s4", sensor: Sensor = EXACT, step: float = 5e-5, **more: float,
-) -> dict[str, np.ndarray]:
-    """The joint let go at an angle against a spring K_p."""
-    loop = replace(law(situation, kp=kp, **more), reference=np.zeros(round(duration * rate)))
-    return simulate(
-        machine, loop, sensor, rate=rate, duration=duration, step=step, initial_position=start, log_rate=RATE
-    )
-
-
-def settled(log: dict[str, np.ndarray]) -> tuple[float, float]:
-    """Amplitude and period of the last third; of a joint that rests, zero and NaN."""
-    q, t = np.asarray(log["true_position"]).reshape(len(log["t"]), -1)[:, 0], log["t"]
-    last = slice(2 * len(t) // 3, None)
-    q, t = q[last], t[last]
-    centred = q - 0.5 * (q.max() + q.min())
-    up = np.flatnonzero((centred[:-1] < 0) & (centred[1:] >= 0))
-    if np.ptp(q) < 1e-4 or up.size < 3:
-        return 0.0, np.nan
-    crossings = t[up] - centred[up] * (t[up + 1] - t[up]) / (centred[up + 1] - centred[up])
-    return float(np.ptp(q) / 2), float(np.mean(np.diff(crossings)))
 
 
 def frictions(folder: Path) -> None:
@@ -248,7 +209,7 @@ def dominant(folder: Path) -> None:
     )
     curves = {}
     for name, run in variants.items():
-        values = np.array([kp * settled(run(kp))[1] ** 2 / (4 * np.pi**2) / INERTIA for kp in STIFF])
+        values = np.array([of_swing(kp, settled(run(kp))[1]) for kp in STIFF]) / INERTIA
         curves[name] = values
         told = [f"{v:.4f}" if np.isfinite(v) else "at rest" for v in values]
         table.row(name, *told, f"{100 * (np.nanmax(values) - np.nanmin(values)):.1f} %")
@@ -306,8 +267,7 @@ def same_logs(folder: Path) -> None:
     (folder / "swing.toml").write_text(SWING % DRY)
     table = Table("from one log of a swing, K_p = 400", ["", "inertia", "Coulomb", "viscous"])
     table.row("true", INERTIA, COULOMB, VISCOUS)
-    period = settled(made)[1]
-    table.row("K_p T^2 / 4 pi^2", f"{400 * period**2 / (4 * np.pi**2):.4f}", "", "")
+    table.row("K_p T^2 / 4 pi^2", f"{of_swing(400.0, settled(made)[1]):.4f}", "", "")
     for method in ("inverse_dynamics", "output_error"):
         found = jaxid.identify(folder / "swing.toml", log, method=method)
         e = found.estimate

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -164,16 +163,34 @@ def base_parameters(
     both = [n for n in keep if {n, n.partition("[")[0]} & set(known)]
     if both:
         raise ValueError(f"{both[0]} is in keep and known; take it out of one of them.")
-    columns = _columns(plant, len(names), np.random.default_rng(seed))
+    states = random_states(plant, _STATES * len(names), np.random.default_rng(seed))
+    columns = np.asarray(inertial_regressor(plant, *states)).reshape(-1, len(names))
     left = [k for k, (name, _) in enumerate(places) if not {name, names[k]} & set(known)]
-    columns, places, names = columns[:, left], tuple(places[k] for k in left), [names[k] for k in left]
+    order = [*keep, *(names[k] for k in left if names[k] not in keep)]
+    return grouped(columns[:, left], tuple(places[k] for k in left), order)
+
+
+def grouped(
+    columns: Float[np.ndarray, "rows standard"], places: tuple[tuple[str, int | None], ...],
+    order: Sequence[str] = (),
+) -> BaseParameters:
+    """The sums of parameters that something linear in them tells.
+
+    Args:
+        columns: Its derivatives in the parameters, on random states.
+        places: Field of the plant, and entry, of each parameter.
+        order: Their names, those first that are to stand for a sum; default as they are.
+
+    Raises:
+        ValueError: If rank and choice disagree.
+    """
+    names = [_name(place) for place in places]
     norm = np.linalg.norm(columns, axis=0)
     norm[norm <= _DEPENDENT * norm.max()] = np.inf
     scaled = columns / norm
     triangle = np.abs(np.diagonal(scipy.linalg.qr(scaled, mode="r", pivoting=True)[0]))
     rank = int(np.sum(triangle > _DEPENDENT))
-    order = [*(names.index(n) for n in keep), *(k for k, n in enumerate(names) if n not in keep)]
-    chosen = tuple(sorted(independent(scaled, order)))
+    chosen = tuple(sorted(independent(scaled, [names.index(n) for n in order or names])))
     if len(chosen) != rank:
         raise ValueError(
             f"{len(chosen)} columns are independent one by one, {rank} together: a length or an angle of the "
@@ -191,15 +208,14 @@ def tidied(mapping: Float[np.ndarray, "base standard"]) -> Float[np.ndarray, "ba
     return np.where(np.abs(mapping - whole) < 1e-10, whole, mapping)
 
 
-def _columns(plant: Plant, unknowns: int, rng: np.random.Generator) -> Float[np.ndarray, "rows standard"]:
-    """The regressor on random states that are possible: half a turn or half a metre to each side."""
-    states = rng.uniform(-1.0, 1.0, (3, _STATES * unknowns, plant.joints))
+def random_states(plant: Plant, count: int, rng: np.random.Generator) -> Float[np.ndarray, "3 count n"]:
+    """Random positions that are possible, half a turn or half a metre to each side, and their derivatives."""
+    states = rng.uniform(-1.0, 1.0, (3, count, plant.joints))
     turns = np.asarray([plant.motion(k) == "rotary" for k in range(plant.joints)])
     states[0] *= np.where(turns, np.pi, 0.5)
     while (found := plant.impossible(states[0])) is not None:
         states[0, found[0]] = plant.any_motion(rng)[0]
-    regressor: Any = inertial_regressor(plant, *states)
-    return np.asarray(regressor).reshape(-1, unknowns)
+    return states
 
 
 def independent(columns: Float[np.ndarray, "rows standard"], order: Sequence[int]) -> list[int]:

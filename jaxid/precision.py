@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -250,19 +250,31 @@ def assess(
     seen = vectors[:, ~blind]
     inverse = seen @ np.diag(1 / values[~blind]) @ seen.T if (~blind).any() else 0 * normal
     covariance = inverse @ meat @ inverse / np.outer(norm, norm)
-    identifiable = np.linalg.norm(vectors[:, blind], axis=1) <= _NEGLIGIBLE
+    identifiable = ~held(vectors[:, blind])
     covariance[~identifiable] = np.nan
     covariance[:, ~identifiable] = np.nan
-    untold = _sparse(vectors[:, blind])
+    untold = named_directions(names, vectors[:, blind])
+    return Precision(covariance, identifiable, untold, values / max(values[-1], 1e-300))
+
+
+def held(directions: Float[np.ndarray, "p k"]) -> Bool[np.ndarray, " p"]:
+    """Which unknowns some orthonormal directions, that nothing tells, hold so far that they are not told."""
+    return np.linalg.norm(directions, axis=1) > _NEGLIGIBLE
+
+
+def named_directions(
+    names: Sequence[str], directions: Float[np.ndarray, "p k"]
+) -> list[dict[str, float]]:
+    """Orthonormal directions that nothing tells, as combinations of the unknowns by name."""
+    untold = _sparse(directions)
     weight = np.abs(untold)
     # Many small weights hold an unknown as one large one does: each is named at least once.
     named = weight > _NEGLIGIBLE
-    named |= ~identifiable[:, None] & (weight >= weight.max(axis=1, keepdims=True, initial=0.0))
-    combinations = [
+    named |= held(directions)[:, None] & (weight >= weight.max(axis=1, keepdims=True, initial=0.0))
+    return [
         {n: float(w) for n, w, there in zip(names, _signed(v), k, strict=True) if there}
         for v, k in zip(untold.T, named.T, strict=True)
     ]
-    return Precision(covariance, identifiable, combinations, values / max(values[-1], 1e-300))
 
 
 def _sparse(vectors: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
