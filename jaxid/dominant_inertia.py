@@ -16,7 +16,7 @@ from jaxid.base_parameters import (
     standard_parameters,
     standard_places,
 )
-from jaxid.errors import InputError
+from jaxid.errors import InputError, suggest
 from jaxid.model import Plant
 from jaxid.precision import held, named_directions
 
@@ -130,14 +130,17 @@ def from_dominant_inertias(
     base = grouped(columns, tuple(places[k] for k in left))
     whole = inertia_regressor(plant, joint, q)
     rest = inertia - whole[:, given] @ values[given]
-    own = whole[:, left][:, list(base.chosen)]
-    norm = np.linalg.norm(own, axis=0)
-    norm[norm == 0.0] = 1.0
-    u, s, vt = np.linalg.svd(own / norm)
+    # A function of the angles that is nothing here, but for rounding, must not be scaled up to one.
+    norm = np.linalg.norm(columns[:, list(base.chosen)], axis=0)
+    own = whole[:, left][:, list(base.chosen)] / norm
+    here = np.linalg.norm(own, axis=0)
+    here[here <= _ROUNDING] = 1.0
+    norm = norm * here
+    u, s, vt = np.linalg.svd(own / here)
     rank = int(np.sum(s > _ROUNDING * s[0]))
     seen, blind = vt[:rank].T, vt[rank:].T
-    theta = seen @ ((u[:, :rank].T @ rest) / s[:rank]) / norm
-    residual = rest - own @ theta
+    scaled = seen @ ((u[:, :rank].T @ rest) / s[:rank])
+    theta, residual = scaled / norm, rest - own / here @ scaled
     free = len(q) - rank
     scatter = np.sqrt(residual @ residual / free) if free else np.nan
     std = scatter * np.linalg.norm(seen / s[:rank], axis=1) / norm
@@ -164,4 +167,4 @@ def _check(
     plain = {n.partition("[")[0] for n in names}
     wrong = [n for n in known if n not in names and n not in plain]
     if wrong:
-        raise InputError(f"{wrong[0]} is none of the plant's parameters", mend=f"it has {', '.join(names)}")
+        raise InputError(f"{wrong[0]} is none of the plant's parameters", mend=suggest(wrong[0], names))
