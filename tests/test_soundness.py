@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stepper import Loop, Machine, Sensor, simulate
 
 from jaxid.errors import InputError
 from jaxid.io.log import Log, read_log
@@ -194,6 +195,19 @@ def test_implied_inertia_is_near_the_truth():
     value = implied_inertia(GAIN * log.force[:, 0], log.position[:, 0], log.period)
     # Noise of 2 um twice differentiated is 5 m/s^2: only the longer windows are near.
     assert value == pytest.approx(INERTIA, rel=0.1)
+
+
+def test_a_spring_that_a_controller_makes_is_no_inertia():
+    """Let go against K_p q, all of the command is a spring: the machine's own law explains it as well."""
+    friction = {"viscous_friction": {"coefficient": 1.7}, "coulomb_friction": {"level": 3.7}}
+    loop = Loop("friction_compensation", kp=235.0, viscous=1.7, reference=np.zeros(900))
+    made = simulate(
+        Machine(1.35, friction), loop, Sensor(position_noise=1e-7, force_noise=0.2), rate=1e3, duration=0.9,
+        initial_position=0.1,
+    )
+    log = Log(made["t"], made["position"], made["force"], source="swing.csv")
+    for guess in (1.35, 0.7, 5.0):
+        assert plausible_inertia(log, guess, motion="rotary") is None
 
 
 def test_implied_inertia_without_motion():

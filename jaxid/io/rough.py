@@ -4,10 +4,15 @@ Nothing here needs the accuracy of the package's filters; it has to be there at
 once, before JAX or scipy are loaded.
 """
 
+import math
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
+
+# A force of which the acceleration explains less than this part is a controller's own: a spring and a damper
+# to a reference that stands. It says nothing of the inertia.
+_SHARE = 0.01
 
 Signal = Float[np.ndarray, " samples"]
 
@@ -87,7 +92,10 @@ def _plateau(values: list[float | None]) -> float | None:
 
 
 def _regress(f: Signal, a: Signal, v: Signal, *x: Signal) -> tuple[float, float | None]:
-    """Share of the force explained, and the coefficient of the acceleration where it is told."""
+    """Share of the force explained, and the coefficient of the acceleration where it is told.
+
+    It is NaN where the acceleration has no share.
+    """
     columns = np.stack([a, v, np.sign(v), *x], axis=1)
     columns = columns - columns.mean(axis=0)
     scale = columns.std(axis=0)
@@ -99,4 +107,7 @@ def _regress(f: Signal, a: Signal, v: Signal, *x: Signal) -> tuple[float, float 
     others = columns[:, 1:] @ np.linalg.lstsq(columns[:, 1:], columns[:, 0], rcond=1e-6)[0]
     told = float(np.var(columns[:, 0] - others))
     value = float(theta[0] / scale[0])
-    return 1.0 - float(left @ left) / float(f @ f), value if told > 0.01 and value > 0 else None
+    explained = 1.0 - float(left @ left) / float(f @ f)
+    if abs(theta[0]) < _SHARE * f.std():
+        return explained, math.nan
+    return explained, value if told > 0.01 and value > 0 else None
