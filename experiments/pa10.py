@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pa10_arm
+import pa10_configurations
 import pa10_figures
 from common import Table, run_studies
 from pa10_joint import (
@@ -312,7 +313,7 @@ def tracking(folder: Path) -> None:
 STUDIES: dict[str, Callable[[Path], None]] = {
     f.__name__: f for f in (
         pa10_arm.dependencies, pa10_arm.excitation, pa10_arm.identification, frictions, situations,
-        limit_cycle, dominant, same_logs, tracking,
+        limit_cycle, dominant, pa10_configurations.configurations, same_logs, tracking,
     )
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,9 @@ from jaxid.parameters import scatter
 from jaxid.plants import SerialArm, pa10
 from jaxid.regrouping import base_parameters_by_rules
 from jaxid.residuals import balance_along
+
+if TYPE_CHECKING:
+    import pinocchio
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import arm_oracle
@@ -106,7 +110,7 @@ def identification(folder: Path) -> None:
     if not (folder / "condition.csv").exists():
         excitation(folder)
     rng = np.random.default_rng(0)
-    bodies = arm_oracle.bodies(7, rng) * np.linspace(1.0, 0.2, 7)[:, None]
+    bodies = random_bodies(rng)
     motions = {name: jaxid.design(folder / f"{name}.toml") for name in ("determinant", "condition")}
     logs = {}
     for name, m in motions.items():
@@ -141,8 +145,8 @@ def identification(folder: Path) -> None:
     table.show(time.perf_counter() - begun)
 
 
-def torque(bodies: np.ndarray, m: Excitation) -> np.ndarray:
-    """Torque along a motion: of rigid links by Pinocchio, of dry and viscous friction by their laws."""
+def model_of(bodies: np.ndarray) -> pinocchio.Model:
+    """The arm of rigid links, in Pinocchio."""
     import pinocchio
 
     model, before, geometry = pinocchio.Model(), 0, pa10()
@@ -154,10 +158,23 @@ def torque(bodies: np.ndarray, m: Excitation) -> np.ndarray:
         inertia = pinocchio.Inertia.FromDynamicParameters(body[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]])
         model.appendBodyToJoint(before, inertia, pinocchio.SE3.Identity())
     model.gravity.linear = np.array([0.0, 0.0, -9.81])
+    return model
+
+
+def torque(bodies: np.ndarray, m: Excitation) -> np.ndarray:
+    """Torque along a motion: of rigid links by Pinocchio, of dry and viscous friction by their laws."""
+    import pinocchio
+
+    model = model_of(bodies)
     data = model.createData()
     rows = zip(m.position, m.velocity, m.acceleration, strict=True)
     rigid = np.array([pinocchio.rnea(model, data, *x) for x in rows])
     return rigid + VISCOUS * m.velocity + COULOMB * np.sign(m.velocity)
+
+
+def random_bodies(rng: np.random.Generator) -> np.ndarray:
+    """Ten parameters of seven links, lighter towards the tip."""
+    return arm_oracle.bodies(7, rng) * np.linspace(1.0, 0.2, 7)[:, None]
 
 
 def _spread(found: Estimate, m: Excitation) -> np.ndarray:
