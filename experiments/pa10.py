@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pa10_arm
 import pa10_configurations
+import pa10_drive
 import pa10_figures
 from common import Table, run_studies
 from pa10_joint import (
@@ -314,6 +315,7 @@ STUDIES: dict[str, Callable[[Path], None]] = {
     f.__name__: f for f in (
         pa10_arm.dependencies, pa10_arm.excitation, pa10_arm.identification, frictions, situations,
         limit_cycle, dominant, pa10_configurations.configurations, same_logs, tracking,
+        pa10_drive.drive,
     )
 }
 

@@ -85,3 +85,21 @@ def tracking(path: Path, time: np.ndarray, errors: Mapping[str, np.ndarray]) -> 
     axes.set(xlabel="time [s]", ylabel="tracking error [mrad]")
     axes.legend()
     _saved(figure, path)
+
+
+def supplies(path: Path, runs: Mapping[tuple[float, float], Run], fastest: float) -> None:
+    """Velocity and torque at either supply; what the joint's own limit of speed asks for."""
+    figure, all_axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for (supply, limit), run in runs.items():
+        if limit < 10.0:
+            continue
+        part = slice(0, 4000)
+        all_axes[0].plot(run["t"][part], run["true_velocity"][part], lw=0.9, label=f"{supply:.0f} V")
+        all_axes[1].plot(run["true_velocity"], run["true_force"], ".", ms=2, label=f"{supply:.0f} V")
+    for side in (1, -1):
+        all_axes[0].axhline(side * fastest, color="0.6", lw=0.8, label="its largest" if side > 0 else None)
+    all_axes[0].set(xlabel="time [s]", ylabel="velocity [rad/s]")
+    all_axes[1].set(xlabel="velocity [rad/s]", ylabel="torque of the drive [N m]")
+    for axes in all_axes:
+        axes.legend(fontsize=8)
+    _saved(figure, path)

@@ -1,0 +1,192 @@
+"""Study of the PA-10's drive chain, chapter 5: amplifier, torque constant, supply and what they limit."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pa10_figures
+from common import Table
+from pa10_joint import COULOMB, FASTEST, RATE, VISCOUS
+
+import jaxid
+from jaxid.io.log import Log
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from stepper import Loop, Machine, Sensor, simulate
+from stepper_machines import moves
+
+# Table 5.1: rated torque [N m] and torque constant [N m/A]; and table 5.2 as printed, whose first is 0.766.
+RATED = {"1, 2": (5.3, 0.692, 0.776), "3, 4": (2.0, 0.501, 0.399), "5, 6, 7": (0.36, 0.0831, 0.433)}
+TORQUE_CONSTANT = RATED["1, 2"][1]
+AMPLIFIER = RATED["1, 2"][0] / TORQUE_CONSTANT / 10  # A/V, (5.1)
+# Not in the report, chosen: reduction, resistance [ohm], part of its gain that the amplifier has, its
+# offset [V], and the first joint's inertia with the arm stretched out [kg m^2].
+REDUCTION, RESISTANCE, ACTUAL, OFFSET, INERTIA = 50.0, 2.0, 0.85, 0.25, 6.0
+# As in the report: the amplifier's input [V], and supplies [V].
+INPUT, SUPPLIES = 10.0, (24.0, 48.0)
+CONSTANT = REDUCTION * TORQUE_CONSTANT  # N m/A at the joint, and V s/rad
+DECLARED = CONSTANT * AMPLIFIER  # N m/V
+KP, KD = 300.0, 12.0  # V/rad and V s/rad
+DRIVES = ["voltage_limit", "actuator_offset"]
+SENSOR = Sensor(position_noise=1e-5, force_noise=1e-3)
+
+
+def machine(supply: float) -> Machine:
+    """The first joint with its drive, by an exact stepper."""
+    stiff = ACTUAL * DECLARED
+    return Machine(
+        INERTIA,
+        {
+            "viscous_friction": {"coefficient": VISCOUS}, "coulomb_friction": {"level": COULOMB},
+            "actuator_gain": {"gain": ACTUAL}, "actuator_offset": {"level": stiff * OFFSET},
+            "saturation": {"limit": stiff * INPUT},
+            "voltage_limit": {"stall": CONSTANT * supply / RESISTANCE, "velocity": supply / CONSTANT},
+        },
+        actuator_gain=DECLARED,
+    )
+
+
+def moved(supply: float, limit: float = INPUT, seed: int = 0) -> dict[str, np.ndarray]:
+    """The joint led to and fro, harder and faster than the smaller supply allows, 20 s."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(20 * RATE)) / RATE
+    points = rng.uniform(0.05, 0.4, 24) * np.where(np.arange(24) % 2, 1.0, -1.0)
+    reference = moves(t, points, rng.uniform(0.15, 1.5, 24), 100.0, rest=0.1)
+    loop = Loop("pd", reference=reference - reference[0], kp=KP, kd=KD, limit=limit)
+    return simulate(machine(supply), loop, SENSOR, rate=RATE, duration=20.0, seed=seed, step=1e-5)
+
+
+def drive(folder: Path) -> None:
+    """What the amplifier's offset and input, and the supply, do to the joint; and all of it from one log."""
+    start = time.perf_counter()
+    table = Table("Table 5.2: A_g = T_r / (10 V K_T) [A/V]", ["joint", "computed", "printed"])
+    for joint, (torque, constant, printed) in RATED.items():
+        table.row(joint, f"{torque / constant / 10:.3f}", f"{printed:.3f}")
+    table.show(time.perf_counter() - start)
+    table = Table(
+        "led hard: torque at the joint [N m], time with command and offset beyond 10 V, fastest [rad/s]",
+        ["supply", "command within", "largest", "smallest", "beyond", "fastest", "no load"],
+    )
+    runs = {}
+    for supply in SUPPLIES:
+        for limit in (INPUT, 9.7):
+            runs[supply, limit] = log = moved(supply, limit)
+            clips = np.abs(log["true_command"] + OFFSET) > INPUT
+            table.row(
+                f"{supply:.0f} V", f"{limit:.1f} V", f"{log['true_force'].max():.1f}",
+                f"{log['true_force'].min():.1f}", f"{100 * clips.mean():.2f} %",
+                f"{np.abs(log['true_velocity']).max():.3f}", f"{supply / CONSTANT:.3f}",
+            )
+    table.show(time.perf_counter() - start)
+    pa10_figures.supplies(folder / "supplies.png", runs, FASTEST)
+    chain(folder)
+    hidden(folder)
+
+
+def log_of(run: dict[str, np.ndarray], source: str) -> Log:
+    """What a user would have of it."""
+    return Log(run["t"], run["position"], run["force"], reference=run["reference"], source=source)
+
+
+def chain(folder: Path) -> None:
+    """All of the chain from one log at the smaller supply, the inertia known."""
+    start = time.perf_counter()
+    supply = SUPPLIES[0]
+    run = moved(supply)
+    (folder / "drive.toml").write_text(CASE.format(inertia=INERTIA, gain=DECLARED, effects=CHAIN))
+    true = machine(supply).effects
+    table = Table(
+        "the chain from one log, as the case has it, and as the report does",
+        ["", "true", "inverse_dynamics", "output_error"],
+    )
+    fits = [
+        jaxid.identify(folder / "drive.toml", log_of(run, "moves"), method=m)
+        for m in ("inverse_dynamics", "output_error")
+    ]
+    for name in fits[0].estimate.names:
+        kind, _, parameter = name.partition(".")
+        cells = [f"{f.value(name):.4f} +- {f.estimate.std[f.estimate.names.index(name)]:.2g}" for f in fits]
+        table.row(name, f"{true[kind][parameter]:.4f}", *cells)
+    physical = [_physical(f.value) for f in fits]
+    truths = (ACTUAL * AMPLIFIER, OFFSET, INPUT, supply, RESISTANCE)
+    names = ("amplifier [A/V]", "its offset [V]", "its input [V]", "supply [V]", "resistance [ohm]")
+    for row in zip(names, truths, *physical, strict=True):
+        table.row(row[0], *[f"{x:.4f}" for x in row[1:]])
+    table.show(time.perf_counter() - start)
+
+
+def _physical(value) -> tuple[float, ...]:
+    """What the case's parameters say of amplifier and supply."""
+    stiff = value("actuator_gain.gain") * DECLARED
+    supply = value("voltage_limit.velocity") * CONSTANT
+    return (
+        stiff / CONSTANT, value("actuator_offset.level") / stiff, value("saturation.limit") / stiff, supply,
+        CONSTANT * supply / value("voltage_limit.stall"),
+    )
+
+
+def hidden(folder: Path) -> None:
+    """What `discover` says, told of friction and the amplifier's input, of a hidden offset and supply."""
+    table = Table("hidden: the offset and a supply of 24 V", ["looks for", "verdict", "names", "s"])
+    told = CASE.format(inertia="{ guess = 4.0 }", gain=ACTUAL * DECLARED, effects=FRICTION + INPUT_CASE)
+    start = time.perf_counter()
+    fit, other = (log_of(moved(SUPPLIES[0], seed=s), f"moves {s}") for s in (0, 1))
+    for what, asked in (("what it always does", []), ("the drive's, too", DRIVES)):
+        begun = time.perf_counter()
+        more = f"[discover]\ncandidates = {asked}\n" if asked else ""
+        (folder / "hidden.toml").write_text(told + more)
+        found = jaxid.discover(folder / "hidden.toml", fit, validate=[other])
+        found.save(folder / f"hidden{len(asked)}", force=True)
+        names = ", ".join(found.kinds)
+        table.row(what, found.verdict, names, f"{time.perf_counter() - begun:.0f}")
+        print(found)
+    table.show(time.perf_counter() - start)
+
+
+CASE = """[plant]
+kind = "axis"
+motion = "rotary"
+[plant.parameters]
+inertia = {inertia}
+{effects}[actuator]
+gain = {gain!r}
+[log]
+time = "t"
+position = "q"
+force = "u"
+reference = "ref"
+[controller]
+kind = "pd"
+kp = 300.0
+kd = 12.0
+limit = 10.0
+[sensor]
+position_noise = 1e-5
+force_noise = 1e-3
+"""
+FRICTION = """[[effects]]
+kind = "viscous_friction"
+coefficient = { guess = 8.0 }
+[[effects]]
+kind = "coulomb_friction"
+level = { guess = 5.0 }
+"""
+# From below: a limit that a log does not reach has no gradient.
+INPUT_CASE = """[[effects]]
+kind = "saturation"
+limit = { guess = 180.0 }
+"""
+CHAIN = FRICTION + """[[effects]]
+kind = "actuator_gain"
+gain = { guess = 1.0 }
+[[effects]]
+kind = "actuator_offset"
+level = { guess = 0.0 }
+""" + INPUT_CASE + """[[effects]]
+kind = "voltage_limit"
+stall = { guess = 600.0 }
+velocity = { guess = 0.9 }
+"""
