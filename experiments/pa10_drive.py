@@ -98,7 +98,11 @@ def log_of(run: dict[str, np.ndarray], source: str) -> Log:
 
 
 def chain(folder: Path) -> None:
-    """All of the chain from one log at the smaller supply, the inertia known."""
+    """All of the chain from one log at the smaller supply, the inertia known.
+
+    The amplifier's input is not told: an offset of 0.25 V exceeds it in few samples, and by 2 %. With its
+    guess at 180 N m, below the truth, `output_error` ends elsewhere altogether.
+    """
     start = time.perf_counter()
     supply = SUPPLIES[0]
     run = moved(supply)
@@ -114,11 +118,13 @@ def chain(folder: Path) -> None:
     ]
     for name in fits[0].estimate.names:
         kind, _, parameter = name.partition(".")
-        cells = [f"{f.value(name):.4f} +- {f.estimate.std[f.estimate.names.index(name)]:.2g}" for f in fits]
+        std = [f.estimate.std[f.estimate.names.index(name)] for f in fits]
+        cells = [f"{f.value(name):.4f} +- {s:.2g}" for f, s in zip(fits, std, strict=True)]
+        cells = [c if np.isfinite(s) else "not told" for c, s in zip(cells, std, strict=True)]
         table.row(name, f"{true[kind][parameter]:.4f}", *cells)
     physical = [_physical(f.value) for f in fits]
-    truths = (ACTUAL * AMPLIFIER, OFFSET, INPUT, supply, RESISTANCE)
-    names = ("amplifier [A/V]", "its offset [V]", "its input [V]", "supply [V]", "resistance [ohm]")
+    truths = (ACTUAL * AMPLIFIER, OFFSET, supply, RESISTANCE)
+    names = ("amplifier [A/V]", "its offset [V]", "supply [V]", "resistance [ohm]")
     for row in zip(names, truths, *physical, strict=True):
         table.row(row[0], *[f"{x:.4f}" for x in row[1:]])
     table.show(time.perf_counter() - start)
@@ -129,7 +135,7 @@ def _physical(value) -> tuple[float, ...]:
     stiff = value("actuator_gain.gain") * DECLARED
     supply = value("voltage_limit.velocity") * CONSTANT
     return (
-        stiff / CONSTANT, value("actuator_offset.level") / stiff, value("saturation.limit") / stiff, supply,
+        stiff / CONSTANT, value("actuator_offset.level") / stiff, supply,
         CONSTANT * supply / value("voltage_limit.stall"),
     )
 
@@ -142,7 +148,7 @@ def hidden(folder: Path) -> None:
     """
     table = Table("hidden: a supply of 24 V", ["looks for", "verdict", "names", "s"])
     gain = ACTUAL * DECLARED
-    known = INPUT_CASE.replace("{ guess = 180.0 }", repr(INPUT * gain))
+    known = INPUT_CASE.replace("{ guess = 250.0 }", repr(INPUT * gain))
     told = CASE.format(inertia="{ guess = 4.0 }", gain=gain, effects=FRICTION + OFFSET_CASE + known)
     start = time.perf_counter()
     runs = (led(SUPPLIES[0], INPUT, seed, 8.0, 15.0, 0.75) for seed in (0, 1))
@@ -187,14 +193,15 @@ coefficient = { guess = 8.0 }
 kind = "coulomb_friction"
 level = { guess = 5.0 }
 """
-# From below: a limit that a log does not reach has no gradient.
 INPUT_CASE = """[[effects]]
 kind = "saturation"
-limit = { guess = 180.0 }
+limit = { guess = 250.0 }
 """
+# The report's margin of 0.3 V bounds it. Without bounds a search pushes it into saturation: the drive is then
+# a constant that constant_force cancels, a perfect fit to any log.
 OFFSET_CASE = """[[effects]]
 kind = "actuator_offset"
-level = { guess = 0.0 }
+level = { guess = 0.0, min = -6.7, max = 6.7 }
 """
 CHAIN = FRICTION + """[[effects]]
 kind = "actuator_gain"

@@ -51,7 +51,8 @@ class ActuatorOffset(Effect):
     """The force is the declared one plus a constant, before what follows in the drive.
 
     Behind it a saturation, or a limit by the supply's voltage, cuts off more on one side. Where neither acts
-    it is `constant_force` by another name.
+    it is `constant_force` by another name. Where both are unknown before a saturation it wants bounds: far
+    beyond that the drive is a constant.
 
     Source:
         "PA-10 traineeship", section 5.2: an amplifier adds an offset to the command that it receives.
