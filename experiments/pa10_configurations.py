@@ -136,6 +136,10 @@ def configurations(folder: Path) -> None:
 
     Hypothesis: with exact periods the thirteen unknown sums come out; the method fails by what its
     periods are off, more than by the stacking.
+
+    It holds. At 20 kHz inertias elsewhere are right to 0.4 %; of the limit cycle at 1 kHz to 2 % (joints 1 to
+    4) and 8 % (wrist), with a velocity of five samples to 38 %. With Coulomb friction left alone, read from
+    turn to turn: 0.6 % at 1 kHz, 1.4 % lagging.
     """
     start = time.perf_counter()
     true = random_bodies(np.random.default_rng(0))
