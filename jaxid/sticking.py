@@ -59,30 +59,47 @@ def set_valued_step(
     none, standing = jnp.zeros(plant.ports(x.q).size), jnp.zeros_like(x.q)
     if flow is None:
         flow = lambda x, reaction=none: step(plant, x, u, t, h, reaction)
-    free, end = flow(x), u(jnp.asarray(1.0))
+    end = u(jnp.asarray(1.0))
 
-    def at(qd: Array, qdd: Array = standing) -> Balance:
-        return balance_of(plant, x.q, qd, qdd, end, t, x.own, none)
+    def at(q: Array, qd: Array, qdd: Array = standing) -> Balance:
+        return balance_of(plant, q, qd, qdd, end, t, x.own, none)
 
-    def residual(qdd: Array) -> tuple[Array, Balance]:
-        levels = at(midway, qdd)
-        return levels.residual, levels
+    def without() -> tuple[State, tuple[Array, Array], Array, Balance]:
+        """The step without friction; position, velocity, mass and levels halfway."""
+        free = flow(x)
+        # A mass that depends on the position counts halfway, as all else does.
+        halfway = 0.5 * (x.q + free.q) if plant.coupled else x.q, 0.5 * (x.qd + free.qd)
 
-    # The mass does not depend on the velocity: one balance gives it and the levels.
-    midway = 0.5 * (x.qd + free.qd)
-    mass, levels = mass_of(plant, residual, x.q)
+        def residual(qdd: Array) -> tuple[Array, Balance]:
+            levels = at(*halfway, qdd)
+            return levels.residual, levels
+
+        # The mass does not depend on the velocity: one balance gives it and the levels.
+        return free, halfway, *mass_of(plant, residual, halfway[0])
+
+    def sliding(free: State, halfway: tuple, mass: Array, levels: Balance) -> _Sliding:
+        q, qd = halfway
+        if plant.coupled and qd.size > 1:
+            # A force changes a velocity over a step by less than its impulse would, for damping: a joint that
+            # stands would else pull at the others by a force that is off in the first order of the step.
+            mass = mass + 0.5 * h * jax.jacfwd(lambda qd: at(q, qd).residual)(qd)
+        return _sliding(plant, x, free, mass, levels, end, t, h)
+
+    free, halfway, mass, levels = parts = without()
     if not levels.slides:
         return free, none
-    sliding = _sliding(plant, x, free, mass, levels, end, t, h)
-    moves = depends(lambda qd: [getattr(at(qd), n) for n in ("dry", "stick", "rising")], (midway,))
-    at_rest = at(standing) if moves else levels
-
-    found = sliding.answer(levels, at_rest)
+    told = lambda *motion: [getattr(at(*motion), n) for n in ("dry", "stick", "rising")]
+    moves = depends(lambda qd: told(halfway[0], qd), halfway[1:])
+    at_rest = at(halfway[0], standing) if moves else levels
+    slides = sliding(*parts)
+    # Where no level hangs on the motion, tangents of all this are asked for in few steps only.
+    lean = plant.coupled and not depends(told, halfway)
+    found = slides.answer(levels, at_rest, (lambda: sliding(*without())) if lean else None)
     reaction = spread(found.reaction, levels.slides, none.size)
     if moves:
         # Without friction motion begins too fast, and friction that falls with speed is too small.
         slowed = free.qd + h * solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
-        found = sliding.answer(at(0.5 * (x.qd + slowed)), at_rest)
+        found = slides.answer(at(halfway[0], 0.5 * (x.qd + slowed)), at_rest)
         reaction = spread(found.reaction, levels.slides, none.size)
     end_of_step = _rest_exactly(flow(x, reaction), found.stuck, levels.slides)
     return _turned(x, end_of_step, found, h, levels.slides), reaction
@@ -124,8 +141,16 @@ class _Sliding:
     own: Array
     corner: Array
 
-    def answer(self, levels: Balance, at_rest: Balance) -> _Answer:
-        """Of friction at given levels, and at those at rest."""
+    def answer(
+        self, levels: Balance, at_rest: Balance, anew: Callable[[], _Sliding] | None = None
+    ) -> _Answer:
+        """Of friction at given levels, and at those at rest.
+
+        Args:
+            levels, at_rest: The balances that hold them.
+            anew: Makes the same once more within the branch that takes it: derivatives are then worked out
+                in that branch alone.
+        """
         dry = picked(levels.dry, self.ports)
         held = picked(at_rest.dry, self.ports) + picked(at_rest.stick, self.ports)
         if levels.rises:
@@ -139,7 +164,11 @@ class _Sliding:
             general = lambda: _own_reaction(self.own, self.speed, self.before, dry, held)
         else:
             after = self.speed + jnp.sum(self.mobility * drag, axis=1)
-            general = lambda: _shared_reaction(self.mobility, self.speed, self.before, dry, held)
+
+            def general() -> _Answer:
+                own = self if anew is None else anew()
+                return _shared_reaction(own.mobility, own.speed, own.before, dry, held)
+
         no = jnp.zeros(drag.shape, bool)
         # Nearly all steps only drag. A branch, not a choice between two results: the others cost more.
         return jax.lax.cond(
