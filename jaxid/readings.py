@@ -77,6 +77,8 @@ def acceleration(
 
     mass, rest = mass_of(plant, residual, x.q)
     if reaction is not None or not rest.rises:
+        if plant.coupled:
+            return _implicit(lambda qdd: residual(qdd)[0], solved(mass, -rest.residual))
         return solved(mass, -rest.residual)
     # At rest in acceleration the balance has nothing of what acts while speed grows: that resists what
     # is left of the force, as far as it goes.
@@ -87,6 +89,18 @@ def acceleration(
     forth, back = 0.5 * (1 + way) * forth, 0.5 * (1 - way) * back
     more = ramp(left, forth, plant.sharpness * forth) - ramp(-left, back, plant.sharpness * back)
     return (left - more) / each
+
+
+def _implicit(residual: Callable[[Array], Array], qdd: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Accelerations at which a residual that is affine in them is zero, differentiated as such.
+
+    A tangent then takes one balance, and not those of all columns of the mass: of seven joints one for
+    eight, and the same through the elimination.
+    """
+    none = jnp.zeros_like(qdd)
+    return jax.lax.custom_root(
+        residual, qdd, lambda _, known: known, lambda slope, y: solved(jax.jacfwd(slope)(none), y)
+    )
 
 
 def need_apart(plant: Plant, mass: Array, ports: tuple[int, ...]) -> Array:
