@@ -54,9 +54,35 @@ def test_an_unknown_without_effect_does_not_stop_the_start_inside():
     true, guess = arm_oracle.bodies(2, np.random.default_rng(0))
     columns = np.column_stack([np.random.default_rng(0).normal(size=(50, 10)), np.zeros(50)])
     theta = jnp.asarray(np.append(guess, 0.3))
-    found = inner_start(columns, -columns[:, :10] @ true, theta, (tuple(range(10)),), eliminated)
+    found, _ = inner_start(columns, -columns[:, :10] @ true, theta, (tuple(range(10)),), eliminated)
     np.testing.assert_allclose(found[:10], true, rtol=0, atol=1e-6)
     assert found[10] == 0.3
+
+
+def test_of_what_nothing_tells_bodies_stay_near_their_start():
+    """Where a body may have any mass, nothing pulls it to infinity."""
+    rng = np.random.default_rng(0)
+    true, guess = arm_oracle.bodies(2, rng)
+    # Six of the ten, as of a link near the base.
+    columns = np.zeros((40, 10))
+    columns[:, [1, 2, 4, 5, 7, 9]] = rng.normal(size=(40, 6))
+    found, _ = inner_start(columns, -columns @ true, jnp.asarray(guess), (tuple(range(10)),), eliminated)
+    assert guess[0] / 3 < found[0] < 3 * guess[0]
+    np.testing.assert_allclose(columns @ found, columns @ true, atol=1e-4)
+
+
+def test_no_body_has_less_than_the_floor():
+    """Noise asks for what no body can be: the best has no extent some way, and is known to be the best."""
+    rng = np.random.default_rng(0)
+    true, guess = arm_oracle.bodies(2, rng)
+    columns = rng.normal(size=(40, 10))
+    rest = -columns @ (true * np.where(np.arange(10) == 9, -0.2, 1.0)) + 0.01 * rng.normal(size=40)
+    found, floor = inner_start(columns, rest, jnp.asarray(guess), (tuple(range(10)),), eliminated)
+    cost = lambda theta: 0.5 * np.sum((columns @ theta + rest) ** 2)
+    assert cost(np.linalg.lstsq(columns, -rest)[0]) < 0.5 * cost(found)
+    assert 0 <= cost(found) - floor < 1e-8 * cost(found)
+    for body in arm_oracle.bodies(50, rng):
+        assert cost(found + 1e-4 * rng.uniform() * (body - found)) > floor
 
 
 def motion(seed: int) -> tuple[np.ndarray, ...]:

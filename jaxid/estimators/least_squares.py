@@ -28,6 +28,9 @@ _WHOLE = 1e-2
 # way along curves.
 _BODY_STEPS = 500
 _BODY_TOLERANCE = 1e-9
+# And where it is above what it is known not to fall below by no more than this over the residual's entries: a
+# hundredth of a standard deviation too.
+_SURE = 1e-4
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
 _ROUGH = 1e-6
 _STUCK = 1e3
@@ -216,12 +219,12 @@ def levenberg_marquardt(
             theta, cost, jnp.asarray(1), jnp.isfinite(cost), kept, jnp.zeros((kept.size, 0)),
         )
     # Traced once, for its shape and for its Jacobian.
-    residual = jax.jit(residual)
+    residual, floor = jax.jit(residual), -jnp.inf
     if transform.affine:
         columns = jax.jacfwd(residual)(theta).reshape(-1, theta.size)
         rest = residual(theta).ravel() - columns @ theta
         residual = lambda theta: columns @ theta + rest
-        theta = inner_start(columns, rest, theta, transform.bodies, eliminated)
+        theta, floor = inner_start(columns, rest, theta, transform.bodies, eliminated)
     if transform.bodies:
         tolerance = max(tolerance, _BODY_TOLERANCE)
     max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
@@ -231,7 +234,7 @@ def levenberg_marquardt(
     size = jax.eval_shape(residual, theta).size if keep else 0
     start = Progress.at(x0, own, size, damping)
     on_scale = lambda x: residual(transform.outward(x))
-    return descend(on_scale, start, bounds, max_steps, active, tolerance).minimum(transform)
+    return descend(on_scale, start, bounds, max_steps, active, tolerance, floor).minimum(transform)
 
 
 def descend(
@@ -241,6 +244,7 @@ def descend(
     max_steps: Array | int,
     active: Bool[Array, " p"] | None = None,
     tolerance: float = _TOLERANCE,
+    floor: Array | float = -np.inf,
 ) -> Progress:
     """Go on with a descent; see `levenberg_marquardt`, but on the solver's scale.
 
@@ -250,6 +254,7 @@ def descend(
         bounds: On the solver's unknowns.
         max_steps: Evaluations at which to stop, those so far among them.
         active, tolerance: As there.
+        floor: What the cost is known not to fall below: near enough to it, it has converged too.
     """
     moves = jnp.ones(progress.x.size, bool) if active is None else active
 
@@ -259,14 +264,14 @@ def descend(
 
     def advance(p: Progress) -> Progress:
         jacobian, e = jax.jacfwd(flat, has_aux=True)(p.trial)
-        return _advanced(p, e, jacobian, bounds, moves, tolerance)
+        return _advanced(p, e, jacobian, bounds, moves, tolerance, floor)
 
     return jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, progress)
 
 
 def _advanced(
     p: Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
-    tolerance: float,
+    tolerance: float, floor: Array | float,
 ) -> Progress:
     """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
     (lower, upper), keep = bounds, p.kept[0].size > 0
@@ -299,7 +304,7 @@ def _advanced(
     growth = jnp.where(better, 2.0, 2 * p.growth)
     return Progress(
         trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.own, nothing, p.steps + 1,
-        small | stuck | ~jnp.isfinite(cost),
+        small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
     )
 
 
