@@ -85,8 +85,9 @@ def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
 def _start(session: Session) -> Steps[np.ndarray | None]:
     """Where output error starts: at what another method found where that tells all unknowns of the plant.
 
-    Else at the guesses (None). Inverse dynamics keeps the bounds, and may end at one; what does not keep
-    them may end where there is nothing to simulate.
+    Else at the guesses (None). Links that are kept to bodies are told well enough: what no log tells of them
+    is that of a body, and moves nothing. Inverse dynamics keeps the bounds, and may end at one; what does not
+    keep them may end where there is nothing to simulate.
     """
     parameters = session.machine.parameters
     method = session.case.output_error.get("start", "inverse_dynamics")
@@ -94,7 +95,8 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
         return None
     first = yield from METHODS[method](session)
     elsewhere = [path[0] == REFERENCE for path, _ in parameters.places]
-    told = first.converged and np.all(first.identifiable | elsewhere)
+    within = np.isin(np.arange(len(first.theta)), [k for body in parameters.bodies for k in body.places])
+    told = first.converged and np.all(first.identifiable | elsewhere | within)
     lower, upper = parameters.bounds
     inside = np.all((first.theta >= lower) & (first.theta <= upper))
     return first.theta if told and inside else None
