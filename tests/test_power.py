@@ -145,18 +145,43 @@ def torques(t: np.ndarray, a: float, b: float, d: float) -> np.ndarray:
     return (momenta(t + h) - momenta(t - h)) / (2 * h) - np.stack([0 * pull, pull], axis=1)
 
 
-def test_a_mass_that_depends_on_where_it_is():
-    """One balance for the machine; the mass's own rate is in it. Accelerations are left out: zero."""
-    t, truth = np.arange(4000) / 500.0, np.array([0.9, 0.3, 0.4])
-    names = ("a", "b", "d")
-    free = Parameters(tuple(Free(n, (n,), "kg m^2", "positive", 1.0) for n in names))
+MOMENTS = np.array([0.9, 0.3, 0.4])
+
+
+def swung(samples: int = 4000, noise: np.ndarray | None = None) -> tuple[Machine, Prepared]:
+    """The arm with nothing known, and a motion of it without accelerations: they are zero."""
+    t = np.arange(samples) / 500.0
+    free = Parameters(tuple(Free(n, (n,), "kg m^2", "positive", 1.0) for n in ("a", "b", "d")))
     machine = Machine(Arm(1.0, 1.0, 1.0), free, np.ones(2), Units("rotary"))
     recipe = Recipe(20.0, 4, 5, 2, (1e-3, 1e-3), False, "spectral")
     q, v, every = swing(t, 0), swing(t, 1), np.ones((len(t), 2), bool)
+    force = torques(t, *MOMENTS) + (0.0 if noise is None else noise[:samples])
     data = Prepared(
-        q, v, np.zeros_like(q), torques(t, *truth), 0.002, 0.0, recipe, every[::5], every[::5],
-        np.arange(len(t))[::5],
+        q, v, np.zeros_like(q), force, 0.002, 0.0, recipe, every[::5], every[::5], np.arange(len(t))[::5]
     )
-    estimate = power(machine, data)
+    return machine, data
+
+
+def test_a_mass_that_depends_on_where_it_is():
+    """One balance for the machine; the mass's own rate is in it."""
+    estimate = power(*swung())
     assert estimate.residual.shape[1] == 1
-    np.testing.assert_allclose(estimate.theta, truth, rtol=1e-4)
+    np.testing.assert_allclose(estimate.theta, MOMENTS, rtol=1e-4)
+
+
+def test_one_balance_of_all_joints_asks_for_as_many_windows_as_unknowns():
+    """Not for that over the joints: a second joint adds no equation."""
+    with pytest.raises(InputError, match=r"only [345] windows"):
+        power(*swung(150))
+
+
+def test_a_noisy_joint_counts_for_less_where_it_is_fast(monkeypatch):
+    rng = np.random.default_rng(0)
+    logs = [swung(noise=rng.standard_normal((4000, 2)) * np.array([1.0, 0.02])) for _ in range(12)]
+
+    def off() -> float:
+        return float(np.sqrt(np.mean([(power(*log).theta - MOMENTS) ** 2 for log in logs])))
+
+    by_noise = off()
+    monkeypatch.setattr("jaxid.estimators.power._noise_shares", lambda data: np.ones(2))
+    assert by_noise < 0.8 * off()

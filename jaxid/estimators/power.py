@@ -26,6 +26,7 @@ import scipy.signal
 from jaxtyping import Array, Bool, Float
 
 from jaxid import signals
+from jaxid.base_parameters import base_parameters
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import ForceData, linear_scale, sharpened
 from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
@@ -36,6 +37,7 @@ from jaxid.model import Balance, Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess
 from jaxid.preprocess import Prepared, lasting
+from jaxid.regrouping import base_parameters_by_rules
 from jaxid.residuals import drive_own_states, drive_ratio
 
 # A hill of speed stands out by this part of the RMS speed.
@@ -198,22 +200,24 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     """Windows over a log, and the RMS force of its drives [N or N m].
 
     A window's energy is taken over the root of its integrals of w^2 and (w qd)^2: what is left is
-    then a force, whose noise is as large in slow windows as in fast ones.
+    then a force, whose noise is as large in slow windows as in fast ones. In one equation for all joints
+    each one's speed counts by the noise of its force.
     """
     joints, period = data.q.shape[1], data.period
     half, first = _half(data), data.recipe.trim * data.recipe.decimation
     count = (len(data.q) - 2 * first) // half - 1
-    fewest = _FEWEST * len(machine.parameters.free)
-    if count * joints < fewest:
+    apart = machine.plant.diagonal or joints == 1
+    fewest = _FEWEST * _asked(machine)
+    if count * (joints if apart else 1) < fewest:
         raise InputError(
             f"only {max(count, 0)} windows of {2 * half * period:.3g} s fit into the log",
             mend="take a longer log, or use inverse_dynamics",
         )
-    apart = machine.plant.diagonal or joints == 1
     slowest, halts = np.asarray(data.recipe.rest_velocity), _halts(machine.plant, data)
     speed = data.qd
     if not apart:
-        speed, slowest = (np.sqrt(np.sum(x**2, axis=-1, keepdims=True)) for x in (speed, slowest))
+        share = _noise_shares(data)
+        speed, slowest = (np.sqrt(np.sum((share * x) ** 2, axis=-1, keepdims=True)) for x in (speed, slowest))
         halts = np.any(halts, axis=1, keepdims=True)
     weigh = window((np.arange(2 * half) + 0.5) / half)
     middle = slice(half // 2, 2 * half - half // 2)
@@ -226,6 +230,26 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     mean = period * np.sqrt(np.where(counts, squares, 1.0) * np.sum(weigh**2))
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
     return PowerData(ForceData.of(data), np.where(counts, 1 / mean, 0.0), half, first), force
+
+
+def _asked(machine: Machine) -> int:
+    """How many numbers an equation is to tell: of bodies only sums count, as many as there are."""
+    unknown = machine.parameters
+    if not unknown.bodies:
+        return len(unknown.free)
+    # Without weight the rules say nothing.
+    found = base_parameters_by_rules if np.any(machine.plant.gravity_vector) else base_parameters
+    sums = found(machine.plant).chosen_names
+    within = {k for body in unknown.bodies for k in body.places}
+    return sum(k not in within or f.name in sums for k, f in enumerate(unknown.free))
+
+
+def _noise_shares(data: Prepared) -> Float[np.ndarray, " n"]:
+    """Noise of each joint's force over that of all, from its high band; one each where it cannot be had."""
+    noise = signals.high_band_std(data.force)
+    if noise.size != data.q.shape[1] or not np.all(noise > 0):
+        return np.ones(data.q.shape[1])
+    return noise / np.sqrt(np.mean(noise**2))
 
 
 def _halts(plant: Plant, data: Prepared) -> Bool[np.ndarray, "time n"]:
