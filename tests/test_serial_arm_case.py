@@ -95,6 +95,26 @@ def test_starts_of_an_arm_are_no_place_to_look_for_break_away_friction(estimates
     assert ["push one another" in why for why in found] == [True, True, True]
 
 
+def test_weights_are_by_joint_and_leave_wild_samples_out(estimates, tmp_path):
+    """One torque sensor a hundred times worse than the other, and one reading in fifty of neither."""
+    rows, rng = dict(followed(TwoLinks())), np.random.default_rng(3)
+    for name, noise in (("u1", 3.0), ("u2", 0.03)):
+        wild = rng.random(len(rows["t"])) < 0.02
+        rows[name] = rows[name] + noise * np.where(wild, 30.0, 1.0) * rng.standard_normal(len(wild))
+    path = tmp_path / "case.toml"
+    path.write_text(text())
+    session = open_session(path, write_csv(tmp_path / "log.csv", rows))
+    plain, weighted = (
+        inverse_dynamics(session.machine, session.fit.data, reweighted=r) for r in (False, True)
+    )
+    names = ["first_moment_x[2]", "first_moment_y[2]", "viscous_friction[2].coefficient"]
+    off = [max(abs(e.value(n) - truth()[n]) for n in names) for e in (plain, weighted)]
+    assert weighted.converged
+    assert off[1] < 0.2 * off[0]
+    std = dict(zip(weighted.names, weighted.std, strict=True))
+    assert all(abs(weighted.value(n) - truth()[n]) < 4 * std[n] for n in names)
+
+
 RATIO = np.array([[20.0, 0.0], [30.0, -30.0]])
 
 

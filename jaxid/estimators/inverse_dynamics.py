@@ -155,7 +155,8 @@ def inverse_dynamics(
     Args:
         machine: The machine; its guesses matter only where the balance is nonlinear.
         data: The log, prepared.
-        reweighted: Weight samples by a robust (bisquare) weight of their residual, twice over.
+        reweighted: Weight joints by the spread of their residuals, and samples by a robust (bisquare) weight
+            of theirs, twice over.
         start: In place of the guesses.
 
     Returns:
@@ -163,7 +164,7 @@ def inverse_dynamics(
 
     Source:
         Gautier (1986) and Janot, Vandanjon & Gautier (2014) for filtered inverse dynamics; Tukey's
-        bisquare with constant 4.685 for the weights.
+        bisquare with constant 4.685 for the weights. Gautier (1997), ICRA, for those of the joints.
     """
     return alone(inverse_dynamics_steps(machine, data, reweighted=reweighted, start=start))
 
@@ -194,8 +195,10 @@ def inverse_dynamics_steps(
     fit = next((f for f in lowest if bool(f.converged)), lowest[0])
     for _ in range(2 if reweighted else 0):
         e = np.asarray(fit.residual).reshape(data.moving.shape)
-        weight = np.sqrt(_bisquare(e, rows)) * rows
-        arrays = eqx.tree_at(lambda a: a.weight, arrays, weight)
+        was = np.asarray(arrays.weight)
+        # What has no weight left has none again.
+        e = np.where(was > 0, e / np.where(was > 0, was, 1.0), np.inf)
+        arrays = eqx.tree_at(lambda a: a.weight, arrays, _robust(e, rows))
         fit, _ = yield Solve(_solve, (plant, places, arrays, fit.theta, *options))
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
@@ -294,6 +297,10 @@ def force_precision(
     return assess(machine.parameters.names, jacobian, e, rows, float(size), scale)
 
 
-def _bisquare(e: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    spread = 1.4826 * np.median(np.abs(e[counts]))
-    return np.where(np.abs(e) < 4.685 * spread, (1 - (e / (4.685 * spread)) ** 2) ** 2, 0.0)
+def _robust(e: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Weights of residuals: of a joint one over their spread, on the mean of all, and the bisquare's root."""
+    middle = [np.median(np.abs(x[c])) if c.any() else 0.0 for x, c in zip(e.T, counts.T, strict=True)]
+    spread = 1.4826 * np.array(middle)
+    spread = np.where(spread > 0, spread, 1.0)
+    ratio = np.minimum(np.abs(e) / (4.685 * spread), 1.0)
+    return counts * (1 - ratio**2) * np.sqrt(np.mean(spread**2)) / spread
