@@ -10,9 +10,11 @@ import pytest
 
 import jaxid
 from jaxid.cli import main
-from jaxid.estimators import need_consistent
+from jaxid.estimators import _start, need_consistent
+from jaxid.estimators.consistency import need_bodies
 from jaxid.estimators.interior import inner_start
 from jaxid.estimators.least_squares import eliminated
+from jaxid.estimators.steps import alone
 from jaxid.io.case import load_case
 from jaxid.io.log import Log
 from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
@@ -171,6 +173,14 @@ def test_results_hold_the_links(fits, tmp_path):
         assert link["eigenvalue_ratio"] == pytest.approx(true[0] / true[-1], rel=1e-6)
     assert any("bodies" in note for note in fits[True].estimate.notes)
     assert "links" not in json.loads((fits[False].save(tmp_path / "plain") / "result.json").read_text())
+
+
+def test_output_error_starts_at_the_bodies_that_inverse_dynamics_finds(fits):
+    """Sums that no log tells are no reason to start at the guesses, far from what was told."""
+    start = alone(_start(need_bodies(fits[True].session)))
+    np.testing.assert_allclose(start, fits[True].estimate.theta)
+    # without, what is untold may be anything
+    assert alone(_start(fits[False].session)) is None
 
 
 @pytest.mark.slow
