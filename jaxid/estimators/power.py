@@ -37,7 +37,6 @@ from jaxid.model import Balance, Plant
 from jaxid.parameters import scatter
 from jaxid.precision import assess
 from jaxid.preprocess import Prepared, lasting
-from jaxid.regrouping import base_parameters_by_rules
 from jaxid.residuals import drive_own_states, drive_ratio
 
 # A hill of speed stands out by this part of the RMS speed.
@@ -237,9 +236,7 @@ def _asked(machine: Machine) -> int:
     unknown = machine.parameters
     if not unknown.bodies:
         return len(unknown.free)
-    # Without weight the rules say nothing.
-    found = base_parameters_by_rules if np.any(machine.plant.gravity_vector) else base_parameters
-    sums = found(machine.plant).chosen_names
+    sums = base_parameters(machine.plant).chosen_names
     within = {k for body in unknown.bodies for k in body.places}
     return sum(k not in within or f.name in sums for k, f in enumerate(unknown.free))
 
