@@ -115,7 +115,7 @@ def identification(folder: Path) -> None:
     if not (folder / "condition.csv").exists():
         excitation(folder)
     rng = np.random.default_rng(0)
-    arm = _arm(arm_oracle.bodies(7, rng) * np.linspace(1.0, 0.2, 7)[:, None])
+    arm = arm_of(random_bodies(rng))
     fitted, other = (jaxid.design(folder / f"{name}.toml") for name in ("determinant", "condition"))
     run = arm_stepper.followed(arm, fitted.position, rate=200.0, kp=KP, kd=KD)
     position, force = (run[k] + noise * rng.standard_normal(run[k].shape) for k, noise in
@@ -158,7 +158,13 @@ def identification(folder: Path) -> None:
     table.show(time.perf_counter() - begun)
 
 
-def _arm(bodies: np.ndarray) -> arm_stepper.Arm:
+def random_bodies(rng: np.random.Generator) -> np.ndarray:
+    """Ten parameters of seven links, lighter towards the tip."""
+    return arm_oracle.bodies(7, rng) * np.linspace(1.0, 0.2, 7)[:, None]
+
+
+def arm_of(bodies: np.ndarray) -> arm_stepper.Arm:
+    """The PA-10 of such links, with exact friction in every joint."""
     axes, origins = (np.asarray(x) for x in pa10().frames(np.zeros(7)))
     return arm_stepper.Arm(axes, origins, bodies, VISCOUS, COULOMB)
 

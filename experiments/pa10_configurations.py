@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from common import Table
-from pa10_arm import COULOMB, KNOWN, VISCOUS, model_of, random_bodies
+from pa10_arm import COULOMB, KNOWN, VISCOUS, arm_of, random_bodies
 from pa10_joint import CROSSING, EXACT, FAST, RATE, settled
 
 import jaxid
@@ -217,8 +217,7 @@ def inertias(bodies: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Diagonal of the mass matrix in some configurations, by Pinocchio, (w, 7)."""
     import pinocchio
 
-    model = model_of(bodies)
-    data = model.createData()
+    model, data = arm_of(bodies).model()
     return np.array([np.diag(pinocchio.crba(model, data, x)) for x in q])
 
 
