@@ -221,6 +221,8 @@ class _Loop:
         white, left = self._white(), lambda e: e - self.base @ self._giving_way(e)
         most = _correlation(left(white)).max()
         noisy = bool(_correlation(left(self.residual[:, None]))[0] <= most)
+        # A position's own rounding is correlated where it moves slowly, and is not drawn.
+        noisy |= self.problem.on == "position" and self.session.machine.sensor.position_resolution is not None
         if not looks:
             return 0.0, noisy
         # Colour that the best of them explains is none of the noise's.
