@@ -3,6 +3,7 @@
 import json
 
 import arm_oracle
+import arm_stepper
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,7 @@ from jaxid.estimators.least_squares import eliminated
 from jaxid.estimators.steps import alone
 from jaxid.io.case import load_case
 from jaxid.io.log import Log
+from jaxid.machine import build_machine
 from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
 
 RNG = np.random.default_rng(4)
@@ -87,9 +89,9 @@ def test_no_body_has_less_than_the_floor():
         assert cost(found + 1e-4 * rng.uniform() * (body - found)) > floor
 
 
-def motion(seed: int) -> tuple[np.ndarray, ...]:
+def motion(seed: int, rate: float = RATE) -> tuple[np.ndarray, ...]:
     """Sums of sines, and their derivatives."""
-    rng, t = np.random.default_rng(seed), np.arange(0, SECONDS, 1 / RATE)[:, None, None]
+    rng, t = np.random.default_rng(seed), np.arange(0, SECONDS, 1 / rate)[:, None, None]
     ranges = ((0.1, 1.0), (0.0, 6.0), (0.1, 0.5))
     hz, phase, size = (rng.uniform(*r, (3, 5)) for r in ranges)
     w = 2 * np.pi * hz
@@ -192,6 +194,33 @@ def test_power_keeps_links_too(log, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", ["instrumental_variable", "didim"])
+def test_methods_that_simulate_the_motion_keep_links_too(tmp_path, method):
+    """From a loop of other physics; without, the noise of the torque asks for what no body can be."""
+    rate, kp, kd = 200.0, [600.0, 150.0, 3.0], [30.0, 8.0, 0.15]
+    t, q, _, _ = motion(0, rate)
+    reference = q * np.minimum(1.0, t)[:, None] ** 3
+    law = f'[controller]\nkind = "pd"\nkp = {kp}\nkd = {kd}\nperiod = {1 / rate}\n'
+    text = case(True).replace("[log]\n", '[log]\nreference = ["r1", "r2", "r3"]\n') + law
+    (tmp_path / "case.toml").write_text(text)
+    (tmp_path / "plain.toml").write_text(text.replace("consistent = true", "consistent = false"))
+    geometry = build_machine(load_case(tmp_path / "case.toml"), period=1 / rate).plant.geometry
+    axes, origins = (np.asarray(x) for x in geometry.frames(np.zeros(3)))
+    arm = arm_stepper.Arm(axes, origins, TRUE, np.zeros(3), np.zeros(3))
+    run = arm_stepper.followed(arm, reference, rate=rate, kp=np.array(kp), kd=np.array(kd))
+    rng = np.random.default_rng(3)
+    position = run["q"] + 1e-5 * rng.standard_normal(q.shape)
+    force = run["u"] + NOISE * rng.standard_normal(q.shape)
+    log = Log(time=t, position=position, force=force, reference=reference, source="loop")
+    cases = (tmp_path / f"{name}.toml" for name in ("case", "plain"))
+    kept, plain = (jaxid.identify(path, log, method=method) for path in cases)
+    assert kept.estimate.converged
+    assert eigenvalues(kept).min() > 0
+    assert eigenvalues(plain).min() < -0.001
+    assert left(kept) < 1.02
+
+
+@pytest.mark.slow
 def test_output_error_keeps_links_too(tmp_path):
     """One link that swings; its moment about the joint, and its first moments, are told."""
     true = TRUE[0]
@@ -238,7 +267,8 @@ def test_a_prior_is_in_the_way_of_output_error_only(tmp_path):
         ("mass = { guess = 1.0 }", "mass = 1.0", "power", ["link 1", "mass[1] is known and others are not"]),
         ("mass = { guess = 1.0 }", "mass = { guess = 1.0, max = 2.0 }", "power", ["mass[1] has min or max"]),
         ("mass = { guess = 1.0 }", "mass = { guess = 0.1 }", "power", ["link 1", "its guess is no body"]),
-        ("mass = { guess", "mass = { guess", "didim", ["does not go with didim", "inverse_dynamics, power"]),
+        ("mass = { guess", "mass = { guess", "recursive",
+         ["does not go with recursive", "inverse_dynamics, power"]),
         ("[log]", "[output_error]\nprior = 0.5\n[log]", "output_error",
          ["output_error with a prior", "leave one of them out"]),
         ("= true", "= 1", "power", ["physically_consistent", "true or false"]),

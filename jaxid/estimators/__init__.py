@@ -179,8 +179,10 @@ _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 # Methods that simulate, and can be told how.
 SIMULATING = ("output_error", "instrumental_variable", "didim")
 
-# Methods that can keep links to what bodies can be: they minimise by the same solver.
-CONSISTENT = ("inverse_dynamics", "power", "algebraic", "output_error")
+# Methods that can keep links to what bodies can be: they minimise, step by step at least.
+CONSISTENT = (
+    "inverse_dynamics", "power", "algebraic", "instrumental_variable", "didim", "output_error",
+)
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,

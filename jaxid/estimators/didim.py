@@ -32,7 +32,7 @@ from jaxid.estimators.inverse_dynamics import (
     inverse_dynamics_steps,
     sharpened,
 )
-from jaxid.estimators.rerun import Rerun, bounded_step, settled, span
+from jaxid.estimators.rerun import Rerun, best_step, settled, span
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.io.log import Log
@@ -134,7 +134,7 @@ def didim_steps(
         columns = look.seen if held else look.slope
         columns = look.regressor if held and step <= _ROUGH_STEPS else columns
         e, columns = look.e[look.rows], columns[look.rows]
-        change = bounded_step(columns, e, theta, machine.parameters.bounds)
+        change = best_step(machine.parameters, columns, e, theta)
         done = settled(columns @ change, e, look.size)
         for _ in range(_HALVINGS):
             rows = None if step <= _CHOOSING else look.rows

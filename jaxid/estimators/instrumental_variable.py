@@ -21,12 +21,13 @@ from jaxid.estimators.inverse_dynamics import (
     inverse_dynamics_steps,
     sharpened,
 )
-from jaxid.estimators.rerun import Rerun, bounded_step, settled, span
+from jaxid.estimators.rerun import Rerun, best_step, settled, span
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps, alone
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import Plant
+from jaxid.parameters import Parameters
 from jaxid.preprocess import Prepared
 from jaxid.replay import Numerics
 
@@ -69,14 +70,16 @@ def instrumental_variable_steps(
 ) -> Steps[Estimate]:
     """`instrumental_variable`, one solve at a time."""
     first = yield from inverse_dynamics_steps(machine, data)
-    theta = first.theta if first.told else machine.parameters.guess
+    # Of bodies what no log tells is that of a body, and moves nothing.
+    within = bool(machine.parameters.bodies) and first.converged
+    theta = first.theta if first.told or within else machine.parameters.guess
     if log.reference is None:
         machine = replace(machine, controller=None)
     rerun = Rerun.of(machine.with_estimate(theta), log, data, numerics)
     plant, rows, places = sharpened(machine.plant, data), data.fitted, machine.parameters.places
     arrays = ForceData.of(data, rows)
     size = yield Solve(force_size, (plant, arrays))
-    found = yield from _search(rerun, plant, arrays, rows, theta, float(size))
+    found = yield from _search(rerun, plant, arrays, rows, machine.parameters, theta, float(size))
     theta, e, columns, basis = found.theta, found.e, found.columns, found.basis
     # Seen through the instruments: with it the formulas of least squares are those of instruments.
     seen = np.zeros((*rows.shape, len(places)))
@@ -112,10 +115,11 @@ class _Found:
 
 
 def _search(
-    rerun: Rerun, plant: Plant, arrays: ForceData, rows: np.ndarray, theta: np.ndarray, size: float
+    rerun: Rerun, plant: Plant, arrays: ForceData, rows: np.ndarray, unknown: Parameters, theta: np.ndarray,
+    size: float,
 ) -> Steps[_Found]:
     """Instruments at the estimate, the estimate by the instruments, until it stays where it is."""
-    places, bounds = rerun.machine.parameters.places, rerun.machine.parameters.bounds
+    places = unknown.places
 
     def along(data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
         e, columns = yield Solve(force_and_columns, (plant, places, data, theta))
@@ -137,7 +141,7 @@ def _search(
             basis = span(simulated[rows])
         if basis is None:
             return _Found(theta, e, columns, None, "the simulation diverged from these starting values", step)
-        change = bounded_step(basis.T @ columns[rows], basis.T @ e[rows], theta, bounds)
+        change = best_step(unknown, basis.T @ columns[rows], basis.T @ e[rows], theta)
         was = float(np.linalg.norm(basis.T @ e[rows]))
         done = settled(basis.T @ columns[rows] @ change, e[rows], size)
         for _ in range(_HALVINGS):

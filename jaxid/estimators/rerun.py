@@ -8,11 +8,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.steps import Solve, Steps
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import Plant
-from jaxid.parameters import scatter
+from jaxid.parameters import Parameters, scatter
 from jaxid.preprocess import Prepared, prepare
 from jaxid.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
 
@@ -99,6 +100,37 @@ def _simulated(replay: Replay, places: tuple, plant: Plant, theta: Array) -> tup
     """Position, (time, n), and command, (time, m), at the samples of the log."""
     run = replay(scatter(places, plant, theta))
     return run.position, run.command
+
+
+def best_step(
+    parameters: Parameters, columns: Float[np.ndarray, "rows p"], e: Float[np.ndarray, " rows"],
+    theta: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Gauss-Newton's step: within bounds, or, where links are kept to bodies, to the best of all bodies.
+
+    Between two bodies there are only bodies: any part of the step keeps to them too.
+
+    Args:
+        parameters: The unknowns; what the columns do not tell of bodies stays near their guess.
+        columns: Jacobian of the residual.
+        e: Residual.
+        theta: The unknowns.
+    """
+    if not parameters.bodies:
+        return bounded_step(columns, e, theta, parameters.bounds)
+    # As many rows as unknowns hold all that a sum of squares does.
+    triangle = np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r")
+    minimum = _best_bodies(triangle, Transform.of(parameters), parameters.guess, parameters.bounds)
+    return np.asarray(minimum.theta) - theta
+
+
+@eqx.filter_jit
+def _best_bodies(
+    triangle: Array, transform: Transform, guess: Array, bounds: tuple[Array, Array]
+) -> Minimum:
+    linear = replace(transform, log=np.zeros(guess.size, bool), affine=True)
+    residual = lambda theta: triangle[:, :-1] @ theta + triangle[:, -1]
+    return levenberg_marquardt(residual, guess, linear, *bounds)
 
 
 def bounded_step(
