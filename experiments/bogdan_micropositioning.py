@@ -314,29 +314,17 @@ def load(folder: Path, runs: int) -> None:
     scale = np.round(made["x"] / SCALE) * SCALE
     log = Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
               reference=reference[:, None], load_position=scale[:, None], source="the designed log")
-    table = Table(
-        "The designed log with the table's position, elastic screw in the model",
-        ["fitted on", "evaluations", "criterion %", "combinations, in sigma off",
-         "motor inertia over the truth", "table's position off [um]"],
-    )
-    for on in ("force", "both"):
-        stated = ON_FORCE.replace('"force"', f'"{on}"')
-        case = case_of(folder, "load", 1, guess=1, coupling="elastic", more=stated)
-        counts = f"position_resolution = {stages.COUNT!r}"
-        stated = f"position_resolution = [{stages.COUNT!r}, {SCALE!r}]"
-        case.write_text(case.read_text().replace(counts, stated))
-        found = jaxid.identify(case, log)
-        found.save(folder / f"load_{on}", force=True)
-        e = found.estimate
-        off = off_in_sigma(e, case, log, begin, 1)
-        k, true = e.names.index("motor_inertia"), stages.TRUTH[1]["motor_inertia"]
-        told = f"{e.theta[k] / true:.3f} +- {e.std[k] / true:.3f}" if np.isfinite(e.std[k]) else "not told"
-        table.row(
-            on, e.steps if e.converged else e.message, f"{e.details['criterion_percent']:.2f}",
-            ", ".join(f"{o:+.1f}" for o in off), told, f"{1e6 * found.gaps[0].simulation.rms[1]:.1f}",
-        )
-        print(f"  {on}: {time.perf_counter() - start:.0f} s", flush=True)
-    table.show(time.perf_counter() - start)
+    stated = ON_FORCE.replace('"force"', '"both"')
+    case = case_of(folder, "load", 1, guess=1, coupling="elastic", more=stated)
+    counts = f"position_resolution = {stages.COUNT!r}"
+    case.write_text(case.read_text().replace(counts, f"position_resolution = [{stages.COUNT!r}, {SCALE!r}]"))
+    found = jaxid.identify(case, log)
+    found.save(folder / "load", force=True)
+    off = ", ".join(f"{o:+.1f}" for o in off_in_sigma(found.estimate, case, log, begin, 1))
+    table = 1e6 * found.gaps[0].simulation.rms[1]
+    e, seconds = found.estimate, time.perf_counter() - start
+    print(f"\nload: {e.message} in {e.steps} evaluations ({seconds:.0f} s)")
+    print(f"combinations off by {off} sigma; the simulated table by {table:.1f} um\n{found}", flush=True)
 
 
 def needles(folder: Path, runs: int) -> None:
