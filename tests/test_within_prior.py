@@ -1,10 +1,13 @@
 """What `discover` says of a log of a hundred samples, fitted within a prior, from the exact stepper."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import stages
 
 import jaxid
+from jaxid.discovery.within_prior import _Loop
 from jaxid.io.log import Log
 
 PRIOR = '[output_error]\non = "force"\nprior = 0.5\n'
@@ -60,6 +63,10 @@ def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolu
     assert 0.0 < max(s.evidence for s in only.step.scores) < only.step.threshold
     found.save(tmp_path / "out")
     assert "nothing_missing" in str(found)
+    # What ends at its bound is no guess that a relative prior says nothing of.
+    at = found.after.theta * (np.array(found.after.names) != "viscous_friction[1].coefficient")
+    ended = dataclasses.replace(found.after, machine=found.after.machine.with_estimate(at))
+    assert np.all(np.isfinite(_Loop.of(found.session, ended).base))
 
 
 @pytest.mark.slow

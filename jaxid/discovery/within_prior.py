@@ -33,6 +33,7 @@ from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
 from jaxid.gap import noise_floor
 from jaxid.identification import gaps
+from jaxid.machine import Machine
 from jaxid.model import Plant, parameters_of
 from jaxid.parameters import free_effect
 from jaxid.precision import NoiseModel
@@ -50,8 +51,6 @@ _FEW, _PROMISING = 4, (0.5, 0.1)
 _AS_GOOD = 2.0
 # Lags whose correlation says whether a residual is noise.
 _LAGS = 10
-# Columns in a compiled call.
-_COLUMNS = 4
 UNSEEN = "a fit within a prior looks at the loop alone"
 
 
@@ -133,6 +132,7 @@ class _Loop:
         problem: What the fit compared.
         residual: What it left, over the noise, by row.
         base: Derivatives of that in units of the prior, (rows, unknowns and starts).
+        sigma: The noise, in units of the weighted residual.
     """
 
     session: Session
@@ -148,7 +148,8 @@ class _Loop:
         """Of what a fit within a prior found."""
         stated, log, machine = session.case.output_error, session.fit.log, estimate.machine
         numerics = choose_numerics(machine, log)
-        problem = Problem.of(machine, log, stated["prior"], stated.get("on", "position"), numerics)
+        on, widths = stated.get("on", "position"), _widths(session, machine)
+        problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
         here = alone(read(problem, problem.ladder[-1], np.zeros(problem.prior.base.size)))
         problem, here = problem.weighed(here)
         sigma = problem.noise(here, len(estimate.details["directions"]))
@@ -197,7 +198,8 @@ class _Loop:
         """Residual with a candidate at some values, and its derivatives in them, over the noise."""
         theta = self.theta.copy()
         theta[c.index] = values
-        directions = np.zeros((len(theta), _COLUMNS))
+        # Of one width for all: one compiled function.
+        directions = np.zeros((len(theta), max(len(c.index) for c in self.union.candidates)))
         directions[c.index, np.arange(len(c.index))] = 1.0
         plant = replace(self.union.machine.plant, sharpness=self.problem.ladder[-1])
         p = self.problem
@@ -308,6 +310,14 @@ def _correlation(e: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " k"]:
     return sum((np.sum(e[k:] * e[:-k], axis=0) / np.sum(e**2, axis=0)) ** 2 for k in lags)
 
 
+def _widths(session: Session, machine: Machine) -> dict[str, float]:
+    """Standard deviations about where the unknowns are now; what ended at zero has no size of its own."""
+    first = dict(zip(session.machine.parameters.names, session.machine.parameters.guess, strict=True))
+    prior = session.case.output_error["prior"]
+    sizes = {f.name: abs(first.get(f.name, f.guess)) or 1.0 for f in machine.parameters.free}
+    return {f.name: prior * sizes[f.name] for f in machine.parameters.free if f.sign != "positive"}
+
+
 def _refitted(
     session: Session, loop: _Loop, base: Estimate, score: Score
 ) -> tuple[Score, Estimate, Found]:
@@ -318,7 +328,7 @@ def _refitted(
     values = dict(zip(names, score.guess, strict=True))
     plant, free = free_effect(plant, type(effect)(**values, port=c.port), base.machine.units)
     machine = base.machine.with_plant(plant, base.machine.parameters.extended(free))
-    widths = {
+    widths = _widths(session, base.machine) | {
         f.name: 1.0 if f.sign == "positive" else float(max(np.abs(c.starts[:, k]).max(), abs(f.guess)))
         for k, f in enumerate(free)
     }
