@@ -66,7 +66,16 @@ def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolu
     # What ends at its bound is no guess that a relative prior says nothing of.
     at = found.after.theta * (np.array(found.after.names) != "viscous_friction[1].coefficient")
     ended = dataclasses.replace(found.after, machine=found.after.machine.with_estimate(at))
-    assert np.all(np.isfinite(_Loop.of(found.session, ended).base))
+    loop = _Loop.of(found.session, ended)
+    assert np.all(np.isfinite(loop.base))
+    # What may have either sign is looked for in either.
+    looks = loop.looks()
+    drag = next(x for x in looks if x.candidate.kind == "quadratic_drag")
+    for sign in (1.0, -1.0):
+        faced = dataclasses.replace(loop, residual=-sign * drag.columns[:, 0])
+        seen = next(s for s in faced.scored(looks) if s.candidate.kind == "quadratic_drag")
+        assert seen.evidence > 10
+        assert np.sign(seen.guess[0]) == sign
 
 
 @pytest.mark.slow

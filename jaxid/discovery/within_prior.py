@@ -127,7 +127,7 @@ class _Loop:
     """A fitted machine in its loop, with every effect that it might lack doing nothing yet.
 
     Args:
-        session, estimate: Of the machine.
+        session: Case and log.
         union: With the effects.
         problem: What the fit compared.
         residual: What it left, over the noise, by row.
@@ -136,7 +136,6 @@ class _Loop:
     """
 
     session: Session
-    estimate: Estimate
     union: Union
     problem: Problem
     residual: Float[np.ndarray, " rows"]
@@ -158,7 +157,7 @@ class _Loop:
         searched = [e for e in session.case.searched if e not in _LEFT_OUT]
         union = build_union(machine, data, searched)
         return cls(
-            session, estimate, union, problem, np.asarray(here.residual).ravel() / sigma,
+            session, union, problem, np.asarray(here.residual).ravel() / sigma,
             np.asarray(here.jacobian) / sigma, sigma,
         )
 
@@ -181,7 +180,7 @@ class _Loop:
         free = self.union.machine.parameters.free
         for c in self.union.candidates:
             drive = not c.amplitude.any()
-            positive = all(free[i].sign != "any" for i in c.index[c.amplitude])
+            positive = all(free[i].sign != "free" for i in c.index[c.amplitude])
             for k in range(len(c.starts)):
                 e, columns = self._at(c, c.starts[k] if drive else c.probe(k))
                 if drive:
@@ -250,7 +249,7 @@ class _Loop:
         white = rng.standard_normal((_DRAWS, self.residual.size))
         rounded = drawn_roundings(self.session.machine, self.problem, _DRAWS)
         if rounded is not None:
-            e = (rounded - rounded.mean(axis=0)) / self.sigma
+            e = rounded / self.sigma
             share = min(float(np.mean(e**2)), 1.0)
             white = e + np.sqrt(1.0 - share) * white
         counts = np.tile(self.problem.weight[0] > 0, self.problem.weight.shape[0])
