@@ -283,7 +283,7 @@ def many_points(union: Union, candidate: Candidate, data: Samples) -> list[Point
     """A candidate with many starts at each of them, on a plant that has nothing else."""
     effect: Effect = union.machine.plant.effects[position(union, candidate)]
     alone = eqx.tree_at(lambda p: p.effects, union.machine.plant, (effect,))
-    names = [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
+    names = own_names(effect)
     places = tuple((("effects", 0, n), None) for n in names)
     probes = np.stack([candidate.probe(k) for k in range(len(candidate.starts))])
     found = []
@@ -315,6 +315,17 @@ def position(union: Union, candidate: Candidate) -> int:
     """Index of a candidate among the effects of the union's plant."""
     path = union.machine.parameters.free[candidate.index[0]].path
     return int(path[1])
+
+
+def effect_at(union: Union, candidate: Candidate, values: Float[np.ndarray, " k"]) -> Effect:
+    """A candidate as an effect of its own, at some values of its unknowns."""
+    effect: Effect = union.machine.plant.effects[position(union, candidate)]
+    return type(effect)(**dict(zip(own_names(effect), values, strict=True)), port=candidate.port)
+
+
+def own_names(effect: Effect) -> list[str]:
+    """Parameters that an effect has, those that it leaves out apart."""
+    return [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
 
 
 def free_of(union: Union, index: np.ndarray) -> Parameters:

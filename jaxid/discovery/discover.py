@@ -29,7 +29,6 @@ from jaxid.identification import Gap, gaps
 from jaxid.io.case import Case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.model import parameters_of
 from jaxid.parameters import free_effect
 from jaxid.session import Session, open_session
 from jaxid.stiffness import TooStiffError
@@ -214,9 +213,8 @@ def _final_machine(
     theta = [*search.theta[search.union.base]]
     effects = []
     for k, c in enumerate(search.added):
-        effect = search.union.machine.plant.effects[cand.position(search.union, c)]
-        values = dict(zip(_names(effect), search.theta[c.index], strict=True))
-        plant, free = free_effect(plant, type(effect)(**values, port=c.port), machine.units)
+        effect = cand.effect_at(search.union, c, search.theta[c.index])
+        plant, free = free_effect(plant, effect, machine.units)
         parameters = parameters.extended(free)
         theta.extend(search.theta[c.index])
         score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
@@ -225,10 +223,6 @@ def _final_machine(
         effects.append(Found(c.kind, c.label, place, names, score, alternatives.get(k, ())))
     final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
     return final, tuple(effects)
-
-
-def _names(effect: object) -> list[str]:
-    return [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
 
 
 def _refit(session: Session, start: Estimate) -> Estimate:

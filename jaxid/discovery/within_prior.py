@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.discovery.candidates import Candidate, Union
+from jaxid.discovery.candidates import Candidate, Union, effect_at
 from jaxid.discovery.result import Discovery, Found, Round
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Step
@@ -34,7 +34,7 @@ from jaxid.estimators.steps import alone
 from jaxid.gap import noise_floor
 from jaxid.identification import gaps
 from jaxid.machine import Machine
-from jaxid.model import Plant, parameters_of
+from jaxid.model import Plant
 from jaxid.parameters import free_effect
 from jaxid.precision import NoiseModel
 from jaxid.replay import Replay
@@ -322,10 +322,7 @@ def _refitted(
 ) -> tuple[Score, Estimate, Found]:
     """The fit within the prior with an effect beside the rest, and what it gains."""
     c, plant = score.candidate, base.machine.plant
-    effect = loop.union.machine.plant.effects[loop.union.machine.parameters.free[c.index[0]].path[1]]
-    names = [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
-    values = dict(zip(names, score.guess, strict=True))
-    plant, free = free_effect(plant, type(effect)(**values, port=c.port), base.machine.units)
+    plant, free = free_effect(plant, effect_at(loop.union, c, score.guess), base.machine.units)
     machine = base.machine.with_plant(plant, base.machine.parameters.extended(free))
     widths = _widths(session, base.machine) | {
         f.name: 1.0 if f.sign == "positive" else float(max(np.abs(c.starts[:, k]).max(), abs(f.guess)))
