@@ -33,10 +33,12 @@ from pa10_joint import (
     RATE,
     SITUATIONS,
     VISCOUS,
+    case_text,
     law,
     released,
     settled,
     swinging,
+    unknown,
 )
 
 import jaxid
@@ -93,28 +95,14 @@ def frictions(folder: Path) -> None:
     pa10_figures.frictions(folder / "frictions.png", logs)
 
 
-FRICTION = """[plant]
-kind = "axis"
-motion = "rotary"
-[plant.parameters]
-inertia = { guess = 2.0 }
-[[effects]]
-kind = "viscous_friction"
-coefficient = { guess = 1.0 }
-[[effects]]
-kind = "asymmetric_viscous"
-coefficient = { guess = 0.0 }
-[[effects]]
-kind = "coulomb_friction"
-level = { guess = 1.0 }
-[[effects]]
-kind = "constant_force"
-level = { guess = 0.0 }
-[log]
-time = "t"
-position = "q"
-force = "u"
-"""
+FRICTION = case_text(
+    unknown(2.0),
+    {
+        "viscous_friction": {"coefficient": unknown(1.0)},
+        "asymmetric_viscous": {"coefficient": unknown(0.0)},
+        "coulomb_friction": {"level": unknown(1.0)}, "constant_force": {"level": unknown(0.0)},
+    },
+)
 
 
 def plateaus() -> tuple[np.ndarray, np.ndarray]:
@@ -233,28 +221,12 @@ def flexible(kp: float, stiffness: float) -> dict[str, np.ndarray]:
     )
 
 
-SWING = """[plant]
-kind = "axis"
-motion = "rotary"
-[plant.parameters]
-inertia = { guess = 6.0 }
-[[effects]]
-kind = "viscous_friction"
-coefficient = { guess = 12.0 }
-%s[log]
-time = "t"
-position = "q"
-force = "u"
-reference = "ref"
-[controller]
-kind = "friction_compensation"
-kp = 400.0
-kd = 0.0
-coulomb = 10.1
-viscous = 3.0
-period = 0.001
-"""
-DRY = '[[effects]]\nkind = "coulomb_friction"\nlevel = { guess = 2.0 }\n'
+VISCOUS_ONLY = {"viscous_friction": {"coefficient": unknown(12.0)}}
+DRY = VISCOUS_ONLY | {"coulomb_friction": {"level": unknown(2.0)}}
+SWUNG = {
+    "kind": "friction_compensation", "kp": 400.0, "kd": 0.0, "coulomb": 10.1, "viscous": 3.0,
+    "period": 1 / RATE,
+}
 
 
 def same_logs(folder: Path) -> None:
@@ -266,7 +238,7 @@ def same_logs(folder: Path) -> None:
     )
     keys = dict(position="position", force="force", reference="reference")
     log = Log(time=made["t"], **{k: made[v] for k, v in keys.items()}, source="the swing")
-    (folder / "swing.toml").write_text(SWING % DRY)
+    (folder / "swing.toml").write_text(case_text(unknown(6.0), DRY, controller=SWUNG))
     table = Table("from one log of a swing, K_p = 400", ["", "inertia", "Coulomb", "viscous"])
     table.row("true", INERTIA, COULOMB, VISCOUS)
     table.row("K_p T^2 / 4 pi^2", f"{of_swing(400.0, settled(made)[1]):.4f}", "", "")
@@ -276,7 +248,7 @@ def same_logs(folder: Path) -> None:
         cell = lambda n, e=e: f"{e.theta[e.names.index(n)]:.4f} +- {e.std[e.names.index(n)]:.2g}"
         table.row(method, *map(cell, ("inertia", "coulomb_friction.level", "viscous_friction.coefficient")))
     table.show(time.perf_counter() - start)
-    (folder / "viscous_only.toml").write_text(SWING % "")
+    (folder / "viscous_only.toml").write_text(case_text(unknown(6.0), VISCOUS_ONLY, controller=SWUNG))
     found = jaxid.discover(folder / "viscous_only.toml", log)
     found.save(folder / "viscous_only", force=True)
     print(f"\ntold of viscous friction only: {found.verdict}: {', '.join(found.kinds)}"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from common import Table
 from pa10_arm import COULOMB, KNOWN, VISCOUS, arm_of, random_bodies
-from pa10_joint import CROSSING, EXACT, FAST, RATE, settled
+from pa10_joint import CROSSING, EXACT, FAST, RATE, case_text, settled, unknown
 
 import jaxid
 from jaxid.base_parameters import BaseParameters, base_parameters
@@ -86,43 +86,20 @@ def turning(log: dict[str, np.ndarray]) -> float:
     return float(2 * np.mean(np.diff(at))) if k.size > 1 else np.nan
 
 
-CASE = """[plant]
-kind = "axis"
-motion = "rotary"
-[plant.parameters]
-inertia = {{ guess = {guess!r} }}
-[[effects]]
-kind = "viscous_friction"
-coefficient = {{ guess = {viscous!r} }}
-[[effects]]
-kind = "coulomb_friction"
-level = {{ guess = {coulomb!r} }}
-[log]
-time = "t"
-position = "q"
-force = "u"
-reference = "ref"
-[controller]
-kind = "friction_compensation"
-kp = {kp!r}
-kd = 0.0
-coulomb = 0.0
-viscous = {compensated!r}
-period = 0.001
-[sensor]
-position_noise = 1e-7
-force_noise = 0.2
-"""
-
-
 def identified(folder: Path, method: str) -> Callable[[int, float], float]:
     """The same inertia from the swing's noisy log, guesses off by half."""
 
     def inertia_of(k: int, inertia: float) -> float:
         loop, made = swing(k, inertia, FINE)
-        (folder / "swing.toml").write_text(CASE.format(
-            guess=0.5 * float(inertia), viscous=1.5 * float(VISCOUS[k]), coulomb=0.5 * float(COULOMB[k]),
-            kp=float(loop.kp), compensated=float(loop.viscous),
+        friction = {
+            "viscous_friction": {"coefficient": unknown(1.5 * VISCOUS[k])},
+            "coulomb_friction": {"level": unknown(0.5 * COULOMB[k])},
+        }
+        law = {"kp": float(loop.kp), "kd": 0.0, "coulomb": 0.0, "viscous": float(loop.viscous)}
+        (folder / "swing.toml").write_text(case_text(
+            unknown(0.5 * inertia), friction,
+            controller={"kind": "friction_compensation", **law, "period": 1 / RATE},
+            sensor={"position_noise": FINE.position_noise, "force_noise": FINE.force_noise},
         ))
         keys = {k: made[k] for k in ("position", "force", "reference")}
         log = Log(time=made["t"], **keys, source=f"joint {k + 1}")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pa10_figures
 from common import Table
-from pa10_joint import COULOMB, FASTEST, RATE, VISCOUS
+from pa10_joint import COULOMB, FASTEST, RATE, VISCOUS, case_text, unknown
 
 import jaxid
 from jaxid.io.log import Log
@@ -106,7 +106,7 @@ def chain(folder: Path) -> None:
     start = time.perf_counter()
     supply = SUPPLIES[0]
     run = moved(supply)
-    (folder / "drive.toml").write_text(CASE.format(inertia=INERTIA, gain=DECLARED, effects=CHAIN))
+    (folder / "drive.toml").write_text(case_of(DECLARED, INERTIA, CHAIN))
     true = machine(supply).effects
     table = Table(
         "the chain from one log, as the case has it, and as the report does",
@@ -148,8 +148,7 @@ def hidden(folder: Path) -> None:
     """
     table = Table("hidden: a supply of 24 V", ["looks for", "verdict", "names", "s"])
     gain = ACTUAL * DECLARED
-    known = INPUT_CASE.replace("{ guess = 250.0 }", repr(INPUT * gain))
-    told = CASE.format(inertia="{ guess = 4.0 }", gain=gain, effects=FRICTION + OFFSET_CASE + known)
+    told = case_of(gain, unknown(4.0), {**FRICTION, **BOUNDED, "saturation": {"limit": INPUT * gain}})
     start = time.perf_counter()
     runs = (led(SUPPLIES[0], INPUT, seed, 8.0, 15.0, 0.75) for seed in (0, 1))
     fit, other = (log_of(run, f"moves {seed}") for seed, run in enumerate(runs))
@@ -165,49 +164,20 @@ def hidden(folder: Path) -> None:
     table.show(time.perf_counter() - start)
 
 
-CASE = """[plant]
-kind = "axis"
-motion = "rotary"
-[plant.parameters]
-inertia = {inertia}
-{effects}[actuator]
-gain = {gain!r}
-[log]
-time = "t"
-position = "q"
-force = "u"
-reference = "ref"
-[controller]
-kind = "pd"
-kp = 300.0
-kd = 12.0
-limit = 10.0
-[sensor]
-position_noise = 1e-5
-force_noise = 1e-3
-"""
-FRICTION = """[[effects]]
-kind = "viscous_friction"
-coefficient = { guess = 8.0 }
-[[effects]]
-kind = "coulomb_friction"
-level = { guess = 5.0 }
-"""
-INPUT_CASE = """[[effects]]
-kind = "saturation"
-limit = { guess = 250.0 }
-"""
+def case_of(gain: float, inertia: float | dict[str, float], effects: dict) -> str:
+    """The joint in its loop, its drive's gain declared [N m/V]."""
+    law = {"kind": "pd", "kp": KP, "kd": KD, "limit": INPUT}
+    sensor = {"position_noise": SENSOR.position_noise, "force_noise": SENSOR.force_noise}
+    return case_text(inertia, effects, actuator={"gain": gain}, controller=law, sensor=sensor)
+
+
+FRICTION = {
+    "viscous_friction": {"coefficient": unknown(8.0)}, "coulomb_friction": {"level": unknown(5.0)},
+}
 # The report's margin of 0.3 V bounds it. Without bounds a search pushes it into saturation: the drive is then
 # a constant that constant_force cancels, a perfect fit to any log.
-OFFSET_CASE = """[[effects]]
-kind = "actuator_offset"
-level = { guess = 0.0, min = -6.7, max = 6.7 }
-"""
-CHAIN = FRICTION + """[[effects]]
-kind = "actuator_gain"
-gain = { guess = 1.0 }
-""" + OFFSET_CASE + INPUT_CASE + """[[effects]]
-kind = "voltage_limit"
-stall = { guess = 600.0 }
-velocity = { guess = 0.9 }
-"""
+BOUNDED = {"actuator_offset": {"level": unknown(0.0, min=-6.7, max=6.7)}}
+CHAIN = {
+    **FRICTION, "actuator_gain": {"gain": unknown(1.0)}, **BOUNDED, "saturation": {"limit": unknown(250.0)},
+    "voltage_limit": {"stall": unknown(600.0), "velocity": unknown(0.9)},
+}

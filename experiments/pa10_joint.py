@@ -68,3 +68,29 @@ def settled(log: dict[str, np.ndarray]) -> tuple[float, float]:
         return 0.0, np.nan
     crossings = t[up] - centred[up] * (t[up + 1] - t[up]) / (centred[up + 1] - centred[up])
     return float(np.ptp(q) / 2), float(np.mean(np.diff(crossings)))
+
+
+def unknown(guess: float, **bounds: float) -> dict[str, float]:
+    """An unknown of a case."""
+    return {"guess": float(guess), **bounds}
+
+
+def case_text(
+    inertia: float | dict[str, float], effects: dict[str, dict[str, float | dict[str, float]]],
+    **tables: dict[str, float | str],
+) -> str:
+    """The case of one joint; a reference is logged where there is a controller."""
+    def entry(value: float | str | dict[str, float]) -> str:
+        if isinstance(value, dict):
+            return "{ " + ", ".join(f"{k} = {v!r}" for k, v in value.items()) + " }"
+        return f'"{value}"' if isinstance(value, str) else repr(value)
+
+    lines = ["[plant]", 'kind = "axis"', 'motion = "rotary"', "[plant.parameters]"]
+    lines += [f"inertia = {entry(inertia)}"]
+    for kind, values in effects.items():
+        lines += ["[[effects]]", f'kind = "{kind}"', *[f"{k} = {entry(v)}" for k, v in values.items()]]
+    columns = {"time": "t", "position": "q", "force": "u"}
+    columns |= {"reference": "ref"} if "controller" in tables else {}
+    for name, values in {"log": columns, **tables}.items():
+        lines += [f"[{name}]", *[f"{k} = {entry(v)}" for k, v in values.items()]]
+    return "\n".join(lines) + "\n"
