@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -14,6 +15,7 @@ from stepper import Loop, Sensor
 from stepper_machines import moves, servo
 from test_recursion import gain_regression
 
+from jaxid.errors import InputError
 from jaxid.estimators.recursion import Recursion, run
 from jaxid.estimators.recursive import start_of
 from jaxid.estimators.recursive_precision import precision_of
@@ -50,6 +52,20 @@ def test_many_logs_in_one_call(axis):
     one = estimate(axis[0], logs[1])
     np.testing.assert_allclose(together[1].theta, one.theta, rtol=1e-12)
     assert np.any(together[0].theta != together[1].theta)
+
+
+def test_many_logs_each_by_a_case_of_its_own(axis, tmp_path):
+    """The second's start counts for a whole sample, and is felt."""
+    logs = [log_of(slide(seed=seed)) for seed in (1, 1)]
+    text = Path(axis[0]).read_text() + "\n[recursive]\nregularization = 1.0\n"
+    (tmp_path / "case.toml").write_text(text)
+    cases = [axis[0], tmp_path / "case.toml"]
+    found = identify_many(cases, logs, method="recursive", lanes=2)
+    for one, case in zip(found, cases, strict=True):
+        np.testing.assert_allclose(one.theta, estimate(case, logs[0]).theta, rtol=1e-12)
+    assert np.any(np.abs(found[0].theta / found[1].theta - 1) > 1e-6)
+    with pytest.raises(InputError, match="1 cases for 2 logs"):
+        identify_many(cases[:1], logs, method="recursive")
 
 
 def test_forgetting_follows_a_drift(tmp_path):
