@@ -1,0 +1,89 @@
+"""Logs, cases and judged fits of the micropositioning stage, for `bogdan_micropositioning.py`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.estimators.directions_problem import Prior, criterion_steps
+from jaxid.estimators.result import Estimate
+from jaxid.estimators.steps import together
+from jaxid.identification import identify_many
+from jaxid.io.log import Log
+from jaxid.session import open_session
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+import stages
+
+ON_FORCE = '[output_error]\non = "force"\nprior = 0.5\n'
+
+
+def noise_of(data: int, resolution: float) -> float:
+    """Noise on the current [A] that, beside what rounding does, puts the criterion at the published one."""
+    reference = stages.move(0.5, **stages.MOVES[data])
+    stage = stages.machine(data, rigid=True)
+    fine = stages.record(stage, reference, resolution=0.0)["true_i"]
+    starts = np.random.default_rng(0).uniform(-0.5, 0.5, 20) * resolution
+    off = [stages.record(stage, reference, resolution=resolution, start=s)["true_i"] - fine for s in starts]
+    wanted = stages.CRITERION[data] / 100 * np.var(fine)
+    return float(np.sqrt(max(wanted - np.mean(np.square(off)), 0.1 * wanted)))
+
+
+def logs_of(
+    data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT, noise: float | None = None
+) -> tuple[list[Log], np.ndarray]:
+    """Logs that differ in noise, and in where within its first count the motor stood: that too [rad]."""
+    reference = stages.move(0.5, **stages.MOVES[data])
+    noise = noise_of(data, resolution) if noise is None else noise
+    stage, rng = stages.machine(data, rigid=rigid), np.random.default_rng(1)
+    out, starts = [], rng.uniform(-0.5, 0.5, runs) * resolution
+    for k in range(runs):
+        made = stages.record(
+            stage, reference, noise=noise, resolution=resolution, seed=k, step=5e-6 if rigid else 2e-6,
+            start=starts[k],
+        )
+        out.append(
+            Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
+                reference=reference[:, None], source=f"run {k} of data {data}")
+        )
+    return out, starts
+
+
+def off_in_sigma(estimate: Estimate, case: Path, log: Log, start: float, data: int) -> np.ndarray:
+    """By how many of its standard deviations each direction is off the truth, the motor's start included."""
+    machine = open_session(case, log).machine
+    w = Prior.of(machine, 0.5, np.zeros(0)).inward(np.array([stages.TRUTH[data][n] for n in estimate.names]))
+    truth = dict(zip(estimate.names, w, strict=True))
+    if start:
+        truth["start position 1"] = start / float(np.max(machine.sensor.position_std))
+    directions = estimate.details["directions"]
+    at = [sum(v * truth.get(n, 0.0) for n, v in d["combination"].items()) for d in directions]
+    return np.array([(d["value"] - t) / d["std"] for d, t in zip(directions, at, strict=True)])
+
+
+def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, more: str = ON_FORCE,
+            **stated: Any) -> Path:
+    """A case file; guesses at the truth, or drawn up to 50 % around it."""
+    drawn = None if guess is None else stages.drawn(guess, data=data)
+    path = folder / f"{name}.toml"
+    path.write_text(stages.text(data, guess=drawn, more=more, **stated))
+    return path
+
+
+def studied(
+    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, data: int, on: str = "force"
+) -> tuple[list[Estimate], np.ndarray, list[np.ndarray]]:
+    """Estimates, criterion over that of the truth, and directions in sigma from the truth."""
+    cases = [cases] * len(logs) if isinstance(cases, Path) else cases
+    found = zip(identify_many(cases, logs), cases, logs, starts, strict=True)
+    kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
+    machine = open_session(cases[0], logs[0]).machine
+    truth = np.array([stages.TRUTH[data][n] for n in machine.parameters.names])
+    at = together([criterion_steps(machine, log, truth, on=on) for _, _, log, _ in kept], 16)
+    ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])
+    off = [off_in_sigma(e, case, log, start, data) for e, case, log, start in kept]
+    return [e for e, *_ in kept], ratio, off
