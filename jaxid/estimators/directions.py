@@ -2,7 +2,8 @@
 
 A short log cannot tell all unknowns. Fitted all the same they run away along what is flat, and what is
 told goes with them. Here each guess is a prior of a stated relative width; combinations of unknowns that
-the log tells better than that are fitted, the others are held.
+the log tells better than that are fitted, the others follow their prior: they move only where guesses and
+log together are more probable.
 """
 
 from __future__ import annotations
@@ -14,27 +15,32 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxid.estimators.directions_posterior import most_probable, spread
 from jaxid.estimators.directions_precision import (
     Told,
     add_profiles,
     assessed,
     hessian_of,
     told_of,
+    with_guesses,
 )
 from jaxid.estimators.directions_problem import (
     AT_ONCE,
+    DRAWN,
     FAR,
     NEAR,
     NO_PULL,
-    SETTLED,
+    STAYS,
     Found,
     Problem,
+    at_each,
+    at_each_soon,
     columns,
     descent,
     fit_each,
     read,
 )
-from jaxid.estimators.directions_rounding import covariance_with_rounding, draws_soon, rounds
+from jaxid.estimators.directions_rounding import draws_soon, rounds, sifted
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -42,18 +48,18 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.replay import Numerics
 
-# A direction is fitted where its standard deviation is below this part of the prior's; one that was stays
-# up to the second.
-_TOLD_TWICE, _STAYS = 0.5, 0.6
+# A direction is fitted where its standard deviation is below this part of the prior's; one that was, up to
+# `STAYS`.
+_TOLD_TWICE = 0.5
 # Directions change with the point at which they are read: most rounds, in how many of them they are read
 # anew.
 _ROUNDS, _READ = 6, 3
-# A direction that changes so small a part of what another does is not felt.
-_UNFELT = 1e-6
 # Starts where the guesses tell nothing.
 _WHERE_NOTHING_SHOWS = 32
 # Where along the best told direction a start is led from which the simulation does not move [priors].
 _LOOK = np.linspace(-3.0, 3.0, 13)
+# How far a fit looks for where to begin, in priors.
+_LOOKED = 2.0
 # Two starts end at one optimum where their costs differ by less than this.
 _SAME = 1e-3
 
@@ -63,7 +69,7 @@ def directions_steps(
     others: Sequence[np.ndarray] = (), hessian: bool = False, profile: bool = False,
     numerics: Numerics | None = None, widths: Mapping[str, float] | None = None,
 ) -> Steps[Estimate]:
-    """Fit what a log tells of the unknowns in the loop, and hold the rest at the guesses.
+    """Fit what a log tells of the unknowns in the loop, and leave the rest to the guesses.
 
     Args:
         machine: The machine; its controller closes the loop, which begins at rest.
@@ -80,8 +86,8 @@ def directions_steps(
         widths: Standard deviations of single guesses, by name; of what must be positive of its logarithm.
 
     Returns:
-        The estimate. Standard deviations hold what is left of the prior along held directions;
-        `details["directions"]` has the combinations with their own.
+        The estimate. Standard deviations hold what is left of the prior along other directions, and what
+        those do to the fitted ones; `details["directions"]` has the combinations with their own.
 
     Raises:
         InputError: If the loop cannot be simulated, or a guess is zero.
@@ -95,35 +101,32 @@ def directions_steps(
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     found, told, many = yield from _searched(machine, problem, starts, given)
     p = len(machine.parameters.free)
-    r, z = found.count, np.asarray(found.minimum.theta)
+    r = found.count
     remarks: list[str] = []
-    if hessian and told is not None and rounds(machine, problem):
-        remarks.append("rounding was simulated: the Hessian says nothing beside it")
-    elif hessian and told is not None:
-        args = (*found.problem.args, found.problem.ladder[-1], found.first, z)
-        full = np.asarray((yield Solve(hessian_of, args)))[:r, :r]
-        if np.linalg.eigvalsh(full)[0] > 0.0:
-            told = told_of(found, full)
-        else:
-            remarks.append("the cost does not curve upwards everywhere: Gauss-Newton's curvature was taken")
+    if (hessian or profile) and told is not None and rounds(machine, problem):
+        remarks.append("rounding was simulated: neither Hessian nor profiles say anything beside it")
+    elif told is not None:
+        noise = found.problem.noise(found.minimum, r)
+        if hessian:
+            told, said = yield from _by_hessian(found, told, noise)
+            remarks += said
     precision, stated = assessed(machine, found, told)
-    if profile:
-        remarks += yield from add_profiles(found, stated)
+    if profile and told is not None and not rounds(machine, problem):
+        remarks += yield from add_profiles(found, noise, stated)
     theta = np.asarray(found.problem.prior.outward(found.point))[:p]
     e = np.asarray(found.minimum.residual).reshape(found.problem.measured.shape)
     counts = found.problem.weight > 0
-    converged = bool(found.minimum.converged) and found.settled
-    message = "the directions that the log tells did not settle"
+    message = "the fit within the prior did not settle"
     if not np.isfinite(float(found.minimum.cost)) or not np.all(np.isfinite(found.minimum.jacobian)):
         message = "the simulation is not finite where the fit ended"
-    remarks.insert(0, f"{r} directions of {p} unknowns fitted, the rest held at the guesses")
+    remarks.insert(0, f"{r} directions of {p} unknowns fitted, the rest left to the guesses")
     return Estimate(
         method="output_error",
         machine=machine.with_estimate(theta),
         theta=theta,
         precision=precision,
-        converged=converged,
-        message="converged" if converged else message,
+        converged=found.settled,
+        message="converged" if found.settled else message,
         residual=np.where(counts, e / np.where(counts, found.problem.weight, 1.0), np.nan),
         samples=int(counts.sum()),
         steps=found.evaluations,
@@ -132,30 +135,76 @@ def directions_steps(
     )
 
 
+def _by_hessian(found: Found, told: Told, noise: float) -> Steps[tuple[Told, list[str]]]:
+    """With the full Hessian's quadratic picture, where it has one; and what to remark."""
+    z = np.asarray(found.minimum.theta)
+    args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
+    full = np.asarray((yield Solve(hessian_of, args))) / noise**2 + np.eye(z.size)
+    if np.linalg.eigvalsh(full)[0] <= 0.0:
+        return told, ["the cost does not curve upwards everywhere: its curvature was not taken"]
+    return with_guesses(found, told_of(found), found.vectors @ np.linalg.inv(full) @ found.vectors.T), []
+
+
 def _searched(
     machine: Machine, problem: Problem, starts: int, given: Sequence[np.ndarray]
 ) -> Steps[tuple[Found, Told | None, dict[str, Any]]]:
     """Where the fit ends, how well its directions are told, and what is to be stated of its starts."""
-    # What rounding does leaves few directions told in the end: the best of them come first.
-    most = problem.prior.base.size
+    yield at_each_soon(problem)
+    ended, most = _most_probable, problem.prior.base.size
     if rounds(machine, problem):
-        most = AT_ONCE
+        # What rounding does leaves few directions told in the end: the best of them come first.
+        ended, most = sifted, AT_ONCE
         yield draws_soon(machine, problem)
     found = yield from _rounds(problem, np.zeros(problem.prior.base.size), most)
     many: dict[str, Any] = {}
     if starts > 1 or given:
         found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
-    found, told = yield from _sifted(machine, found)
+    found, told = yield from ended(machine, found)
     if told is None and not many:
         # A machine that sticks at the guesses, or nearly, shows nothing.
         found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
-        found, told = yield from _sifted(machine, found)
+        found, told = yield from ended(machine, found)
     while found.count == most and found.more:
         most += AT_ONCE
         spent = found.evaluations
         found = yield from _rounds(found.problem, found.point, most, last=True)
-        found, told = yield from _sifted(machine, replace(found, evaluations=found.evaluations + spent))
+        found, told = yield from ended(machine, replace(found, evaluations=found.evaluations + spent))
     return found, told, many
+
+
+def _looked(problem: Problem, told: np.ndarray, w: np.ndarray) -> Steps[np.ndarray]:
+    """Of points along what is told best, and the one given, that of the lowest cost: it has many valleys."""
+    z = np.random.default_rng(1).uniform(-_LOOKED, _LOOKED, (DRAWN, told.shape[1]))
+    points = w + (z - told.T @ w) @ told.T
+    points[0] = w
+    e = np.asarray((yield at_each(problem, points))).reshape(DRAWN, -1)
+    costs = np.sum(e**2, axis=1)
+    return points[np.argmin(np.where(np.isfinite(costs), costs, np.inf))]
+
+
+def _most_probable(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
+    """On to where guesses and log agree, and how well directions are told there by both."""
+    problem = found.problem
+    if not np.all(np.isfinite(found.minimum.jacobian)):
+        return found, None
+    noise = problem.noise(found.minimum, found.count)
+    w, here, settled = yield from most_probable(problem, noise, found.point)
+    jacobian = np.asarray(here.jacobian)
+    vectors, count = _directions(jacobian / noise, found.count)
+    while True:
+        minimum = replace(here, theta=vectors.T @ w, jacobian=jacobian @ vectors)
+        spent = found.evaluations + int(here.steps)
+        ended = Found(problem, vectors, count, minimum, spent, settled, False)
+        if not count:
+            return ended, None
+        whole = yield from spread(ended, problem.noise(minimum, count))
+        told = with_guesses(ended, told_of(ended), whole)
+        stays = told.std <= STAYS
+        if np.all(stays):
+            return ended, told
+        # What noise of the residual's colour leaves too wide goes behind those that stay.
+        order = np.concatenate([np.argsort(~stays, kind="stable"), np.arange(count, len(vectors))])
+        vectors, count = vectors[:, order], int(stays.sum())
 
 
 def _drawn(problem: Problem, starts: int) -> np.ndarray:
@@ -172,8 +221,6 @@ def _rounds(problem: Problem, w: np.ndarray, most: int, *, last: bool = False) -
     `last`: at the sharpest only, from a point that is near.
     """
     size, spent = problem.prior.base.size, 0
-    # Where rounding will let go of most of them it is enough to be near.
-    enough = NEAR if most < size and not last else SETTLED
     ladder = problem.ladder[-1:] if last else problem.ladder
     count, more, cost, settled = 0, False, np.inf, False
     for rung in range(len(ladder) + _ROUNDS):
@@ -191,60 +238,22 @@ def _rounds(problem: Problem, w: np.ndarray, most: int, *, last: bool = False) -
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
             more, count = count > most, min(count, most)
+            if rung == 0 and not last and count:
+                w = yield from _looked(problem, vectors[:, : min(count, AT_ONCE)], w)
         some = columns(vectors, count)
         fitted = np.arange(some.shape[1]) < count
         start = np.where(fitted, np.clip(some.T @ w, -FAR, FAR), 0.0)
-        pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
-        # A rung above the last is only to lead near.
-        left = enough if sharpness is ladder[-1] else NEAR
-        minimum = yield from descent(problem, sharpness, pull, np.zeros(size), some, start, fitted, left)
+        # These only lead near.
+        pull = np.asarray(noise)
+        minimum = yield from descent(problem, sharpness, pull, np.zeros(size), some, start, fitted, NEAR)
         spent += int(minimum.steps)
         w = some @ np.asarray(minimum.theta)
         moved = abs(float(minimum.cost) - cost)
-        close = before == count and moved <= enough / len(problem.measured) * cost
+        close = before == count and moved <= NEAR / len(problem.measured) * cost
         settled, cost = close and sharpness is ladder[-1], float(minimum.cost)
         if settled or not np.isfinite(cost):
             break
     return Found(problem, vectors, count, minimum, spent, settled, more)
-
-
-def _sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
-    """Let go of directions that are told only as long as noise counts as white, and fit the rest again.
-
-    A residual's colour, and above all what rounding of the readings does in the loop, moves an estimate
-    farther along them than its prior would let it.
-    """
-    ended = not rounds(machine, found.problem)
-    while found.count and np.all(np.isfinite(found.minimum.jacobian)):
-        stays, told = _felt(found), None
-        if np.all(stays):
-            told = told_of(found)
-            if rounds(machine, found.problem):
-                covariance = yield from covariance_with_rounding(machine, found, told.std)
-                told = replace(told, covariance=covariance)
-            stays = told.std <= _STAYS
-        if ended and told is not None and np.all(stays):
-            return found, told
-        rest = np.arange(found.count, len(found.vectors))
-        order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
-        vectors, count = found.vectors[:, order], int(stays.sum())
-        some = columns(vectors, count)
-        fitted = np.arange(some.shape[1]) < count
-        z = np.where(fitted, some.T @ found.point, 0.0)
-        origin = np.zeros(len(vectors))
-        last = found.problem.ladder[-1]
-        minimum = yield from descent(found.problem, last, NO_PULL, origin, some, z, fitted)
-        spent = found.evaluations + int(minimum.steps)
-        found = replace(found, vectors=vectors, count=count, minimum=minimum, evaluations=spent)
-        ended = True
-    return found, None
-
-
-def _felt(found: Found) -> Bool[np.ndarray, " r"]:
-    """Which fitted directions still change anything: not those that end where an unknown is at its bound."""
-    triangle = np.linalg.qr(np.asarray(found.minimum.jacobian)[:, : found.count], mode="r")
-    size = np.abs(np.diag(triangle))
-    return size > _UNFELT * size.max()
 
 
 def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
@@ -256,7 +265,7 @@ def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     told[: values.size] = values
     count = int(np.sum(told > 1.0 / _TOLD_TWICE))
     if before > count:
-        count = int(np.sum(told[:before] > 1.0 / _STAYS))
+        count = int(np.sum(told[:before] > 1.0 / STAYS))
     # Eigenvectors come with either sign: the largest entry is taken positive.
     return rows.T * np.sign(rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]), count
 
@@ -282,17 +291,16 @@ def _many_starts(
         some, origin = found.first, np.zeros(points.shape[1])
         fitted = np.arange(some.shape[1]) < found.count
         # The fit itself is the last of them: it may only be near its own optimum.
-        z = np.concatenate([np.clip(points @ some, -FAR, FAR), [np.asarray(found.minimum.theta)]])
+        z = np.clip(np.concatenate([points, [found.point]]) @ some, -FAR, FAR)
         z = np.where(fitted, z, 0.0)
         active = np.tile(fitted, (len(z), 1))
-        flat = yield from _flat(found, z[:-1], active[:-1])
+        # Asked of the fit too, for nothing: of one count less the same code would be compiled once more.
+        flat = (yield from _flat(found, z, active))[:-1]
         if np.any(flat):
             z[:-1][flat] = (yield from _led(found, z))[:-1][flat]
-        noise = found.problem.noise(found.minimum, found.count)
-        ladder = found.problem.ladder
-        for sharpness in ladder:
-            pull = np.asarray(0.0 if sharpness is ladder[-1] else noise)
-            args = (*found.problem.args, sharpness, pull, origin, some, z, active)
+        noise = np.asarray(found.problem.noise(found.minimum, found.count))
+        for sharpness in found.problem.ladder:
+            args = (*found.problem.args, sharpness, noise, origin, some, z, active)
             z, costs, _, _ = (np.asarray(x) for x in (yield Solve(fit_each, args)))
         costs = np.where(np.isfinite(costs), costs, np.inf)
         best, cost = int(np.argmin(costs)), float(found.minimum.cost)

@@ -10,8 +10,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from jaxid.estimators.directions_problem import NO_PULL, Found, fit_each, residual_of
-from jaxid.estimators.steps import Solve, Steps
+from jaxid.estimators.directions_posterior import loss_of, most_probable
+from jaxid.estimators.directions_problem import Found, residual_of
+from jaxid.estimators.steps import Steps
 from jaxid.machine import Machine
 from jaxid.precision import Precision, assess, full_hessian
 
@@ -21,7 +22,7 @@ _TOLD = 0.5
 _NEGLIGIBLE = 0.1
 # A profile is taken at so many standard deviations of the quadratic picture.
 _PROFILED = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-# Variances by which one may end below the fit for numerics alone.
+# Variances by which one may end below the fit, which is not told to the last digit.
 _BELOW = 0.1
 
 
@@ -38,13 +39,15 @@ class Told:
 
     Args:
         covariance: Of their coordinates, (r, r).
-        white: Standard deviations as if noise were white, (r,).
+        white: Standard deviations by the log alone, as if noise were white, (r,).
         information: See `Precision`.
+        whole: Covariance of all unknowns in units of the prior; none where what is held counts as its prior.
     """
 
     covariance: np.ndarray
     white: np.ndarray
     information: np.ndarray
+    whole: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:
@@ -52,8 +55,8 @@ class Told:
         return np.sqrt(np.diag(self.covariance))
 
 
-def told_of(found: Found, hessian: np.ndarray | None = None) -> Told:
-    """Precision of the fitted directions, one at least, from the residual's own colour; see `hessian_of`."""
+def told_of(found: Found) -> Told:
+    """Precision of the fitted directions, one at least, by the log alone: from the residual's own colour."""
     problem, r = found.problem, found.count
     shape, counts = problem.measured.shape, problem.weight > 0
     jacobian = np.asarray(found.minimum.jacobian).reshape(*shape, -1)[..., :r]
@@ -62,7 +65,7 @@ def told_of(found: Found, hessian: np.ndarray | None = None) -> Told:
     signal = float(np.linalg.norm(deviation))
     told = assess(
         [f"direction {k + 1}" for k in range(r)], jacobian, e, counts,
-        signal, np.ones(r), hessian, crossed=problem.on == "both",
+        signal, np.ones(r), crossed=problem.on == "both",
     )
     # Of the triangle: some directions are told a million times better than others.
     triangle = np.linalg.qr(jacobian.reshape(-1, r), mode="r")
@@ -71,6 +74,20 @@ def told_of(found: Found, hessian: np.ndarray | None = None) -> Told:
     larger = np.maximum(1.0, white / told.std)
     of_seen = told.covariance * np.outer(larger, larger)
     return Told(of_seen, white, told.information)
+
+
+def with_guesses(found: Found, told: Told, whole: np.ndarray) -> Told:
+    """With the guesses counted in.
+
+    Args:
+        found: The fit.
+        told: By the log alone.
+        whole: Covariance of all unknowns by guesses and log, as if noise were white.
+    """
+    seen = found.vectors[:, : found.count]
+    along = np.eye(len(whole)) + (seen * (told.std / told.white - 1.0)) @ seen.T
+    whole = along @ whole @ along.T
+    return replace(told, covariance=seen.T @ whole @ seen, whole=whole)
 
 
 def assessed(
@@ -83,8 +100,8 @@ def assessed(
     names = [*machine.parameters.names, *problem.nuisances]
     z = np.asarray(found.minimum.theta)
     seen, held = found.vectors[:, :r], found.vectors[:, r:]
+    whole = seen @ told.covariance @ seen.T + held @ held.T if told.whole is None else told.whole
     slope = problem.prior.slope(np.asarray(problem.prior.outward(found.point)))
-    whole = seen @ told.covariance @ seen.T + held @ held.T
     p = len(problem.places)
     left = np.sqrt(np.diag(whole))[:p]
     identifiable = left < _TOLD
@@ -113,31 +130,27 @@ def _named(names: Sequence[str], vector: np.ndarray) -> dict[str, float]:
     return {n: float(v) for n, v in zip(names, vector, strict=True) if abs(v) > _NEGLIGIBLE}
 
 
-def add_profiles(found: Found, stated: list[dict[str, Any]]) -> Steps[list[str]]:
-    """Add to each direction its profile: by how many variances the cost rises when it is held elsewhere.
+def add_profiles(found: Found, noise: float, stated: list[dict[str, Any]]) -> Steps[list[str]]:
+    """Add to each direction its profile: twice the nats by which guess and log speak against it elsewhere.
 
     Returns:
         What to remark: profiles that fall below the fit.
     """
-    r, some = found.count, found.first
-    if not r:
-        return []
-    best = np.asarray(found.minimum.theta)
-    z = np.tile(best, (r, _PROFILED.size, 1))
-    active = np.tile(np.arange(best.size) < r, (r, _PROFILED.size, 1))
-    for k in range(r):
-        z[k, :, k] += _PROFILED * stated[k]["std"]
-        active[k, :, k] = False
-    flat = (z.reshape(-1, best.size), active.reshape(-1, best.size))
-    still = (NO_PULL, np.zeros(len(some)), some)
-    args = (*found.problem.args, found.problem.ladder[-1], *still, *flat)
-    _, costs, _, _ = yield Solve(fit_each, args)
-    rise = 2 * (np.asarray(costs).reshape(r, -1) - float(found.minimum.cost))
-    noise = found.problem.noise(found.minimum, r) ** 2
-    for k in range(r):
-        stated[k]["profile"] = {
-            "at_std": _PROFILED.tolist(), "rise": (rise[k] / noise).tolist(),
-        }
-    below = [k + 1 for k in range(r) if np.nanmin(rise[k]) < -_BELOW * noise]
-    words = "the profile of direction {} falls below the fit: there is a better optimum beside it"
-    return [words.format(k) for k in below]
+    best, words = found.point, []
+    below = "the profile of direction {} falls below the fit: there is a better optimum beside it"
+    for k, direction in enumerate(stated):
+        along, rise = found.vectors[:, k], np.full(_PROFILED.size, np.nan)
+        lowest = loss_of(noise, found.minimum, best)
+        # From the fit outwards: each begins where its neighbour ended.
+        for side in (_PROFILED < 0, _PROFILED > 0):
+            w, before = best, 0.0
+            places = np.flatnonzero(side)
+            for i in places[np.argsort(np.abs(_PROFILED[places]))]:
+                w = w + (_PROFILED[i] - before) * direction["std"] * along
+                before = _PROFILED[i]
+                w, here, _ = yield from most_probable(found.problem, noise, w, held=along)
+                rise[i] = 2 * (loss_of(noise, here, w) - lowest)
+        direction["profile"] = {"at_std": _PROFILED.tolist(), "rise": rise.tolist()}
+        if np.nanmin(rise) < -_BELOW:
+            words.append(below.format(k + 1))
+    return words

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxid.errors import InputError
 from jaxid.estimators.least_squares import Minimum, Progress, Transform, descend
 from jaxid.estimators.output_error import choose_numerics, measured_output, output_residual
-from jaxid.estimators.steps import Solve, Steps
+from jaxid.estimators.steps import Solve, Soon, Steps
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import Plant
@@ -31,6 +31,10 @@ FAR = 8.0
 # Coordinates of a compiled fit come in multiples of this: few directions are told, and each costs as much
 # as the simulation itself.
 AT_ONCE = 4
+# What is left of the prior along a direction that was fitted and stays.
+STAYS = 0.6
+# Points at which a compiled call simulates.
+DRAWN = 512
 # No pull towards the guesses.
 NO_PULL = np.zeros(())
 # Friction that rises with speeding up lets a velocity stand, and costs have a kink wherever it does: such
@@ -205,6 +209,32 @@ def residual_of(
     return lambda z: physical(jnp.concatenate([prior.outward(origin + vectors @ z), still]))
 
 
+@eqx.filter_jit
+def residual_at_each(*args: Any) -> Array:
+    """Residuals at many points in units of the prior, from as many starts; `Problem.args` first."""
+    *problem, sharpness, w, starts = args
+    replay, places, plant, *rest = problem
+    plant = replace(plant, sharpness=sharpness)
+    moved = lambda start: eqx.tree_at(lambda r: r.position, replay, replay.position + start)
+    at = lambda w, start: residual_of(moved(start), places, plant, *rest, jnp.eye(w.size))(w)
+    return eqx.filter_vmap(at)(w, starts)
+
+
+def at_each(
+    problem: Problem, w: Float[np.ndarray, "draws q"], starts: Float[np.ndarray, "draws n"] | None = None
+) -> Solve:
+    """Residuals at so many points as `DRAWN`, from rest at zero if no starts are given."""
+    if starts is None:
+        starts = np.zeros((len(w), problem.replay.position.size))
+    return Solve(residual_at_each, (*problem.args, problem.ladder[-1], w, starts))
+
+
+def at_each_soon(problem: Problem) -> Soon:
+    """What `at_each` will ask for."""
+    function, args = at_each(problem, np.zeros((DRAWN, problem.prior.base.size)))
+    return Soon(function, args, (function, jax.tree.structure(args), problem.measured.shape))
+
+
 def _goes_on(*args: Any) -> Progress:
     """Down the cost; `pull`, the noise that a prior is held against, keeps the way near the guesses."""
     replay, places, plant, *rest, sharpness, pull, origin, vectors, active, tolerance, stop, progress = args
@@ -291,8 +321,8 @@ def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
 class Found:
     """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum.
 
-    The minimum is in the coordinates of the first few directions; the others' are zero. Evaluations are those
-    that it took; `more`: other directions are told too, beyond the most that were asked for.
+    The minimum is in the coordinates of the first directions, or of all; those of others are zero.
+    Evaluations are those that it took; `more`: others are told too, beyond the most that were asked for.
     """
 
     problem: Problem
@@ -305,13 +335,14 @@ class Found:
 
     @property
     def first(self) -> np.ndarray:
-        """Directions of the minimum's coordinates."""
+        """Directions that compiled code is made for."""
         return columns(self.vectors, self.count)
 
     @property
     def point(self) -> np.ndarray:
         """In units of the prior."""
-        return self.first @ np.asarray(self.minimum.theta)
+        theta = np.asarray(self.minimum.theta)
+        return self.vectors[:, : theta.size] @ theta
 
 
 def criterion_steps(

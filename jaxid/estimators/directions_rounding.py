@@ -8,20 +8,27 @@ and a line is laid through what the fit makes of those like the log's.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float
 
-from jaxid.estimators.directions_problem import Found, Problem, residual_of
-from jaxid.estimators.steps import Solve, Soon, Steps
+from jaxid.estimators.directions_precision import Told, told_of
+from jaxid.estimators.directions_problem import (
+    DRAWN,
+    STAYS,
+    Found,
+    Problem,
+    at_each,
+    at_each_soon,
+    columns,
+    descent,
+)
+from jaxid.estimators.steps import Soon, Steps
 from jaxid.machine import Machine
 from jaxid.replay import with_sensor
 
-_DRAWS = 512
+# A direction that changes so small a part of what another does is not felt.
+_UNFELT = 1e-6
 # Data are drawn so many deviations around the estimate, but over this part of the prior at least, and this
 # at most; the nearest of them count.
 _REACH, _LEAST, _MOST = 8.0, 0.8, 2.0
@@ -34,16 +41,6 @@ _FEWEST = 100
 _OWN = 0.1
 
 
-@eqx.filter_jit
-def _each(*args: Any) -> Array:
-    *problem, sharpness, w, starts = args
-    replay, places, plant, *rest = problem
-    plant = replace(plant, sharpness=sharpness)
-    moved = lambda start: eqx.tree_at(lambda r: r.position, replay, replay.position + start)
-    at = lambda w, start: residual_of(moved(start), places, plant, *rest, jnp.eye(w.size))(w)
-    return eqx.filter_vmap(at)(w, starts)
-
-
 def rounds(machine: Machine, problem: Problem) -> bool:
     """Whether the loop reads by counts that its simulation left out."""
     coarse = machine.sensor.position_resolution is not None and problem.on != "position"
@@ -52,13 +49,12 @@ def rounds(machine: Machine, problem: Problem) -> bool:
 
 def draws_soon(machine: Machine, problem: Problem) -> Soon:
     """What `covariance_with_rounding` will ask for."""
-    n, size = problem.replay.position.size, problem.prior.base.size
-    args = (*_args(machine, problem), np.zeros((_DRAWS, size)), np.zeros((_DRAWS, n)))
-    return Soon(_each, args, (_each, jax.tree.structure(args), problem.measured.shape))
+    return at_each_soon(_rounding(machine, problem))
 
 
-def _args(machine: Machine, problem: Problem) -> tuple:
-    return with_sensor(problem.replay, machine.sensor), *problem.args[1:], problem.ladder[-1]
+def _rounding(machine: Machine, problem: Problem) -> Problem:
+    """The same with rounding in its loop."""
+    return replace(problem, replay=with_sensor(problem.replay, machine.sensor))
 
 
 def drawn_roundings(
@@ -77,12 +73,55 @@ def drawn_roundings(
     if not rounds(machine, problem):
         return None
     rng, size = np.random.default_rng(2), problem.prior.base.size
-    shape, still = (_DRAWS, problem.replay.position.size), np.zeros((_DRAWS, size))
-    count, args = np.asarray(machine.sensor.position_resolution), _args(machine, problem)
-    parts = -(-draws // _DRAWS)
-    e = [_each(*args, still, rng.uniform(-0.5, 0.5, shape) * count) for _ in range(parts)]
-    e = np.concatenate([np.asarray(x).reshape(_DRAWS, -1) for x in e])[:draws]
+    shape, still = (DRAWN, problem.replay.position.size), np.zeros((DRAWN, size))
+    count, rounding = np.asarray(machine.sensor.position_resolution), _rounding(machine, problem)
+    asked = [
+        at_each(rounding, still, rng.uniform(-0.5, 0.5, shape) * count) for _ in range(-(-draws // DRAWN))
+    ]
+    e = [function(*args) for function, args in asked]
+    e = np.concatenate([np.asarray(x).reshape(DRAWN, -1) for x in e])[:draws]
     return e - e.mean(axis=0)
+
+
+def sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
+    """Let go of directions that are told only as long as noise counts as white, and fit the rest again.
+
+    What rounding of the readings does in the loop moves an estimate farther along them than its prior would
+    let it.
+    """
+    ended = False
+    while found.count and np.all(np.isfinite(found.minimum.jacobian)):
+        stays, told = _felt(found), None
+        if np.all(stays):
+            told = told_of(found)
+            covariance = yield from covariance_with_rounding(machine, found, told.std)
+            told = replace(told, covariance=covariance)
+            stays = told.std <= STAYS
+        if ended and told is not None and np.all(stays):
+            return found, told
+        rest = np.arange(found.count, len(found.vectors))
+        order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
+        vectors, count = found.vectors[:, order], int(stays.sum())
+        some = columns(vectors, count)
+        fitted = np.arange(some.shape[1]) < count
+        z = np.where(fitted, some.T @ found.point, 0.0)
+        origin = np.zeros(len(vectors))
+        last, pull = found.problem.ladder[-1], np.asarray(found.problem.noise(found.minimum, found.count))
+        minimum = yield from descent(found.problem, last, pull, origin, some, z, fitted)
+        spent = found.evaluations + int(minimum.steps)
+        settled = bool(minimum.converged)
+        found = replace(
+            found, vectors=vectors, count=count, minimum=minimum, evaluations=spent, settled=settled
+        )
+        ended = True
+    return found, None
+
+
+def _felt(found: Found) -> Bool[np.ndarray, " r"]:
+    """Which fitted directions still change anything: not those that end where an unknown is at its bound."""
+    triangle = np.linalg.qr(np.asarray(found.minimum.jacobian)[:, : found.count], mode="r")
+    size = np.abs(np.diag(triangle))
+    return size > _UNFELT * size.max()
 
 
 def covariance_with_rounding(
@@ -119,16 +158,20 @@ def _within(
     problem, r, rng = found.problem, found.count, np.random.default_rng(0)
     best, n = np.asarray(found.minimum.theta), problem.replay.position.size
     count = np.asarray(machine.sensor.position_resolution)
-    starts = rng.uniform(-0.5, 0.5, (_DRAWS, n)) * count
-    off = rng.uniform(-1.0, 1.0, (_DRAWS, r)) * reach
-    z = np.tile(best, (_DRAWS, 1))
+    starts = rng.uniform(-0.5, 0.5, (DRAWN, n)) * count
+    off = rng.uniform(-1.0, 1.0, (DRAWN, r)) * reach
+    z = np.tile(best, (DRAWN, 1))
     z[:, :r] += off
     # In units of the prior, not of the directions: one compiled call, however many of them there are.
     w = z @ found.first.T
-    e = np.asarray((yield Solve(_each, (*_args(machine, problem), w, starts))))
+    # What is held is anywhere within its prior too; where the motor starts is drawn already.
+    held = rng.standard_normal((DRAWN, len(found.vectors) - r)) @ found.vectors[:, r:].T
+    own = slice(0, len(problem.places))
+    w[:, own] += held[:, own]
+    e = np.asarray((yield at_each(_rounding(machine, problem), w, starts)))
     # Of data drawn, less what the estimate says: what a fit of them would begin with.
     shape = problem.measured.shape
-    apart = (np.asarray(found.minimum.residual).reshape(shape) - e).reshape(_DRAWS, -1)
+    apart = (np.asarray(found.minimum.residual).reshape(shape) - e).reshape(DRAWN, -1)
     # Far from the estimate a loop may run away.
     sound = np.all(np.isfinite(apart), axis=1)
     if sound.sum() < _FEWEST:

@@ -121,7 +121,7 @@ def _blind(estimate: Estimate) -> list[str]:
     """What the log does not tell; a fit within a prior holds it."""
     combinations = estimate.precision.unidentifiable
     if "directions" in estimate.details:
-        return [f"held at the guesses: {_sum(c)}" for c in combinations]
+        return [f"left to the guesses: {_sum(c)}" for c in combinations]
     return _untold(combinations)
 
 
