@@ -278,7 +278,7 @@ def test_many_logs_are_fitted_as_each_alone(folder, fitted):
 
 @pytest.mark.slow
 def test_intervals_hold_what_wrong_guesses_do(tmp_path):
-    """64 logs, guesses 50 % off: what is held at them makes up for nothing, and where it does sigma says so."""
+    """64 logs, guesses 50 % off: what is left to them gives way, and sigma says what that leaves."""
     cases = [tmp_path / f"case{k}.toml" for k in range(64)]
     for k, case in enumerate(cases):
         case.write_text(stages.text(1, guess=stages.drawn(100 + k), resolution=0.0, more=STATED))
