@@ -39,6 +39,7 @@ from jaxid.parameters import free_effect
 from jaxid.precision import NoiseModel
 from jaxid.replay import Replay
 from jaxid.session import Session
+from jaxid.stiffness import calmed
 
 # A smooth loop of fixed steps cannot take these in.
 _LEFT_OUT = (StaticFriction, Backlash, JointFlexibility)
@@ -200,8 +201,9 @@ class _Loop:
         # Of one width for all: one compiled function.
         directions = np.zeros((len(theta), max(len(c.index) for c in self.union.candidates)))
         directions[c.index, np.arange(len(c.index))] = 1.0
-        plant = replace(self.union.machine.plant, sharpness=self.problem.ladder[-1])
-        p = self.problem
+        p, log = self.problem, self.session.fit.log
+        plant = calmed(self.union.machine.plant, jnp.asarray(log.filled[0]), log.period)
+        plant = replace(plant, sharpness=p.ladder[-1])
         args = (p.replay, self.union.machine.parameters.places, plant, p.measured, p.weight, p.on)
         e, columns = _columns(*args, theta, directions)
         return np.asarray(e) / self.sigma, np.asarray(columns)[:, : len(c.index)] / self.sigma

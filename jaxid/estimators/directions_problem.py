@@ -21,6 +21,7 @@ from jaxid.machine import Machine
 from jaxid.model import Plant
 from jaxid.replay import Numerics, Replay, from_rest, make_replay, with_sensor
 from jaxid.sensors import Sensor
+from jaxid.stiffness import calmed, steps_when_calmed
 
 # In parts of the variance of one sample: where a fit has settled, and where it is near enough to go on
 # sharper.
@@ -138,16 +139,19 @@ class Problem:
         Raises:
             InputError: If a guess is zero, or the loop cannot be simulated.
         """
+        n = log.position.shape[1]
+        plant = calmed(machine.plant, jnp.asarray(log.filled[0]), log.period)
+        if plant is not machine.plant:
+            numerics = replace(numerics, substeps=steps_when_calmed(numerics.substeps))
         replay = from_rest(make_replay(machine, log, numerics))
         if on != "position":
             replay = with_sensor(replay, Sensor())
         measured, counts = measured_output(machine, log, on)
         std = machine.sensor.position_std
-        n = log.position.shape[1]
         start = np.zeros(0) if std is None else np.broadcast_to(np.asarray(std), n)
         whole = Prior.of(machine, prior, start, widths)
         weight = np.tile(counts.astype(float), (len(measured), 1))
-        plant, m = machine.plant, log.force.shape[1]
+        m = log.force.shape[1]
         ladder = _LADDER if _rises(plant, np.zeros(n), np.zeros(m)) else (plant.sharpness,)
         sharp = tuple(np.asarray(s) for s in ladder)
         return cls(replay, machine.parameters.places, plant, measured, weight, whole, on, sharp)
