@@ -34,10 +34,14 @@ def noise_of(data: int, resolution: float) -> float:
 
 
 def logs_of(
-    data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT, noise: float | None = None
+    data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT, noise: float | None = None,
+    reference: np.ndarray | None = None,
 ) -> tuple[list[Log], np.ndarray]:
-    """Logs that differ in noise, and in where within its first count the motor stood: that too [rad]."""
-    reference = stages.move(0.5, **stages.MOVES[data])
+    """Logs that differ in noise, and in where within its first count the motor stood: that too [rad].
+
+    Of the published move, or of another reference.
+    """
+    reference = stages.move(0.5, **stages.MOVES[data]) if reference is None else reference
     noise = noise_of(data, resolution) if noise is None else noise
     stage, rng = stages.machine(data, rigid=rigid), np.random.default_rng(1)
     out, starts = [], rng.uniform(-0.5, 0.5, runs) * resolution
