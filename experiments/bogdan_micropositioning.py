@@ -143,7 +143,8 @@ def scatter(folder: Path, runs: int) -> None:
                 f"{np.mean([e.details['criterion_percent'] for e in found]):.2f}", f"{ratio.mean():.3f}",
                 f"{1 - fitted / 100:.3f}", f"{np.mean(ratio <= 1):.0%}", inside(1.96), inside(3.0),
             )
-            print(f"  {guesses}, {name}, {screw}: {time.perf_counter() - start:.0f} s", flush=True)
+            so_far = f"{inside(1.96)} within 1.96 sigma ({time.perf_counter() - start:.0f} s)"
+            print(f"  {guesses}, {name}, {screw}: {so_far}", flush=True)
     table.show(time.perf_counter() - start)
 
 
