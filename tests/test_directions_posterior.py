@@ -8,7 +8,7 @@ import pytest
 from jaxid.estimators import directions, directions_posterior, directions_rounding
 from jaxid.estimators.directions_posterior import most_probable, spread
 from jaxid.estimators.directions_precision import add_profiles
-from jaxid.estimators.directions_problem import DRAWN, Found
+from jaxid.estimators.directions_problem import Found
 from jaxid.estimators.least_squares import Minimum
 from jaxid.estimators.steps import alone
 
@@ -35,7 +35,7 @@ def simulated(monkeypatch):
         return SimpleNamespace(function=lambda: e.reshape(len(w), *problem.measured.shape), args=())
 
     monkeypatch.setattr(directions_posterior, "read", read)
-    for module in (directions_posterior, directions, directions_rounding):
+    for module in (directions_posterior, directions):
         monkeypatch.setattr(module, "at_each", at_each)
 
 
@@ -131,17 +131,42 @@ def test_a_fit_begins_in_the_deeper_valley():
     np.testing.assert_allclose(alone(directions._looked(problem, told, np.array([1.1, 0.0, 0.0])))[0], 1.1)
 
 
-def test_rounding_is_drawn_over_what_is_held_too(monkeypatch):
-    """The log tells w0 + (w1^2 - 1) / 2, of which w1 is held: off by as much as that scatters."""
-    residual = lambda w: np.array([w[0] + 0.5 * (w[1] ** 2 - 1.0), *np.zeros(7)])
-    problem = problem_of(residual, None, 2, 8)
+def one_told(monkeypatch, residual):
+    """A fit of the first of two unknowns, whose loop with rounding leaves another residual."""
+    problem = problem_of(None, None, 2, 8)
     jacobian = np.zeros((8, 2))
     jacobian[0, 0] = 1.0
     e = 1e-3 * np.random.default_rng(0).standard_normal(8)
     minimum = Minimum(np.zeros(2), np.asarray(0.0), np.asarray(1), np.asarray(True), e, jacobian)
-    found = Found(problem, np.eye(2), 1, minimum, 1, True, False)
+
+    def at_each(problem, w, starts):
+        rounded = np.zeros((len(w), 8, 1))
+        rounded[:, 0, 0] = residual(w, starts[:, 0])
+        return SimpleNamespace(function=lambda: rounded, args=())
+
+    monkeypatch.setattr(directions_rounding, "at_each", at_each)
     monkeypatch.setattr(directions_rounding, "_rounding", lambda machine, problem: problem)
     machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=0.1))
-    covariance = alone(directions_rounding._within(machine, found, np.array([2.0])))
-    assert DRAWN == 512
-    assert 0.4 < np.sqrt(covariance[0, 0]) < 0.8
+    return machine, Found(problem, np.eye(2), 1, minimum, 1, True, False)
+
+
+def test_rounding_is_drawn_over_what_is_held_too(monkeypatch):
+    """The log tells w0 + (w1^2 - 1) / 2, of which w1 is held: off by as much as that scatters."""
+    machine, found = one_told(monkeypatch, lambda w, start: w[:, 0] + 0.5 * (w[:, 1] ** 2 - 1.0))
+    off, covariance = alone(directions_rounding._within(machine, found, np.array([2.0])))
+    h = np.linspace(-6, 6, 2001)
+    place = 0.5 * (1.0 - h**2)
+    weight = np.exp(-0.5 * h**2 - 0.5 * place**2)
+    mean = np.average(place, weights=weight)
+    exact = np.sqrt(np.average((place - mean) ** 2, weights=weight))
+    assert off[0] == pytest.approx(mean, abs=0.1)
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(exact, rel=0.2)
+
+
+@pytest.mark.parametrize(("shift", "corrected"), [(0.3, 0.3), (0.02, 0.0)])
+def test_what_rounding_does_on_average_is_corrected(monkeypatch, shift, corrected):
+    """Where it is more than it scatters: by 0.058, from a start anywhere within a count of 0.1."""
+    machine, found = one_told(monkeypatch, lambda w, start: w[:, 0] - shift + 2.0 * start)
+    off, covariance = alone(directions_rounding.off_by_rounding(machine, found, np.array([1e-3])))
+    assert off[0] == pytest.approx(corrected, abs=0.02)
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(np.hypot(0.058, shift - corrected), abs=0.015)

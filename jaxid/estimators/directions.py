@@ -166,7 +166,7 @@ def _searched(
         # A machine that sticks at the guesses, or nearly, shows nothing.
         found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
         found, told = yield from ended(machine, found)
-    while found.count == most and found.more:
+    while found.more and 2 * found.count > most:
         most += AT_ONCE
         spent = found.evaluations
         found = yield from _rounds(found.problem, found.point, most, last=True)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from jaxid.estimators.directions_precision import Told, told_of
 from jaxid.estimators.directions_problem import (
     DRAWN,
+    NO_PULL,
     STAYS,
     Found,
     Problem,
@@ -29,12 +30,14 @@ from jaxid.replay import with_sensor
 
 # A direction that changes so small a part of what another does is not felt.
 _UNFELT = 1e-6
-# Data are drawn so many deviations around the estimate, but over this part of the prior at least, and this
-# at most; the nearest of them count.
-_REACH, _LEAST, _MOST = 8.0, 0.8, 2.0
+# Data are drawn so many deviations around the estimate, but over this part of the prior at most; the nearest
+# of them count.
+_REACH, _MOST = 8.0, 2.0
 _NEAREST = 0.3
 # Then anew within so many of the deviations found, as long as that is less than half as far.
 _AGAIN, _PASSES = 4.0, 4
+# Fits of so many evaluations until one settles.
+_TRIES = 3
 # With fewer that did not run away nothing is told.
 _FEWEST = 100
 # Least part of a residual that is noise.
@@ -48,7 +51,7 @@ def rounds(machine: Machine, problem: Problem) -> bool:
 
 
 def draws_soon(machine: Machine, problem: Problem) -> Soon:
-    """What `covariance_with_rounding` will ask for."""
+    """What `off_by_rounding` will ask for."""
     return at_each_soon(_rounding(machine, problem))
 
 
@@ -94,11 +97,11 @@ def sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
         stays, told = _felt(found), None
         if np.all(stays):
             told = told_of(found)
-            covariance = yield from covariance_with_rounding(machine, found, told.std)
+            off, covariance = yield from off_by_rounding(machine, found, told.std)
             told = replace(told, covariance=covariance)
             stays = told.std <= STAYS
         if ended and told is not None and np.all(stays):
-            return found, told
+            return (yield from _moved(found, off)), told
         rest = np.arange(found.count, len(found.vectors))
         order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
         vectors, count = found.vectors[:, order], int(stays.sum())
@@ -107,9 +110,12 @@ def sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
         z = np.where(fitted, some.T @ found.point, 0.0)
         origin = np.zeros(len(vectors))
         last, pull = found.problem.ladder[-1], np.asarray(found.problem.noise(found.minimum, found.count))
-        minimum = yield from descent(found.problem, last, pull, origin, some, z, fitted)
-        spent = found.evaluations + int(minimum.steps)
-        settled = bool(minimum.converged)
+        settled, spent = False, found.evaluations
+        for _ in range(_TRIES):
+            if not settled:
+                minimum = yield from descent(found.problem, last, pull, origin, some, z, fitted)
+                z, settled = np.asarray(minimum.theta), bool(minimum.converged)
+                spent += int(minimum.steps)
         found = replace(
             found, vectors=vectors, count=count, minimum=minimum, evaluations=spent, settled=settled
         )
@@ -124,10 +130,22 @@ def _felt(found: Found) -> Bool[np.ndarray, " r"]:
     return size > _UNFELT * size.max()
 
 
-def covariance_with_rounding(
+def _moved(found: Found, off: Float[np.ndarray, " r"]) -> Steps[Found]:
+    """The fit with its directions elsewhere; nothing is fitted."""
+    z = np.array(found.minimum.theta)
+    z[: found.count] += off
+    last, nothing = found.problem.ladder[-1], np.zeros(z.size, bool)
+    origin = np.zeros(len(found.vectors))
+    there = yield from descent(found.problem, last, NO_PULL, origin, found.first, z, nothing)
+    if not np.all(np.isfinite(there.jacobian)):
+        return found
+    return replace(found, minimum=there, evaluations=found.evaluations + 1)
+
+
+def off_by_rounding(
     machine: Machine, found: Found, std: Float[np.ndarray, " r"]
-) -> Steps[Float[np.ndarray, "r r"]]:
-    """Mean square of the truth's distance from the estimate, by simulation.
+) -> Steps[tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]]:
+    """How far the truth is from the estimate, by simulation.
 
     Args:
         machine: Its sensor rounds.
@@ -135,25 +153,45 @@ def covariance_with_rounding(
         std: Standard deviations of the directions' coordinates without rounding.
 
     Returns:
-        About the estimate, what is off on average included; the prior's where too many data ran away.
+        By how much the truth is elsewhere on average, for a loop that rounds is on average not as one that
+        does not; and the covariance about that, the prior's where too many data ran away.
 
     Source:
         Beaumont, Zhang and Balding (2002), "Approximate Bayesian computation in population genetics":
         local linear regression on a summary, here the estimate of one Gauss-Newton step.
     """
-    reach = np.clip(_REACH * std, _LEAST, _MOST)
+    reach = np.minimum(_REACH * (yield from _scatter(machine, found, std)), _MOST)
     for _ in range(_PASSES):
-        covariance = yield from _within(machine, found, reach)
-        closer = np.minimum(_AGAIN * np.sqrt(np.diag(covariance)), reach)
+        off, covariance = yield from _within(machine, found, reach)
+        closer = np.minimum(_AGAIN * np.sqrt(np.diag(covariance) + off**2), reach)
         if np.all(closer > 0.5 * reach):
             break
         reach = closer
-    return covariance
+    # What is less than its own deviation is not told: it is not corrected, but counts.
+    told = off**2 > np.diag(covariance)
+    left = np.where(told, 0.0, off)
+    return np.where(told, off, 0.0), covariance + np.outer(left, left)
+
+
+def _scatter(
+    machine: Machine, found: Found, std: Float[np.ndarray, " r"]
+) -> Steps[Float[np.ndarray, " r"]]:
+    """Standard deviations with what rounding at the estimate does to one Gauss-Newton step: their size."""
+    problem = found.problem
+    starts = np.random.default_rng(3).uniform(-0.5, 0.5, (DRAWN, problem.replay.position.size))
+    starts = starts * np.asarray(machine.sensor.position_resolution)
+    w = np.tile(found.point, (DRAWN, 1))
+    e = np.asarray((yield at_each(_rounding(machine, problem), w, starts))).reshape(DRAWN, -1)
+    e = e[np.all(np.isfinite(e), axis=1)]
+    if len(e) < _FEWEST:
+        return np.full(std.shape, _MOST)
+    inverse = np.linalg.pinv(np.asarray(found.minimum.jacobian)[:, : found.count])
+    return np.hypot(std, np.std(e @ inverse.T, axis=0))
 
 
 def _within(
     machine: Machine, found: Found, reach: Float[np.ndarray, " r"]
-) -> Steps[Float[np.ndarray, "r r"]]:
+) -> Steps[tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]]:
     """The same from data drawn so far around the estimate."""
     problem, r, rng = found.problem, found.count, np.random.default_rng(0)
     best, n = np.asarray(found.minimum.theta), problem.replay.position.size
@@ -175,7 +213,7 @@ def _within(
     # Far from the estimate a loop may run away.
     sound = np.all(np.isfinite(apart), axis=1)
     if sound.sum() < _FEWEST:
-        return np.eye(r)
+        return np.zeros(r), np.eye(r)
     apart, off = apart[sound], off[sound]
     jacobian = np.asarray(found.minimum.jacobian)[:, :r]
     inverse = np.linalg.pinv(jacobian)
@@ -207,10 +245,12 @@ def _own_noise(
 
 def _about_zero(
     x: Float[np.ndarray, "draws r"], y: Float[np.ndarray, "draws r"], weight: Float[np.ndarray, " draws"]
-) -> Float[np.ndarray, "r r"]:
-    """Mean square of y where x is zero: a weighted line's value there, and what is left around it."""
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]:
+    """Of y where x is zero: a weighted line's value there, and the covariance around it."""
     rows = np.concatenate([np.ones((len(x), 1)), x], axis=1)
     root = np.sqrt(weight)[:, None]
     line = np.linalg.lstsq(rows * root, y * root)[0]
     left = y - rows @ line
-    return (left * weight[:, None]).T @ left / weight.sum() + np.outer(line[0], line[0])
+    weight = weight / weight.sum()
+    # The line's value is itself of so many draws.
+    return line[0], (left * weight[:, None]).T @ left * (1.0 + np.sum(weight**2))
