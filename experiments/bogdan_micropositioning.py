@@ -219,7 +219,7 @@ def designed(folder: Path, runs: int) -> None:
         inside = f"{np.mean(np.abs(each) < 3):.0%} within 3 sigma, at most {np.abs(each).max():.1f}"
         print(f"  {screw}: {', '.join(str(len(o)) for o in off)} combinations, {inside}", flush=True)
         estimate = jaxid.identify(many, logs[0]).estimate
-        alike = "of {count} starts {same_optimum} end at one cost, {same_estimate} within a sigma"
+        alike = "of {count} starts {same_optimum} end at one cost"
         alike = alike.format(**estimate.details["starts"])
         print(f"  {screw}: {alike} ({time.perf_counter() - start:.0f} s)", flush=True)
         for k, name in enumerate(names):

@@ -100,8 +100,6 @@ def directions_steps(
     problem = Problem.of(machine, log, prior, on, numerics, widths)
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     found, told, many = yield from _searched(machine, problem, starts, given)
-    if many:
-        many["starts"]["same_estimate"] = _alike(found, told, many.pop("ends"))
     p = len(machine.parameters.free)
     r = found.count
     remarks: list[str] = []
@@ -319,19 +317,7 @@ def _many_starts(
     # A start that ended lower, where other directions are told and the fit was worse, is not alike.
     same = np.abs(np.append(costs[:-1], cost) - cost) <= cost * _SAME
     stated = {"count": len(same), "same_optimum": int(same.sum()), "flat": int(flat.sum())}
-    return replace(found, evaluations=spent), {"starts": stated, "ends": z[:-1] @ some.T}
-
-
-def _alike(found: Found, told: Told | None, ends: Float[np.ndarray, "starts q"]) -> int:
-    """How many starts end within a deviation of the estimate along all that is told, the fit itself included.
-
-    Stick and slip make several minima of a long log's cost, beside each other: a start may miss the best of
-    them and yet find what it says.
-    """
-    if told is None:
-        return 0
-    away = (ends - found.point) @ found.vectors[:, : found.count]
-    return 1 + int(np.sum(np.all(np.abs(away) <= told.std, axis=1)))
+    return replace(found, evaluations=spent), {"starts": stated}
 
 
 def _led(found: Found, z: Float[np.ndarray, "starts k"]) -> Steps[Float[np.ndarray, "starts k"]]:

@@ -178,7 +178,6 @@ def within_prior_words(content: Mapping) -> list[str]:
     starts = content.get("starts")
     if starts:
         shown = f"starts: {starts['same_optimum']} of {starts['count']} end at the same cost"
-        shown += f", {starts['same_estimate']} within a standard deviation of the estimate"
         if starts["flat"]:
             shown += f"; {starts['flat']} from which the simulation does not move were led on first"
         lines.append(shown)
