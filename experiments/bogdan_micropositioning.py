@@ -318,7 +318,8 @@ def short(folder: Path, runs: int) -> None:
             verdicts = ", ".join(f"{said.count(v)} {v}" for v in dict.fromkeys(said))
             size = 1e3 * (noise_of(data, resolution) if noise is None else noise)
             table.row(data, name, f"{size:.1f}", f"{np.median(nats):.1f}", f"{np.max(nats):.1f}", verdicts)
-            print(f"  data {data}, {name}: {time.perf_counter() - start:.0f} s", flush=True)
+            took = f"{np.median(nats):.1f} nats, {verdicts} ({time.perf_counter() - start:.0f} s)"
+            print(f"  data {data}, {name}: {took}", flush=True)
     table.show(time.perf_counter() - start)
 
 
