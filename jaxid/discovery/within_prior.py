@@ -2,7 +2,8 @@
 
 Each effect that the machine might lack is added to the simulated loop next to no strength, and its column is
 laid through what the fit leaves, the unknowns free to give way within their priors. What noise alone would
-gain by the best of them, rounding in the loop included, is drawn; what gains more is fitted for good.
+gain by the best of them, rounding in the loop included, is drawn; what gains more is fitted for good, from
+where the best of its looks leads when it is simulated.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from jaxid.gap import noise_floor
 from jaxid.identification import gaps
 from jaxid.machine import Machine
 from jaxid.model import Plant
-from jaxid.parameters import free_effect
+from jaxid.parameters import Free, free_effect
 from jaxid.precision import NoiseModel
 from jaxid.replay import Replay
 from jaxid.session import Session
@@ -48,11 +49,30 @@ _DRAWS = 1024
 # So many candidates are fitted for good, the most promising first: those that a linear look gives this part
 # of the threshold; the second where something is seen, for the look knows an effect at few shapes only.
 _FEW, _PROMISING = 4, (0.5, 0.1)
+# Where fits of a candidate begin: at so many of its looks, the most promising, as far along as that of these
+# parts of the way where it simulates best. A look is linear: strong friction that acts briefly promises most,
+# and makes the machine stick; what acts longer may lie in another valley.
+_LOOKS, _PARTS = 6, 0.5 ** np.arange(5)
 # What is that near to the best [nats] cannot be told from it.
 _AS_GOOD = 2.0
 # Lags whose correlation says whether a residual is noise.
 _LAGS = 10
 UNSEEN = "a fit within a prior looks at the loop alone"
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A fit within the prior.
+
+    Args:
+        machine: What was fitted, at its guesses.
+        widths: Standard deviations of those that have one of their own, by name; see `directions_steps`.
+        estimate: What was found.
+    """
+
+    machine: Machine
+    widths: dict[str, float]
+    estimate: Estimate
 
 
 @dataclass(frozen=True)
@@ -73,6 +93,23 @@ class _Look:
     positive: bool
 
 
+@dataclass(frozen=True)
+class _Begin:
+    """Where a fit with a candidate begins.
+
+    Args:
+        start: Index of the candidate's start.
+        values: Of its unknowns.
+        point: The base's, in units of the prior.
+        squares: What is left there, over the noise, squared; how far guesses are off included.
+    """
+
+    start: int
+    values: Float[np.ndarray, " k"]
+    point: Float[np.ndarray, " q"]
+    squares: float
+
+
 def explore_within(
     session: Session, *, max_effects: int, progress: Callable[[str], None]
 ) -> Discovery:
@@ -87,7 +124,7 @@ def explore_within(
         InputError: If the loop cannot be simulated, or a guess is zero.
     """
     progress("fitting what is there")
-    before = after = alone(steps_of("output_error", session))
+    before = after = _Fit(session.machine, {}, alone(steps_of("output_error", session)))
     effects: list[Found] = []
     rounds = []
     added: Score | None = None
@@ -105,7 +142,7 @@ def explore_within(
         least = _PROMISING[0 if noisy else 1] * threshold
         for score in [s for s in screened if s.evidence > least][:_FEW]:
             progress(f"refitting with {score.candidate.label}")
-            refitted.append(_refitted(session, loop, after, score))
+            refitted.append(_refitted(loop, after, score, looks))
         good = sorted((r for r in refitted if r[0].evidence > threshold), key=lambda r: -r[0].evidence)
         if not good:
             break
@@ -114,12 +151,13 @@ def explore_within(
         effects.append(replace(found, alternatives=tuple(near)))
     verdict = "found" if effects else "nothing_missing" if noisy else "unexplained"
     progress("simulating")
-    old = gaps(before.machine, session.runs)
-    new = gaps(after.machine, session.runs) if effects else old
-    floor = noise_floor(before.machine, session.fit.log, session.fit.data)
+    first, last = before.estimate, after.estimate
+    old = gaps(first.machine, session.runs)
+    new = gaps(last.machine, session.runs) if effects else old
+    floor = noise_floor(first.machine, session.fit.log, session.fit.data)
     where = None if verdict == "nothing_missing" else _Loop.of(session, before).where()
     return Discovery(
-        session, verdict, where, tuple(effects), tuple(rounds), before, after, old, new, floor, (), UNSEEN
+        session, verdict, where, tuple(effects), tuple(rounds), first, last, old, new, floor, (), UNSEEN
     )
 
 
@@ -131,7 +169,8 @@ class _Loop:
         session: Case and log.
         union: With the effects.
         problem: What the fit compared.
-        residual: What it left, over the noise, by row.
+        point: Where it ended, in units of the prior.
+        residual: What it left, over the noise, by row of the log; behind them how far it is from its guesses.
         base: Derivatives of that in units of the prior, (rows, unknowns and starts).
         sigma: The noise, in units of the weighted residual.
     """
@@ -139,28 +178,33 @@ class _Loop:
     session: Session
     union: Union
     problem: Problem
+    point: Float[np.ndarray, " q"]
     residual: Float[np.ndarray, " rows"]
     base: Float[np.ndarray, "rows q"]
     sigma: float
 
     @classmethod
-    def of(cls, session: Session, estimate: Estimate) -> _Loop:
+    def of(cls, session: Session, fit: _Fit) -> _Loop:
         """Of what a fit within a prior found."""
-        stated, log, machine = session.case.output_error, session.fit.log, estimate.machine
-        numerics = choose_numerics(machine, log)
-        on, widths = stated.get("on", "position"), _widths(session, machine)
-        problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
-        here = alone(read(problem, problem.ladder[-1], np.zeros(problem.prior.base.size)))
+        stated, log, estimate = session.case.output_error, session.fit.log, fit.estimate
+        numerics, on = choose_numerics(fit.machine, log), stated.get("on", "position")
+        problem = Problem.of(fit.machine, log, stated["prior"], on, numerics, fit.widths)
+        point = problem.prior.inward(problem.padded(estimate.theta))
+        here = alone(read(problem, problem.ladder[-1], point))
         problem, here = problem.weighed(here)
         sigma = problem.noise(here, len(estimate.details["directions"]))
         # Sizes of motion from all samples: those of a short log may hardly leave its rest.
         data = replace(session.fit.data, moving=np.ones_like(session.fit.data.moving))
         searched = [e for e in session.case.searched if e not in _LEFT_OUT]
-        union = build_union(machine, data, searched)
-        return cls(
-            session, union, problem, np.asarray(here.residual).ravel() / sigma,
-            np.asarray(here.jacobian) / sigma, sigma,
-        )
+        union = build_union(estimate.machine, data, searched)
+        residual = np.concatenate([np.asarray(here.residual).ravel() / sigma, point])
+        base = np.concatenate([np.asarray(here.jacobian) / sigma, np.eye(point.size)])
+        return cls(session, union, problem, point, residual, base, sigma)
+
+    @property
+    def samples(self) -> int:
+        """Rows of the residual that are the log's."""
+        return self.residual.size - self.point.size
 
     @property
     def theta(self) -> np.ndarray:
@@ -172,7 +216,7 @@ class _Loop:
         """RMS of the residual, by column that counts, in its own units."""
         weight = self.problem.weight
         counts = weight[0] > 0
-        e = self.sigma * self.residual.reshape(weight.shape)[:, counts] / weight[:, counts]
+        e = self.sigma * self.residual[: self.samples].reshape(weight.shape)[:, counts] / weight[:, counts]
         return np.sqrt(np.mean(e**2, axis=0))
 
     def looks(self) -> list[_Look]:
@@ -183,10 +227,9 @@ class _Loop:
             drive = not c.amplitude.any()
             positive = all(free[i].sign != "free" for i in c.index[c.amplitude])
             for k in range(len(c.starts)):
-                e, columns = self._at(c, c.starts[k] if drive else c.probe(k))
+                e, columns = self._at(c, c.starts[k] if drive else c.probe(k), self.point)
                 if drive:
-                    scale = np.where(c.starts[k] != 0, np.abs(c.starts[k]), 1.0)
-                    look = _Look(c, k, e - self.residual, columns * scale, False)
+                    look = _Look(c, k, e - self.residual, columns * _size(c.starts[k]), False)
                 else:
                     strength = columns @ np.where(c.amplitude, c.starts[k], 0.0)
                     look = _Look(c, k, np.zeros_like(e), strength[:, None], positive)
@@ -194,9 +237,48 @@ class _Loop:
                     out.append(look)
         return out
 
-    def _at(self, c: Candidate, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def begins(self, c: Candidate, looks: list[_Look]) -> list[_Begin]:
+        """Where looks at a candidate lead when they are simulated, the lowest first; those that lead down."""
+        own = [x for x in looks if x.candidate is c]
+        found = zip(own, self._gains(own, self.residual[:, None]), strict=True)
+        out = []
+        for look, (_, step) in sorted(found, key=lambda x: -float(x[1][0][0]))[:_LOOKS]:
+            left = self.residual + look.offset + look.columns @ step[:, 0]
+            moved = -self._giving_way(left[:, None])[:, 0]
+            each = []
+            for part in _PARTS:
+                values, point = self._along(look, part * step[:, 0]), self.point + part * moved
+                e, _ = self._at(c, values, point)
+                each.append(_Begin(look.start, values, point, float(np.nan_to_num(e @ e, nan=np.inf))))
+            out.append(min(each, key=lambda b: b.squares))
+        out.sort(key=lambda b: b.squares)
+        return [b for b in out if b.squares < self.residual @ self.residual] or out[:1]
+
+    def _along(self, look: _Look, step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Values of a candidate's unknowns where a step of its look leads."""
+        c, start = look.candidate, look.candidate.starts[look.start]
+        if c.amplitude.any():
+            return np.where(c.amplitude, start * step[0], start)
+        parameters = self.union.machine.parameters
+        grows = np.array([parameters.free[i].sign == "positive" for i in c.index])
+        lower, upper = (b[c.index] for b in parameters.bounds)
+        moved = np.where(grows, start * np.exp(np.where(grows, step, 0.0)), start + _size(start) * step)
+        return np.clip(moved, lower, upper)
+
+    def gained(self, after: Estimate, before: Estimate) -> float:
+        """Nats by which a log and the base's guesses are likelier with another effect."""
+        ratio = after.details["criterion_percent"] / before.details["criterion_percent"]
+        known = after.theta[: len(self.problem.places)]
+        point = self.problem.prior.inward(self.problem.padded(known))
+        # The noise is that of either fit.
+        return 0.5 * float(self.point @ self.point - point @ point - self.samples * np.log(ratio))
+
+    def _at(
+        self, c: Candidate, values: np.ndarray, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Residual with a candidate at some values, and its derivatives in them, over the noise."""
         theta = self.theta.copy()
+        theta[self.union.base] = np.asarray(self.problem.prior.outward(point))[: len(self.union.base)]
         theta[c.index] = values
         # Of one width for all: one compiled function.
         directions = np.zeros((len(theta), max(len(c.index) for c in self.union.candidates)))
@@ -206,7 +288,9 @@ class _Loop:
         plant = replace(plant, sharpness=p.ladder[-1])
         args = (p.replay, self.union.machine.parameters.places, plant, p.measured, p.weight, p.on)
         e, columns = _columns(*args, theta, directions)
-        return np.asarray(e) / self.sigma, np.asarray(columns)[:, : len(c.index)] / self.sigma
+        slope = np.zeros((self.residual.size, len(c.index)))
+        slope[: self.samples] = np.asarray(columns)[:, : len(c.index)] / self.sigma
+        return np.concatenate([np.asarray(e) / self.sigma, point]), slope
 
     def scored(self, looks: list[_Look]) -> list[Score]:
         """Best start of every candidate by what it gains, the most first."""
@@ -221,7 +305,8 @@ class _Loop:
 
     def threshold(self, looks: list[_Look]) -> tuple[float, bool]:
         """Evidence that noise alone reaches once in a thousand searches; whether the residual is noise."""
-        white, left = self._white(), lambda e: e - self.base @ self._giving_way(e)
+        white = self._white()
+        left = lambda e: (e - self.base @ self._giving_way(e))[: self.samples]
         most = _correlation(left(white)).max()
         noisy = bool(_correlation(left(self.residual[:, None]))[0] <= most)
         # A position's own rounding is correlated where it moves slowly, and is not drawn.
@@ -243,30 +328,34 @@ class _Loop:
         for k in np.flatnonzero(self.problem.weight[0] > 0):
             model = NoiseModel.fit(columns[:, k], np.ones(shape[0], bool))
             drawn[:, :, k] = model.sample(rng, shape[0], _DRAWS)
-        return drawn.reshape(_DRAWS, -1).T
+        return self._beside_guesses(drawn.reshape(_DRAWS, -1), rng)
+
+    def _beside_guesses(
+        self, e: Float[np.ndarray, "draws samples"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "rows draws"]:
+        """With guesses that are as far off as their prior says."""
+        return np.concatenate([e, rng.standard_normal((len(e), self.point.size))], axis=1).T
 
     def _white(self) -> Float[np.ndarray, "rows draws"]:
         """What a residual may be that is nothing but white noise, and rounding in the loop where there is."""
         rng = np.random.default_rng(1)
-        white = rng.standard_normal((_DRAWS, self.residual.size))
+        white = rng.standard_normal((_DRAWS, self.samples))
         rounded = drawn_roundings(self.session.machine, self.problem, _DRAWS)
         if rounded is not None:
             e = rounded / self.sigma
             share = min(float(np.mean(e**2)), 1.0)
             white = e + np.sqrt(1.0 - share) * white
         counts = np.tile(self.problem.weight[0] > 0, self.problem.weight.shape[0])
-        return (white * counts).T
+        return self._beside_guesses(white * counts, rng)
 
     def _giving_way(self, e: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, "q k"]:
-        """What the unknowns take of some residuals, each held within its prior; their columns times that."""
-        gram = self.base.T @ self.base + np.eye(self.base.shape[1])
-        return np.linalg.solve(gram, self.base.T @ e)
+        """How far the unknowns go for some residuals, each held to its guess, with the sign turned."""
+        return np.linalg.solve(self.base.T @ self.base, self.base.T @ e)
 
     def _gains(
         self, looks: list[_Look], residuals: Float[np.ndarray, "rows k"]
     ) -> list[tuple[Float[np.ndarray, " k"], Float[np.ndarray, "own k"]]]:
         """Gain in log-likelihood of each look on some residuals, and its own steps."""
-        n = residuals.shape[0]
         squares = lambda e: np.sum((e - self.base @ self._giving_way(e)) * e, axis=0)
         before = squares(residuals)
         out = []
@@ -279,12 +368,13 @@ class _Loop:
             if look.positive:
                 step = np.maximum(step, 0.0)
             after = squares(e) + 2 * np.sum((y.T @ e) * step, axis=0) + np.sum((gram @ step) * step, axis=0)
-            out.append((0.5 * n * np.log(before / np.maximum(after, 1e-12 * before)), step))
+            out.append((0.5 * self.samples * np.log(before / np.maximum(after, 1e-12 * before)), step))
         return out
 
     def where(self) -> Where:
         """When the residual is largest; of a curve so few samples tell nothing."""
-        log, e = self.session.fit.log, self.residual.reshape(self.problem.weight.shape)
+        log = self.session.fit.log
+        e = self.residual[: self.samples].reshape(self.problem.weight.shape)
         power = np.convolve(np.sum(e**2, axis=1), np.ones(_LAGS), "valid")
         k = int(np.argmax(power))
         times = log.time[[k, k + _LAGS - 1]] - log.time[0]
@@ -304,6 +394,10 @@ def _columns(
     return residual(theta), slope(jnp.asarray(directions).T)
 
 
+def _size(start: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    return np.where(start != 0, np.abs(start), 1.0)
+
+
 def _correlation(e: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " k"]:
     """Sum of the squared autocorrelations at the first lags, of each column."""
     e = e - e.mean(axis=0)
@@ -311,35 +405,35 @@ def _correlation(e: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " k"]:
     return sum((np.sum(e[k:] * e[:-k], axis=0) / np.sum(e**2, axis=0)) ** 2 for k in lags)
 
 
-def _widths(session: Session, machine: Machine) -> dict[str, float]:
-    """Standard deviations about where the unknowns are now; what ended at zero has no size of its own."""
-    first = dict(zip(session.machine.parameters.names, session.machine.parameters.guess, strict=True))
-    prior = session.case.output_error["prior"]
-    sizes = {f.name: abs(first.get(f.name, f.guess)) or 1.0 for f in machine.parameters.free}
-    return {f.name: prior * sizes[f.name] for f in machine.parameters.free if f.sign != "positive"}
-
-
 def _refitted(
-    session: Session, loop: _Loop, base: Estimate, score: Score
-) -> tuple[Score, Estimate, Found]:
-    """The fit within the prior with an effect beside the rest, and what it gains."""
-    c, plant = score.candidate, base.machine.plant
-    plant, free = free_effect(plant, effect_at(loop.union, c, score.guess), base.machine.units)
-    machine = base.machine.with_plant(plant, base.machine.parameters.extended(free))
-    widths = _widths(session, base.machine) | {
-        f.name: 1.0 if f.sign == "positive" else float(max(np.abs(c.starts[:, k]).max(), abs(f.guess)))
-        for k, f in enumerate(free)
-    }
-    stated = session.case.output_error
+    loop: _Loop, base: _Fit, score: Score, looks: list[_Look]
+) -> tuple[Score, _Fit, Found]:
+    """The best fit within the prior with an effect beside the rest, and what it gains."""
+    fits = [_fitted(loop, base, score.candidate, begin) for begin in loop.begins(score.candidate, looks)]
+    gained, begin, fit = max(fits, key=lambda f: f[0])
+    refitted = replace(score, start=begin.start, guess=begin.values, evidence=gained)
+    c, own = score.candidate, fit.machine.parameters.names[len(loop.union.base) :]
+    return refitted, fit, Found(c.kind, c.label, fit.machine.plant.place(c.port), own, refitted, ())
+
+
+def _fitted(
+    loop: _Loop, base: _Fit, c: Candidate, begin: _Begin
+) -> tuple[float, _Begin, _Fit]:
+    stated, machine = loop.session.case.output_error, base.machine
+    plant, free = free_effect(machine.plant, effect_at(loop.union, c, begin.values), machine.units)
+    machine = machine.with_plant(plant, machine.parameters.extended(free))
+    widths = base.widths | {f.name: _width(f, c.starts[:, k]) for k, f in enumerate(free)}
+    known = np.asarray(loop.problem.prior.outward(begin.point))[: len(loop.union.base)]
     after = alone(directions_steps(
-        machine, session.fit.log, prior=stated["prior"], on=stated.get("on", "position"), widths=widths
+        machine, loop.session.fit.log, prior=stated["prior"], on=stated.get("on", "position"),
+        widths=widths, begin=np.concatenate([known, begin.values]),
     ))
-    old, new = (e.details["criterion_percent"] for e in (base, after))
-    gained = 0.5 * loop.residual.size * np.log(old / new)
-    if not after.converged or not np.isfinite(gained):
-        gained = 0.0
-    refitted = replace(score, evidence=float(gained))
-    found = Found(
-        c.kind, c.label, plant.place(c.port), tuple(f.name for f in free), refitted, ()
-    )
-    return refitted, after, found
+    gained = loop.gained(after, base.estimate) if after.converged else 0.0
+    return gained, begin, _Fit(machine, widths, after)
+
+
+def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:
+    """Standard deviation of what an effect begins at: it may be as far off as where else it might begin."""
+    if free.sign == "positive":
+        return max(1.0, float(np.log(starts.max() / starts.min())))
+    return float(max(np.abs(starts).max(), abs(free.guess))) or 1.0

@@ -68,6 +68,7 @@ def directions_steps(
     machine: Machine, log: Log, *, prior: float, on: str = "position", starts: int = 1,
     others: Sequence[np.ndarray] = (), hessian: bool = False, profile: bool = False,
     numerics: Numerics | None = None, widths: Mapping[str, float] | None = None,
+    begin: np.ndarray | None = None,
 ) -> Steps[Estimate]:
     """Fit what a log tells of the unknowns in the loop, and leave the rest to the guesses.
 
@@ -84,6 +85,7 @@ def directions_steps(
         profile: Also take profile likelihoods of the fitted directions.
         numerics: How to integrate.
         widths: Standard deviations of single guesses, by name; of what must be positive of its logarithm.
+        begin: Values of the unknowns to begin at; absent: the best of many points about the guesses.
 
     Returns:
         The estimate. Standard deviations hold what is left of the prior along other directions, and what
@@ -99,7 +101,8 @@ def directions_steps(
     numerics = numerics or choose_numerics(machine, log)
     problem = Problem.of(machine, log, prior, on, numerics, widths)
     given = [problem.prior.inward(problem.padded(t)) for t in others]
-    found, told, many = yield from _searched(machine, problem, starts, given)
+    first = None if begin is None else problem.prior.inward(problem.padded(begin))
+    found, told, many = yield from _searched(machine, problem, first, starts, given)
     p = len(machine.parameters.free)
     r = found.count
     remarks: list[str] = []
@@ -146,7 +149,8 @@ def _by_hessian(found: Found, told: Told, noise: float) -> Steps[tuple[Told, lis
 
 
 def _searched(
-    machine: Machine, problem: Problem, starts: int, given: Sequence[np.ndarray]
+    machine: Machine, problem: Problem, first: np.ndarray | None, starts: int,
+    given: Sequence[np.ndarray],
 ) -> Steps[tuple[Found, Told | None, dict[str, Any]]]:
     """Where the fit ends, how well its directions are told, and what is to be stated of its starts."""
     yield at_each_soon(problem)
@@ -155,7 +159,8 @@ def _searched(
         # What rounding does leaves few directions told in the end: the best of them come first.
         ended, most = sifted, AT_ONCE
         yield draws_soon(machine, problem)
-    found = yield from _rounds(problem, np.zeros(problem.prior.base.size), most)
+    nowhere = np.zeros(problem.prior.base.size)
+    found = yield from _rounds(problem, nowhere if first is None else first, most, look=first is None)
     many: dict[str, Any] = {}
     if starts > 1 or given:
         found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
@@ -215,10 +220,12 @@ def _drawn(problem: Problem, starts: int) -> np.ndarray:
     return w
 
 
-def _rounds(problem: Problem, w: np.ndarray, most: int, *, last: bool = False) -> Steps[Found]:
+def _rounds(
+    problem: Problem, w: np.ndarray, most: int, *, look: bool = True, last: bool = False
+) -> Steps[Found]:
     """Read the directions, fit along them, so many at most, and again, each time sharper, until they stay.
 
-    `last`: at the sharpest only, from a point that is near.
+    `look`: begin at the best of many points; `last`: at the sharpest only, from a point that is near.
     """
     size, spent = problem.prior.base.size, 0
     ladder = problem.ladder[-1:] if last else problem.ladder
@@ -238,7 +245,7 @@ def _rounds(problem: Problem, w: np.ndarray, most: int, *, last: bool = False) -
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
             more, count = count > most, min(count, most)
-            if rung == 0 and not last and count:
+            if rung == 0 and look and not last and count:
                 w = yield from _looked(problem, vectors[:, : min(count, AT_ONCE)], w)
         some = columns(vectors, count)
         fitted = np.arange(some.shape[1]) < count
