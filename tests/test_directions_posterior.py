@@ -7,7 +7,7 @@ import pytest
 
 from jaxid.estimators import directions, directions_posterior, directions_rounding
 from jaxid.estimators.directions_posterior import most_probable, spread
-from jaxid.estimators.directions_precision import add_profiles
+from jaxid.estimators.directions_precision import Told, add_profiles
 from jaxid.estimators.directions_problem import Found
 from jaxid.estimators.least_squares import Minimum
 from jaxid.estimators.steps import alone
@@ -76,7 +76,7 @@ def found_at(problem, w, told):
     jacobian = problem.jacobian(w)
     e = problem.residual(w)
     minimum = Minimum(w, np.asarray(0.5 * e @ e), np.asarray(1), np.asarray(True), e, jacobian)
-    return Found(problem, np.eye(w.size), told, minimum, 1, True, False)
+    return Found(problem, np.eye(w.size), told, minimum, 1, True)
 
 
 def test_the_spread_of_a_line_is_the_quadratic_pictures():
@@ -131,42 +131,84 @@ def test_a_fit_begins_in_the_deeper_valley():
     np.testing.assert_allclose(alone(directions._looked(problem, told, np.array([1.1, 0.0, 0.0])))[0], 1.1)
 
 
-def one_told(monkeypatch, residual):
-    """A fit of the first of two unknowns, whose loop with rounding leaves another residual."""
-    problem = problem_of(None, None, 2, 8)
-    jacobian = np.zeros((8, 2))
-    jacobian[0, 0] = 1.0
+def through(monkeypatch, residual, *, unknowns=2, told=1, best=None):
+    """A fit whose loop with rounding leaves another residual: where it ends, and how it is told."""
+    problem = problem_of(None, None, unknowns, 8)
+    problem.noise = lambda minimum, count: 1e-3
+    jacobian = np.zeros((8, unknowns))
+    jacobian[np.arange(told), np.arange(told)] = 1.0
     e = 1e-3 * np.random.default_rng(0).standard_normal(8)
-    minimum = Minimum(np.zeros(2), np.asarray(0.0), np.asarray(1), np.asarray(True), e, jacobian)
+    best = np.zeros(unknowns) if best is None else best
+    minimum = Minimum(best, np.asarray(0.0), np.asarray(1), np.asarray(True), e, jacobian)
 
     def at_each(problem, w, starts):
         rounded = np.zeros((len(w), 8, 1))
-        rounded[:, 0, 0] = residual(w, starts[:, 0])
+        rounded[:, :told, 0] = residual(w, starts)
         return SimpleNamespace(function=lambda: rounded, args=())
 
     monkeypatch.setattr(directions_rounding, "at_each", at_each)
     monkeypatch.setattr(directions_rounding, "_rounding", lambda machine, problem: problem)
+    white = lambda found: Told(np.eye(found.count), np.ones(found.count), np.zeros(0))
+    monkeypatch.setattr(directions_rounding, "told_of", white)
     machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=0.1))
-    return machine, Found(problem, np.eye(2), 1, minimum, 1, True, False)
+    found = Found(problem, np.eye(unknowns), told, minimum, 1, True)
+    return alone(directions_rounding.through_rounding(machine, found))
 
 
 def test_rounding_is_drawn_over_what_is_held_too(monkeypatch):
-    """The log tells w0 + (w1^2 - 1) / 2, of which w1 is held: off by as much as that scatters."""
-    machine, found = one_told(monkeypatch, lambda w, start: w[:, 0] + 0.5 * (w[:, 1] ** 2 - 1.0))
-    off, covariance = alone(directions_rounding._within(machine, found, np.array([2.0])))
-    h = np.linspace(-6, 6, 2001)
-    place = 0.5 * (1.0 - h**2)
-    weight = np.exp(-0.5 * h**2 - 0.5 * place**2)
-    mean = np.average(place, weights=weight)
-    exact = np.sqrt(np.average((place - mean) ** 2, weights=weight))
-    assert off[0] == pytest.approx(mean, abs=0.1)
-    assert np.sqrt(covariance[0, 0]) == pytest.approx(exact, rel=0.2)
+    """The log tells w0 + w1 / 2, of which w1 is held: off by as much as that scatters."""
+    found, told = through(monkeypatch, lambda w, starts: w[:, :1] + 0.5 * w[:, 1:])
+    assert found.point[0] == pytest.approx(0.0, abs=0.05)
+    # Beside the guess: a variance of 1 / 4 and one of 1.
+    assert told.std[0] == pytest.approx(np.sqrt(1 / 5), rel=0.1)
+    np.testing.assert_allclose(np.diag(told.whole), [told.std[0] ** 2, 1.0])
 
 
-@pytest.mark.parametrize(("shift", "corrected"), [(0.3, 0.3), (0.02, 0.0)])
-def test_what_rounding_does_on_average_is_corrected(monkeypatch, shift, corrected):
-    """Where it is more than it scatters: by 0.058, from a start anywhere within a count of 0.1."""
-    machine, found = one_told(monkeypatch, lambda w, start: w[:, 0] - shift + 2.0 * start)
-    off, covariance = alone(directions_rounding.off_by_rounding(machine, found, np.array([1e-3])))
-    assert off[0] == pytest.approx(corrected, abs=0.02)
-    assert np.sqrt(covariance[0, 0]) == pytest.approx(np.hypot(0.058, shift - corrected), abs=0.015)
+@pytest.mark.parametrize("shift", [0.3, 0.02])
+def test_what_rounding_does_on_average_is_corrected(monkeypatch, shift):
+    """From a start anywhere within a count of 0.1."""
+    found, told = through(monkeypatch, lambda w, starts: w[:, :1] - shift + 2.0 * starts)
+    assert found.point[0] == pytest.approx(shift, abs=0.01)
+    assert told.std[0] == pytest.approx(2 * 0.1 / np.sqrt(12), rel=0.1)
+
+
+def test_the_truth_is_where_logs_look_alike_to_the_fit_though_that_is_no_line(monkeypatch):
+    """Five unknowns at once, each far from the fit in its own deviations, and pulling at its neighbour."""
+    true = np.array([0.4, -0.3, 0.2, 0.5, -0.4])
+    bent = lambda w: w + 0.5 * w**2 + 0.3 * np.roll(w, 1, axis=-1)
+    residual = lambda w, starts: bent(w[:, :5]) - bent(true) + 0.2 * starts
+    found, told = through(monkeypatch, residual, unknowns=6, told=5)
+    np.testing.assert_allclose(found.point[:5], true, atol=0.02)
+    assert found.count == 5
+    assert np.all(told.std < 0.04)
+    assert np.all(np.diff(told.std) >= 0)
+    np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(6), atol=1e-12)
+    np.testing.assert_allclose(np.asarray(found.minimum.theta), found.vectors.T @ found.point, atol=1e-12)
+
+
+def test_logs_that_run_away_do_not_count(monkeypatch):
+    def residual(w, starts):
+        out = w[:, :1] - 0.1 + 2.0 * starts
+        out[:40], out[40:80] = 1e6, np.nan
+        return out
+
+    found, told = through(monkeypatch, residual)
+    assert found.point[0] == pytest.approx(0.1, abs=0.01)
+    assert told.std[0] == pytest.approx(2 * 0.1 / np.sqrt(12), rel=0.1)
+
+
+def test_where_all_logs_run_away_nothing_is_told(monkeypatch):
+    found, told = through(monkeypatch, lambda w, starts: np.full((len(w), 1), np.nan))
+    assert (found.count, told) == (0, None)
+
+
+def test_what_rounding_leaves_hardly_told_is_let_go(monkeypatch):
+    """The first unknown is told, the second scatters by more than its guess."""
+    def residual(w, starts):
+        return w[:, :2] + np.array([0.1, 60.0]) * starts
+
+    found, told = through(monkeypatch, residual, unknowns=3, told=2)
+    assert found.count == 1
+    np.testing.assert_allclose(np.abs(found.vectors[:, 0]), [1.0, 0.0, 0.0], atol=0.02)
+    assert told.std[0] < 0.01
+    assert np.sqrt(told.whole[1, 1]) > 0.6

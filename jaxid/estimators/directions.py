@@ -40,7 +40,7 @@ from jaxid.estimators.directions_problem import (
     fit_each,
     read,
 )
-from jaxid.estimators.directions_rounding import draws_soon, rounds, sifted
+from jaxid.estimators.directions_rounding import draws_soon, rounds, through_rounding
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -154,26 +154,18 @@ def _searched(
 ) -> Steps[tuple[Found, Told | None, dict[str, Any]]]:
     """Where the fit ends, how well its directions are told, and what is to be stated of its starts."""
     yield at_each_soon(problem)
-    ended, most = _most_probable, problem.prior.base.size
     if rounds(machine, problem):
-        # What rounding does leaves few directions told in the end: the best of them come first.
-        ended, most = sifted, AT_ONCE
         yield draws_soon(machine, problem)
     nowhere = np.zeros(problem.prior.base.size)
-    found = yield from _rounds(problem, nowhere if first is None else first, most, look=first is None)
+    found = yield from _rounds(problem, nowhere if first is None else first, look=first is None)
     many: dict[str, Any] = {}
     if starts > 1 or given:
-        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
-    found, told = yield from ended(machine, found)
+        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]))
+    found, told = yield from _most_probable(machine, found)
     if told is None and not many:
         # A machine that sticks at the guesses, or nearly, shows nothing.
-        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
-        found, told = yield from ended(machine, found)
-    while found.more and 2 * found.count > most:
-        most += AT_ONCE
-        spent = found.evaluations
-        found = yield from _rounds(found.problem, found.point, most, last=True)
-        found, told = yield from ended(machine, replace(found, evaluations=found.evaluations + spent))
+        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS))
+        found, told = yield from _most_probable(machine, found)
     return found, told, many
 
 
@@ -199,9 +191,11 @@ def _most_probable(machine: Machine, found: Found) -> Steps[tuple[Found, Told | 
     while True:
         minimum = replace(here, theta=vectors.T @ w, jacobian=jacobian @ vectors)
         spent = found.evaluations + int(here.steps)
-        ended = Found(problem, vectors, count, minimum, spent, settled, False)
+        ended = Found(problem, vectors, count, minimum, spent, settled)
         if not count:
             return ended, None
+        if rounds(machine, problem):
+            return (yield from through_rounding(machine, ended))
         whole = yield from spread(ended, problem.noise(minimum, count))
         told = with_guesses(ended, told_of(ended), whole)
         stays = told.std <= STAYS
@@ -221,15 +215,15 @@ def _drawn(problem: Problem, starts: int) -> np.ndarray:
 
 
 def _rounds(
-    problem: Problem, w: np.ndarray, most: int, *, look: bool = True, last: bool = False
+    problem: Problem, w: np.ndarray, *, look: bool = True, last: bool = False
 ) -> Steps[Found]:
-    """Read the directions, fit along them, so many at most, and again, each time sharper, until they stay.
+    """Read the directions, fit along the best of them, and again, each time sharper, until they stay.
 
     `look`: begin at the best of many points; `last`: at the sharpest only, from a point that is near.
     """
     size, spent = problem.prior.base.size, 0
     ladder = problem.ladder[-1:] if last else problem.ladder
-    count, more, cost, settled = 0, False, np.inf, False
+    count, cost, settled = 0, np.inf, False
     for rung in range(len(ladder) + _ROUNDS):
         sharpness, before = ladder[min(rung, len(ladder) - 1)], count
         # Between the first rung and the last they hardly turn; those that change places with one another for
@@ -241,12 +235,12 @@ def _rounds(
                 # Coordinates are of the first few directions: one of them leads to where this was read.
                 whole = np.linalg.qr(np.column_stack([w, np.eye(size)]))[0]
                 here = replace(here, theta=columns(whole, 0).T @ w)
-                return Found(problem, whole, 0, here, spent, False, False)
+                return Found(problem, whole, 0, here, spent, False)
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
-            more, count = count > most, min(count, most)
+            count = min(count, AT_ONCE)
             if rung == 0 and look and not last and count:
-                w = yield from _looked(problem, vectors[:, : min(count, AT_ONCE)], w)
+                w = yield from _looked(problem, vectors[:, :count], w)
         some = columns(vectors, count)
         fitted = np.arange(some.shape[1]) < count
         start = np.where(fitted, np.clip(some.T @ w, -FAR, FAR), 0.0)
@@ -260,7 +254,7 @@ def _rounds(
         settled, cost = close and sharpness is ladder[-1], float(minimum.cost)
         if settled or not np.isfinite(cost):
             break
-    return Found(problem, vectors, count, minimum, spent, settled, more)
+    return Found(problem, vectors, count, minimum, spent, settled)
 
 
 def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
@@ -277,22 +271,22 @@ def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     return rows.T * np.sign(rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]), count
 
 
-def _elsewhere(found: Found, points: np.ndarray, most: int) -> Steps[Found]:
+def _elsewhere(found: Found, points: np.ndarray) -> Steps[Found]:
     """The rounds from the best of some points too: a machine that sticks at the guesses shows nothing."""
     problem, nothing = found.problem, np.zeros(points.shape[1])
     still = (nothing, np.eye(points.shape[1]), points, np.zeros(points.shape, bool))
     _, costs, _, _ = yield Solve(fit_each, (*problem.args, problem.ladder[0], NO_PULL, *still))
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-    other = yield from _rounds(problem, points[best], most)
+    other = yield from _rounds(problem, points[best])
     better = float(other.minimum.cost) < float(found.minimum.cost) * (1 - _SAME)
     return replace(other if better else found, evaluations=found.evaluations + other.evaluations)
 
 
 def _many_starts(
-    found: Found, points: np.ndarray, most: int
+    found: Found, points: np.ndarray
 ) -> Steps[tuple[Found, dict[str, Any]]]:
     """The best of many starts, and how many end there."""
-    found = yield from _elsewhere(found, points, most)
+    found = yield from _elsewhere(found, points)
     spent = found.evaluations
     for again in (True, False):
         some, origin = found.first, np.zeros(points.shape[1])
@@ -316,7 +310,7 @@ def _many_starts(
         if not again or costs[best] >= cost * (1 - _SAME):
             break
         # Other directions may be told from there.
-        other = yield from _rounds(found.problem, some @ z[best], most, last=True)
+        other = yield from _rounds(found.problem, some @ z[best], last=True)
         spent += other.evaluations
         if float(other.minimum.cost) >= cost:
             break

@@ -326,7 +326,7 @@ class Found:
     """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum.
 
     The minimum is in the coordinates of the first directions, or of all; those of others are zero.
-    Evaluations are those that it took; `more`: others are told too, beyond the most that were asked for.
+    Evaluations are those that it took.
     """
 
     problem: Problem
@@ -335,7 +335,6 @@ class Found:
     minimum: Minimum
     evaluations: int
     settled: bool
-    more: bool
 
     @property
     def first(self) -> np.ndarray:

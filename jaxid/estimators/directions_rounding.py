@@ -1,47 +1,46 @@
 """What rounding of readings does to a fit that simulates its loop without: found by simulating it.
 
 In a loop with a coarse encoder the instant at which a reading steps is chaotic, and what it does to the
-force is neither small nor white, nor the same elsewhere within the prior. So data are drawn over all of that
-and a line is laid through what the fit makes of those like the log's.
+force is neither small nor white, nor nothing on average. So logs are drawn with it, about where the truth may
+be, and the truth is taken to be where such logs look, to the fit, as the measured one does.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxid.estimators.directions_precision import Told, told_of
 from jaxid.estimators.directions_problem import (
     DRAWN,
-    NO_PULL,
     STAYS,
     Found,
     Problem,
     at_each,
     at_each_soon,
-    columns,
-    descent,
 )
 from jaxid.estimators.steps import Soon, Steps
 from jaxid.machine import Machine
 from jaxid.replay import with_sensor
 
-# A direction that changes so small a part of what another does is not felt.
-_UNFELT = 1e-6
-# Data are drawn so many deviations around the estimate, but over this part of the prior at most; the nearest
-# of them count.
-_REACH, _MOST = 8.0, 2.0
-_NEAREST = 0.3
-# Then anew within so many of the deviations found, as long as that is less than half as far.
-_AGAIN, _PASSES = 4.0, 4
-# Fits of so many evaluations until one settles.
-_TRIES = 3
+# Logs are drawn so many deviations about the point that was found last, or as far as the next is from it, but
+# over this part of the prior at most; from one pass to the next the width changes by these factors at most.
+_REACH, _MOST = 2.5, 1.5
+_NARROWER, _WIDER = 0.3, 2.0
+# Of the first pass, over what logs drawn at the fit itself scatter by.
+_FIRST = 4.0
+# Passes, and those after which points are averaged: the line through logs drawn anew is another each time.
+_PASSES, _SETTLING = 10, 4
+# Logs so far beyond the rest, in deviations of their distance, are of a loop that ran away.
+_AWAY, _SIEVED = 6.0, 3
 # With fewer that did not run away nothing is told.
 _FEWEST = 100
 # Least part of a residual that is noise.
 _OWN = 0.1
+# Of a scatter that is none: of a direction that ended at a bound.
+_LEAST = 1e-12
 
 
 def rounds(machine: Machine, problem: Problem) -> bool:
@@ -51,7 +50,7 @@ def rounds(machine: Machine, problem: Problem) -> bool:
 
 
 def draws_soon(machine: Machine, problem: Problem) -> Soon:
-    """What `off_by_rounding` will ask for."""
+    """What `through_rounding` will ask for."""
     return at_each_soon(_rounding(machine, problem))
 
 
@@ -86,171 +85,155 @@ def drawn_roundings(
     return e - e.mean(axis=0)
 
 
-def sifted(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
-    """Let go of directions that are told only as long as noise counts as white, and fit the rest again.
+@dataclass(frozen=True)
+class _Summary:
+    """What a fit sees of a log in few numbers: how far one Gauss-Newton step moves along its directions.
 
-    What rounding of the readings does in the loop moves an estimate farther along them than its prior would
-    let it.
+    Args:
+        problem: With rounding in its loop.
+        resolution: Counts of the readings.
+        vectors: All directions, (q, q).
+        point: Where the fit ended, along them, (q,).
+        residual: What it left of the measured log, (rows,).
+        jacobian: Of that along the r fitted directions, (rows, r).
+        step: From a residual to the numbers, (r, rows).
     """
-    ended = False
-    while found.count and np.all(np.isfinite(found.minimum.jacobian)):
-        stays, told = _felt(found), None
-        if np.all(stays):
-            told = told_of(found)
-            off, covariance = yield from off_by_rounding(machine, found, told.std)
-            told = replace(told, covariance=covariance)
-            stays = told.std <= STAYS
-        if ended and told is not None and np.all(stays):
-            return (yield from _moved(found, off)), told
-        rest = np.arange(found.count, len(found.vectors))
-        order = np.concatenate([np.flatnonzero(stays), np.flatnonzero(~stays), rest])
-        vectors, count = found.vectors[:, order], int(stays.sum())
-        some = columns(vectors, count)
-        fitted = np.arange(some.shape[1]) < count
-        z = np.where(fitted, some.T @ found.point, 0.0)
-        origin = np.zeros(len(vectors))
-        last, pull = found.problem.ladder[-1], np.asarray(found.problem.noise(found.minimum, found.count))
-        settled, spent = False, found.evaluations
-        for _ in range(_TRIES):
-            if not settled:
-                minimum = yield from descent(found.problem, last, pull, origin, some, z, fitted)
-                z, settled = np.asarray(minimum.theta), bool(minimum.converged)
-                spent += int(minimum.steps)
-        found = replace(
-            found, vectors=vectors, count=count, minimum=minimum, evaluations=spent, settled=settled
+
+    problem: Problem
+    resolution: Float[np.ndarray, " n"]
+    vectors: Float[np.ndarray, "q q"]
+    point: Float[np.ndarray, " q"]
+    residual: Float[np.ndarray, " rows"]
+    jacobian: Float[np.ndarray, "rows r"]
+    step: Float[np.ndarray, "r rows"]
+
+    @classmethod
+    def of(cls, machine: Machine, found: Found) -> _Summary:
+        """Of a fit; its minimum is in the coordinates of all directions."""
+        r, noise = found.count, found.problem.noise(found.minimum, found.count)
+        jacobian = np.asarray(found.minimum.jacobian)[:, :r]
+        over = jacobian / noise
+        step = np.linalg.solve(over.T @ over + np.eye(r), over.T) / noise
+        resolution = np.broadcast_to(machine.sensor.position_resolution, found.problem.replay.position.size)
+        return cls(
+            _rounding(machine, found.problem), resolution, found.vectors,
+            np.asarray(found.minimum.theta), np.asarray(found.minimum.residual).ravel(), jacobian, step,
         )
-        ended = True
-    return found, None
+
+    @property
+    def count(self) -> int:
+        """Of the numbers."""
+        return self.jacobian.shape[1]
+
+    def drawn(
+        self, centre: Float[np.ndarray, " r"], reach: Float[np.ndarray, " r"], rng: np.random.Generator
+    ) -> Steps[tuple[Float[np.ndarray, "draws r"], Float[np.ndarray, "draws r"]]]:
+        """Logs drawn about a point: how far from it, and their numbers less the measured log's.
+
+        What is not fitted is anywhere within its prior, the start anywhere within its first count.
+        """
+        r, q, places = self.count, self.point.size, len(self.problem.places)
+        starts = rng.uniform(-0.5, 0.5, (DRAWN, self.resolution.size)) * self.resolution
+        off = rng.uniform(-1.0, 1.0, (DRAWN, r)) * reach
+        z = np.tile(self.point, (DRAWN, 1))
+        z[:, :r] = centre + off
+        # In units of the prior, not of the directions: one compiled call, however many of them there are.
+        w = z @ self.vectors.T
+        held = rng.standard_normal((DRAWN, q - r)) @ self.vectors[:, r:].T
+        w[:, :places] += held[:, :places]
+        e = np.asarray((yield at_each(self.problem, w, starts)))
+        shape = e.shape[1:]
+        e = e.reshape(DRAWN, -1)
+        sound = np.all(np.isfinite(e), axis=1)
+        apart, off = e[sound] - self.residual, off[sound]
+        if len(apart):
+            unseen = (apart - apart @ self.step.T @ self.jacobian.T).reshape(-1, *shape)
+            own = _own_noise(self.residual.reshape(shape), unseen)
+            apart += (rng.standard_normal((len(apart), *shape)) * own).reshape(len(apart), -1)
+        return off, (apart + self.residual) @ self.step.T
 
 
-def _felt(found: Found) -> Bool[np.ndarray, " r"]:
-    """Which fitted directions still change anything: not those that end where an unknown is at its bound."""
-    triangle = np.linalg.qr(np.asarray(found.minimum.jacobian)[:, : found.count], mode="r")
-    size = np.abs(np.diag(triangle))
-    return size > _UNFELT * size.max()
-
-
-def _moved(found: Found, off: Float[np.ndarray, " r"]) -> Steps[Found]:
-    """The fit with its directions elsewhere; nothing is fitted."""
-    z = np.array(found.minimum.theta)
-    z[: found.count] += off
-    last, nothing = found.problem.ladder[-1], np.zeros(z.size, bool)
-    origin = np.zeros(len(found.vectors))
-    there = yield from descent(found.problem, last, NO_PULL, origin, found.first, z, nothing)
-    if not np.all(np.isfinite(there.jacobian)):
-        return found
-    return replace(found, minimum=there, evaluations=found.evaluations + 1)
-
-
-def off_by_rounding(
-    machine: Machine, found: Found, std: Float[np.ndarray, " r"]
-) -> Steps[tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]]:
-    """How far the truth is from the estimate, by simulation.
+def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
+    """Where the truth is, given what rounding does to a log, and which directions that leaves told.
 
     Args:
         machine: Its sensor rounds.
-        found: The fit, of one direction at least.
-        std: Standard deviations of the directions' coordinates without rounding.
+        found: The fit, of one direction at least; its minimum in the coordinates of all directions.
 
     Returns:
-        By how much the truth is elsewhere on average, for a loop that rounds is on average not as one that
-        does not; and the covariance about that, the prior's where too many data ran away.
+        The fit at that point, its directions such that they are uncorrelated, the best told first, with cost
+        and residual those of the fit without rounding; and how well they are told, or None where too many of
+        the logs drawn ran away or none is told.
 
     Source:
-        Beaumont, Zhang and Balding (2002), "Approximate Bayesian computation in population genetics":
-        local linear regression on a summary, here the estimate of one Gauss-Newton step.
+        Gourieroux, Monfort and Renault (1993), "Indirect inference", with guesses counted as normal: numbers
+        of the drawn logs are taken as a line in where they were drawn, and its scatter as their covariance.
     """
-    reach = np.minimum(_REACH * (yield from _scatter(machine, found, std)), _MOST)
-    for _ in range(_PASSES):
-        off, covariance = yield from _within(machine, found, reach)
-        closer = np.minimum(_AGAIN * np.sqrt(np.diag(covariance) + off**2), reach)
-        if np.all(closer > 0.5 * reach):
-            break
-        reach = closer
-    # What is less than its own deviation is not told: it is not corrected, but counts.
-    told = off**2 > np.diag(covariance)
-    left = np.where(told, 0.0, off)
-    return np.where(told, off, 0.0), covariance + np.outer(left, left)
+    summary, rng = _Summary.of(machine, found), np.random.default_rng(0)
+    r = found.count
+    centre, reach, passed = summary.point[:r].copy(), np.zeros(r), []
+    for k in range(-1, _PASSES):
+        off, numbers = yield from summary.drawn(centre, reach, rng)
+        if len(off) < _FEWEST:
+            return replace(found, count=0), None
+        if k < 0:
+            reach = np.minimum(_FIRST * np.std(numbers, axis=0), _MOST)
+            continue
+        step, covariance = _where_alike(off, numbers, centre)
+        if k >= _SETTLING:
+            passed.append((centre + step, covariance))
+        centre = centre + np.clip(step, -reach, reach) / max(1, k - _SETTLING + 1)
+        wanted = np.maximum(_REACH * np.sqrt(np.diag(covariance)), np.abs(step))
+        reach = np.clip(wanted, _NARROWER * reach, np.minimum(_WIDER * reach, _MOST))
+    points = np.array([point for point, _ in passed])
+    covariance = np.mean([c for _, c in passed], axis=0) + np.cov(points.T).reshape(r, r)
+    return _told_along_axes(found, np.mean(points, axis=0), covariance)
 
 
-def _scatter(
-    machine: Machine, found: Found, std: Float[np.ndarray, " r"]
-) -> Steps[Float[np.ndarray, " r"]]:
-    """Standard deviations with what rounding at the estimate does to one Gauss-Newton step: their size."""
-    problem = found.problem
-    starts = np.random.default_rng(3).uniform(-0.5, 0.5, (DRAWN, problem.replay.position.size))
-    starts = starts * np.asarray(machine.sensor.position_resolution)
-    w = np.tile(found.point, (DRAWN, 1))
-    e = np.asarray((yield at_each(_rounding(machine, problem), w, starts))).reshape(DRAWN, -1)
-    e = e[np.all(np.isfinite(e), axis=1)]
-    if len(e) < _FEWEST:
-        return np.full(std.shape, _MOST)
-    inverse = np.linalg.pinv(np.asarray(found.minimum.jacobian)[:, : found.count])
-    return np.hypot(std, np.std(e @ inverse.T, axis=0))
+def _where_alike(
+    off: Float[np.ndarray, "draws r"], numbers: Float[np.ndarray, "draws r"], centre: Float[np.ndarray, " r"]
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]:
+    """How far from the centre the numbers are zero, the guesses counted in, and the covariance about that."""
+    r, stays = off.shape[1], np.ones(len(off), bool)
+    rows = np.column_stack([np.ones(len(off)), off])
+    for _ in range(_SIEVED):
+        line = np.linalg.lstsq(rows[stays], numbers[stays])[0]
+        left = numbers - rows @ line
+        scatter = left[stays].T @ left[stays] / (stays.sum() - r - 1)
+        scatter[np.diag_indices(r)] += _LEAST
+        distance = np.sum(left * np.linalg.solve(scatter, left.T).T, axis=1)
+        stays = distance < r + _AWAY * np.sqrt(2 * r)
+    weighed = np.linalg.solve(scatter, line[1:].T)
+    covariance = np.linalg.inv(line[1:] @ weighed + np.eye(r))
+    return -covariance @ (weighed.T @ line[0] + centre), covariance
 
 
-def _within(
-    machine: Machine, found: Found, reach: Float[np.ndarray, " r"]
-) -> Steps[tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]]:
-    """The same from data drawn so far around the estimate."""
-    problem, r, rng = found.problem, found.count, np.random.default_rng(0)
-    best, n = np.asarray(found.minimum.theta), problem.replay.position.size
-    count = np.asarray(machine.sensor.position_resolution)
-    starts = rng.uniform(-0.5, 0.5, (DRAWN, n)) * count
-    off = rng.uniform(-1.0, 1.0, (DRAWN, r)) * reach
-    z = np.tile(best, (DRAWN, 1))
-    z[:, :r] += off
-    # In units of the prior, not of the directions: one compiled call, however many of them there are.
-    w = z @ found.first.T
-    # What is held is anywhere within its prior too; where the motor starts is drawn already.
-    held = rng.standard_normal((DRAWN, len(found.vectors) - r)) @ found.vectors[:, r:].T
-    own = slice(0, len(problem.places))
-    w[:, own] += held[:, own]
-    e = np.asarray((yield at_each(_rounding(machine, problem), w, starts)))
-    # Of data drawn, less what the estimate says: what a fit of them would begin with.
-    shape = problem.measured.shape
-    apart = (np.asarray(found.minimum.residual).reshape(shape) - e).reshape(DRAWN, -1)
-    # Far from the estimate a loop may run away.
-    sound = np.all(np.isfinite(apart), axis=1)
-    if sound.sum() < _FEWEST:
-        return np.zeros(r), np.eye(r)
-    apart, off = apart[sound], off[sound]
-    jacobian = np.asarray(found.minimum.jacobian)[:, :r]
-    inverse = np.linalg.pinv(jacobian)
-    prior = np.exp(-0.5 * np.sum((best[:r] + off) ** 2, axis=1))
-    weight = prior * _near(-apart @ inverse.T)
-    left = (apart - apart @ inverse.T @ jacobian.T).reshape(-1, *shape)
-    own = _own_noise(np.asarray(found.minimum.residual).reshape(shape), left, weight)
-    apart = apart + (rng.standard_normal((len(apart), *shape)) * own).reshape(len(apart), -1)
-    ended = -apart @ inverse.T
-    return _about_zero(ended, off, prior * _near(ended))
-
-
-def _near(ended: Float[np.ndarray, "draws r"]) -> Float[np.ndarray, " draws"]:
-    """Weights of data whose fits end near the log's own."""
-    scale = np.maximum(np.median(np.abs(ended), axis=0), 1e-300)
-    distance = np.sum((ended / scale) ** 2, axis=1)
-    return np.maximum(1.0 - distance / np.quantile(distance, _NEAREST), 0.0)
+def _told_along_axes(
+    found: Found, point: Float[np.ndarray, " r"], covariance: Float[np.ndarray, "r r"]
+) -> tuple[Found, Told | None]:
+    """A fit elsewhere, along directions that are not correlated; those that stay told."""
+    r, vectors = found.count, found.vectors.copy()
+    variances, axes = np.linalg.eigh(covariance)
+    vectors[:, :r] = vectors[:, :r] @ axes
+    vectors[:, :r] *= np.sign(vectors[np.argmax(np.abs(vectors[:, :r]), axis=0), np.arange(r)])
+    whole = found.vectors[:, :r] @ covariance @ found.vectors[:, :r].T
+    whole += found.vectors[:, r:] @ found.vectors[:, r:].T
+    z = np.array(found.minimum.theta)
+    z[:r] = point
+    w, jacobian = found.vectors @ z, np.asarray(found.minimum.jacobian) @ found.vectors.T
+    minimum = replace(found.minimum, theta=vectors.T @ w, jacobian=jacobian @ vectors)
+    count = int(np.sum(np.sqrt(variances) <= STAYS))
+    ended = replace(found, vectors=vectors, count=count, minimum=minimum)
+    if not count:
+        return ended, None
+    told = told_of(ended)
+    return ended, replace(told, covariance=np.diag(variances[:count]), whole=whole)
 
 
 def _own_noise(
-    residual: Float[np.ndarray, "time k"], left: Float[np.ndarray, "draws time k"],
-    weight: Float[np.ndarray, " draws"],
+    residual: Float[np.ndarray, "time k"], left: Float[np.ndarray, "draws time k"]
 ) -> Float[np.ndarray, " k"]:
     """Standard deviation of what rounding does not explain of a residual, by column."""
     power = np.mean(residual**2, axis=0)
-    explained = np.average(np.mean(left**2, axis=1), axis=0, weights=weight)
+    explained = np.mean(np.var(left, axis=0), axis=0)
     return np.sqrt(np.maximum(power - explained, _OWN * power))
-
-
-def _about_zero(
-    x: Float[np.ndarray, "draws r"], y: Float[np.ndarray, "draws r"], weight: Float[np.ndarray, " draws"]
-) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]:
-    """Of y where x is zero: a weighted line's value there, and the covariance around it."""
-    rows = np.concatenate([np.ones((len(x), 1)), x], axis=1)
-    root = np.sqrt(weight)[:, None]
-    line = np.linalg.lstsq(rows * root, y * root)[0]
-    left = y - rows @ line
-    weight = weight / weight.sum()
-    # The line's value is itself of so many draws.
-    return line[0], (left * weight[:, None]).T @ left * (1.0 + np.sum(weight**2))
