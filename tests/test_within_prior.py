@@ -71,7 +71,7 @@ def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolu
     # What ends at its bound is no guess that a relative prior says nothing of.
     at = found.after.theta * (np.array(found.after.names) != "viscous_friction[1].coefficient")
     ended = dataclasses.replace(found.after, machine=found.after.machine.with_estimate(at))
-    loop = _Loop.of(found.session, _Fit(found.session.machine, {}, ended))
+    loop = _Loop.of(found.session, _Fit.of(found.session, found.session.machine, {}, ended))
     assert np.all(np.isfinite(loop.base))
     # What may have either sign is looked for in either.
     looks = loop.looks()

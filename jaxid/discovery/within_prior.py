@@ -27,8 +27,10 @@ from jaxid.effects.coupling import Backlash, JointFlexibility
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators import steps_of
 from jaxid.estimators.directions import directions_steps
+from jaxid.estimators.directions_posterior import most_probable
 from jaxid.estimators.directions_problem import Problem, read
 from jaxid.estimators.directions_rounding import drawn_roundings
+from jaxid.estimators.least_squares import Minimum
 from jaxid.estimators.output_error import choose_numerics, output_residual
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone
@@ -68,11 +70,37 @@ class _Fit:
         machine: What was fitted, at its guesses.
         widths: Standard deviations of those that have one of their own, by name; see `directions_steps`.
         estimate: What was found.
+        problem: What it compared.
+        point: Where its loop, which rounds no reading, follows the log best, in units of the prior.
+        minimum: There.
     """
 
     machine: Machine
     widths: dict[str, float]
     estimate: Estimate
+    problem: Problem
+    point: Float[np.ndarray, " q"]
+    minimum: Minimum
+
+    @classmethod
+    def of(
+        cls, session: Session, machine: Machine, widths: dict[str, float], estimate: Estimate
+    ) -> _Fit:
+        """With the point anew: what rounding does on average was taken off the estimate."""
+        stated, log = session.case.output_error, session.fit.log
+        numerics, on = choose_numerics(machine, log), stated.get("on", "position")
+        problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
+        point = problem.prior.inward(problem.padded(estimate.theta))
+        here = alone(read(problem, problem.ladder[-1], point))
+        problem, here = problem.weighed(here)
+        noise = problem.noise(here, len(estimate.details["directions"]))
+        point, here, _ = alone(most_probable(problem, noise, point))
+        return cls(machine, widths, estimate, problem, point, here)
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the weighted residual."""
+        return self.problem.noise(self.minimum, len(self.estimate.details["directions"]))
 
 
 @dataclass(frozen=True)
@@ -124,7 +152,8 @@ def explore_within(
         InputError: If the loop cannot be simulated, or a guess is zero.
     """
     progress("fitting what is there")
-    before = after = _Fit(session.machine, {}, alone(steps_of("output_error", session)))
+    first = alone(steps_of("output_error", session))
+    before = after = _Fit.of(session, session.machine, {}, first)
     effects: list[Found] = []
     rounds = []
     added: Score | None = None
@@ -151,7 +180,7 @@ def explore_within(
         effects.append(replace(found, alternatives=tuple(near)))
     verdict = "found" if effects else "nothing_missing" if noisy else "unexplained"
     progress("simulating")
-    first, last = before.estimate, after.estimate
+    last = after.estimate
     old = gaps(first.machine, session.runs)
     new = gaps(last.machine, session.runs) if effects else old
     floor = noise_floor(first.machine, session.fit.log, session.fit.data)
@@ -168,8 +197,7 @@ class _Loop:
     Args:
         session: Case and log.
         union: With the effects.
-        problem: What the fit compared.
-        point: Where it ended, in units of the prior.
+        problem, point: Of the fit.
         residual: What it left, over the noise, by row of the log; behind them how far it is from its guesses.
         base: Derivatives of that in units of the prior, (rows, unknowns and starts).
         sigma: The noise, in units of the weighted residual.
@@ -186,20 +214,14 @@ class _Loop:
     @classmethod
     def of(cls, session: Session, fit: _Fit) -> _Loop:
         """Of what a fit within a prior found."""
-        stated, log, estimate = session.case.output_error, session.fit.log, fit.estimate
-        numerics, on = choose_numerics(fit.machine, log), stated.get("on", "position")
-        problem = Problem.of(fit.machine, log, stated["prior"], on, numerics, fit.widths)
-        point = problem.prior.inward(problem.padded(estimate.theta))
-        here = alone(read(problem, problem.ladder[-1], point))
-        problem, here = problem.weighed(here)
-        sigma = problem.noise(here, len(estimate.details["directions"]))
+        sigma, point, here = fit.noise, fit.point, fit.minimum
         # Sizes of motion from all samples: those of a short log may hardly leave its rest.
         data = replace(session.fit.data, moving=np.ones_like(session.fit.data.moving))
         searched = [e for e in session.case.searched if e not in _LEFT_OUT]
-        union = build_union(estimate.machine, data, searched)
+        union = build_union(fit.estimate.machine, data, searched)
         residual = np.concatenate([np.asarray(here.residual).ravel() / sigma, point])
         base = np.concatenate([np.asarray(here.jacobian) / sigma, np.eye(point.size)])
-        return cls(session, union, problem, point, residual, base, sigma)
+        return cls(session, union, fit.problem, point, residual, base, sigma)
 
     @property
     def samples(self) -> int:
@@ -265,13 +287,13 @@ class _Loop:
         moved = np.where(grows, start * np.exp(np.where(grows, step, 0.0)), start + _size(start) * step)
         return np.clip(moved, lower, upper)
 
-    def gained(self, after: Estimate, before: Estimate) -> float:
+    def gained(self, after: _Fit, before: _Fit) -> float:
         """Nats by which a log and the base's guesses are likelier with another effect."""
-        ratio = after.details["criterion_percent"] / before.details["criterion_percent"]
-        known = after.theta[: len(self.problem.places)]
-        point = self.problem.prior.inward(self.problem.padded(known))
+        ratio, (then, now) = after.minimum.cost / before.minimum.cost, (before.point, after.point)
+        known = len(self.problem.places)
         # The noise is that of either fit.
-        return 0.5 * float(self.point @ self.point - point @ point - self.samples * np.log(ratio))
+        guesses = then[:known] @ then[:known] - now[:known] @ now[:known]
+        return 0.5 * float(guesses - self.samples * np.log(ratio))
 
     def _at(
         self, c: Candidate, values: np.ndarray, point: np.ndarray
@@ -428,8 +450,8 @@ def _fitted(
         machine, loop.session.fit.log, prior=stated["prior"], on=stated.get("on", "position"),
         widths=widths, begin=np.concatenate([known, begin.values]),
     ))
-    gained = loop.gained(after, base.estimate) if after.converged else 0.0
-    return gained, begin, _Fit(machine, widths, after)
+    fit = _Fit.of(loop.session, machine, widths, after)
+    return loop.gained(fit, base) if after.converged else 0.0, begin, fit
 
 
 def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:
