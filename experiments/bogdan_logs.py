@@ -39,16 +39,17 @@ def logs_of(
 ) -> tuple[list[Log], np.ndarray]:
     """Logs that differ in noise, and in where within its first count the motor stood: that too [rad].
 
-    Of the published move, or of another reference.
+    Of the published move, or of another reference, where that begins.
     """
     reference = stages.move(0.5, **stages.MOVES[data]) if reference is None else reference
     noise = noise_of(data, resolution) if noise is None else noise
     stage, rng = stages.machine(data, rigid=rigid), np.random.default_rng(1)
     out, starts = [], rng.uniform(-0.5, 0.5, runs) * resolution
+    first = np.round(reference[0] / resolution) * resolution if resolution else reference[0]
     for k in range(runs):
         made = stages.record(
             stage, reference, noise=noise, resolution=resolution, seed=k, step=5e-6 if rigid else 2e-6,
-            start=starts[k],
+            start=first + starts[k],
         )
         out.append(
             Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],

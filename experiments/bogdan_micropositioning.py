@@ -194,7 +194,8 @@ DESIGNED, VISIBLE = 8, 0.5
 def designed(folder: Path, runs: int) -> None:
     """(b) Logs of 2000 samples out and back, found by its information; both screws; one with 32 starts."""
     start = time.perf_counter()
-    text = stages.text(1, reference="", more=ON_FORCE + DESIGN)
+    # Who designs knows his guesses only.
+    text = stages.text(1, guess=stages.drawn(1, data=1), reference="", more=ON_FORCE + DESIGN)
     noise = noise_of(1, stages.COUNT)
     (folder / "design.toml").write_text(text.replace("[sensor]\n", f"[sensor]\nforce_noise = {noise!r}\n"))
     plan = jaxid.design(folder / "design.toml")
@@ -239,8 +240,9 @@ def load(folder: Path, runs: int) -> None:
     """(b) What `designed` wrote, run again: the table's position logged, the elastic screw in the model."""
     start = time.perf_counter()
     reference, begin = np.loadtxt(folder / "design.csv", delimiter=",", skiprows=1)[:, 1], 0.3 * stages.COUNT
+    first = np.round(reference[0] / stages.COUNT) * stages.COUNT
     made = stages.record(
-        stages.machine(1), reference, noise=noise_of(1, stages.COUNT), step=2e-6, start=begin
+        stages.machine(1), reference, noise=noise_of(1, stages.COUNT), step=2e-6, start=first + begin
     )
     scale = np.round(made["x"] / SCALE) * SCALE
     log = Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],

@@ -18,7 +18,10 @@ from jaxid.discovery.rivals import Bounds
 from jaxid.discovery.separate import improved
 from jaxid.discovery.shapes import Shapes, basis
 from jaxid.errors import InputError
-from jaxid.estimators.directions_problem import Prior, residual_of, with_sensor
+from jaxid.estimators.directions import expected_steps
+from jaxid.estimators.directions_problem import Prior, Problem, residual_of, with_sensor
+from jaxid.estimators.directions_rounding import rounds
+from jaxid.estimators.steps import alone
 from jaxid.excitation import Excitation, excite
 from jaxid.io.case import Case, load_case
 from jaxid.io.output import write_whole
@@ -131,23 +134,23 @@ def design(
         return excite(case, progress)
     bench = _Bench.of(case)
     progress("looking at sines and tours")
-    starts = bench.starts
     both = lambda p: _valued(bench, p)
+    # Within the limits from the beginning: what breaks them is led back to them, not to what tells most.
+    starts = [p for p in map(bench.within, bench.starts) if p is not None]
+    if not starts:
+        raise InputError(
+            "no experiment within the limits was found", where=f"{case.path}, [limits]",
+            mend="widen them, or check the loop's gains: the machine went beyond whatever it was asked",
+        )
     known = [both(p) for p in starts]
     ranked = sorted(range(len(starts)), key=lambda k: known[k][0])[:_IMPROVED]
     found = []
     for k in ranked:
         progress("improving the most telling")
-        found.append(improved(both, starts[k], known[k], _EVALUATIONS))
-    tour, *others = (bench.kept(p) for p in (*starts, *(p for _, p in found)))
-    kept = [k for k in (tour, *others) if k is not None]
-    if not kept:
-        raise InputError(
-            "no experiment within the limits was found", where=f"{case.path}, [limits]",
-            mend="widen them, or check the loop's gains: the machine went beyond whatever it was asked",
-        )
-    best = max(kept, key=lambda k: bench.nats(k[0]))
-    return bench.designed(*best, kept[0][0])
+        found.append(improved(both, starts[k], known[k], _EVALUATIONS)[1])
+    progress("expecting what each will tell")
+    kept = [p for p in (*starts, *map(bench.within, found)) if p is not None]
+    return bench.designed([bench.shapes.signal(p) for p in kept])
 
 
 def _check(case: Case) -> None:
@@ -168,6 +171,7 @@ class _Bench:
     machine: Machine
     replay: Replay
     weight: np.ndarray
+    own: np.ndarray
     prior: Prior
     on: str
     limits: Limits
@@ -204,8 +208,9 @@ class _Bench:
         replay = replace(replay, drive=replace(drive, substeps=steps))
         on = case.output_error.get("on", "position")
         prior = Prior.of(machine, case.output_error.get("prior", _PRIOR), np.zeros(0))
-        bench = cls(machine, replay, np.zeros(0), prior, on, limits, shapes, starts)
-        return replace(bench, weight=_weights(case, bench, len(range(0, ticks, every))))
+        bench = cls(machine, replay, np.zeros(0), np.zeros(0), prior, on, limits, shapes, starts)
+        own, whole = _noises(case, bench)
+        return replace(bench, weight=np.tile(1.0 / whole, (len(range(0, ticks, every)), 1)), own=own / whole)
 
     def run(self, signal: Array, sensor: Sensor | None = None) -> Replay:
         """The machine under a signal."""
@@ -217,32 +222,42 @@ class _Bench:
         run = _trajectory(self.run(signal), self.machine.plant)
         return Peaks.of(*(np.asarray(x) for x in (run.position, run.velocity, run.command)))
 
-    def kept(self, p: np.ndarray) -> tuple[np.ndarray, Peaks] | None:
-        """The signal of some numbers, at the largest amplitude at which the machine keeps to its limits."""
-        return kept_within(self.limits, self.shapes, p, self.peaks)
+    def within(self, p: np.ndarray) -> np.ndarray | None:
+        """Some numbers, at the largest amplitude at which the machine keeps to its limits."""
+        kept = kept_within(self.limits, self.shapes, p, self.peaks)
+        return None if kept is None else kept[0]
 
-    def information(self, signal: np.ndarray) -> np.ndarray:
-        """Of a signal's log in units of the prior, the prior's included, (p, p)."""
-        return np.eye(self.prior.base.size) + np.asarray(_information(*self.args(), jnp.asarray(signal)))
+    def expected(self, signal: np.ndarray) -> np.ndarray:
+        """Covariance of the unknowns that a signal's log will leave, in units of the prior, (p, p).
 
-    def nats(self, signal: np.ndarray) -> float:
-        """Information gained over the guesses."""
-        return 0.5 * float(np.linalg.slogdet(self.information(signal))[1])
+        Where readings round, that which is found of a log simulated at the guesses: see `through_rounding`.
+        """
+        problem = Problem(
+            _under(self.replay, self.machine.plant, jnp.asarray(signal)), self.machine.parameters.places,
+            self.machine.plant, np.zeros(self.weight.shape), self.weight, self.prior, self.on,
+            (np.asarray(self.machine.plant.sharpness),),
+        )
+        if not rounds(self.machine, problem):
+            information = np.asarray(_information(*self.args(), jnp.asarray(signal)))
+            return np.linalg.inv(np.eye(len(information)) + information)
+        return alone(expected_steps(self.machine, problem, self.own))
 
     def args(self) -> tuple:
         """For the compiled functions."""
         unknown = self.machine.parameters
         return (self.replay, unknown.places, self.machine.plant, self.weight, self.prior, self.on)
 
-    def designed(self, signal: np.ndarray, peaks: Peaks, tour: np.ndarray) -> Design:
-        """The design with what is expected of it."""
-        of = (signal, tour)
-        std = [np.sqrt(np.diag(np.linalg.inv(self.information(x)))) * self.relative for x in of]
-        nats = (self.nats(signal), self.nats(tour))
-        period = self.replay.drive.period
+    def designed(self, signals: list[np.ndarray]) -> Design:
+        """The most telling of some signals with what is expected of it, beside the first."""
+        left = [self.expected(x) for x in signals]
+        gained = [-0.5 * float(np.linalg.slogdet(covariance)[1]) for covariance in left]
+        best = int(np.argmax(gained))
+        std = [np.sqrt(np.diag(left[k])) * self.relative for k in (best, 0)]
+        signal = signals[best]
+        time = float(self.replay.drive.period) * np.arange(len(signal))
         name = "reference" if self.replay.controller is not None else "input"
-        time = float(period) * np.arange(len(signal))
-        return Design(self.machine, name, time, signal, *std, nats, self.limits, peaks)
+        nats = (gained[best], gained[0])
+        return Design(self.machine, name, time, signal, *std, nats, self.limits, self.peaks(signal))
 
     @property
     def relative(self) -> np.ndarray:
@@ -283,14 +298,16 @@ def _family(
     return shapes, [shapes.numbers(w) for w in weights]
 
 
-def _weights(case: Case, bench: _Bench, samples: int) -> Float[np.ndarray, "time k"]:
-    """One over the noise of what is compared; that of the command holds what rounding does in the loop."""
+def _noises(case: Case, bench: _Bench) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Of what is compared: that of its own, and with what rounding does in the loop to the command."""
     sensor, n, m = bench.machine.sensor, case.plant.joints, bench.machine.gain.size
     std: list[np.ndarray] = []
+    more = np.zeros(0)
     if bench.on in ("position", "both"):
         if sensor.position_std is None:
             raise _no_noise(case, "position", "position_noise or position_resolution")
         std.append(np.broadcast_to(np.asarray(sensor.position_std), n))
+        more = np.zeros(n)
     if bench.on in ("force", "both"):
         if sensor.force_noise is None:
             raise _no_noise(case, "force", "force_noise")
@@ -299,8 +316,10 @@ def _weights(case: Case, bench: _Bench, samples: int) -> Float[np.ndarray, "time
         rounded, exact = (np.asarray(run.command) for run in runs)
         through = np.sqrt(np.mean((rounded - exact) ** 2, axis=0))
         own = np.broadcast_to(np.asarray(sensor.force_noise), m)
-        std.append(np.abs(bench.machine.gain) * np.hypot(own, through))
-    return np.tile(1.0 / np.concatenate(std), (samples, 1))
+        std.append(np.abs(bench.machine.gain) * own)
+        more = np.concatenate([more, np.abs(bench.machine.gain) * through])
+    own = np.concatenate(std)
+    return own, np.hypot(own, more)
 
 
 def _no_noise(case: Case, what: str, key: str) -> InputError:

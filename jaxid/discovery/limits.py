@@ -75,7 +75,7 @@ class Limits:
 
 def kept_within(
     limits: Limits, shapes: Shapes, p: Float[np.ndarray, " p"], peaks_of: Callable[[np.ndarray], Peaks]
-) -> tuple[Float[np.ndarray, "time m"], Peaks] | None:
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "time m"], Peaks] | None:
     """The signal of some numbers at the largest amplitude at which a machine keeps to its limits.
 
     Args:
@@ -84,13 +84,14 @@ def kept_within(
         peaks_of: How far the machine goes under a signal.
 
     Returns:
-        The signal and how far it goes; None where it goes beyond whatever the amplitude.
+        Its numbers, the signal and how far it goes; None where it goes beyond whatever the amplitude.
     """
     for factor in _AMPLITUDES:
-        signal = shapes.signal(shapes.smaller(p, factor))
+        smaller = shapes.smaller(p, factor)
+        signal = shapes.signal(smaller)
         peaks = peaks_of(signal)
         if not limits.broken(peaks):
-            return signal, peaks
+            return smaller, signal, peaks
     return None
 
 

@@ -151,7 +151,7 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
         fitting = kept_within(limits, shapes, p, lambda signal: stage.peaks(pair, signal))
         if fitting is None:
             continue
-        signal, reached = fitting
+        _, signal, reached = fitting
         now = min(stage.outcomes(search.union, pair, signal), key=lambda o: o.short)
         if outcome is None or now.short > outcome.short:
             best, outcome, peaks = signal, now, reached

@@ -40,7 +40,7 @@ from jaxid.estimators.directions_problem import (
     fit_each,
     read,
 )
-from jaxid.estimators.directions_rounding import draws_soon, rounds, through_rounding
+from jaxid.estimators.directions_rounding import draws_soon, one_rounded, rounds, through_rounding
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -167,6 +167,35 @@ def _searched(
         found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS))
         found, told = yield from _most_probable(machine, found)
     return found, told, many
+
+
+def expected_steps(
+    machine: Machine, problem: Problem, own: Float[np.ndarray, " k"]
+) -> Steps[Float[np.ndarray, "q q"]]:
+    """How well a log will tell the unknowns of a machine whose readings round, simulated at the guesses.
+
+    Args:
+        machine: The machine.
+        problem: What is to be compared, with nothing measured: zeros.
+        own: Noise beside what rounding does, by column, over what the problem weighs it by.
+
+    Returns:
+        Covariance of all unknowns in units of the prior; the prior's where nothing is told.
+    """
+    rng, here = np.random.default_rng(0), np.zeros((DRAWN, problem.prior.base.size))
+    # A residual is of what is measured less what is simulated.
+    log = -np.asarray((yield one_rounded(machine, problem)))[0]
+    log = log + own * rng.standard_normal(log.shape)
+    problem = replace(problem, measured=log / problem.weight)
+    minimum = yield from read(problem, problem.ladder[-1], here[0])
+    jacobian = np.asarray(minimum.jacobian)
+    vectors, count = _directions(jacobian / problem.noise(minimum, 0), 0)
+    minimum = replace(minimum, theta=vectors.T @ here[0], jacobian=jacobian @ vectors)
+    if count:
+        _, told = yield from through_rounding(machine, Found(problem, vectors, count, minimum, 1, True))
+        if told is not None:
+            return told.whole
+    return np.eye(len(vectors))
 
 
 def _looked(problem: Problem, told: np.ndarray, w: np.ndarray) -> Steps[np.ndarray]:

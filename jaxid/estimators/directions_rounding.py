@@ -21,7 +21,7 @@ from jaxid.estimators.directions_problem import (
     at_each,
     at_each_soon,
 )
-from jaxid.estimators.steps import Soon, Steps
+from jaxid.estimators.steps import Solve, Soon, Steps
 from jaxid.machine import Machine
 from jaxid.replay import with_sensor
 
@@ -52,6 +52,13 @@ def rounds(machine: Machine, problem: Problem) -> bool:
 def draws_soon(machine: Machine, problem: Problem) -> Soon:
     """What `through_rounding` will ask for."""
     return at_each_soon(_rounding(machine, problem))
+
+
+def one_rounded(machine: Machine, problem: Problem) -> Solve:
+    """Residuals at the guesses with rounding in the loop, from starts within the first count."""
+    starts = np.random.default_rng(4).uniform(-0.5, 0.5, (DRAWN, problem.replay.position.size))
+    starts = starts * np.asarray(machine.sensor.position_resolution)
+    return at_each(_rounding(machine, problem), np.zeros((DRAWN, problem.prior.base.size)), starts)
 
 
 def _rounding(machine: Machine, problem: Problem) -> Problem:
