@@ -84,6 +84,45 @@ def test_what_it_expects_is_what_a_fit_of_such_a_log_says(found):
     assert np.all((ratio > 0.4) & (ratio < 2.5))
 
 
+COUNT = 5e-5
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory):
+    """The same on the command, where a coarse encoder closes the loop."""
+    path = tmp_path_factory.mktemp("coarse") / "case.toml"
+    rounded = f"position_resolution = {COUNT}\nforce_noise = 2.0"
+    text = CASE.replace("position_noise = 1e-5", rounded).replace("prior = 0.5", 'prior = 0.5\non = "force"')
+    path.write_text(text)
+    return path, jaxid.design(path)
+
+
+def test_what_rounding_takes_is_expected_too(coarse):
+    """Of an exact machine's logs sigma is as expected; and more is told than of the tour."""
+    path, design = coarse
+    machine = Machine(90.0, {"viscous_friction": {"coefficient": 150.0}, "coulomb_friction": {"level": 25.0}})
+    reference = design.values[:, 0]
+    loop = Loop("cascade_pd", reference=reference, kp=60.0, kv=3000.0, limit=400.0)
+    ratios, off = [], []
+    for seed in range(4):
+        start = (np.round(reference[0] / COUNT) + np.random.default_rng(seed).uniform(-0.5, 0.5)) * COUNT
+        made = simulate(
+            machine, loop, Sensor(position_resolution=COUNT, force_noise=2.0), rate=500.0,
+            duration=len(reference) / 500.0, initial_position=start, seed=seed,
+        )
+        log = Log(
+            time=made["t"], position=made["position"][:, None], force=made["force"][:, None],
+            reference=reference[:, None], source="designed",
+        )
+        estimate = jaxid.identify(path, log).estimate
+        ratios.append(estimate.std / np.array([90.0, 150.0, 25.0]) / design.std)
+        off.append((estimate.theta - np.array([90.0, 150.0, 25.0])) / estimate.std)
+    assert np.all(np.isfinite(ratios))
+    assert np.all((np.median(ratios, axis=0) > 0.7) & (np.median(ratios, axis=0) < 1.4))
+    assert np.max(np.abs(off)) < 3
+    assert design.nats[0] > design.nats[1] + 1.0
+
+
 def test_the_signal_is_a_reference_to_simulate(found, tmp_path):
     design = found[1]
     design.save(tmp_path / "ref.csv")

@@ -193,7 +193,8 @@ def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told 
         wanted = np.maximum(_REACH * np.sqrt(np.diag(covariance)), np.abs(step))
         reach = np.clip(wanted, _NARROWER * reach, np.minimum(_WIDER * reach, _MOST))
     points = np.array([point for point, _ in passed])
-    covariance = np.mean([c for _, c in passed], axis=0) + np.cov(points.T).reshape(r, r)
+    # Beside that of the truth about the point, that of the point, which is a mean.
+    covariance = np.mean([c for _, c in passed], axis=0) + np.cov(points.T).reshape(r, r) / len(points)
     return _told_along_axes(found, np.mean(points, axis=0), covariance)
 
 
