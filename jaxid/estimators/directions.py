@@ -60,6 +60,9 @@ _WHERE_NOTHING_SHOWS = 32
 _LOOK = np.linspace(-3.0, 3.0, 13)
 # How far a fit looks for where to begin, in priors.
 _LOOKED = 2.0
+# A simulation without rounding follows a loop in which that moves what is compared by this part of its
+# variance at most.
+_FOLLOWED = 0.1
 # Two starts end at one optimum where their costs differ by less than this.
 _SAME = 1e-3
 
@@ -106,8 +109,13 @@ def directions_steps(
     p = len(machine.parameters.free)
     r = found.count
     remarks: list[str] = []
-    if (hessian or profile) and told is not None and rounds(machine, problem):
-        remarks.append("rounding was simulated: neither Hessian nor profiles say anything beside it")
+    if told is not None and rounds(machine, problem):
+        remarks.append(
+            "what rounding of the readings does on average was taken off; criterion and residual are "
+            "those of the fit before that"
+        )
+        if hessian or profile:
+            remarks.append("rounding was simulated: neither Hessian nor profiles say anything beside it")
     elif told is not None:
         noise = found.problem.noise(found.minimum, r)
         if hessian:
@@ -180,14 +188,18 @@ def expected_steps(
         own: Noise beside what rounding does, by column, over what the problem weighs it by.
 
     Returns:
-        Covariance of all unknowns in units of the prior; the prior's where nothing is told.
+        Covariance of all unknowns in units of the prior; the prior's where nothing is told, and where
+        rounding moves the loop so far that a fit which simulates it without will not find its way.
     """
     rng, here = np.random.default_rng(0), np.zeros((DRAWN, problem.prior.base.size))
     # A residual is of what is measured less what is simulated.
-    log = -np.asarray((yield one_rounded(machine, problem)))[0]
-    log = log + own * rng.standard_normal(log.shape)
+    exact = -np.asarray((yield one_rounded(machine, problem)))[0]
+    log = exact + own * rng.standard_normal(exact.shape)
     problem = replace(problem, measured=log / problem.weight)
     minimum = yield from read(problem, problem.ladder[-1], here[0])
+    followed = log - np.asarray(minimum.residual).reshape(log.shape)
+    if np.any(np.var(exact - followed, axis=0) > _FOLLOWED * np.var(followed, axis=0)):
+        return np.eye(len(here[0]))
     jacobian = np.asarray(minimum.jacobian)
     vectors, count = _directions(jacobian / problem.noise(minimum, 0), 0)
     minimum = replace(minimum, theta=vectors.T @ here[0], jacobian=jacobian @ vectors)
