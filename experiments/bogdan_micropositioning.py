@@ -162,15 +162,17 @@ def position(folder: Path, runs: int) -> None:
             case = case_of(folder, "position", 1, resolution=resolution, more=stated)
             logs, starts = logs_of(1, runs // 2, resolution=resolution)
             found, ratio, off = studied(case, logs, starts, 1, on)
-            std = np.array([[d["std"] for d in e.details["directions"][:2]] for e in found])
+            # Of a log that tells one only there is no second.
+            two = lambda values: np.resize([*values[:2], np.nan, np.nan], 2)
+            std = np.array([two([d["std"] for d in e.details["directions"]]) for e in found])
             stated += "starts = 64\n"
             far = case_of(folder, "position", 1, guess=1, resolution=resolution, more=stated)
             alike = jaxid.identify(far, logs[0]).estimate.details["starts"]
-            wrong = np.sqrt(np.mean((std * np.array([o[:2] for o in off])) ** 2, axis=0))
+            wrong = np.sqrt(np.nanmean((std * np.array([two(o) for o in off])) ** 2, axis=0))
             share = lambda x: ", ".join(f"{50 * v:.2g} %" for v in x)
             table.row(
                 "current" if on == "force" else on, name, f"{np.mean([len(o) for o in off]):.1f}",
-                share(wrong), share(np.median(std, axis=0)),
+                share(wrong), share(np.nanmedian(std, axis=0)),
                 f"{np.mean(np.abs(np.concatenate(off)) < 1.96):.0%}", f"{ratio.mean():.3f}",
                 f"{alike['same_optimum']} of {alike['count']}",
             )

@@ -170,7 +170,7 @@ def test_a_point_whose_slopes_are_not_finite_is_kept(monkeypatch, unknowns):
     problem = SimpleNamespace(prior=SimpleNamespace(base=np.ones(unknowns)), ladder=(1.0,))
     problem.weighed = lambda found: (problem, found)
     for w in (np.zeros(unknowns), np.arange(1.0, unknowns + 1)):
-        found = alone(directions._rounds(problem, w))
+        found = alone(directions._rounds(problem, w, unknowns))
         assert found.count == 0
         np.testing.assert_allclose(found.point, w, rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(unknowns), atol=1e-12)

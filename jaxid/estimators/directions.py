@@ -162,17 +162,20 @@ def _searched(
 ) -> Steps[tuple[Found, Told | None, dict[str, Any]]]:
     """Where the fit ends, how well its directions are told, and what is to be stated of its starts."""
     yield at_each_soon(problem)
+    most = problem.prior.base.size
     if rounds(machine, problem):
+        # What rounding does leaves few directions told in the end, and others many valleys.
+        most = AT_ONCE
         yield draws_soon(machine, problem)
     nowhere = np.zeros(problem.prior.base.size)
-    found = yield from _rounds(problem, nowhere if first is None else first, look=first is None)
+    found = yield from _rounds(problem, nowhere if first is None else first, most, look=first is None)
     many: dict[str, Any] = {}
     if starts > 1 or given:
-        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]))
+        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
     found, told = yield from _most_probable(machine, found)
     if told is None and not many:
         # A machine that sticks at the guesses, or nearly, shows nothing.
-        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS))
+        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
         found, told = yield from _most_probable(machine, found)
     return found, told, many
 
@@ -256,9 +259,9 @@ def _drawn(problem: Problem, starts: int) -> np.ndarray:
 
 
 def _rounds(
-    problem: Problem, w: np.ndarray, *, look: bool = True, last: bool = False
+    problem: Problem, w: np.ndarray, most: int, *, look: bool = True, last: bool = False
 ) -> Steps[Found]:
-    """Read the directions, fit along the best of them, and again, each time sharper, until they stay.
+    """Read the directions, fit along them, so many at most, and again, each time sharper, until they stay.
 
     `look`: begin at the best of many points; `last`: at the sharpest only, from a point that is near.
     """
@@ -279,9 +282,9 @@ def _rounds(
                 return Found(problem, whole, 0, here, spent, False)
             noise = problem.noise(here, count)
             vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
-            count = min(count, AT_ONCE)
+            count = min(count, most)
             if rung == 0 and look and not last and count:
-                w = yield from _looked(problem, vectors[:, :count], w)
+                w = yield from _looked(problem, vectors[:, : min(count, AT_ONCE)], w)
         some = columns(vectors, count)
         fitted = np.arange(some.shape[1]) < count
         start = np.where(fitted, np.clip(some.T @ w, -FAR, FAR), 0.0)
@@ -312,22 +315,22 @@ def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     return rows.T * np.sign(rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]), count
 
 
-def _elsewhere(found: Found, points: np.ndarray) -> Steps[Found]:
+def _elsewhere(found: Found, points: np.ndarray, most: int) -> Steps[Found]:
     """The rounds from the best of some points too: a machine that sticks at the guesses shows nothing."""
     problem, nothing = found.problem, np.zeros(points.shape[1])
     still = (nothing, np.eye(points.shape[1]), points, np.zeros(points.shape, bool))
     _, costs, _, _ = yield Solve(fit_each, (*problem.args, problem.ladder[0], NO_PULL, *still))
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-    other = yield from _rounds(problem, points[best])
+    other = yield from _rounds(problem, points[best], most)
     better = float(other.minimum.cost) < float(found.minimum.cost) * (1 - _SAME)
     return replace(other if better else found, evaluations=found.evaluations + other.evaluations)
 
 
 def _many_starts(
-    found: Found, points: np.ndarray
+    found: Found, points: np.ndarray, most: int
 ) -> Steps[tuple[Found, dict[str, Any]]]:
     """The best of many starts, and how many end there."""
-    found = yield from _elsewhere(found, points)
+    found = yield from _elsewhere(found, points, most)
     spent = found.evaluations
     for again in (True, False):
         some, origin = found.first, np.zeros(points.shape[1])
@@ -351,7 +354,7 @@ def _many_starts(
         if not again or costs[best] >= cost * (1 - _SAME):
             break
         # Other directions may be told from there.
-        other = yield from _rounds(found.problem, some @ z[best], last=True)
+        other = yield from _rounds(found.problem, some @ z[best], most, last=True)
         spent += other.evaluations
         if float(other.minimum.cost) >= cost:
             break
