@@ -6,6 +6,7 @@ from stepper import Loop, Machine, Sensor, simulate
 
 import jaxid
 from jaxid.cli import main
+from jaxid.experiment import _Bench
 from jaxid.io.log import Log
 
 CASE = """
@@ -121,6 +122,17 @@ def test_what_rounding_takes_is_expected_too(coarse):
     assert np.all((np.median(ratios, axis=0) > 0.7) & (np.median(ratios, axis=0) < 1.4))
     assert np.max(np.abs(off)) < 3
     assert design.nats[0] > design.nats[1] + 1.0
+
+
+def test_of_a_loop_that_rounding_tosses_about_nothing_is_expected(coarse):
+    path, design = coarse
+    told = {}
+    for count in (COUNT, 200 * COUNT):
+        case = path.with_name("tossed.toml")
+        case.write_text(path.read_text().replace(f"resolution = {COUNT}", f"resolution = {count}"))
+        told[count] = _Bench.of(jaxid.load_case(case)).expected(design.values)
+    assert np.all(np.diag(told[COUNT]) < 0.2)
+    np.testing.assert_array_equal(told[200 * COUNT], np.eye(3))
 
 
 def test_the_signal_is_a_reference_to_simulate(found, tmp_path):

@@ -206,7 +206,9 @@ def test_rounding_widens_what_it_moves(tmp_path):
     for count in (1e-5, stages.COUNT):
         text = stages.text(1, resolution=count, more=STATED)
         (tmp_path / "case.toml").write_text(text)
-        second = jaxid.identify(tmp_path / "case.toml", log).estimate.details["directions"][1]
+        estimate = jaxid.identify(tmp_path / "case.toml", log).estimate
+        assert any("rounding" in note and "taken off" in note for note in estimate.notes)
+        second = estimate.details["directions"][1]
         sigma.append(second["std"] / second["std_white"])
     assert sigma[1] > 2 * sigma[0]
 

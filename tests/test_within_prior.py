@@ -7,7 +7,7 @@ import pytest
 import stages
 
 import jaxid
-from jaxid.discovery.within_prior import _Fit, _Loop
+from jaxid.discovery.looks import Fit, Loop
 from jaxid.io.log import Log
 
 PRIOR = '[output_error]\non = "force"\nprior = 0.5\n'
@@ -71,10 +71,19 @@ def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolu
     # What ends at its bound is no guess that a relative prior says nothing of.
     at = found.after.theta * (np.array(found.after.names) != "viscous_friction[1].coefficient")
     ended = dataclasses.replace(found.after, machine=found.after.machine.with_estimate(at))
-    loop = _Loop.of(found.session, _Fit.of(found.session, found.session.machine, {}, ended))
+    loop = Loop.of(found.session, Fit.of(found.session, found.session.machine, {}, ended))
     assert np.all(np.isfinite(loop.base))
     # What may have either sign is looked for in either.
     looks = loop.looks()
+    # Fits begin where simulation, not the line of a look, says that the residual is less.
+    cogging = next(c for c in loop.union.candidates if c.kind == "cogging")
+    begins = loop.begins(cogging, looks)
+    assert 1 < len({b.start for b in begins}) == len(begins) <= 6
+    assert np.all(np.diff([b.squares for b in begins]) >= 0)
+    for b in begins:
+        e, _ = loop._at(cogging, b.values, b.point)
+        assert b.squares == pytest.approx(e @ e)
+        assert b.squares < loop.residual @ loop.residual
     drag = next(x for x in looks if x.candidate.kind == "quadratic_drag")
     for sign in (1.0, -1.0):
         faced = dataclasses.replace(loop, residual=-sign * drag.columns[:, 0])

@@ -39,8 +39,9 @@ from jaxid.estimators.directions_problem import (
     descent,
     fit_each,
     read,
+    signed,
 )
-from jaxid.estimators.directions_rounding import draws_soon, one_rounded, rounds, through_rounding
+from jaxid.estimators.directions_rounding import draws_soon, rounded, rounds, through_rounding
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -196,7 +197,7 @@ def expected_steps(
     """
     rng, here = np.random.default_rng(0), np.zeros((DRAWN, problem.prior.base.size))
     # A residual is of what is measured less what is simulated.
-    exact = -np.asarray((yield one_rounded(machine, problem)))[0]
+    exact = -np.asarray((yield rounded(machine, problem, np.random.default_rng(4))))[0]
     log = exact + own * rng.standard_normal(exact.shape)
     problem = replace(problem, measured=log / problem.weight)
     minimum = yield from read(problem, problem.ladder[-1], here[0])
@@ -311,8 +312,7 @@ def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     count = int(np.sum(told > 1.0 / _TOLD_TWICE))
     if before > count:
         count = int(np.sum(told[:before] > 1.0 / STAYS))
-    # Eigenvectors come with either sign: the largest entry is taken positive.
-    return rows.T * np.sign(rows[np.arange(size), np.argmax(np.abs(rows), axis=1)]), count
+    return signed(rows.T), count
 
 
 def _elsewhere(found: Found, points: np.ndarray, most: int) -> Steps[Found]:

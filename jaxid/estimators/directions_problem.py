@@ -197,6 +197,12 @@ def _rises(plant: Plant, q: Array, u: Array) -> bool:
     return bool(plant.balance(q, q, q, u, jnp.zeros(()), plant.initial_states(u)).rises)
 
 
+def signed(vectors: Float[np.ndarray, "q k"]) -> Float[np.ndarray, "q k"]:
+    """Columns that come with either sign, with their largest entry positive."""
+    largest = np.argmax(np.abs(vectors), axis=0)
+    return vectors * np.sign(vectors[largest, np.arange(vectors.shape[1])])
+
+
 def columns(vectors: Float[np.ndarray, "q q"], count: int) -> Float[np.ndarray, "q k"]:
     """The first directions, so many at least, in a number that compiled code is made for."""
     return vectors[:, : AT_ONCE * max(1, -(-count // AT_ONCE))]

@@ -20,6 +20,7 @@ from jaxid.estimators.directions_problem import (
     Problem,
     at_each,
     at_each_soon,
+    signed,
 )
 from jaxid.estimators.steps import Solve, Soon, Steps
 from jaxid.machine import Machine
@@ -54,9 +55,9 @@ def draws_soon(machine: Machine, problem: Problem) -> Soon:
     return at_each_soon(_rounding(machine, problem))
 
 
-def one_rounded(machine: Machine, problem: Problem) -> Solve:
+def rounded(machine: Machine, problem: Problem, rng: np.random.Generator) -> Solve:
     """Residuals at the guesses with rounding in the loop, from starts within the first count."""
-    starts = np.random.default_rng(4).uniform(-0.5, 0.5, (DRAWN, problem.replay.position.size))
+    starts = rng.uniform(-0.5, 0.5, (DRAWN, problem.replay.position.size))
     starts = starts * np.asarray(machine.sensor.position_resolution)
     return at_each(_rounding(machine, problem), np.zeros((DRAWN, problem.prior.base.size)), starts)
 
@@ -81,14 +82,10 @@ def drawn_roundings(
     """
     if not rounds(machine, problem):
         return None
-    rng, size = np.random.default_rng(2), problem.prior.base.size
-    shape, still = (DRAWN, problem.replay.position.size), np.zeros((DRAWN, size))
-    count, rounding = np.asarray(machine.sensor.position_resolution), _rounding(machine, problem)
-    asked = [
-        at_each(rounding, still, rng.uniform(-0.5, 0.5, shape) * count) for _ in range(-(-draws // DRAWN))
-    ]
-    e = [function(*args) for function, args in asked]
-    e = np.concatenate([np.asarray(x).reshape(DRAWN, -1) for x in e])[:draws]
+    rng = np.random.default_rng(2)
+    asked = [rounded(machine, problem, rng) for _ in range(-(-draws // DRAWN))]
+    e = [np.asarray(solve.function(*solve.args)).reshape(DRAWN, -1) for solve in asked]
+    e = np.concatenate(e)[:draws]
     return e - e.mean(axis=0)
 
 
@@ -222,8 +219,7 @@ def _told_along_axes(
     """A fit elsewhere, along directions that are not correlated; those that stay told."""
     r, vectors = found.count, found.vectors.copy()
     variances, axes = np.linalg.eigh(covariance)
-    vectors[:, :r] = vectors[:, :r] @ axes
-    vectors[:, :r] *= np.sign(vectors[np.argmax(np.abs(vectors[:, :r]), axis=0), np.arange(r)])
+    vectors[:, :r] = signed(vectors[:, :r] @ axes)
     whole = found.vectors[:, :r] @ covariance @ found.vectors[:, :r].T
     whole += found.vectors[:, r:] @ found.vectors[:, r:].T
     z = np.array(found.minimum.theta)
