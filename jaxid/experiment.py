@@ -202,7 +202,8 @@ class _Bench:
         free = machine.controller
         if looped and free.limit is not None:
             free = replace(free, limit=_BEYOND * jnp.asarray(free.limit))
-        replay = Replay(drive, free, Sensor(), *inputs, start.astype(float), np.zeros(n), None, every)
+        state = (start.astype(float), np.zeros(n))
+        replay = Replay(drive, free, Sensor(), *inputs, *state, None, every, np.eye(n))
         q = jnp.asarray(replay.position)[None]
         steps = min(needed_substeps(plant, drive, q, jnp.zeros_like(q), jnp.zeros((1, m))), _STEPS)
         replay = replace(replay, drive=replace(drive, substeps=steps))
@@ -235,7 +236,7 @@ class _Bench:
         problem = Problem(
             _under(self.replay, self.machine.plant, jnp.asarray(signal)), self.machine.parameters.places,
             self.machine.plant, np.zeros(self.weight.shape), self.weight, self.prior, self.on,
-            (np.asarray(self.machine.plant.sharpness),),
+            (np.asarray(self.machine.plant.sharpness),), tuple(range(self.replay.position.size)),
         )
         if not rounds(self.machine, problem):
             information = np.asarray(_information(*self.args(), jnp.asarray(signal)))

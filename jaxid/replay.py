@@ -23,6 +23,7 @@ from jaxid.sensors import Sensor
 from jaxid.simulation import Drive, Trajectory, closed_loop, open_loop
 from jaxid.solvers import Adaptive
 from jaxid.stiffness import needed_steps
+from jaxid.unmeasured import resting
 
 # Ticks of past command that a delay in a loop may reach back.
 _LONGEST_DELAY = 12
@@ -67,6 +68,7 @@ class Replay(eqx.Module):
         position, velocity: At the start.
         restart: Flags, positions and velocities of segments (open loop).
         every: The log holds one tick in so many.
+        follow: How positions at the start go along with those of joints that have an encoder, (n, k).
     """
 
     drive: Drive
@@ -79,6 +81,7 @@ class Replay(eqx.Module):
     velocity: Float[Array, " n"]
     restart: tuple[Array, Array, Array] | None
     every: int = eqx.field(static=True)
+    follow: Float[Array, "n k"]
 
     def __call__(self, plant: Plant, nudge: Array | None = None) -> Trajectory:
         """Trajectory at the samples of the log.
@@ -100,6 +103,10 @@ class Replay(eqx.Module):
             run = open_loop(plant, self.drive, self.command, q, v, None, self.restart)
         return jax.tree.map(lambda a: a[:: self.every], run)
 
+    def started(self, start: Float[Array, " k"]) -> Replay:
+        """The same run, joints that have an encoder moved by so much and the others at rest with them."""
+        return replace(self, position=self.position + self.follow @ start)
+
     def following(self, places: tuple, theta: Float[Array, " p"]) -> Replay:
         """The same run with what is unknown of its reference at theta."""
         if not isinstance(self.reference, Course):
@@ -120,9 +127,11 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
             fit the controller's.
     """
     numerics = numerics or Numerics(substeps=needed_steps(machine, log))
-    velocity = start_velocity(log)
+    position, follow = resting(machine.plant, log.filled[0], machine.gain.size, log.measured)
+    velocity = follow @ start_velocity(log)[list(log.measured)]
+    start = (position, velocity)
     if machine.controller is None:
-        return _open(machine, log, numerics, velocity)
+        return _open(machine, log, numerics, start, follow)
     period = machine.controller.period
     every = max(1, round(log.period / period))
     if abs(log.period / period / every - 1) > 1e-3:
@@ -154,7 +163,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"), machine.controller,
-        machine.sensor.mean, reference, disturbance, None, log.filled[0], velocity, None, every,
+        machine.sensor.mean, reference, disturbance, None, *start, None, every, follow,
     )
 
 
@@ -220,7 +229,9 @@ def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, 
     return jax.lax.fori_loop(0, 3, improve, jnp.zeros(2 * replay.position.size))
 
 
-def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) -> Replay:
+def _open(
+    machine: Machine, log: Log, numerics: Numerics, start: tuple[np.ndarray, np.ndarray], follow: np.ndarray
+) -> Replay:
     command, period, hold, every = log.force, log.period, log.hold, 1
     if hold == "band_limited":
         command, every = _refined(command), _REFINE
@@ -229,7 +240,7 @@ def _open(machine: Machine, log: Log, numerics: Numerics, velocity: np.ndarray) 
     drive = _drive(machine, log, numerics, period, hold)
     restart = _segments(log, numerics.segment, every) if numerics.segment else None
     return Replay(
-        drive, None, machine.sensor.mean, None, None, command, log.filled[0], velocity, restart, every,
+        drive, None, machine.sensor.mean, None, None, command, *start, restart, every, follow,
     )
 
 

@@ -7,6 +7,7 @@ stays where it is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -28,6 +29,9 @@ from jaxid.readings import (
 from jaxid.sticking import set_valued_step
 
 Motion = tuple[Array, Array, Array]
+
+# Steps of Newton to where joints without an encoder stand.
+_RELAXING = 4
 
 
 class Carried(Plant):
@@ -102,11 +106,10 @@ def complete_motion(
 
     together = [jnp.broadcast_to(jnp.mean(a[0]), hidden.shape) for a in known]
     memory, none = plant.initial_states(u[0]), jnp.zeros(hidden.size)
-    pull = lambda q: carried.balance(q, *together[1:], force[0, 0], times[0], memory, none).residual
-    relaxed = together[0] - small_solve(jax.jacfwd(pull)(together[0]), pull(together[0]))
-    # Within a clearance nothing pulls, and there is no such place.
-    nearer = jnp.all(jnp.abs(pull(relaxed)) <= jnp.abs(pull(together[0])))
-    relaxed = jnp.where(nearer, relaxed, together[0])
+    relaxed = _relaxed(
+        lambda q: carried.balance(q, *together[1:], force[0, 0], times[0], memory, none).residual,
+        together[0],
+    )
     x0 = State(relaxed, together[1], memory)
     flow = affine_flow(carried, x0, tuple(force[0]), times[0], h)
 
@@ -123,6 +126,51 @@ def complete_motion(
     found = (x.q, x.qd, solved(x, force[last, 2], times[1:], reaction))
     own = [jnp.concatenate([a[None], b]) for a, b in zip((relaxed, *together[1:]), found, strict=True)]
     return tuple(a.at[:, hidden].set(b) for a, b in zip((q, qd, qdd), own, strict=True))
+
+
+def resting(
+    plant: Plant, q: Float[np.ndarray, " n"], drives: int, measured: tuple[bool, ...]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n k"]]:
+    """Where joints without an encoder stand while all is at rest, and how they go along with the others.
+
+    Args:
+        plant: The plant.
+        q: Positions; what stands there for joints without an encoder is not used.
+        drives: How many forces the plant is driven by.
+        measured: Which joints have an encoder, k of them.
+
+    Returns:
+        Positions of all joints, and their derivative in those of the joints with an encoder. Joints that
+        nothing holds stand where the others do on average.
+    """
+    if all(measured):
+        return q, np.eye(q.size)
+    seen, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
+    carried = Carried(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
+    return tuple(np.asarray(a) for a in _resting(carried, q[seen], drives))
+
+
+@eqx.filter_jit
+def _resting(carried: Carried, known: Array, drives: int) -> tuple[Array, Array]:
+    n, u = len(carried.seen) + len(carried.hidden), jnp.zeros(drives)
+    still, memory = jnp.zeros(len(carried.hidden)), carried.plant.initial_states(u)
+
+    def whole(known: Array) -> Array:
+        force = jnp.concatenate([u, known, jnp.zeros(2 * known.size)])
+        pull = lambda q: carried.balance(q, still, still, force, jnp.zeros(()), memory, still).residual
+        own = _relaxed(pull, jnp.broadcast_to(jnp.mean(known), still.shape))
+        return spread(known, carried.seen, n) + spread(own, carried.hidden, n)
+
+    return whole(known), jax.jacfwd(whole)(known)
+
+
+def _relaxed(pull: Callable[[Array], Array], together: Array) -> Array:
+    """Where nothing pulls; where the others are if there is no such place, as within a clearance."""
+    q = together
+    # One step for linear forces; a ripple along a stiff spring takes more, and slopes one more than places.
+    for _ in range(_RELAXING):
+        q = q - small_solve(jax.jacfwd(pull)(q), pull(q))
+    return jnp.where(jnp.all(jnp.abs(pull(q)) <= jnp.abs(pull(together))), q, together)
 
 
 def _between(known: Motion, s: Array, period: Array) -> Motion:

@@ -116,8 +116,12 @@ def write(log: dict[str, np.ndarray], path, columns: tuple[str, ...] = ("t", "q"
 def text(
     data: int = 1, *, guess: dict[str, float] | None = None, known: tuple[str, ...] = (),
     coupling: str = "rigid", reference: str = 'reference = "ref"', resolution: float = COUNT, more: str = "",
+    load: bool = True,
 ) -> str:
-    """The case file: everything unknown, guesses at the truth unless others are given."""
+    """The case file: everything unknown, guesses at the truth unless others are given.
+
+    `load`: an elastic stage's log has the position of the table.
+    """
     truth = {k: v for k, v in TRUTH[data].items() if coupling == "elastic" or k != "stiffness"}
     guess = truth | (guess or {})
 
@@ -146,7 +150,7 @@ def text(
         *effect("velocity_hysteresis", "2", *own("velocity_hysteresis", *_RISING)),
         *effect("cogging", "2", f"period = {PITCH}", *own("cogging", "amplitude", "phase")),
         "[actuator]", f"gain = {GAIN}", "[log]", 'time = "t"', 'position = "q"', 'force = "i"', reference,
-        *(['load_position = "x"'] if coupling == "elastic" else []),
+        *(['load_position = "x"'] if coupling == "elastic" and load else []),
         "[controller]", 'kind = "pid"', *[f"{k} = {v}" for k, v in LAW.items()],
         f"period = {1 / RATE}", "limit = 5.0",
         *(["[sensor]", f"position_resolution = {resolution!r}"] if resolution else []), more,

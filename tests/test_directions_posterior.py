@@ -20,6 +20,7 @@ def problem_of(residual, jacobian, size, rows):
     return SimpleNamespace(
         residual=residual, jacobian=jacobian, ladder=(1.0,), prior=SimpleNamespace(base=np.ones(size)),
         replay=SimpleNamespace(position=np.zeros(1)), measured=np.zeros((rows, 1)), places=(None,) * size,
+        encoders=(0,),
     )
 
 

@@ -58,6 +58,31 @@ def test_elastic_stage_moves_as_the_exact_one(tmp_path):
     assert np.abs(ours - lag).max() < 0.01 * np.ptp(lag)
 
 
+def test_a_table_without_an_encoder_starts_where_the_screw_does_not_pull(tmp_path):
+    """Its position is in metres, the motor's in radians: it stands nowhere near the same number."""
+    reference = 3.0 + stages.move(0.5, **stages.MOVES[1])
+    made = stages.record(stages.machine(1), reference, resolution=0.0, start=3.0)
+    path = tmp_path / "case.toml"
+    path.write_text(stages.text(1, coupling="elastic", resolution=0.0, load=False))
+    case = load_case(path)
+    log = Log(
+        time=made["t"], position=np.column_stack([made["q"], np.full(made["q"].size, np.nan)]),
+        force=made["i"][:, None], reference=made["ref"][:, None],
+    )
+    machine = build_machine(case, true=True, period=1 / stages.RATE)
+    replay = make_replay(machine, log, Numerics(substeps=320))
+    # What the table's ripple stretches the screw by: its slope of 1 kN/m is no force at rest.
+    ripple = stages.TRUTH[1]["cogging[2].amplitude"] / stages.TRUTH[1]["stiffness"]
+    assert abs(replay.position[1] - stages.R * 3.0) < 1.01 * ripple
+    np.testing.assert_allclose(replay.follow, [[1.0], [stages.R]], rtol=1e-3)
+    moved = replay.started(np.array([0.1]))
+    np.testing.assert_allclose(moved.position, [3.1, stages.R * 3.1], atol=1.01 * ripple)
+    np.testing.assert_allclose(replay.velocity, [0.0, 0.0], atol=1e-6)
+    position = np.asarray(replay(machine.plant).position)
+    assert np.abs(position[:, 0] - made["true_q"]).max() < 1e-2 * np.ptp(made["true_q"])
+    assert np.abs(position[:, 1] - made["x"]).max() < 1e-2 * np.ptp(made["x"])
+
+
 def test_a_stiff_screw_is_no_screw():
     """On the motor's side both do the same, but for starts and stops: there the motor winds up its screw."""
     reference = stages.move(0.3, **stages.MOVES[1])

@@ -113,6 +113,7 @@ class Problem:
         prior: Of the unknowns, nuisances behind them.
         on: What of the simulation is compared.
         ladder: Sharpnesses at which to fit, one after the other.
+        encoders: Joints that have one.
     """
 
     replay: Replay
@@ -123,6 +124,7 @@ class Problem:
     prior: Prior
     on: str
     ladder: tuple[np.ndarray, ...]
+    encoders: tuple[int, ...]
 
     @property
     def args(self) -> tuple:
@@ -139,7 +141,7 @@ class Problem:
         Raises:
             InputError: If a guess is zero, or the loop cannot be simulated.
         """
-        n = log.position.shape[1]
+        n, encoders = log.position.shape[1], tuple(np.flatnonzero(log.measured).tolist())
         plant = calmed(machine.plant, jnp.asarray(log.filled[0]), log.period)
         if plant is not machine.plant:
             numerics = replace(numerics, substeps=steps_when_calmed(numerics.substeps))
@@ -148,18 +150,20 @@ class Problem:
             replay = with_sensor(replay, Sensor())
         measured, counts = measured_output(machine, log, on)
         std = machine.sensor.position_std
-        start = np.zeros(0) if std is None else np.broadcast_to(np.asarray(std), n)
+        start = np.zeros(0) if std is None else np.broadcast_to(np.asarray(std), n)[[*encoders]]
         whole = Prior.of(machine, prior, start, widths)
         weight = np.tile(counts.astype(float), (len(measured), 1))
         m = log.force.shape[1]
         ladder = _LADDER if _rises(plant, np.zeros(n), np.zeros(m)) else (plant.sharpness,)
         sharp = tuple(np.asarray(s) for s in ladder)
-        return cls(replay, machine.parameters.places, plant, measured, weight, whole, on, sharp)
+        places = machine.parameters.places
+        return cls(replay, places, plant, measured, weight, whole, on, sharp, encoders)
 
     @property
     def nuisances(self) -> list[str]:
         """Names of what is unknown behind the machine's own unknowns."""
-        return [f"start position {k + 1}" for k in range(self.prior.base.size - len(self.places))]
+        count = self.prior.base.size - len(self.places)
+        return [f"start position {k + 1}" for k in self.encoders[:count]]
 
     def padded(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " q"]:
         """Unknowns with all nuisances at zero."""
@@ -214,9 +218,15 @@ def residual_of(
 ) -> Any:
     """Residual as a function of the directions' coordinates, counted from a point in units of the prior."""
     physical = output_residual(replay, places, plant, measured, weight, on)
-    # Behind the unknowns stand positions at the start; velocities there are known to be those of the log.
-    still = jnp.zeros(prior.base.size - len(places))
-    return lambda z: physical(jnp.concatenate([prior.outward(origin + vectors @ z), still]))
+
+    def residual(z: Array) -> Array:
+        # Behind the unknowns stand positions at the start; velocities there are known to be those of the log.
+        theta, start = jnp.split(prior.outward(origin + vectors @ z), [len(places)])
+        if start.size:
+            start = replay.follow @ start
+        return physical(jnp.concatenate([theta, start, jnp.zeros_like(start)]))
+
+    return residual
 
 
 @eqx.filter_jit
@@ -225,17 +235,16 @@ def residual_at_each(*args: Any) -> Array:
     *problem, sharpness, w, starts = args
     replay, places, plant, *rest = problem
     plant = replace(plant, sharpness=sharpness)
-    moved = lambda start: eqx.tree_at(lambda r: r.position, replay, replay.position + start)
-    at = lambda w, start: residual_of(moved(start), places, plant, *rest, jnp.eye(w.size))(w)
+    at = lambda w, start: residual_of(replay.started(start), places, plant, *rest, jnp.eye(w.size))(w)
     return eqx.filter_vmap(at)(w, starts)
 
 
 def at_each(
-    problem: Problem, w: Float[np.ndarray, "draws q"], starts: Float[np.ndarray, "draws n"] | None = None
+    problem: Problem, w: Float[np.ndarray, "draws q"], starts: Float[np.ndarray, "draws k"] | None = None
 ) -> Solve:
     """Residuals at so many points as `DRAWN`, from rest at zero if no starts are given."""
     if starts is None:
-        starts = np.zeros((len(w), problem.replay.position.size))
+        starts = np.zeros((len(w), problem.replay.follow.shape[1]))
     return Solve(residual_at_each, (*problem.args, problem.ladder[-1], w, starts))
 
 

@@ -57,9 +57,14 @@ def draws_soon(machine: Machine, problem: Problem) -> Soon:
 
 def rounded(machine: Machine, problem: Problem, rng: np.random.Generator) -> Solve:
     """Residuals at the guesses with rounding in the loop, from starts within the first count."""
-    starts = rng.uniform(-0.5, 0.5, (DRAWN, problem.replay.position.size))
-    starts = starts * np.asarray(machine.sensor.position_resolution)
+    starts = rng.uniform(-0.5, 0.5, (DRAWN, len(problem.encoders))) * _counts(machine, problem)
     return at_each(_rounding(machine, problem), np.zeros((DRAWN, problem.prior.base.size)), starts)
+
+
+def _counts(machine: Machine, problem: Problem) -> Float[np.ndarray, " k"]:
+    """Counts of the readings, by encoder."""
+    each = np.broadcast_to(machine.sensor.position_resolution, problem.replay.position.size)
+    return each[[*problem.encoders]]
 
 
 def _rounding(machine: Machine, problem: Problem) -> Problem:
@@ -95,7 +100,7 @@ class _Summary:
 
     Args:
         problem: With rounding in its loop.
-        resolution: Counts of the readings.
+        resolution: Counts of the readings, by encoder.
         vectors: All directions, (q, q).
         point: Where the fit ended, along them, (q,).
         residual: What it left of the measured log, (rows,).
@@ -104,7 +109,7 @@ class _Summary:
     """
 
     problem: Problem
-    resolution: Float[np.ndarray, " n"]
+    resolution: Float[np.ndarray, " k"]
     vectors: Float[np.ndarray, "q q"]
     point: Float[np.ndarray, " q"]
     residual: Float[np.ndarray, " rows"]
@@ -118,9 +123,8 @@ class _Summary:
         jacobian = np.asarray(found.minimum.jacobian)[:, :r]
         over = jacobian / noise
         step = np.linalg.solve(over.T @ over + np.eye(r), over.T) / noise
-        resolution = np.broadcast_to(machine.sensor.position_resolution, found.problem.replay.position.size)
         return cls(
-            _rounding(machine, found.problem), resolution, found.vectors,
+            _rounding(machine, found.problem), _counts(machine, found.problem), found.vectors,
             np.asarray(found.minimum.theta), np.asarray(found.minimum.residual).ravel(), jacobian, step,
         )
 
