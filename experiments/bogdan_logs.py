@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+import jaxid
 from jaxid.estimators.directions_problem import Prior, criterion_steps
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import together
@@ -79,12 +80,21 @@ def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, mor
     return path
 
 
+def _fitted(case: Path, log: Log) -> Estimate:
+    return jaxid.identify(case, log).estimate
+
+
 def studied(
-    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, data: int, on: str = "force"
+    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, data: int, on: str = "force",
+    *, many: bool = True,
 ) -> tuple[list[Estimate], np.ndarray, list[np.ndarray]]:
-    """Estimates, criterion over that of the truth, and directions in sigma from the truth."""
+    """Estimates, criterion over that of the truth, and directions in sigma from the truth.
+
+    `many`: side by side; else one after the other, which is faster where a simulation takes many steps.
+    """
     cases = [cases] * len(logs) if isinstance(cases, Path) else cases
-    found = zip(identify_many(cases, logs), cases, logs, starts, strict=True)
+    fits = identify_many(cases, logs) if many else map(_fitted, cases, logs)
+    found = zip(fits, cases, logs, starts, strict=True)
     kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
     machine = open_session(cases[0], logs[0]).machine
     truth = np.array([stages.TRUTH[data][n] for n in machine.parameters.names])
