@@ -169,7 +169,7 @@ def elastic(folder: Path, runs: int) -> None:
             f"{np.mean([e.details['criterion_percent'] for e in found]):.2f}", f"{ratio.mean():.3f}",
             f"{np.mean([len(o) for o in off]):.2f}", f"{np.mean(ratio <= 1):.0%}", inside(1.96), inside(3.0),
         )
-        print(f"  {guesses}: {inside(1.96)} within 1.96 sigma ({time.perf_counter() - start:.0f} s)", flush=True)
+        print(f"  {guesses}: {inside(1.96)} ({time.perf_counter() - start:.0f} s)", flush=True)
     table.show(time.perf_counter() - start)
 
 
@@ -355,7 +355,8 @@ def short(folder: Path, runs: int) -> None:
 STUDIES: dict[str, Callable[[Path, int], None]] = {
     f.__name__: f
     for f in (
-        published, begun, unrecorded, scatter, elastic, position, designed, load, needles, frictions, hidden, short,
+        published, begun, unrecorded, scatter, elastic, position, designed, load, needles, frictions,
+        hidden, short,
     )
 }
 
