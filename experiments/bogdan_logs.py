@@ -71,6 +71,18 @@ def off_in_sigma(estimate: Estimate, case: Path, log: Log, start: float, data: i
     return np.array([(d["value"] - t) / d["std"] for d, t in zip(directions, at, strict=True)])
 
 
+def nats_above(estimate: Estimate, case: Path, log: Log, ratio: float, data: int) -> float:
+    """By how much the truth is less probable than what was found, the guesses counted in; exact encoders.
+
+    `ratio`: the criterion over that of the truth.
+    """
+    prior = Prior.of(open_session(case, log).machine, 0.5, np.zeros(0))
+    truth = np.array([stages.TRUTH[data][n] for n in estimate.names])
+    far, near = (prior.inward(theta) for theta in (truth, estimate.theta))
+    freedom = log.samples - len(estimate.details["directions"])
+    return 0.5 * (freedom * (1 / ratio - 1) + far @ far - near @ near)
+
+
 def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, more: str = ON_FORCE,
             **stated: Any) -> Path:
     """A case file; guesses at the truth, or drawn up to 50 % around it."""
@@ -98,7 +110,8 @@ def studied(
     kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
     machine = open_session(cases[0], logs[0]).machine
     truth = np.array([stages.TRUTH[data][n] for n in machine.parameters.names])
-    at = together([criterion_steps(machine, log, truth, on=on) for _, _, log, _ in kept], 16)
+    opened = [open_session(case, log).fit.log for _, case, log, _ in kept]
+    at = together([criterion_steps(machine, log, truth, on=on) for log in opened], 16)
     ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])
     off = [off_in_sigma(e, case, log, start, data) for e, case, log, start in kept]
     return [e for e, *_ in kept], ratio, off
