@@ -18,7 +18,7 @@ from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulatio
 from jaxid.io.case import Case, load_case
 from jaxid.io.log import Log
 from jaxid.machine import Machine
-from jaxid.replay import exact_numerics, from_rest, make_replay, with_fitted_start
+from jaxid.replay import exact_numerics, from_rest, make_replay, start_shows, with_fitted_start
 from jaxid.session import Run, Session, open_session
 from jaxid.solvers import SOLVERS
 from jaxid.stiffness import TooStiffError
@@ -198,13 +198,15 @@ def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:
 
 
 def _shown(machine: Machine, log: Log) -> SimulationGap | None:
-    """The gap in position; on a short log in a loop that of a start at rest, where it is nearer.
+    """The gap in position; in a loop that of a start at rest where it shows, or may, and is nearer.
 
     Where a log begins with a jerk, a parabola through its first readings is no velocity, however few:
     six masses that start from rest were off by up to half a millimetre, whatever the parameters.
     """
     gap = simulated(machine, log)
-    if gap is None or gap.command is None or log.samples > SHORT:
+    if gap is None or gap.command is None:
+        return gap
+    if log.samples > SHORT and not start_shows((log.position - gap.position)[:, list(log.measured)]):
         return gap
     rested = simulated(machine, log, at_rest=True)
     nearer = rested is not None and np.nansum(rested.rms**2) < np.nansum(gap.rms**2)

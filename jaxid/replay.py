@@ -27,6 +27,8 @@ from jaxid.unmeasured import resting
 
 # Ticks of past command that a delay in a loop may reach back.
 _LONGEST_DELAY = 12
+# Samples within which an error of a loop's start shows, and by how much more than the rest they are off then.
+_FIRST, _FAR_MORE = 100, 5.0
 # A band-limited command is refined so often, then joined by lines.
 _REFINE = 8
 
@@ -181,6 +183,16 @@ def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: 
 def from_rest(replay: Replay) -> Replay:
     """The same run, nothing moving at its start."""
     return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
+
+
+def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
+    """Whether far more is left of the first samples of a run than of those behind them.
+
+    Args:
+        off: Measured less simulated; NaN where there is no reading.
+    """
+    squares = np.nanmean(np.square(off), axis=1)
+    return bool(np.mean(squares[:_FIRST]) > _FAR_MORE * np.mean(squares[_FIRST:]))
 
 
 def with_sensor(replay: Replay, sensor: Sensor) -> Replay:

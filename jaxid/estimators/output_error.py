@@ -24,7 +24,15 @@ from jaxid.machine import Machine, position_noise
 from jaxid.model import Plant
 from jaxid.parameters import REFERENCE, scatter
 from jaxid.precision import assess, full_hessian
-from jaxid.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
+from jaxid.replay import (
+    Numerics,
+    Replay,
+    exact_numerics,
+    from_rest,
+    make_replay,
+    start_shows,
+    with_fitted_start,
+)
 from jaxid.simulation import Drive, needed_substeps
 from jaxid.solvers import RELATIVE
 
@@ -38,7 +46,8 @@ _LOST = 0.5
 # samples tell far better.
 _NOISE_LIMITED = 3.0
 # In a loop an error of the start dies out. On a log of at most so many samples it may not be small
-# beside the rest, and the start is fitted too where that explains more than so many times chance.
+# beside the rest, and the start is fitted too where that explains more than so many times chance; on a longer
+# one a start at rest is tried where the start shows.
 SHORT = 2000
 _CLEARLY = 10.0
 # See `_turning_steps`: what a step misses, how much of the noise that may be, and most steps for it.
@@ -200,6 +209,14 @@ def output_error_steps(
         spread = np.maximum(np.std(np.asarray(e), axis=0), 1e-12 * np.std(problem[3], axis=0))
         problem = (*problem[:4], problem[4] / spread, *problem[5:])
         minimum = yield Solve(_fit, (*problem, active))
+    if looped and not nuisance and not numerics.segment:
+        left = np.asarray(minimum.residual).reshape(problem[3].shape)
+        if start_shows(left[:, problem[4][0] > 0]):
+            # A log that begins with a jerk from rest: its first readings are no velocity.
+            rested = (from_rest(problem[0]), *problem[1:5], minimum.theta, *problem[6:])
+            other = yield Solve(_fit, (*rested, active))
+            if bool(other.converged) and float(other.cost) < float(minimum.cost):
+                problem, minimum = rested, other
     if nuisance and looped:
         every = np.ones(p + nuisance, bool)
         freed = yield Solve(_fit, (*problem, every))
