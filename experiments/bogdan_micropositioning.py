@@ -25,7 +25,7 @@ from jaxid.io.log import Log
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import bogdan_figures
 import stages
-from bogdan_logs import ON_FORCE, case_of, logs_of, noise_of, off_in_sigma, studied
+from bogdan_logs import ON_FORCE, case_of, logs_of, nats_above, noise_of, off_in_sigma, studied
 
 # Of the published table: relative precision of data 1 and 2 [%].
 PUBLISHED = {

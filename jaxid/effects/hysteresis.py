@@ -71,5 +71,6 @@ class VelocityHysteresis(Effect):
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        widths = (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)
-        return [{"level": scales.force, "velocity": scales.velocity * w} for w in widths]
+        # Either way its own: one level for both would hide that they differ.
+        levels = {"level": scales.force, "level_negative": scales.force}
+        return [levels | {"velocity": scales.velocity * w} for w in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)]
