@@ -17,6 +17,8 @@ from jaxid.readings import State, acceleration, derivative
 
 # Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
 _FINE = 0.2
+# Any number of steps up to this; beyond, so many numbers from one to its double.
+_EACH, _AN_OCTAVE = 8, 4
 # More integration steps a sample than that no machine asks for: a fit or a guess has run away.
 _MOST_STEPS = 2000
 # Damping ratio of a spring that rings faster than a log samples, and steps in parts of those that its ring
@@ -51,7 +53,15 @@ def needed_steps(machine: Machine, log: Log) -> int:
             mend="an inertia that is far too small, or a stiffness or damping far too large, does "
             "that: check the guesses, or declare less",
         )
-    return max(1, int(np.ceil(steps)))
+    return _rounded(max(1, int(np.ceil(steps))))
+
+
+def _rounded(steps: int) -> int:
+    """Up to one of few numbers, a fifth more at most: for every other one all code is compiled anew."""
+    if steps <= _EACH:
+        return steps
+    octave = np.ceil(_AN_OCTAVE * np.log2(steps / _EACH)) / _AN_OCTAVE
+    return int(np.ceil(_EACH * 2**octave))
 
 
 @eqx.filter_jit
