@@ -1,4 +1,4 @@
-"""Figures of the micropositioning stage, and the long log in which friction is to be found."""
+"""Figures of the micropositioning stage."""
 
 from __future__ import annotations
 
@@ -110,54 +110,3 @@ def frictions(path: Path) -> None:
     axes.legend()
     figure.savefig(path, dpi=110)
     plt.close(figure)
-
-
-def long_case(folder: Path, seconds: float = 20.0) -> tuple[Path, Path]:
-    """A log that shows the friction: to and fro at many speeds, read finely; and a case without its physics.
-
-    The motor's viscous and Coulomb friction are declared, and its current loop; nothing on the table. What
-    ripples with the screw is a ripple only where a stroke has more than two of its turns.
-    """
-    t = np.arange(round(seconds * stages.RATE)) / stages.RATE
-    tones = zip((0.3, 0.7, 1.3), (1.0, 0.5, 0.12), (0.0, 1.0, 2.0), strict=True)
-    turns = sum(a * (np.sin(2 * np.pi * f * t + p) - np.sin(p)) for f, a, p in tones)
-    fine = 2 * np.pi / 1e6
-    log = stages.record(
-        stages.machine(1, rigid=True), stages.TURN * turns, noise=1e-3, resolution=fine, seed=1
-    )
-    stages.write(log, folder / "hidden.csv")
-    whole = stages.text(1, resolution=fine)
-    lines = [
-        "[plant]", 'kind = "micropositioning_stage"', 'coupling = "rigid"', "[plant.parameters]",
-        f"pitch = {stages.PITCH}", "table_mass = 0.417", "motor_inertia = { guess = 1e-5 }",
-        "[[effects]]", 'kind = "actuator_lag"', "joint = 1", f"time_constant = {stages.LAG}",
-        "[[effects]]", 'kind = "coulomb_friction"', "joint = 1", "level = { guess = 5e-3 }",
-        "[[effects]]", 'kind = "viscous_friction"', "joint = 1", "coefficient = { guess = 1e-4 }",
-    ]
-    (folder / "hidden.toml").write_text("\n".join(lines) + "\n" + whole[whole.index("[actuator]") :])
-    return folder / "hidden.toml", folder / "hidden.csv"
-
-
-# What `discover` finds in the long log, and what it does not look for: a level of its own backwards.
-FOUND = """
-[[effects]]
-kind = "velocity_hysteresis"
-joint = 2
-level = { guess = 2.0 }
-level_negative = { guess = 2.0 }
-velocity = { guess = 1e-3 }
-[[effects]]
-kind = "cogging"
-joint = 2
-amplitude = { guess = 0.3 }
-period = { guess = 2e-3 }
-phase = { guess = 0.0 }
-"""
-
-
-def told_case(case: Path) -> Path:
-    """A long case with what was found in its log."""
-    text = case.read_text()
-    told = case.with_name("hidden_told.toml")
-    told.write_text(text.replace("[actuator]", FOUND + "[actuator]"))
-    return told

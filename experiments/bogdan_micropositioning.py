@@ -310,16 +310,12 @@ def frictions(folder: Path, runs: int) -> None:
 
 
 def hidden(folder: Path, runs: int) -> None:
-    """A fit with Coulomb and viscous friction only: what `discover` names on a log that shows it.
-
-    It gives the hysteresis one level for both ways; a fit of a model with two tells what that leaves.
-    """
+    """A fit with Coulomb and viscous friction only: what `discover` names on a log that shows it."""
     start = time.perf_counter()
-    case, log = bogdan_figures.long_case(folder)
+    case, log = stages.long_case(folder)
     found = jaxid.discover(case, log)
     found.save(folder / "hidden", force=True)
-    print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}", flush=True)
-    print(f"\nwith a level of its own backwards:\n{jaxid.identify(bogdan_figures.told_case(case), log)}")
+    print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")
 
 
 def named(case: Path, log: Log) -> str:

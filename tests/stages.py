@@ -10,6 +10,8 @@ Gains of the loop and the ramp of the reference are not published; those here ar
 5 Hz, damped, and just fast enough that the short move of data 2 begins within half a second.
 """
 
+from pathlib import Path
+
 import numpy as np
 from chain_stepper import ChainMachine, simulate_chain
 from stepper import Loop, Sensor
@@ -171,3 +173,27 @@ def drawn(seed: int, spread: float = 0.5, data: int = 1) -> dict[str, float]:
     """Guesses drawn up to so far around the truth, relative."""
     rng = np.random.default_rng(seed)
     return {k: v * (1 + spread * rng.uniform(-1, 1)) for k, v in TRUTH[data].items()}
+
+
+def long_case(folder: Path, seconds: float = 20.0) -> tuple[Path, Path]:
+    """A log that shows the friction: to and fro at many speeds, read finely; and a case without its physics.
+
+    The motor's viscous and Coulomb friction are declared, and its current loop; nothing on the table. What
+    ripples with the screw is a ripple only where a stroke has more than two of its turns.
+    """
+    t = np.arange(round(seconds * RATE)) / RATE
+    tones = zip((0.3, 0.7, 1.3), (1.0, 0.5, 0.12), (0.0, 1.0, 2.0), strict=True)
+    turns = sum(a * (np.sin(2 * np.pi * f * t + p) - np.sin(p)) for f, a, p in tones)
+    fine = 2 * np.pi / 1e6
+    log = record(machine(1, rigid=True), TURN * turns, noise=1e-3, resolution=fine, seed=1)
+    write(log, folder / "hidden.csv")
+    whole = text(1, resolution=fine)
+    lines = [
+        "[plant]", 'kind = "micropositioning_stage"', 'coupling = "rigid"', "[plant.parameters]",
+        f"pitch = {PITCH}", "table_mass = 0.417", "motor_inertia = { guess = 1e-5 }",
+        "[[effects]]", 'kind = "actuator_lag"', "joint = 1", f"time_constant = {LAG}",
+        "[[effects]]", 'kind = "coulomb_friction"', "joint = 1", "level = { guess = 5e-3 }",
+        "[[effects]]", 'kind = "viscous_friction"', "joint = 1", "coefficient = { guess = 1e-4 }",
+    ]
+    (folder / "hidden.toml").write_text("\n".join(lines) + "\n" + whole[whole.index("[actuator]") :])
+    return folder / "hidden.toml", folder / "hidden.csv"
