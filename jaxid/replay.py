@@ -250,7 +250,11 @@ def _open(
         period, hold = period / every, "linear"
         numerics = replace(numerics, substeps=max(1, round(numerics.substeps / every)))
     drive = _drive(machine, log, numerics, period, hold)
-    restart = _segments(log, numerics.segment, every) if numerics.segment else None
+    restart = None
+    if numerics.segment:
+        flags, q, v = _segments(log, numerics.segment, every)
+        seen = list(log.measured)
+        restart = flags, start[0] + (q - start[0])[:, seen] @ follow.T, v[:, seen] @ follow.T
     return Replay(
         drive, None, machine.sensor.mean, None, None, command, *start, restart, every, follow,
     )

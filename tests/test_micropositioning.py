@@ -78,6 +78,13 @@ def test_a_table_without_an_encoder_starts_where_the_screw_does_not_pull(tmp_pat
     moved = replay.started(np.array([0.1]))
     np.testing.assert_allclose(moved.position, [3.1, stages.R * 3.1], atol=1.01 * ripple)
     np.testing.assert_allclose(replay.velocity, [0.0, 0.0], atol=1e-6)
+    # Segments that restart from the log too.
+    driven = dataclasses.replace(machine, controller=None)
+    flags, starts, speeds = make_replay(driven, log, Numerics(substeps=320, segment=20)).restart
+    assert flags.sum() == 5
+    assert np.abs(np.diff(starts[flags, 0])).max() > 0.1
+    np.testing.assert_allclose(starts[flags, 1], stages.R * starts[flags, 0], atol=2 * ripple)
+    np.testing.assert_allclose(speeds[:, 1], stages.R * speeds[:, 0], rtol=1e-3)
     position = np.asarray(replay(machine.plant).position)
     assert np.abs(position[:, 0] - made["true_q"]).max() < 1e-2 * np.ptp(made["true_q"])
     assert np.abs(position[:, 1] - made["x"]).max() < 1e-2 * np.ptp(made["x"])
