@@ -16,6 +16,8 @@ from jaxid.discovery.worth import RELEVANT, Worth
 from jaxid.precision import NoiseModel
 from jaxid.preprocess import Prepared
 
+# What the case has is gone where less than this part of it is left beside an effect.
+_GONE = 1e-2
 # An effect that is there already goes where it closes less than this part of the gap: a third of
 # what it must close to be named.
 _SUPERFLUOUS = 0.05
@@ -81,6 +83,8 @@ class Search:
         self.theta = self.union.neutral
         self._many: dict[tuple[str, int], list[cand.Point]] = {}
         self._limit = 0.0
+        # All unknowns where nothing is added.
+        self._alone = self.theta
 
     @property
     def active(self) -> np.ndarray:
@@ -105,7 +109,7 @@ class Search:
     def run(self, most: int) -> list[Step]:
         """Add effects until none is worth it; drop what becomes superfluous on the way."""
         self.progress("fitting the baseline")
-        self.theta = self._fit(self.theta, self.active)
+        self.theta = self._alone = self._fit(self.theta, self.active)
         return [Step(None, None, (), 0.0, self.theta, self.active), *self._grow(most)]
 
     def bar(self, c: cand.Candidate, why: str, most: int) -> list[Step]:
@@ -120,8 +124,16 @@ class Search:
 
     def without(self, c: cand.Candidate) -> np.ndarray:
         """All unknowns, those of one effect neutral and the others fitted again."""
-        left = [a for a in self.added if a is not c]
-        return self._fit(self._neutral(self.theta, c), self._active(left))
+        active = self._active([a for a in self.added if a is not c])
+        theta = self._neutral(self.theta, c)
+        found = self._fit(theta, active)
+        now, alone = np.abs(theta[self.union.base]), np.abs(self._alone[self.union.base])
+        if np.all(now > _GONE * alone):
+            return found
+        # An effect that took over from what the case has, as a limit that all of the force exceeds: from
+        # next to nothing that does not come back.
+        theta[self.union.base] = self._alone[self.union.base]
+        return min((found, self._fit(theta, active)), key=self.worth.squares)
 
     def _grow(self, most: int) -> list[Step]:
         steps: list[Step] = []
