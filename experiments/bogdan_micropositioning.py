@@ -312,7 +312,7 @@ def frictions(folder: Path, runs: int) -> None:
 def hidden(folder: Path, runs: int) -> None:
     """A fit with Coulomb and viscous friction only: what `discover` names on a log that shows it."""
     start = time.perf_counter()
-    case, log = stages.long_case(folder)
+    case, log = stages.long_case(folder, stages.to_and_fro())
     found = jaxid.discover(case, log)
     found.save(folder / "hidden", force=True)
     print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")

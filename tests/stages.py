@@ -175,17 +175,27 @@ def drawn(seed: int, spread: float = 0.5, data: int = 1) -> dict[str, float]:
     return {k: v * (1 + spread * rng.uniform(-1, 1)) for k, v in TRUTH[data].items()}
 
 
-def long_case(folder: Path, seconds: float = 20.0) -> tuple[Path, Path]:
-    """A log that shows the friction: to and fro at many speeds, read finely; and a case without its physics.
-
-    The motor's viscous and Coulomb friction are declared, and its current loop; nothing on the table. What
-    ripples with the screw is a ripple only where a stroke has more than two of its turns.
-    """
+def to_and_fro(seconds: float = 20.0) -> np.ndarray:
+    """Motion at many speeds [rad]; a ripple with turns is one only where a stroke has more than two."""
     t = np.arange(round(seconds * RATE)) / RATE
     tones = zip((0.3, 0.7, 1.3), (1.0, 0.5, 0.12), (0.0, 1.0, 2.0), strict=True)
-    turns = sum(a * (np.sin(2 * np.pi * f * t + p) - np.sin(p)) for f, a, p in tones)
+    return TURN * sum(a * (np.sin(2 * np.pi * f * t + p) - np.sin(p)) for f, a, p in tones)
+
+
+def one_way(seconds: float = 20.0) -> np.ndarray:
+    """Motion that never turns, at speeds that come and go [rad]."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    speed = 4 + 4 * np.sin(2 * np.pi * 0.3 * t) + 2 * np.sin(2 * np.pi * 0.9 * t)
+    return np.cumsum(np.maximum(speed, 0.0) * np.minimum(t, 1.0)) / RATE
+
+
+def long_case(folder: Path, reference: np.ndarray) -> tuple[Path, Path]:
+    """A log that is read finely, and a case without the physics of its table.
+
+    The motor's viscous and Coulomb friction are declared, and its current loop.
+    """
     fine = 2 * np.pi / 1e6
-    log = record(machine(1, rigid=True), TURN * turns, noise=1e-3, resolution=fine, seed=1)
+    log = record(machine(1, rigid=True), reference, noise=1e-3, resolution=fine, seed=1)
     write(log, folder / "hidden.csv")
     whole = text(1, resolution=fine)
     lines = [
