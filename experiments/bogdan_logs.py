@@ -20,7 +20,8 @@ from jaxid.session import open_session
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import stages
 
-ON_FORCE = '[output_error]\non = "force"\nprior = 0.5\n'
+PRIOR = 0.5
+ON_FORCE = f'[output_error]\non = "force"\nprior = {PRIOR}\n'
 
 
 def noise_of(data: int, resolution: float) -> float:
@@ -59,10 +60,15 @@ def logs_of(
     return out, starts
 
 
+def _truth(names: Sequence[str], data: int) -> np.ndarray:
+    """Table 1 in the order of some unknowns."""
+    return np.array([stages.TRUTH[data][n] for n in names])
+
+
 def off_in_sigma(estimate: Estimate, case: Path, log: Log, start: float, data: int) -> np.ndarray:
     """By how many of its standard deviations each direction is off the truth, the motor's start included."""
     machine = open_session(case, log).machine
-    w = Prior.of(machine, 0.5, np.zeros(0)).inward(np.array([stages.TRUTH[data][n] for n in estimate.names]))
+    w = Prior.of(machine, PRIOR, np.zeros(0)).inward(_truth(estimate.names, data))
     truth = dict(zip(estimate.names, w, strict=True))
     if start:
         truth["start position 1"] = start / float(np.max(machine.sensor.position_std))
@@ -76,9 +82,8 @@ def nats_above(estimate: Estimate, case: Path, log: Log, ratio: float, data: int
 
     `ratio`: the criterion over that of the truth.
     """
-    prior = Prior.of(open_session(case, log).machine, 0.5, np.zeros(0))
-    truth = np.array([stages.TRUTH[data][n] for n in estimate.names])
-    far, near = (prior.inward(theta) for theta in (truth, estimate.theta))
+    prior = Prior.of(open_session(case, log).machine, PRIOR, np.zeros(0))
+    far, near = (prior.inward(theta) for theta in (_truth(estimate.names, data), estimate.theta))
     freedom = log.samples - len(estimate.details["directions"])
     return 0.5 * (freedom * (1 / ratio - 1) + far @ far - near @ near)
 
@@ -109,7 +114,7 @@ def studied(
     found = zip(fits, cases, logs, starts, strict=True)
     kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
     machine = open_session(cases[0], logs[0]).machine
-    truth = np.array([stages.TRUTH[data][n] for n in machine.parameters.names])
+    truth = _truth(machine.parameters.names, data)
     opened = [open_session(case, log).fit.log for _, case, log, _ in kept]
     at = together([criterion_steps(machine, log, truth, on=on) for log in opened], 16)
     ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])

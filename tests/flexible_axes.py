@@ -130,10 +130,10 @@ def text(
 def rigid_text(sensor: Sensor = SENSOR) -> str:
     """The case of who takes the axis for one inertia, and reads the motor alone."""
     motor = text(load=False, sensor=sensor)
-    return _RIGID + motor[motor.index("[actuator]") :]
+    return RIGID + motor[motor.index("[actuator]") :]
 
 
-_RIGID = """[plant]
+RIGID = """[plant]
 kind = "axis"
 [plant.parameters]
 inertia = { guess = 60.0 }

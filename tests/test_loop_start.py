@@ -2,26 +2,14 @@
 
 import numpy as np
 import stepper
+from flexible_axes import RIGID
 
 import jaxid
 from jaxid.replay import start_shows
 
 RATE = 200.0
-TRUE = {
-    "inertia": 90.0, "viscous_friction.coefficient": 200.0, "coulomb_friction.level": 20.0,
-}
-CASE = """
-[plant]
-kind = "axis"
-[plant.parameters]
-inertia = { guess = 60.0 }
-[[effects]]
-kind = "viscous_friction"
-coefficient = { guess = 100.0 }
-[[effects]]
-kind = "coulomb_friction"
-level = { guess = 10.0 }
-[log]
+TRUE = {"inertia": 90.0, "viscous_friction.coefficient": 200.0, "coulomb_friction.level": 20.0}
+CASE = RIGID + """[log]
 time = "t"
 position = "q"
 force = "u"
@@ -55,9 +43,8 @@ def test_a_long_log_that_starts_with_a_jerk_is_simulated_from_rest(tmp_path):
     for name, value, std in zip(
         found.estimate.names, found.estimate.theta, found.estimate.std, strict=True
     ):
-        true = next(v for k, v in TRUE.items() if k.split(".")[0] == name.split(".")[0].split("[")[0])
-        assert abs(value - true) < 1e-3 * true, name
-        assert abs(value - true) < 4 * std, name
+        assert abs(value - TRUE[name]) < 1e-3 * TRUE[name], name
+        assert abs(value - TRUE[name]) < 4 * std, name
     # What is left is the reading's rounding.
     assert found.gaps[0].simulation.rms[0] < 1e-6
 

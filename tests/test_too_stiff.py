@@ -11,7 +11,7 @@ from jaxid.discovery.breakaway import break_away
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.identification import gaps
 from jaxid.session import open_session
-from jaxid.stiffness import TooStiffError, needed_steps
+from jaxid.stiffness import TooStiffError, _rounded, needed_steps
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +54,13 @@ def test_identify_says_so_and_writes_nothing(capsys, tmp_path):
     assert "integration steps every" in ran.err
     assert ran.err.count("\n") == 1
     assert not ran.folder.exists()
+
+
+def test_numbers_of_steps_are_few_and_never_too_small():
+    """Every other number compiles anew: guesses of one machine that differ must share theirs."""
+    asked = np.arange(1, 2001)
+    given = np.array([_rounded(int(k)) for k in asked])
+    assert np.all(given >= asked)
+    assert np.all(given <= np.ceil(1.2 * asked))
+    assert len(set(given[asked > 8])) < 40
+    np.testing.assert_array_equal(given[:8], asked[:8])
