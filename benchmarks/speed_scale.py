@@ -52,7 +52,8 @@ def study(name: str, runs: int, processes: int = 0) -> dict:
 
 def _study(name: str, runs: int, scheduler: str | None = None) -> dict:
     import jaxid
-    from jaxid.studies.plan import Plan, cores
+    from jaxid.estimators.steps import cores
+    from jaxid.studies.plan import Plan
 
     path, counts = CASES[name]
     case = jaxid.load_case(path)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual
 from jaxid.estimators.least_squares import Transform
+from jaxid.estimators.steps import in_threads
 from jaxid.machine import Machine
 from jaxid.model import Effect, Plant, parameters_of
 from jaxid.parameters import Free, Parameters, scatter, seeds
@@ -164,12 +165,10 @@ def evaluate_on(
         parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]
     else:
         parts = [ask]
-    residuals, columns = [], []
-    for log in logs:
-        found = [_asked(union, log, theta, directions, part) for part in parts]
-        residuals.append(found[0][0])
-        columns.append(np.concatenate([c for _, c in found], axis=-1))
-    e, own = np.concatenate(residuals), np.concatenate(columns)
+    found = in_threads(_asked, [(union, log, theta, directions, part) for log in logs for part in parts])
+    each = [found[k : k + len(parts)] for k in range(0, len(found), len(parts))]
+    e = np.concatenate([some[0][0] for some in each])
+    own = np.concatenate([np.concatenate([c for _, c in some], axis=-1) for some in each])
     jacobian = np.zeros((*e.shape, directions.shape[1]))
     jacobian[..., ask] = own
     jacobian = jacobian[..., colours]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeVar
@@ -45,7 +46,19 @@ class Soon(NamedTuple):
     key: Any
 
 
-Steps = Generator[Solve | Soon, Any, T]
+class Parts(NamedTuple):
+    """A compiled function and the arguments of many calls of it, one to a core at a time.
+
+    Args:
+        function: As of `Solve`.
+        args: Of each call.
+    """
+
+    function: Callable
+    args: Sequence[tuple]
+
+
+Steps = Generator[Solve | Soon | Parts, Any, T]
 
 
 def alone(steps: Steps[T], behind: Soon | None = None) -> T:
@@ -64,6 +77,9 @@ def alone(steps: Steps[T], behind: Soon | None = None) -> T:
         if isinstance(asked, Soon):
             _prepare(asked)
             answer = None
+            continue
+        if isinstance(asked, Parts):
+            answer = in_threads(*asked)
             continue
         if behind is not None:
             _prepare(behind)
@@ -92,6 +108,32 @@ def _called(soon: Soon) -> None:
         soon.function(*soon.args)
 
 
+def in_threads(function: Callable[..., T], args: Sequence[tuple]) -> list[T]:
+    """What each of many calls returns, one to a core at a time: compiled code leaves Python's lock alone.
+
+    The first of its kind goes ahead of the others, which would all compile what it does. A call must not ask
+    for the same in its turn.
+    """
+    leaves, structure = jax.tree.flatten(args[0])
+    kind = (function, structure, tuple(x.shape if isinstance(x, _ARRAYS) else type(x) for x in leaves))
+    ahead = [] if kind in _CALLED else [function(*args[0])]
+    _CALLED.add(kind)
+    return [*ahead, *_threads().map(lambda own: function(*own), args[len(ahead) :])]
+
+
+_CALLED: set = set()
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cores(), thread_name_prefix="jaxid-parts")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     """Run the steps of several runs side by side, what is alike in one compiled call.
 
@@ -110,8 +152,8 @@ def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     def advance(k: int, answer: Any) -> None:
         try:
             asked = many[k].send(answer)
-            while isinstance(asked, Soon):
-                asked = many[k].send(None)
+            while not isinstance(asked, Solve):
+                asked = many[k].send(in_threads(*asked) if isinstance(asked, Parts) else None)
             key, arrays = _parted(asked)
         except StopIteration as end:
             ended[k] = end.value

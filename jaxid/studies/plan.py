@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.estimators import need_consistent
+from jaxid.estimators.steps import cores
 from jaxid.io.case import Case
 from jaxid.machine import Machine
 from jaxid.studies.levels import Level, levels_of
@@ -226,11 +227,6 @@ def _memory() -> float:
         return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", _UNSTATED)
     stated = hasattr(os, "sysconf")
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if stated else _UNSTATED
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def at_once() -> int:
