@@ -32,8 +32,8 @@ def simulated(monkeypatch):
         yield
 
     def at_each(problem, w, starts=None):
-        e = np.array([problem.residual(x) for x in w])
-        return SimpleNamespace(function=lambda: e.reshape(len(w), *problem.measured.shape), args=())
+        return np.array([problem.residual(x) for x in w])
+        yield
 
     monkeypatch.setattr(directions_posterior, "read", read)
     for module in (directions_posterior, directions):
@@ -83,7 +83,7 @@ def found_at(problem, w, told):
 def test_the_spread_of_a_line_is_the_quadratic_pictures():
     problem, a, b = linear(np.random.default_rng(2))
     whole = np.linalg.inv(a.T @ a + np.eye(4))
-    found = alone(spread(found_at(problem, whole @ (a.T @ b), 2), NOISE))
+    found = alone(spread(found_at(problem, whole @ (a.T @ b), 2), NOISE))[0]
     # Directions of the linear problem are not quite the axes: fitted ones and others are correlated.
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(whole)), rtol=0.15)
 
@@ -95,7 +95,7 @@ def test_the_spread_of_what_is_held_wrongly_is_found():
         lambda w: np.array([[10.0, 10.0 * w[1]]]), 2, 1,
     )
     best = np.zeros(2)
-    found = alone(spread(found_at(problem, best, 1), NOISE))
+    found, _ = alone(spread(found_at(problem, best, 1), NOISE))
     x, y = np.meshgrid(np.linspace(-8, 3, 2201), np.linspace(-5, 5, 801), indexing="ij")
     nats = -0.5 * (10.0 * (x + 0.5 * y**2) / NOISE) ** 2 - 0.5 * x**2 - 0.5 * y**2
     weight = np.exp(nats - nats.max())
@@ -103,6 +103,21 @@ def test_the_spread_of_what_is_held_wrongly_is_found():
     # The quadratic picture at the fit has 0.03 for x.
     assert np.sqrt(exact[0]) > 0.4
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(exact), rtol=0.25)
+
+
+def test_of_two_valleys_the_spread_has_both_and_knows_the_better():
+    """They differ by 2 nats: a fit that ended in the worse one is off by as far as they lie apart."""
+    residual = lambda w: np.array([2.0 * (w[0] ** 2 - 1.0), 0.3 * (w[0] - 1.0)])
+    jacobian = lambda w: np.array([[4.0 * w[0]], [0.3]])
+    problem = problem_of(residual, jacobian, 1, 2)
+    place = np.linspace(-3, 3, 6001)
+    nats = np.array([-0.5 * np.sum((residual([x]) / NOISE) ** 2) for x in place]) - 0.5 * place**2
+    weight = np.exp(nats - nats.max())
+    for start in (-0.99, 0.99):
+        exact = np.sqrt(np.sum(weight * (place - start) ** 2) / weight.sum())
+        whole, best = alone(spread(found_at(problem, np.array([start]), 1), NOISE))
+        assert np.sqrt(whole[0, 0]) == pytest.approx(exact, rel=0.3)
+        assert best[0] == pytest.approx(place[np.argmax(nats)], abs=0.01)
 
 
 def test_a_profile_holds_one_direction_and_all_others_give_way():
@@ -143,9 +158,10 @@ def through(monkeypatch, residual, *, unknowns=2, told=1, best=None):
     minimum = Minimum(best, np.asarray(0.0), np.asarray(1), np.asarray(True), e, jacobian)
 
     def at_each(problem, w, starts):
-        rounded = np.zeros((len(w), 8, 1))
-        rounded[:, :told, 0] = residual(w, starts)
-        return SimpleNamespace(function=lambda: rounded, args=())
+        rounded = np.zeros((len(w), 8))
+        rounded[:, :told] = residual(w, starts)
+        return rounded
+        yield
 
     monkeypatch.setattr(directions_rounding, "at_each", at_each)
     monkeypatch.setattr(directions_rounding, "_rounding", lambda machine, problem: problem)

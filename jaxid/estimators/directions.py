@@ -143,7 +143,10 @@ def directions_steps(
         samples=int(counts.sum()),
         steps=found.evaluations,
         notes=(*notes_of(machine, numerics, log, on), *remarks),
-        details={"directions": stated, "criterion_percent": found.problem.criterion(found.minimum), **many},
+        details={
+            "directions": stated, "criterion_percent": found.problem.criterion(found.minimum),
+            "effective_parameters": found.effective, **many,
+        },
     )
 
 
@@ -197,7 +200,8 @@ def expected_steps(
     """
     rng, here = np.random.default_rng(0), np.zeros((DRAWN, problem.prior.base.size))
     # A residual is of what is measured less what is simulated.
-    exact = -np.asarray((yield rounded(machine, problem, np.random.default_rng(4))))[0]
+    exact = -(yield from rounded(machine, problem, np.random.default_rng(4)))[0]
+    exact = exact.reshape(problem.measured.shape)
     log = exact + own * rng.standard_normal(exact.shape)
     problem = replace(problem, measured=log / problem.weight)
     minimum = yield from read(problem, problem.ladder[-1], here[0])
@@ -219,36 +223,51 @@ def _looked(problem: Problem, told: np.ndarray, w: np.ndarray) -> Steps[np.ndarr
     z = np.random.default_rng(1).uniform(-_LOOKED, _LOOKED, (DRAWN, told.shape[1]))
     points = w + (z - told.T @ w) @ told.T
     points[0] = w
-    e = np.asarray((yield at_each(problem, points))).reshape(DRAWN, -1)
+    e = yield from at_each(problem, points)
     costs = np.sum(e**2, axis=1)
     return points[np.argmin(np.where(np.isfinite(costs), costs, np.inf))]
 
 
 def _most_probable(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
     """On to where guesses and log agree, and how well directions are told there by both."""
-    problem = found.problem
     if not np.all(np.isfinite(found.minimum.jacobian)):
         return found, None
-    noise = problem.noise(found.minimum, found.count)
-    w, here, settled = yield from most_probable(problem, noise, found.point)
-    jacobian = np.asarray(here.jacobian)
-    vectors, count = _directions(jacobian / noise, found.count)
-    while True:
-        minimum = replace(here, theta=vectors.T @ w, jacobian=jacobian @ vectors)
-        spent = found.evaluations + int(here.steps)
-        ended = Found(problem, vectors, count, minimum, spent, settled)
-        if not count:
-            return ended, None
-        if rounds(machine, problem):
-            return (yield from through_rounding(machine, ended))
-        whole = yield from spread(ended, problem.noise(minimum, count))
-        told = with_guesses(ended, told_of(ended), whole)
+    found = yield from _ended(found, found.point)
+    if not found.count:
+        return found, None
+    if rounds(machine, found.problem):
+        return (yield from through_rounding(machine, found))
+    whole, best = yield from spread(found, found.noise)
+    if np.any(best != found.point):
+        # It ended in a valley that is not the best.
+        found = yield from _ended(found, best)
+        whole, _ = yield from spread(found, found.noise)
+    while found.count:
+        told = with_guesses(found, told_of(found), whole)
         stays = told.std <= STAYS
         if np.all(stays):
-            return ended, told
+            return found, told
         # What noise of the residual's colour leaves too wide goes behind those that stay.
-        order = np.concatenate([np.argsort(~stays, kind="stable"), np.arange(count, len(vectors))])
-        vectors, count = vectors[:, order], int(stays.sum())
+        order = np.argsort(~np.append(stays, np.zeros(len(whole) - found.count, bool)), kind="stable")
+        found = _along(found, found.vectors[:, order], int(stays.sum()))
+    return found, None
+
+
+def _ended(found: Found, w: Float[np.ndarray, " q"]) -> Steps[Found]:
+    """The fit taken from a point to the most probable one, its directions those that are told there."""
+    noise = found.problem.noise(found.minimum, found.count)
+    w, here, settled = yield from most_probable(found.problem, noise, w)
+    vectors, count = _directions(np.asarray(here.jacobian) / noise, found.count)
+    spent = found.evaluations + int(here.steps)
+    return _along(Found(found.problem, np.eye(len(w)), count, here, spent, settled), vectors, count)
+
+
+def _along(found: Found, vectors: np.ndarray, count: int) -> Found:
+    """The same point along other directions, of which so many are fitted."""
+    turn = vectors.T @ found.vectors
+    minimum = found.minimum
+    minimum = replace(minimum, theta=turn @ minimum.theta, jacobian=np.asarray(minimum.jacobian) @ turn.T)
+    return replace(found, vectors=vectors, count=count, minimum=minimum)
 
 
 def _drawn(problem: Problem, starts: int) -> np.ndarray:

@@ -21,10 +21,16 @@ _DAMPED, _BY, _STALLED = 1e-3, 8.0, 100.0
 # Steps of the way to the most probable point; it ends where one gains less than this [nats], and has settled
 # where the next promises less than that.
 _MOST_STEPS, _LEAST_GAIN, _NEAR = 25, 1e-3, 0.5
-# Of the points drawn so many must count.
+# Of the points drawn so many must simulate.
 _COUNTING = 30
-# Degrees of freedom of what they are drawn from: its tails are fatter than a normal's.
-_FREEDOM = 7
+# Moves of each point whenever the log counts more, and when it counts in full; moves reach so far, over what
+# the points scatter by and the root of the unknowns, and so many of them should be taken.
+_MOVES, _LAST_MOVES = 6, 12
+_REACH, _ACCEPTED = 2.38, 0.25
+# Of a scatter that is none: of what ends at a bound.
+_LEAST = 1e-12
+# Halvings of the interval in which the next count of the log lies.
+_HALVED = 40
 
 
 def most_probable(
@@ -76,62 +82,78 @@ def loss_of(noise: float, here: Minimum, w: Float[np.ndarray, " q"]) -> float:
     return 0.5 * float(e @ e) + 0.5 * float(w @ w)
 
 
-def spread(found: Found, noise: float) -> Steps[Float[np.ndarray, "q q"]]:
+def spread(found: Found, noise: float) -> Steps[tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]]:
     """Mean square about the fit of what is as probable, given guesses and log, in units of the prior.
 
-    What is held is drawn first, then what is fitted around the point to which it makes up for that: where the
-    log ties the one to the other narrowly, and not along a line, points drawn at once would miss.
+    Points are drawn as the guesses say and led to the log by letting it count more and more. Where it ties
+    combinations to one another narrowly, and not along a line, or leaves several valleys, points drawn about
+    the fit by the quadratic picture would miss most of what is probable.
 
     Args:
         found: The fit, its minimum in the coordinates of all directions.
         noise: Standard deviation of its residual, white.
 
     Returns:
-        The mean square; the quadratic picture's covariance where too few of the points drawn count.
+        The mean square, the quadratic picture's covariance where too few simulations are finite; and the most
+        probable of the points, the fit among them.
 
     Source:
-        Importance sampling, self-normalised; Owen, "Monte Carlo theory, methods and examples", chapter 9.
+        Sequential Monte Carlo by tempering; Del Moral, Doucet and Jasra (2006), "Sequential Monte Carlo
+        samplers".
     """
-    r, rng = found.count, np.random.default_rng(0)
-    jacobian = np.asarray(found.minimum.jacobian) / noise
-    quadratic = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(found.vectors)))
-    best = np.asarray(found.minimum.theta)
-    z = np.tile(best, (DRAWN, 1))
-    nats = np.zeros(DRAWN)
-    for part in (slice(r, None), slice(0, r)):
-        if part.stop:
-            # A step of Gauss and Newton from the fit, with what is held elsewhere.
-            e = yield from _drawn(found, z, noise)
-            slope = e @ jacobian[:, part] + z[:, part]
-            inner = np.linalg.inv(jacobian[:, part].T @ jacobian[:, part] + np.eye(r))
-            z[:, part] -= slope @ inner
-        else:
-            inner = quadratic[part, part]
-        size = len(inner)
-        if not size:
-            continue
-        x = rng.standard_normal((DRAWN, size))
-        x *= np.sqrt(_FREEDOM / rng.chisquare(_FREEDOM, (DRAWN, 1)))
-        z[:, part] += x @ np.linalg.cholesky(inner).T
-        nats += 0.5 * (_FREEDOM + size) * np.log1p(np.sum(x**2, axis=1) / _FREEDOM)
-    e = yield from _drawn(found, z, noise)
-    nats += -0.5 * np.sum(e**2, axis=1) - 0.5 * np.sum(z**2, axis=1)
-    nats = np.where(np.isfinite(nats), nats, -np.inf)
-    whole = quadratic
-    if np.any(np.isfinite(nats)):
-        weight = np.exp(nats - np.max(nats))
-        weight /= weight.sum()
-        off = np.where(weight[:, None] > 0.0, z - best, 0.0)
-        if 1.0 / np.sum(weight**2) >= _COUNTING:
-            whole = (off * weight[:, None]).T @ off
-    return found.vectors @ whole @ found.vectors.T
+    rng, size = np.random.default_rng(0), len(found.vectors)
+    best, least = found.point, loss_of(noise, found.minimum, found.point)
+    w = rng.standard_normal((DRAWN, size))
+    against = yield from _against(found.problem, w, noise)
+    if np.sum(np.isfinite(against)) < _COUNTING:
+        jacobian = np.asarray(found.minimum.jacobian) @ found.vectors.T / noise
+        return np.linalg.inv(jacobian.T @ jacobian + np.eye(size)), best
+    counts, reach, kept = 0.0, _REACH / np.sqrt(size), []
+    while counts < 1.0:
+        more = _more(against, 1.0 - counts)
+        part = np.exp(-more * (against - against.min()))
+        # Evenly: each point as often as its part says, less than one more or less.
+        even = (np.arange(DRAWN) + rng.random()) / DRAWN
+        chosen = np.minimum(np.searchsorted(np.cumsum(part) / part.sum(), even), DRAWN - 1)
+        w, against, counts = w[chosen], against[chosen], min(counts + more, 1.0)
+        narrow = np.linalg.cholesky(np.cov(w.T).reshape(size, size) + _LEAST * np.eye(size))
+        for move in range(_MOVES if counts < 1.0 else _LAST_MOVES):
+            there = w + reach * rng.standard_normal(w.shape) @ narrow.T
+            then = yield from _against(found.problem, there, noise)
+            better = counts * (against - then) + 0.5 * np.sum(w**2 - there**2, axis=1)
+            goes = np.log(rng.random(DRAWN)) < better
+            w, against = np.where(goes[:, None], there, w), np.where(goes, then, against)
+            reach *= np.exp(np.mean(goes) - _ACCEPTED)
+            if counts == 1.0 and move >= _MOVES:
+                kept.append(w)
+                loss = against + 0.5 * np.sum(w**2, axis=1)
+                if loss.min() < least:
+                    best, least = w[np.argmin(loss)], loss.min()
+    off = np.concatenate(kept) - found.point
+    return off.T @ off / len(off), best
 
 
-def _drawn(
-    found: Found, z: Float[np.ndarray, "draws q"], noise: float
-) -> Steps[Float[np.ndarray, "draws rows"]]:
-    """Residuals over the noise at some coordinates along the directions."""
-    # Where nothing is finite nothing is asked for.
-    w = np.where(np.isfinite(z), z, 0.0) @ found.vectors.T
-    e = np.asarray((yield at_each(found.problem, w))).reshape(len(z), -1)
-    return e / noise
+def _more(against: Float[np.ndarray, " draws"], most: float) -> float:
+    """By how much more the log may count until half of the points do not any more."""
+    low, high = 0.0, most
+    off = against - against.min()
+
+    def counting(more: float) -> float:
+        part = np.exp(-more * off)
+        return part.sum() ** 2 / np.sum(part**2)
+
+    if counting(most) >= 0.5 * DRAWN:
+        return most
+    for _ in range(_HALVED):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if counting(middle) >= 0.5 * DRAWN else (low, middle)
+    return high
+
+
+def _against(
+    problem: Problem, w: Float[np.ndarray, "draws q"], noise: float
+) -> Steps[Float[np.ndarray, " draws"]]:
+    """Nats by which the log speaks against each point; infinite where its simulation is not finite."""
+    e = yield from at_each(problem, w)
+    nats = 0.5 * np.sum((e / noise) ** 2, axis=1)
+    return np.where(np.isfinite(nats), nats, np.inf)

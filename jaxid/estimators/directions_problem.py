@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxid.errors import InputError
 from jaxid.estimators.least_squares import Minimum, Progress, Transform, descend
 from jaxid.estimators.output_error import choose_numerics, measured_output, output_residual
-from jaxid.estimators.steps import Solve, Soon, Steps
+from jaxid.estimators.steps import Parts, Solve, Soon, Steps
 from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.model import Plant
@@ -34,8 +34,8 @@ FAR = 8.0
 AT_ONCE = 4
 # What is left of the prior along a direction that was fitted and stays.
 STAYS = 0.6
-# Points at which a compiled call simulates.
-DRAWN = 512
+# Points that are drawn at a time, and those at which one compiled call simulates.
+DRAWN, _PART = 512, 128
 # No pull towards the guesses.
 NO_PULL = np.zeros(())
 # Friction that rises with speeding up lets a velocity stand, and costs have a kink wherever it does: such
@@ -184,8 +184,8 @@ class Problem:
         weighed = replace(minimum, residual=e, jacobian=jacobian, cost=np.asarray(0.5 * e @ e))
         return replace(self, weight=np.tile(row, (len(self.measured), 1))), weighed
 
-    def noise(self, minimum: Minimum, count: int) -> float:
-        """Standard deviation of a weighted residual of which so many directions are fitted."""
+    def noise(self, minimum: Minimum, count: float) -> float:
+        """Standard deviation of a weighted residual of which so many unknowns are fitted."""
         samples = int(np.sum(self.weight > 0))
         return float(np.sqrt(2 * float(minimum.cost) / max(samples - count, 1)))
 
@@ -241,17 +241,25 @@ def residual_at_each(*args: Any) -> Array:
 
 def at_each(
     problem: Problem, w: Float[np.ndarray, "draws q"], starts: Float[np.ndarray, "draws k"] | None = None
-) -> Solve:
+) -> Steps[Float[np.ndarray, "draws rows"]]:
     """Residuals at so many points as `DRAWN`, from rest at zero if no starts are given."""
     if starts is None:
-        starts = np.zeros((len(w), problem.replay.follow.shape[1]))
-    return Solve(residual_at_each, (*problem.args, problem.ladder[-1], w, starts))
+        starts = _at_rest(problem, len(w))
+    cut = range(_PART, len(w), _PART)
+    some = zip(np.split(w, cut), np.split(starts, cut), strict=True)
+    found = yield Parts(residual_at_each, [(*problem.args, problem.ladder[-1], *at) for at in some])
+    return np.concatenate([np.asarray(e) for e in found]).reshape(len(w), -1)
 
 
 def at_each_soon(problem: Problem) -> Soon:
     """What `at_each` will ask for."""
-    function, args = at_each(problem, np.zeros((DRAWN, problem.prior.base.size)))
-    return Soon(function, args, (function, jax.tree.structure(args), problem.measured.shape))
+    points = np.zeros((_PART, problem.prior.base.size)), _at_rest(problem, _PART)
+    args = (*problem.args, problem.ladder[-1], *points)
+    return Soon(residual_at_each, args, (residual_at_each, jax.tree.structure(args), problem.measured.shape))
+
+
+def _at_rest(problem: Problem, draws: int) -> np.ndarray:
+    return np.zeros((draws, problem.replay.follow.shape[1]))
 
 
 def _goes_on(*args: Any) -> Progress:
@@ -361,6 +369,25 @@ class Found:
         """In units of the prior."""
         theta = np.asarray(self.minimum.theta)
         return self.vectors[:, : theta.size] @ theta
+
+    @property
+    def effective(self) -> float:
+        """Effective number of parameters: of each direction the part in which it follows the log.
+
+        Source:
+            Hastie, Tibshirani and Friedman, "The elements of statistical learning", 7.6: the trace of what
+            maps the measured to the fitted, here with the guesses as the penalty.
+        """
+        jacobian = np.asarray(self.minimum.jacobian) / self.problem.noise(self.minimum, self.count)
+        if not np.all(np.isfinite(jacobian)):
+            return 0.0
+        told = np.linalg.svd(np.linalg.qr(jacobian, mode="r"), compute_uv=False) ** 2
+        return float(np.sum(told / (1.0 + told)))
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the residual, white, of which so many parameters are effective."""
+        return self.problem.noise(self.minimum, self.effective)
 
 
 def criterion_steps(

@@ -22,7 +22,7 @@ from jaxid.estimators.directions_problem import (
     at_each_soon,
     signed,
 )
-from jaxid.estimators.steps import Solve, Soon, Steps
+from jaxid.estimators.steps import Soon, Steps, alone
 from jaxid.machine import Machine
 from jaxid.replay import with_sensor
 
@@ -55,7 +55,9 @@ def draws_soon(machine: Machine, problem: Problem) -> Soon:
     return at_each_soon(_rounding(machine, problem))
 
 
-def rounded(machine: Machine, problem: Problem, rng: np.random.Generator) -> Solve:
+def rounded(
+    machine: Machine, problem: Problem, rng: np.random.Generator
+) -> Steps[Float[np.ndarray, "draws rows"]]:
     """Residuals at the guesses with rounding in the loop, from starts within the first count."""
     starts = rng.uniform(-0.5, 0.5, (DRAWN, len(problem.encoders))) * _counts(machine, problem)
     return at_each(_rounding(machine, problem), np.zeros((DRAWN, problem.prior.base.size)), starts)
@@ -88,8 +90,7 @@ def drawn_roundings(
     if not rounds(machine, problem):
         return None
     rng = np.random.default_rng(2)
-    asked = [rounded(machine, problem, rng) for _ in range(-(-draws // DRAWN))]
-    e = [np.asarray(solve.function(*solve.args)).reshape(DRAWN, -1) for solve in asked]
+    e = [alone(rounded(machine, problem, rng)) for _ in range(-(-draws // DRAWN))]
     e = np.concatenate(e)[:draws]
     return e - e.mean(axis=0)
 
@@ -149,9 +150,7 @@ class _Summary:
         w = z @ self.vectors.T
         held = rng.standard_normal((DRAWN, q - r)) @ self.vectors[:, r:].T
         w[:, :places] += held[:, :places]
-        e = np.asarray((yield at_each(self.problem, w, starts)))
-        shape = e.shape[1:]
-        e = e.reshape(DRAWN, -1)
+        e, shape = (yield from at_each(self.problem, w, starts)), self.problem.measured.shape
         sound = np.all(np.isfinite(e), axis=1)
         apart, off = e[sound] - self.residual, off[sound]
         if len(apart):
