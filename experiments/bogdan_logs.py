@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -88,10 +89,11 @@ def nats_above(estimate: Estimate, case: Path, log: Log, ratio: float, data: int
     return 0.5 * (freedom * (1 / ratio - 1) + far @ far - near @ near)
 
 
-def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, more: str = ON_FORCE,
-            **stated: Any) -> Path:
-    """A case file; guesses at the truth, or drawn up to 50 % around it."""
-    drawn = None if guess is None else stages.drawn(guess, data=data)
+def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, believed: bool = False,
+            more: str = ON_FORCE, **stated: Any) -> Path:
+    """A case file; guesses at the truth, drawn up to 50 % around it, or as the prior says that they are."""
+    far = (lambda seed: stages.believed(seed, PRIOR, data)) if believed else partial(stages.drawn, data=data)
+    drawn = None if guess is None else far(guess)
     path = folder / f"{name}.toml"
     path.write_text(stages.text(data, guess=drawn, more=more, **stated))
     return path

@@ -175,6 +175,13 @@ def drawn(seed: int, spread: float = 0.5, data: int = 1) -> dict[str, float]:
     return {k: v * (1 + spread * rng.uniform(-1, 1)) for k, v in TRUTH[data].items()}
 
 
+def believed(seed: int, width: float = 0.5, data: int = 1) -> dict[str, float]:
+    """Guesses off as a prior of a relative width says, by a factor; the phase, of either sign, as `drawn`."""
+    rng, uniform = np.random.default_rng(seed), drawn(seed, width, data)
+    off = {k: np.exp(width * rng.standard_normal()) for k in TRUTH[data]}
+    return {k: uniform[k] if k.endswith("phase") else v * off[k] for k, v in TRUTH[data].items()}
+
+
 def to_and_fro(seconds: float = 20.0) -> np.ndarray:
     """Motion at many speeds [rad]; a ripple with turns is one only where a stroke has more than two."""
     t = np.arange(round(seconds * RATE)) / RATE
