@@ -26,10 +26,10 @@ def test_a_large_union_is_differentiated_in_parts_alike(session, monkeypatch):
     theta = union.neutral.copy()
     for c in union.candidates:
         theta[c.index] = c.probe(0)
-    e, whole = cand.evaluate(union, samples, theta)
-    assert whole.shape[-1] > 20
-    monkeypatch.setattr(cand, "_WIDE", 10)
-    monkeypatch.setattr(cand, "_COLUMNS", 7)
+    with monkeypatch.context() as at_once:
+        at_once.setattr(cand, "_COLUMNS", len(theta))
+        e, whole = cand.evaluate(union, samples, theta)
+    assert whole.shape[-1] > 5 * cand._COLUMNS
     same, parts = cand.evaluate(union, samples, theta)
     np.testing.assert_allclose(same, e, rtol=1e-12)
     size = np.abs(whole).max(axis=(0, 1))

@@ -30,8 +30,9 @@ _FEW = 8
 # pieces spread over it.
 _MOST = 8_000
 _PIECES = 4
-# A union with more columns than this is differentiated in so many at once, and only in those asked for.
-_WIDE, _COLUMNS = 48, 24
+# A union is differentiated in so many columns at once, and only in those asked for: few, so that what a long
+# log makes of each operation stays in the processor's cache.
+_COLUMNS = 4
 # Strength at which the columns of an added force are taken, relative to the log's force.
 _FAINT = 1e-6
 
@@ -157,14 +158,9 @@ def evaluate_on(
     """The same on several logs or pieces, one after the other."""
     colours = np.asarray(union.colours, int)
     directions = seeds(union.colours)
-    ask = np.arange(directions.shape[1])
-    if len(ask) > _WIDE:
-        some = colours if wanted is None else colours[np.asarray(wanted, int)]
-        # Which are asked is data: one number of columns, and one compiled function.
-        ask = np.unique(some)
-        parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]
-    else:
-        parts = [ask]
+    # Which are asked is data: one number of columns, and one compiled function.
+    ask = np.unique(colours if wanted is None else colours[np.asarray(wanted, int)])
+    parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]
     found = in_threads(_asked, [(union, log, theta, directions, part) for log in logs for part in parts])
     each = [found[k : k + len(parts)] for k in range(0, len(found), len(parts))]
     e = np.concatenate([some[0][0] for some in each])
@@ -179,8 +175,7 @@ def _asked(
     union: Union, log: ForceData, theta: np.ndarray, directions: np.ndarray, part: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residual and derivatives in some directions, filled up to one number of them."""
-    count = directions.shape[1] if directions.shape[1] <= _WIDE else _COLUMNS
-    own = np.zeros((len(theta), count))
+    own = np.zeros((len(theta), _COLUMNS))
     own[:, : len(part)] = directions[:, part]
     plant, places = union.machine.plant, union.machine.parameters.places
     e, columns = force_and_columns(plant, places, log, jnp.asarray(theta), own)
