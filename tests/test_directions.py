@@ -222,7 +222,7 @@ def test_the_full_hessian_is_near_gauss_newtons(folder, tmp_path):
     for full, gauss in zip(whole, drawn, strict=True):
         assert full["std"] == pytest.approx(gauss["std_white"], rel=0.2)
         assert full["std"] != gauss["std_white"]
-    assert drawn[0]["std"] > 2 * whole[0]["std"]
+    assert drawn[1]["std"] > 1.5 * whole[1]["std"]
 
 
 def test_results_hold_the_directions(fitted, tmp_path):

@@ -73,6 +73,7 @@ def explore_within(
         if not good:
             break
         added, after, found = good[0]
+        after = _anew(session, after)
         near = [s for s, *_ in good[1:] if s.evidence > added.evidence - _AS_GOOD]
         effects.append(replace(found, alternatives=tuple(near)))
     verdict = "found" if effects else "nothing_missing" if noisy else "unexplained"
@@ -108,10 +109,20 @@ def _fitted(
     known = np.asarray(loop.problem.prior.outward(begin.point))[: len(loop.union.base)]
     after = alone(directions_steps(
         machine, loop.session.fit.log, prior=stated["prior"], on=stated.get("on", "position"),
-        widths=widths, begin=np.concatenate([known, begin.values]),
+        widths=widths, begin=np.concatenate([known, begin.values]), drawn=False,
     ))
     fit = Fit.of(loop.session, machine, widths, after)
     return loop.gained(fit, base) if after.converged else 0.0, begin, fit
+
+
+def _anew(session: Session, fit: Fit) -> Fit:
+    """A fit from where it ended, with what else is as probable drawn."""
+    stated = session.case.output_error
+    after = alone(directions_steps(
+        fit.machine, session.fit.log, prior=stated["prior"], on=stated.get("on", "position"),
+        widths=fit.widths, begin=fit.estimate.theta,
+    ))
+    return Fit.of(session, fit.machine, fit.widths, after)
 
 
 def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:

@@ -56,14 +56,14 @@ def most_probable(
     loss, damping, steps, gained, promised = loss_of(noise, here, w), _DAMPED, 1, np.inf, np.inf
     # At a kink of the cost no step keeps its promise.
     while np.isfinite(loss) and gained > _LEAST_GAIN and damping < _STALLED:
-        jacobian = np.asarray(here.jacobian) @ across / noise
-        slope = jacobian.T @ (np.asarray(here.residual) / noise) + across.T @ w
-        curvature = jacobian.T @ jacobian + np.eye(len(slope))
-        promised = 0.5 * slope @ np.linalg.solve(curvature, slope)
+        # The guesses are rows below the log's. Squared, a steep log would swallow them.
+        rows = np.concatenate([np.asarray(here.jacobian) @ across / noise, np.eye(across.shape[1])])
+        left = np.concatenate([np.asarray(here.residual).ravel() / noise, across.T @ w])
+        promised = 0.5 * float(np.sum((rows @ np.linalg.lstsq(rows, left)[0]) ** 2))
         if promised < _LEAST_GAIN or steps > _MOST_STEPS:
             break
-        damped = curvature + damping * np.diag(np.diag(curvature))
-        step = -across @ np.linalg.solve(damped, slope)
+        damped = np.concatenate([rows, np.sqrt(damping) * np.diag(np.linalg.norm(rows, axis=0))])
+        step = -across @ np.linalg.lstsq(damped, np.concatenate([left, np.zeros(across.shape[1])]))[0]
         there = yield from read(problem, problem.ladder[-1], w + step)
         steps += 1
         lower = loss - loss_of(noise, there, w + step)
@@ -80,6 +80,15 @@ def loss_of(noise: float, here: Minimum, w: Float[np.ndarray, " q"]) -> float:
         return np.inf
     e = np.asarray(here.residual) / noise
     return 0.5 * float(e @ e) + 0.5 * float(w @ w)
+
+
+def quadratic(found: Found, noise: float) -> Float[np.ndarray, "q q"]:
+    """What `spread` draws, by the quadratic picture at the fit."""
+    jacobian = np.asarray(found.minimum.jacobian) @ found.vectors.T / noise
+    _, told, axes = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
+    left = np.ones(len(found.vectors))
+    left[: told.size] = 1.0 / (1.0 + told**2)
+    return (axes.T * left) @ axes
 
 
 def spread(found: Found, noise: float) -> Steps[tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]]:
@@ -106,8 +115,7 @@ def spread(found: Found, noise: float) -> Steps[tuple[Float[np.ndarray, "q q"], 
     w = rng.standard_normal((DRAWN, size))
     against = yield from _against(found.problem, w, noise)
     if np.sum(np.isfinite(against)) < _COUNTING:
-        jacobian = np.asarray(found.minimum.jacobian) @ found.vectors.T / noise
-        return np.linalg.inv(jacobian.T @ jacobian + np.eye(size)), best
+        return quadratic(found, noise), best
     counts, reach, kept = 0.0, _REACH / np.sqrt(size), []
     while counts < 1.0:
         more = _more(against, 1.0 - counts)
