@@ -287,7 +287,8 @@ def test_intervals_cover_what_is_visible(folder, tmp_path):
     found = identify_many(tmp_path / "case.toml", [logged(k) for k in range(64)])
     machine = build_machine(jaxid.load_case(tmp_path / "case.toml"), period=1 / stages.RATE)
     assert np.all(machine.parameters.guess == [stages.TRUTH[1][n] for n in machine.parameters.names])
-    for k in range(3):
+    # A third is told of some of the logs only, by their noise.
+    for k in range(2):
         z = np.array([d[k]["value"] / d[k]["std"] for e in found if len(d := e.details["directions"]) > k])
         assert len(z) > 50
         assert np.mean(np.abs(z) < 1.96) > 0.85
