@@ -85,7 +85,7 @@ def test_all_starts_end_alike_below_the_truth(fitted, folder):
     assert details["criterion_percent"] < at_truth < 0.2 * at_guess
 
 
-@pytest.mark.parametrize("method", ["inverse_dynamics", "recursive"])
+@pytest.mark.parametrize("method", [pytest.param("inverse_dynamics", marks=pytest.mark.slow), "recursive"])
 def test_what_another_method_finds_is_a_start_too(fitted, folder, tmp_path, method):
     """On a hundred samples neither tells the unknowns: far off as it is, the fit ends where it did."""
     text = (folder / "case.toml").read_text() + f'start = "{method}"\n'
@@ -118,6 +118,7 @@ def test_a_prior_is_normal_in_the_logarithm_of_what_is_positive():
     np.testing.assert_allclose(prior.slope(theta), np.diag(jax.jacfwd(prior.outward)(w)), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
     """The move of data 2: half as much friction again, and nothing moves, nor do most of the starts."""
     truth, reference = stages.TRUTH[2], stages.move(0.5, **stages.MOVES[2])
@@ -225,6 +226,22 @@ def test_the_full_hessian_is_near_gauss_newtons(folder, tmp_path):
     assert drawn[1]["std"] > 1.5 * whole[1]["std"]
 
 
+def test_without_draws_deviations_are_the_quadratic_pictures(folder, fitted, tmp_path):
+    text = (folder / "case.toml").read_text()
+    (tmp_path / "case.toml").write_text(text + "drawn = false\n")
+    quick = jaxid.identify(tmp_path / "case.toml", logged(0)).estimate
+    drawn = fitted.estimate.details
+    assert quick.details["criterion_percent"] == pytest.approx(drawn["criterion_percent"], rel=0.01)
+    for one, other in zip(quick.details["directions"], drawn["directions"], strict=False):
+        assert one["value"] == pytest.approx(other["value"], abs=0.3 * other["std"])
+        assert 0.5 * one["std_white"] < one["std"] < other["std"]
+    text = text.replace("[output_error]", f"[sensor]\nposition_resolution = {stages.COUNT}\n[output_error]")
+    (tmp_path / "case.toml").write_text(text + "drawn = false\n")
+    assert "what rounding of the readings does is in no value" in str(
+        jaxid.identify(tmp_path / "case.toml", logged(0)).estimate.notes
+    )
+
+
 def test_results_hold_the_directions(fitted, tmp_path):
     fitted.save(tmp_path / "out")
     content = json.loads((tmp_path / "out" / "result.json").read_text())
@@ -312,6 +329,7 @@ def test_wrong_priors_are_refused(folder, tmp_path, capsys):
         (text.replace("prior = 0.5", "prior = -1"), "prior"),
         (text.replace("prior = 0.5", "prior = 0.5\nstarts = 0"), "starts"),
         (text.replace("prior = 0.5", "profile = true"), "profile goes with prior only"),
+        (text.replace("prior = 0.5", "drawn = false"), "drawn goes with prior only"),
         (_without_guess(text), "cogging[2].phase has a guess of zero"),
         (text[:start] + text[end:], "[output_error] prior needs a loop"),
         (text, "solver 'tsit5' does not go with [output_error] prior", "--solver", "tsit5"),

@@ -111,6 +111,7 @@ def test_fewer_configurations_than_unknowns_tell_combinations_at_most():
     assert np.isnan(found.std).all()  # nothing is left to judge by
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_repeated_measurements():
     rng = np.random.default_rng(8)
     noisy = INERTIAS[:, 2] + 0.01 * rng.standard_normal((400, len(ANGLES)))

@@ -139,7 +139,7 @@ def simulated(tmp_path, capsys, text, name="sim.csv"):
     # without dry friction both are smooth: fourth order at 0.25 ms, the stepper's second at 10 us
     ({"viscous_friction": FRICTION["viscous_friction"]}, 2e-9),
     # dry friction in all hinges at once: the stepper's turns are of first order, 7e-7 rad at 10 us
-    (FRICTION, 2e-6),
+    pytest.param(FRICTION, 2e-6, marks=pytest.mark.slow),
 ])
 def test_simulation_is_the_steppers(tmp_path, capsys, friction, apart):
     rows = followed(Robot(friction=friction), duration=2.0, noise=0.0)
@@ -205,6 +205,7 @@ def test_columns_are_counted_where_a_case_names_none(tmp_path, capsys):
     assert (tmp_path / "sim.csv").read_text().startswith("t,q1,q2,u1,u2\n")
 
 
+@pytest.mark.slow
 def test_an_experiment_is_designed_from_where_the_robot_starts(tmp_path):
     """Lengths with which both joints at zero is no position."""
     text = PLANT.replace("[0.18,", "[0.6,") + effect("coulomb_friction", unknown(1.0, 2)) + OPEN + (
@@ -293,6 +294,7 @@ def test_passive_angles_belong_to_plants_that_have_them(tmp_path):
     assert "passive = 1 does not exist on kind = 'axis'; leave passive out" in message(tmp_path, text)
 
 
+@pytest.mark.slow
 def test_every_command_takes_a_five_bar_case(tmp_path, capsys, log):
     """Check and identify, with results by place; units are those of the parameter's own motion."""
     text = PLANT.replace("0.292, 0.292", "{ guess = 0.2 }, 0.292").replace("[[0.1254,", "[[{ guess = 0.12 },")

@@ -114,6 +114,7 @@ def test_fits_take_the_steps_that_turning_friction_asks_for(folder):
     assert np.abs(position(1) - fine).max() > noise
 
 
+@pytest.mark.slow
 def test_didim_tells_the_split_from_forces_alone(folder):
     result = jaxid.identify(folder / "motor.toml", folder / "log.csv", method="didim")
     assert result.converged
@@ -155,6 +156,7 @@ def test_tells_the_zero_offset_of_the_second_encoder(tmp_path):
     assert result.value("stiffness") == pytest.approx(8e5, rel=0.02)
 
 
+@pytest.mark.slow
 def test_an_offset_is_not_told_without_the_encoder(tmp_path, folder):
     (tmp_path / "case.toml").write_text(axes.text(load=False, offset=True))
     result = jaxid.identify(tmp_path / "case.toml", folder / "log.csv", method="inverse_dynamics")

@@ -190,6 +190,7 @@ def test_files_hold_what_the_case_names(tmp_path):
     np.testing.assert_allclose(log[:, 1], HIDING[3].run(validation=True)["position"][:, 0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_where_points_at_the_spring(tmp_path):
     """Not at a position, nor at the moments in which a cubic spring is far from its line."""
     case = next(c for c in cases("calibrate") if c.what == "cubic_stiffness" and c.place == 2)

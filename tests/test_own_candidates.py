@@ -84,6 +84,7 @@ def case(folder, *candidates):
     return write_case(folder, text)
 
 
+@pytest.mark.slow
 def test_a_candidate_of_the_case_is_found_and_no_other_case_knows_it(tmp_path, log):
     d = discover(case(tmp_path, "Hum"), log, refit=False)
     assert (d.verdict, d.kinds) == ("found", ["my_effects.py:Hum"])

@@ -118,6 +118,7 @@ def test_what_is_one_by_another_name_is_told_so(tmp_path):
     assert proposal_json(proposal, Units())["file"] is None
 
 
+@pytest.mark.slow
 def test_an_open_loop_gets_an_input(tmp_path):
     setup, declared = setups.sprung()
     kinds = ("quadratic_drag", "cubic_friction")

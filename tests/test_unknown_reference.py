@@ -119,6 +119,7 @@ def test_another_log_is_simulated_with_the_reference_that_it_has(case, log):
     assert found.gaps[1].simulation.relative[0] < 1e-3
 
 
+@pytest.mark.slow
 def test_a_hundred_samples_of_a_stage_tell_its_reference_too(case):
     move = stages.MOVES[1]
     true = {"onset": move["onset"], "speed": move["speed"] / stages.R}

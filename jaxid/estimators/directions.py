@@ -112,7 +112,8 @@ def directions_steps(
     p = len(machine.parameters.free)
     r = found.count
     remarks: list[str] = []
-    if told is not None and drawn and rounds(machine, problem):
+    simulated = drawn and rounds(machine, problem)
+    if told is not None and simulated:
         remarks.append(
             "what rounding of the readings does on average was taken off; criterion and residual are "
             "those of the fit before that"
@@ -124,8 +125,10 @@ def directions_steps(
         if hessian:
             told, said = yield from _by_hessian(found, told, noise)
             remarks += said
+    if not drawn and rounds(machine, problem):
+        remarks.append("drawn = false: what rounding of the readings does is in no value, nor deviation")
     precision, stated = assessed(machine, found, told)
-    if profile and told is not None and not rounds(machine, problem):
+    if profile and told is not None and not simulated:
         remarks += yield from add_profiles(found, noise, stated)
     theta = np.asarray(found.problem.prior.outward(found.point))[:p]
     e = np.asarray(found.minimum.residual).reshape(found.problem.measured.shape)

@@ -102,6 +102,7 @@ OUTPUT_ERROR: Keys = {
     "starts": Key(whole(1), "how many, drawn within the prior"),
     "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),
     "profile": Key(flag, "profile likelihoods of what is fitted"),
+    "drawn": Key(flag, "draw what else is as probable, and what rounding does; default true"),
 }
 DESIGN: Keys = {
     "criterion": Key(choice(CRITERIA)),
