@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from jaxid.estimators.steps import Solve, Soon, alone, together
+from jaxid.estimators.steps import Parts, Solve, Soon, alone, together
 
 
 def double(x):
@@ -43,6 +43,30 @@ def test_what_comes_soon_is_called_beside_once_and_its_error_is_nobodys(seen):
     assert called.wait(10)
     assert len(threads) == 2
     assert all(t is not threading.main_thread() for t in threads)
+
+
+def test_parts_run_beside_each_other_after_the_first_of_their_kind():
+    threads = []
+
+    def function(x):
+        threads.append(threading.current_thread())
+        if x[0] < 0:
+            raise ValueError("negative")
+        return 2.0 * x
+
+    def estimator(values):
+        found = yield Parts(function, [(np.array([x]),) for x in values])
+        return [float(x[0]) for x in found]
+
+    assert alone(estimator([1.0, 2.0, 3.0])) == [2.0, 4.0, 6.0]
+    assert threads[0] is threading.current_thread()
+    assert all(t is not threads[0] for t in threads[1:])
+    threads.clear()
+    assert together([estimator([4.0, 5.0]), estimator([6.0])], 2) == [[8.0, 10.0], [12.0]]
+    assert threading.current_thread() not in threads
+    with pytest.raises(ValueError, match="negative"):
+        alone(estimator([1.0, -1.0]))
+    assert isinstance(together([estimator([-1.0])], 2)[0], ValueError)
 
 
 def test_many_together_do_without(seen):

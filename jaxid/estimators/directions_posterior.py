@@ -163,5 +163,6 @@ def _against(
 ) -> Steps[Float[np.ndarray, " draws"]]:
     """Nats by which the log speaks against each point; infinite where its simulation is not finite."""
     e = yield from at_each(problem, w)
-    nats = 0.5 * np.sum((e / noise) ** 2, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        nats = 0.5 * np.sum((e / noise) ** 2, axis=1)
     return np.where(np.isfinite(nats), nats, np.inf)
