@@ -81,6 +81,7 @@ def test_output_error_sees_the_hold_that_the_published_recipe_does_not(emps):
 
 
 @needs_data
+@pytest.mark.slow
 def test_friction_that_differs_by_direction_is_found_on_emps(emps):
     found = jaxid.discover(emps / "emps_bare.toml", emps / "DATA_EMPS.mat")
     assert found.verdict == "found"
