@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -92,8 +91,8 @@ def nats_above(estimate: Estimate, case: Path, log: Log, ratio: float, data: int
 def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, believed: bool = False,
             more: str = ON_FORCE, **stated: Any) -> Path:
     """A case file; guesses at the truth, drawn up to 50 % around it, or as the prior says that they are."""
-    far = (lambda seed: stages.believed(seed, PRIOR, data)) if believed else partial(stages.drawn, data=data)
-    drawn = None if guess is None else far(guess)
+    draw = stages.believed if believed else stages.drawn
+    drawn = None if guess is None else draw(guess, PRIOR, data)
     path = folder / f"{name}.toml"
     path.write_text(stages.text(data, guess=drawn, more=more, **stated))
     return path

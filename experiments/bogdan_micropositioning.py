@@ -139,16 +139,17 @@ def _scatter(folder: Path, runs: int, words: str, drawn: bool, **guesses: bool) 
         logs, starts = logs_of(1, runs, rigid=rigid, resolution=resolution)
         found, ratio, off = studied(cases, logs, starts, 1)
         inside = lambda bound, off=off: f"{100 * np.mean(np.abs(np.concatenate(off)) < bound):.1f} %"
-        screw, told = "rigid" if rigid else "elastic", ""
+        screw, less_probable = "rigid" if rigid else "elastic", ""
         if not resolution:
             above = map(nats_above, found, cases, logs, ratio, [1] * len(found))
-            told = f"{np.mean(np.array([*above]) >= 0):.1%}"
+            less_probable = f"{np.mean(np.array([*above]) >= 0):.1%}"
         effective = np.mean([e.details["effective_parameters"] for e in found])
         table.row(
             name, screw, f"{np.mean([e.converged for e in found]):.0%}",
             f"{np.mean([len(o) for o in off]):.2f}",
             f"{np.mean([e.details['criterion_percent'] for e in found]):.2f}", f"{ratio.mean():.3f}",
-            f"{1 - effective / 100:.3f}", f"{np.mean(ratio <= 1):.1%}", told, inside(1.96), inside(3.0),
+            f"{1 - effective / 100:.3f}", f"{np.mean(ratio <= 1):.1%}", less_probable, inside(1.96),
+            inside(3.0),
         )
         so_far = f"{inside(1.96)} within 1.96 sigma ({time.perf_counter() - start:.0f} s)"
         print(f"  {name}, {screw}: {so_far}", flush=True)

@@ -155,7 +155,7 @@ def evaluate(
 def evaluate_on(
     union: Union, logs: list[ForceData], theta: Float[np.ndarray, " p"], wanted: Sequence[int] | None = None
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
-    """The same on several logs or pieces, one after the other."""
+    """The same on several logs or pieces, their rows in that order."""
     colours = np.asarray(union.colours, int)
     directions = seeds(union.colours)
     # Which are asked is data: one number of columns, and one compiled function.

@@ -24,6 +24,7 @@ from jaxid.estimators.directions import directions_steps
 from jaxid.estimators.steps import alone
 from jaxid.gap import noise_floor
 from jaxid.identification import gaps
+from jaxid.machine import Machine
 from jaxid.parameters import Free, free_effect
 from jaxid.session import Session
 
@@ -73,7 +74,9 @@ def explore_within(
         if not good:
             break
         added, after, found = good[0]
-        after = _anew(session, after)
+        # Those that were only compared had nothing drawn about them.
+        drawn = session.case.output_error.get("drawn", True)
+        after = _fit(session, after.machine, after.widths, after.estimate.theta, drawn=drawn)
         near = [s for s, *_ in good[1:] if s.evidence > added.evidence - _AS_GOOD]
         effects.append(replace(found, alternatives=tuple(near)))
     verdict = "found" if effects else "nothing_missing" if noisy else "unexplained"
@@ -102,27 +105,26 @@ def _refitted(
 def _fitted(
     loop: Loop, base: Fit, c: Candidate, begin: Begin
 ) -> tuple[float, Begin, Fit]:
-    stated, machine = loop.session.case.output_error, base.machine
+    machine = base.machine
     plant, free = free_effect(machine.plant, effect_at(loop.union, c, begin.values), machine.units)
     machine = machine.with_plant(plant, machine.parameters.extended(free))
     widths = base.widths | {f.name: _width(f, c.starts[:, k]) for k, f in enumerate(free)}
     known = np.asarray(loop.problem.prior.outward(begin.point))[: len(loop.union.base)]
-    after = alone(directions_steps(
-        machine, loop.session.fit.log, prior=stated["prior"], on=stated.get("on", "position"),
-        widths=widths, begin=np.concatenate([known, begin.values]), drawn=False,
-    ))
-    fit = Fit.of(loop.session, machine, widths, after)
-    return loop.gained(fit, base) if after.converged else 0.0, begin, fit
+    fit = _fit(loop.session, machine, widths, np.concatenate([known, begin.values]), drawn=False)
+    return loop.gained(fit, base) if fit.estimate.converged else 0.0, begin, fit
 
 
-def _anew(session: Session, fit: Fit) -> Fit:
-    """A fit from where it ended, with what else is as probable drawn."""
+def _fit(
+    session: Session, machine: Machine, widths: dict[str, float], begin: Float[np.ndarray, " p"], *,
+    drawn: bool,
+) -> Fit:
+    """A fit within the prior from some values of the unknowns; `drawn`: as of `directions_steps`."""
     stated = session.case.output_error
-    after = alone(directions_steps(
-        fit.machine, session.fit.log, prior=stated["prior"], on=stated.get("on", "position"),
-        widths=fit.widths, begin=fit.estimate.theta,
+    found = alone(directions_steps(
+        machine, session.fit.log, prior=stated["prior"], on=stated.get("on", "position"), widths=widths,
+        begin=begin, drawn=drawn,
     ))
-    return Fit.of(session, fit.machine, fit.widths, after)
+    return Fit.of(session, machine, widths, found)
 
 
 def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:

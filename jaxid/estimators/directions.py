@@ -244,13 +244,14 @@ def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[F
         return found, None
     if drawn and rounds(machine, found.problem):
         return (yield from through_rounding(machine, found))
-    whole, best = quadratic(found, found.noise), found.point
     if drawn:
         whole, best = yield from spread(found, found.noise)
-    if np.any(best != found.point):
-        # It ended in a valley that is not the best.
-        found = yield from _ended(found, best)
-        whole, _ = yield from spread(found, found.noise)
+        if np.any(best != found.point):
+            # It ended in a valley that is not the best.
+            found = yield from _ended(found, best)
+            whole, _ = yield from spread(found, found.noise)
+    else:
+        whole = quadratic(found, found.noise)
     while found.count:
         told = with_guesses(found, told_of(found), whole)
         stays = told.std <= STAYS
