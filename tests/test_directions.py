@@ -201,6 +201,7 @@ def test_sensitivities_are_those_of_finite_differences(folder):
         np.testing.assert_allclose(exact[:, k], slope, atol=2e-3 * float(jnp.abs(exact).max()))
 
 
+@pytest.mark.slow
 def test_rounding_widens_what_it_moves(tmp_path):
     """A coarse encoder's rounding is in no residual of white noise; its sigma is simulated."""
     log, sigma = logged(0), []

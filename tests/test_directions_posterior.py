@@ -120,6 +120,21 @@ def test_of_two_valleys_the_spread_has_both_and_knows_the_better():
         assert best[0] == pytest.approx(place[np.argmax(nats)], abs=0.01)
 
 
+def test_a_fit_in_the_worse_valley_goes_on_from_the_better(monkeypatch):
+    """By 11 nats: of the worse next to nothing is left in the deviation."""
+    residual = lambda w: np.array([2.0 * (w[0] ** 2 - 1.0), 0.7 * (w[0] - 1.0)])
+    problem = problem_of(residual, lambda w: np.array([[4.0 * w[0]], [0.7]]), 1, 2)
+    problem.noise, problem.on = lambda minimum, count: NOISE, "position"
+    white = lambda found: Told(1e-3 * np.eye(found.count), np.full(found.count, 0.03), np.zeros(0))
+    monkeypatch.setattr(directions, "told_of", white)
+    machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=None))
+    for drawn, end in ((True, 1.0), (False, -1.0)):
+        start = found_at(problem, np.array([-0.9]), 1)
+        found, told = alone(directions._most_probable(machine, start, drawn))
+        assert found.point[0] == pytest.approx(end, abs=0.1)
+        assert told.std[0] == pytest.approx(NOISE / 4.0, rel=0.3)
+
+
 def test_a_profile_holds_one_direction_and_all_others_give_way():
     """Of a line it rises by the square of the place over the variance that is left."""
     problem, a, b = linear(np.random.default_rng(3))

@@ -66,6 +66,7 @@ def test_both_positions(log):
     assert content["droppable"] == []
 
 
+@pytest.mark.slow
 def test_the_motor_alone(log):
     """What is regrouped is named; the load's viscous friction, which the paper moves, violates (13)."""
     estimate = fitted(log, "motor")
