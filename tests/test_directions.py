@@ -12,7 +12,7 @@ import stages
 
 import jaxid
 from jaxid.cli import main
-from jaxid.estimators import _beside_the_guesses, directions, steps_of
+from jaxid.estimators import _beside_the_guesses, directions_rounds, steps_of
 from jaxid.estimators.directions_problem import Prior, criterion_steps
 from jaxid.estimators.least_squares import Minimum
 from jaxid.estimators.steps import alone
@@ -167,11 +167,11 @@ def test_an_unknown_at_its_bound_does_not_take_the_others_with_it(tmp_path):
 def test_a_point_whose_slopes_are_not_finite_is_kept(monkeypatch, unknowns):
     """Cost and residual there are reported; of more unknowns than coordinates, too."""
     minimum = Minimum(*[np.zeros(())] * 5, np.full((1, unknowns), np.nan))
-    monkeypatch.setattr(directions, "read", lambda *args: _returned(minimum))
+    monkeypatch.setattr(directions_rounds, "read", lambda *args: _returned(minimum))
     problem = SimpleNamespace(prior=SimpleNamespace(base=np.ones(unknowns)), ladder=(1.0,))
     problem.weighed = lambda found: (problem, found)
     for w in (np.zeros(unknowns), np.arange(1.0, unknowns + 1)):
-        found = alone(directions._rounds(problem, w, unknowns))
+        found = alone(directions_rounds.in_rounds(problem, w, unknowns))
         assert found.count == 0
         np.testing.assert_allclose(found.point, w, rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(unknowns), atol=1e-12)

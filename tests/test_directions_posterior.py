@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxid.estimators import directions, directions_posterior, directions_rounding
+from jaxid.estimators import directions, directions_posterior, directions_rounding, directions_rounds
 from jaxid.estimators.directions_posterior import most_probable, spread
 from jaxid.estimators.directions_precision import Told, add_profiles
 from jaxid.estimators.directions_problem import Found
@@ -36,7 +36,7 @@ def simulated(monkeypatch):
         yield
 
     monkeypatch.setattr(directions_posterior, "read", read)
-    for module in (directions_posterior, directions):
+    for module in (directions_posterior, directions_rounds):
         monkeypatch.setattr(module, "at_each", at_each)
 
 
@@ -155,11 +155,12 @@ def test_a_fit_begins_in_the_deeper_valley():
     depth = lambda x: np.array([np.where(x < 0.4, 3.0 + abs(x), 5.0 * abs(x - 1.1))])
     problem = problem_of(lambda w: depth(w[0]), None, 3, 1)
     told = np.eye(3)[:, :1]
-    w = alone(directions._looked(problem, told, np.array([0.0, 0.3, -0.2])))
+    w = alone(directions_rounds._looked(problem, told, np.array([0.0, 0.3, -0.2])))
     assert w[0] == pytest.approx(1.1, abs=0.1)
     np.testing.assert_allclose(w[1:], [0.3, -0.2])
     # And stays where nothing is better.
-    np.testing.assert_allclose(alone(directions._looked(problem, told, np.array([1.1, 0.0, 0.0])))[0], 1.1)
+    w = alone(directions_rounds._looked(problem, told, np.array([1.1, 0.0, 0.0])))
+    np.testing.assert_allclose(w[0], 1.1)
 
 
 def through(monkeypatch, residual, *, unknowns=2, told=1, best=None):

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxid.estimators.directions_posterior import most_probable, quadratic, spread
 from jaxid.estimators.directions_precision import (
@@ -27,21 +27,15 @@ from jaxid.estimators.directions_precision import (
 from jaxid.estimators.directions_problem import (
     AT_ONCE,
     DRAWN,
-    FAR,
-    NEAR,
-    NO_PULL,
     STAYS,
     Found,
     Problem,
-    at_each,
     at_each_soon,
-    columns,
-    descent,
-    fit_each,
     read,
-    signed,
 )
 from jaxid.estimators.directions_rounding import draws_soon, rounded, rounds, through_rounding
+from jaxid.estimators.directions_rounds import in_rounds, told_directions
+from jaxid.estimators.directions_starts import many_starts, starts_within
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -49,23 +43,11 @@ from jaxid.io.log import Log
 from jaxid.machine import Machine
 from jaxid.replay import Numerics
 
-# A direction is fitted where its standard deviation is below this part of the prior's; one that was, up to
-# `STAYS`.
-_TOLD_TWICE = 0.5
-# Directions change with the point at which they are read: most rounds, in how many of them they are read
-# anew.
-_ROUNDS, _READ = 6, 3
 # Starts where the guesses tell nothing.
 _WHERE_NOTHING_SHOWS = 32
-# Where along the best told direction a start is led from which the simulation does not move [priors].
-_LOOK = np.linspace(-3.0, 3.0, 13)
-# How far a fit looks for where to begin, in priors.
-_LOOKED = 2.0
 # A simulation without rounding follows a loop in which that moves what is compared by this part of its
 # variance at most.
 _FOLLOWED = 0.1
-# Two starts end at one optimum where their costs differ by less than this.
-_SAME = 1e-3
 
 
 def directions_steps(
@@ -179,14 +161,14 @@ def _searched(
         if drawn:
             yield draws_soon(machine, problem)
     nowhere = np.zeros(problem.prior.base.size)
-    found = yield from _rounds(problem, nowhere if first is None else first, most, look=first is None)
+    found = yield from in_rounds(problem, nowhere if first is None else first, most, look=first is None)
     many: dict[str, Any] = {}
     if starts > 1 or given:
-        found, many = yield from _many_starts(found, np.array([*given, *_drawn(problem, starts)]), most)
+        found, many = yield from many_starts(found, np.array([*given, *starts_within(problem, starts)]), most)
     found, told = yield from _most_probable(machine, found, drawn)
     if told is None and not many:
         # A machine that sticks at the guesses, or nearly, shows nothing.
-        found, many = yield from _many_starts(found, _drawn(problem, _WHERE_NOTHING_SHOWS), most)
+        found, many = yield from many_starts(found, starts_within(problem, _WHERE_NOTHING_SHOWS), most)
         found, told = yield from _most_probable(machine, found, drawn)
     return found, told, many
 
@@ -216,23 +198,13 @@ def expected_steps(
     if np.any(np.var(exact - followed, axis=0) > _FOLLOWED * np.var(followed, axis=0)):
         return np.eye(len(here[0]))
     jacobian = np.asarray(minimum.jacobian)
-    vectors, count = _directions(jacobian / problem.noise(minimum, 0), 0)
+    vectors, count = told_directions(jacobian / problem.noise(minimum, 0), 0)
     minimum = replace(minimum, theta=vectors.T @ here[0], jacobian=jacobian @ vectors)
     if count:
         _, told = yield from through_rounding(machine, Found(problem, vectors, count, minimum, 1, True))
         if told is not None:
             return told.whole
     return np.eye(len(vectors))
-
-
-def _looked(problem: Problem, told: np.ndarray, w: np.ndarray) -> Steps[np.ndarray]:
-    """Of points along what is told best, and the one given, that of the lowest cost: it has many valleys."""
-    z = np.random.default_rng(1).uniform(-_LOOKED, _LOOKED, (DRAWN, told.shape[1]))
-    points = w + (z - told.T @ w) @ told.T
-    points[0] = w
-    e = yield from at_each(problem, points)
-    costs = np.sum(e**2, axis=1)
-    return points[np.argmin(np.where(np.isfinite(costs), costs, np.inf))]
 
 
 def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[Found, Told | None]]:
@@ -267,7 +239,7 @@ def _ended(found: Found, w: Float[np.ndarray, " q"]) -> Steps[Found]:
     """The fit taken from a point to the most probable one, its directions those that are told there."""
     noise = found.problem.noise(found.minimum, found.count)
     w, here, settled = yield from most_probable(found.problem, noise, w)
-    vectors, count = _directions(np.asarray(here.jacobian) / noise, found.count)
+    vectors, count = told_directions(np.asarray(here.jacobian) / noise, found.count)
     spent = found.evaluations + int(here.steps)
     return _along(Found(found.problem, np.eye(len(w)), count, here, spent, settled), vectors, count)
 
@@ -278,143 +250,3 @@ def _along(found: Found, vectors: np.ndarray, count: int) -> Found:
     minimum = found.minimum
     minimum = replace(minimum, theta=turn @ minimum.theta, jacobian=np.asarray(minimum.jacobian) @ turn.T)
     return replace(found, vectors=vectors, count=count, minimum=minimum)
-
-
-def _drawn(problem: Problem, starts: int) -> np.ndarray:
-    """Starts within one prior of the guesses, (starts - 1, p); the guesses themselves are the first."""
-    size = problem.prior.base.size
-    w = np.random.default_rng(0).uniform(-1.0, 1.0, (max(starts - 1, 0), size))
-    w[:, len(problem.places) :] = 0.0
-    return w
-
-
-def _rounds(
-    problem: Problem, w: np.ndarray, most: int, *, look: bool = True, last: bool = False
-) -> Steps[Found]:
-    """Read the directions, fit along them, so many at most, and again, each time sharper, until they stay.
-
-    `look`: begin at the best of many points; `last`: at the sharpest only, from a point that is near.
-    """
-    size, spent = problem.prior.base.size, 0
-    ladder = problem.ladder[-1:] if last else problem.ladder
-    count, cost, settled = 0, np.inf, False
-    for rung in range(len(ladder) + _ROUNDS):
-        sharpness, before = ladder[min(rung, len(ladder) - 1)], count
-        # Between the first rung and the last they hardly turn; those that change places with one another for
-        # ever are taken as they are.
-        if rung == 0 or len(ladder) - 1 <= rung < len(ladder) + _READ:
-            problem, here = problem.weighed((yield from read(problem, sharpness, w)))
-            spent += int(here.steps)
-            if not np.all(np.isfinite(here.jacobian)):
-                # Coordinates are of the first few directions: one of them leads to where this was read.
-                whole = np.linalg.qr(np.column_stack([w, np.eye(size)]))[0]
-                here = replace(here, theta=columns(whole, 0).T @ w)
-                return Found(problem, whole, 0, here, spent, False)
-            noise = problem.noise(here, count)
-            vectors, count = _directions(np.asarray(here.jacobian) / noise, count)
-            count = min(count, most)
-            if rung == 0 and look and not last and count:
-                w = yield from _looked(problem, vectors[:, : min(count, AT_ONCE)], w)
-        some = columns(vectors, count)
-        fitted = np.arange(some.shape[1]) < count
-        start = np.where(fitted, np.clip(some.T @ w, -FAR, FAR), 0.0)
-        # These only lead near.
-        pull = np.asarray(noise)
-        minimum = yield from descent(problem, sharpness, pull, np.zeros(size), some, start, fitted, NEAR)
-        spent += int(minimum.steps)
-        w = some @ np.asarray(minimum.theta)
-        moved = abs(float(minimum.cost) - cost)
-        close = before == count and moved <= NEAR / len(problem.measured) * cost
-        settled, cost = close and sharpness is ladder[-1], float(minimum.cost)
-        if settled or not np.isfinite(cost):
-            break
-    return Found(problem, vectors, count, minimum, spent, settled)
-
-
-def _directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
-    """Directions as columns, best told first, and how many are fitted; of a Jacobian over the noise."""
-    size = jacobian.shape[1]
-    # Of its triangle, a tenth as long.
-    _, values, rows = np.linalg.svd(np.linalg.qr(jacobian, mode="r"), full_matrices=True)
-    told = np.zeros(size)
-    told[: values.size] = values
-    count = int(np.sum(told > 1.0 / _TOLD_TWICE))
-    if before > count:
-        count = int(np.sum(told[:before] > 1.0 / STAYS))
-    return signed(rows.T), count
-
-
-def _elsewhere(found: Found, points: np.ndarray, most: int) -> Steps[Found]:
-    """The rounds from the best of some points too: a machine that sticks at the guesses shows nothing."""
-    problem, nothing = found.problem, np.zeros(points.shape[1])
-    still = (nothing, np.eye(points.shape[1]), points, np.zeros(points.shape, bool))
-    _, costs, _, _ = yield Solve(fit_each, (*problem.args, problem.ladder[0], NO_PULL, *still))
-    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-    other = yield from _rounds(problem, points[best], most)
-    better = float(other.minimum.cost) < float(found.minimum.cost) * (1 - _SAME)
-    return replace(other if better else found, evaluations=found.evaluations + other.evaluations)
-
-
-def _many_starts(
-    found: Found, points: np.ndarray, most: int
-) -> Steps[tuple[Found, dict[str, Any]]]:
-    """The best of many starts, and how many end there."""
-    found = yield from _elsewhere(found, points, most)
-    spent = found.evaluations
-    for again in (True, False):
-        some, origin = found.first, np.zeros(points.shape[1])
-        fitted = np.arange(some.shape[1]) < found.count
-        # The fit itself is the last of them: it may only be near its own optimum.
-        z = np.clip(np.concatenate([points, [found.point]]) @ some, -FAR, FAR)
-        z = np.where(fitted, z, 0.0)
-        active = np.tile(fitted, (len(z), 1))
-        # Asked of the fit too, for nothing: of one count less the same code would be compiled once more.
-        flat = (yield from _flat(found, z, active))[:-1]
-        if np.any(flat):
-            z[:-1][flat] = (yield from _led(found, z))[:-1][flat]
-        noise = np.asarray(found.problem.noise(found.minimum, found.count))
-        for sharpness in found.problem.ladder:
-            args = (*found.problem.args, sharpness, noise, origin, some, z, active)
-            z, costs, _, _ = (np.asarray(x) for x in (yield Solve(fit_each, args)))
-        costs = np.where(np.isfinite(costs), costs, np.inf)
-        best, cost = int(np.argmin(costs)), float(found.minimum.cost)
-        if abs(costs[-1] - cost) <= NEAR / len(found.problem.measured) * cost:
-            cost = float(costs[-1])
-        if not again or costs[best] >= cost * (1 - _SAME):
-            break
-        # Other directions may be told from there.
-        other = yield from _rounds(found.problem, some @ z[best], most, last=True)
-        spent += other.evaluations
-        if float(other.minimum.cost) >= cost:
-            break
-        found = other
-    # A start that ended lower, where other directions are told and the fit was worse, is not alike.
-    same = np.abs(np.append(costs[:-1], cost) - cost) <= cost * _SAME
-    stated = {"count": len(same), "same_optimum": int(same.sum()), "flat": int(flat.sum())}
-    return replace(found, evaluations=spent), {"starts": stated}
-
-
-def _led(found: Found, z: Float[np.ndarray, "starts k"]) -> Steps[Float[np.ndarray, "starts k"]]:
-    """Each start led along the best told direction to where, at a coarse look, its cost is lowest.
-
-    What keeps a simulation from moving is the level of its friction, and that is what is told best.
-    """
-    args = (*found.problem.args, found.problem.ladder[0], NO_PULL, np.zeros(len(found.vectors)), found.first)
-    looked = np.tile(z, (len(_LOOK), 1, 1))
-    looked[:, :, 0] = _LOOK[:, None]
-    costs = []
-    for there in looked:
-        costs.append(np.asarray((yield Solve(fit_each, (*args, there, np.zeros(z.shape, bool))))[1]))
-    best = np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0)
-    return looked[best, np.arange(len(z))]
-
-
-def _flat(
-    found: Found, z: Float[np.ndarray, "starts k"], active: Bool[np.ndarray, "starts k"]
-) -> Steps[Bool[np.ndarray, " starts"]]:
-    """Which starts show no slope: a machine that sticks throughout says nothing of where to go."""
-    origin, own = np.zeros(len(found.vectors)), found.first.copy()
-    own[len(found.problem.places) :] = 0.0
-    args = (*found.problem.args, found.problem.ladder[0], NO_PULL, origin, own, z, active)
-    ended = np.asarray((yield Solve(fit_each, args))[0])
-    return np.all(ended == z, axis=1)
