@@ -41,6 +41,7 @@ from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
 from jaxid.io.log import Log
 from jaxid.machine import Machine
+from jaxid.precision import Precision
 from jaxid.replay import Numerics
 
 # Starts where the guesses tell nothing.
@@ -91,55 +92,58 @@ def directions_steps(
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     first = None if begin is None else problem.prior.inward(problem.padded(begin))
     found, told, many = yield from _searched(machine, problem, first, starts, given, drawn)
-    p = len(machine.parameters.free)
-    r = found.count
-    remarks: list[str] = []
     simulated = drawn and rounds(machine, problem)
-    if told is not None and simulated:
-        remarks.append(
-            "what rounding of the readings does on average was taken off; criterion and residual are "
-            "those of the fit before that"
-        )
-        if hessian or profile:
-            remarks.append("rounding was simulated: neither Hessian nor profiles say anything beside it")
-    elif told is not None:
-        noise = found.problem.noise(found.minimum, r)
-        if hessian:
-            told, said = yield from _by_hessian(found, told, noise)
-            remarks += said
-    if not drawn and rounds(machine, problem):
-        remarks.append("drawn = false: what rounding of the readings does is in no value, nor deviation")
+    unknowns = len(problem.places)
+    remarks = [f"{found.count} directions of {unknowns} unknowns fitted, the rest left to the guesses"]
+    if told is not None and not simulated and hessian:
+        told, said = yield from _by_hessian(found, told)
+        remarks += said
     precision, stated = assessed(machine, found, told)
-    if profile and told is not None and not simulated:
-        remarks += yield from add_profiles(found, noise, stated)
-    theta = np.asarray(found.problem.prior.outward(found.point))[:p]
-    e = np.asarray(found.minimum.residual).reshape(found.problem.measured.shape)
-    counts = found.problem.weight > 0
-    message = "the fit within the prior did not settle"
-    if not np.isfinite(float(found.minimum.cost)) or not np.all(np.isfinite(found.minimum.jacobian)):
+    if told is not None and not simulated and profile:
+        remarks += yield from add_profiles(found, found.problem.noise(found.minimum, found.count), stated)
+    if rounds(machine, problem):
+        remarks += _of_rounding(drawn, told is not None, hessian or profile)
+    notes = (*notes_of(machine, numerics, log, on), *remarks)
+    return _estimate(machine, found, precision, notes, {"directions": stated} | many)
+
+
+def _of_rounding(drawn: bool, told: bool, more: bool) -> list[str]:
+    """What to remark of a loop whose readings round; `more`: a Hessian or profiles were asked for."""
+    if not drawn:
+        return ["drawn = false: what rounding of the readings does is in no value, nor deviation"]
+    if not told:
+        return []
+    words = [
+        "what rounding of the readings does on average was taken off; criterion and residual are those of "
+        "the fit before that"
+    ]
+    if more:
+        words.append("rounding was simulated: neither Hessian nor profiles say anything beside it")
+    return words
+
+
+def _estimate(
+    machine: Machine, found: Found, precision: Precision, notes: tuple[str, ...], details: dict[str, Any]
+) -> Estimate:
+    """The fit as a result."""
+    problem, minimum = found.problem, found.minimum
+    theta = np.asarray(problem.prior.outward(found.point))[: len(problem.places)]
+    e, counts = np.asarray(minimum.residual).reshape(problem.measured.shape), problem.weight > 0
+    message = "converged" if found.settled else "the fit within the prior did not settle"
+    if not found.settled and not (np.isfinite(float(minimum.cost)) and np.all(np.isfinite(minimum.jacobian))):
         message = "the simulation is not finite where the fit ended"
-    remarks.insert(0, f"{r} directions of {p} unknowns fitted, the rest left to the guesses")
+    of_cost = {"criterion_percent": problem.criterion(minimum), "effective_parameters": found.effective}
     return Estimate(
-        method="output_error",
-        machine=machine.with_estimate(theta),
-        theta=theta,
-        precision=precision,
-        converged=found.settled,
-        message="converged" if found.settled else message,
-        residual=np.where(counts, e / np.where(counts, found.problem.weight, 1.0), np.nan),
-        samples=int(counts.sum()),
-        steps=found.evaluations,
-        notes=(*notes_of(machine, numerics, log, on), *remarks),
-        details={
-            "directions": stated, "criterion_percent": found.problem.criterion(found.minimum),
-            "effective_parameters": found.effective, **many,
-        },
+        method="output_error", machine=machine.with_estimate(theta), theta=theta, precision=precision,
+        converged=found.settled, message=message,
+        residual=np.where(counts, e / np.where(counts, problem.weight, 1.0), np.nan),
+        samples=int(counts.sum()), steps=found.evaluations, notes=notes, details=details | of_cost,
     )
 
 
-def _by_hessian(found: Found, told: Told, noise: float) -> Steps[tuple[Told, list[str]]]:
+def _by_hessian(found: Found, told: Told) -> Steps[tuple[Told, list[str]]]:
     """With the full Hessian's quadratic picture, where it has one; and what to remark."""
-    z = np.asarray(found.minimum.theta)
+    z, noise = np.asarray(found.minimum.theta), found.problem.noise(found.minimum, found.count)
     args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
     full = np.asarray((yield Solve(hessian_of, args))) / noise**2 + np.eye(z.size)
     if np.linalg.eigvalsh(full)[0] <= 0.0:
