@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import multiprocessing
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 import jaxid
 from jaxid.estimators.directions_problem import Prior, criterion_steps
 from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import together
+from jaxid.estimators.steps import alone, cores, together
 from jaxid.identification import identify_many
 from jaxid.io.log import Log
 from jaxid.session import open_session
@@ -98,21 +102,12 @@ def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, bel
     return path
 
 
-def _fitted(case: Path, log: Log) -> Estimate:
-    return jaxid.identify(case, log).estimate
-
-
 def studied(
     cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, data: int, on: str = "force",
-    *, many: bool = True,
 ) -> tuple[list[Estimate], np.ndarray, list[np.ndarray]]:
-    """Estimates, criterion over that of the truth, and directions in sigma from the truth.
-
-    `many`: side by side; else one after the other, which is faster where a simulation takes many steps.
-    """
+    """Estimates, criterion over that of the truth, and directions in sigma from the truth."""
     cases = [cases] * len(logs) if isinstance(cases, Path) else cases
-    fits = identify_many(cases, logs) if many else map(_fitted, cases, logs)
-    found = zip(fits, cases, logs, starts, strict=True)
+    found = zip(identify_many(cases, logs), cases, logs, starts, strict=True)
     kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
     machine = open_session(cases[0], logs[0]).machine
     truth = _truth(machine.parameters.names, data)
@@ -121,3 +116,40 @@ def studied(
     ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])
     off = [off_in_sigma(e, case, log, start, data) for e, case, log, start in kept]
     return [e for e, *_ in kept], ratio, off
+
+
+def apart(
+    file: Path, cases: Sequence[Path], logs: Sequence[Log], starts: np.ndarray, data: int
+) -> list[dict[str, Any]]:
+    """What came of each fit, one to a core at a time: of many steps each, they are slower side by side.
+
+    Each is a line of a file as soon as it ends, and those that the file has are not run again.
+    """
+    known = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    done = {row["run"] for row in known}
+    wanted = [k for k in range(len(cases)) if k not in done]
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(cores(), spawn) as pool, file.open("a") as out:
+        asked = [pool.submit(_fitted, k, cases[k], logs[k], starts[k], data) for k in wanted]
+        for ended in tqdm(as_completed(asked), "fits", len(cases), initial=len(done)):
+            known.append(ended.result())
+            out.write(json.dumps(known[-1]) + "\n")
+            out.flush()
+    return sorted((row for row in known if row["run"] < len(cases)), key=lambda row: row["run"])
+
+
+def _fitted(run: int, case: Path, log: Log, start: float, data: int) -> dict[str, Any]:
+    """What came of one fit."""
+    try:
+        estimate = jaxid.identify(case, log).estimate
+    except jaxid.InputError as error:
+        return {"run": run, "refused": str(error)}
+    opened = open_session(case, log)
+    truth = _truth(opened.machine.parameters.names, data)
+    at = alone(criterion_steps(opened.machine, opened.fit.log, truth, on="force"))
+    percent = estimate.details["criterion_percent"]
+    return {
+        "run": run, "converged": bool(estimate.converged), "percent": percent, "ratio": percent / at,
+        "effective": estimate.details["effective_parameters"],
+        "off": off_in_sigma(estimate, case, log, start, data).tolist(),
+    }
