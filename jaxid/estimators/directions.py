@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.estimators.directions_posterior import most_probable, quadratic, spread
+from jaxid.estimators.directions_posterior import most_probable, past_kinks, quadratic, spread
 from jaxid.estimators.directions_precision import (
     Told,
     add_profiles,
@@ -215,7 +215,7 @@ def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[F
     """On to where guesses and log agree, and how well directions are told there by both."""
     if not np.all(np.isfinite(found.minimum.jacobian)):
         return found, None
-    found = yield from _ended(found, found.point)
+    found = yield from _ended(found, found.point, drawn)
     if not found.count:
         return found, None
     if drawn and rounds(machine, found.problem):
@@ -224,7 +224,7 @@ def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[F
         whole, best = yield from spread(found, found.noise)
         if np.any(best != found.point):
             # It ended in a valley that is not the best.
-            found = yield from _ended(found, best)
+            found = yield from _ended(found, best, drawn)
             whole, _ = yield from spread(found, found.noise)
     else:
         whole = quadratic(found, found.noise)
@@ -239,10 +239,10 @@ def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[F
     return found, None
 
 
-def _ended(found: Found, w: Float[np.ndarray, " q"]) -> Steps[Found]:
+def _ended(found: Found, w: Float[np.ndarray, " q"], drawn: bool) -> Steps[Found]:
     """The fit taken from a point to the most probable one, its directions those that are told there."""
     noise = found.problem.noise(found.minimum, found.count)
-    w, here, settled = yield from most_probable(found.problem, noise, w)
+    w, here, settled = yield from (past_kinks if drawn else most_probable)(found.problem, noise, w)
     vectors, count = told_directions(np.asarray(here.jacobian) / noise, found.count)
     spent = found.evaluations + int(here.steps)
     return _along(Found(found.problem, np.eye(len(w)), count, here, spent, settled), vectors, count)

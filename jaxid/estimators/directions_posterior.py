@@ -21,6 +21,9 @@ _DAMPED, _BY, _STALLED = 1e-3, 8.0, 100.0
 # Steps of the way to the most probable point; it ends where one gains less than this [nats], and has settled
 # where the next promises less than that.
 _MOST_STEPS, _LEAST_GAIN, _NEAR = 25, 1e-3, 0.5
+# Where a kink ends the way, points are drawn about it within these parts of what is as probable, and the way
+# goes on from the best of them, so many times at most.
+_ABOUT, _KINKS = (1.0, 0.5, 0.25, 0.125), 6
 # Of the points drawn so many must simulate.
 _COUNTING = 30
 # Moves of each point whenever the log counts more, and when it counts in full; moves reach so far, over what
@@ -74,6 +77,31 @@ def most_probable(
     return w, replace(here, theta=w, steps=np.asarray(steps)), bool(promised < _NEAR)
 
 
+def past_kinks(
+    problem: Problem, noise: float, w: Float[np.ndarray, " q"]
+) -> Steps[tuple[Float[np.ndarray, " q"], Minimum, bool]]:
+    """As `most_probable`, on from where that does not settle by the best of points drawn about it.
+
+    Where friction begins to stick elsewhere the cost has kinks, and slopes lead over them nowhere. It has
+    settled too where none of the points is more probable.
+    """
+    rng, steps = np.random.default_rng(0), 0
+    for _ in range(_KINKS):
+        w, here, settled = yield from most_probable(problem, noise, w)
+        loss, steps = loss_of(noise, here, w), steps + int(here.steps)
+        if settled or not np.isfinite(loss):
+            break
+        axes, left = _picture(np.asarray(here.jacobian) / noise)
+        about = np.resize(_ABOUT, DRAWN)[:, None] * rng.standard_normal((DRAWN, w.size))
+        points = w + (about * np.sqrt(left / w.size)) @ axes
+        losses = (yield from _against(problem, points, noise)) + 0.5 * np.sum(points**2, axis=1)
+        settled = bool(loss - losses.min() < _NEAR)
+        if settled:
+            break
+        w = points[np.argmin(losses)]
+    return here.theta, replace(here, steps=np.asarray(steps)), settled
+
+
 def loss_of(noise: float, here: Minimum, w: Float[np.ndarray, " q"]) -> float:
     """Nats by which a point is less probable than a perfect fit at the guesses."""
     if not np.all(np.isfinite(here.jacobian)):
@@ -84,11 +112,18 @@ def loss_of(noise: float, here: Minimum, w: Float[np.ndarray, " q"]) -> float:
 
 def quadratic(found: Found, noise: float) -> Float[np.ndarray, "q q"]:
     """What `spread` draws, by the quadratic picture at the fit."""
-    jacobian = np.asarray(found.minimum.jacobian) @ found.vectors.T / noise
-    _, told, axes = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
-    left = np.ones(len(found.vectors))
-    left[: told.size] = 1.0 / (1.0 + told**2)
+    axes, left = _picture(np.asarray(found.minimum.jacobian) @ found.vectors.T / noise)
     return (axes.T * left) @ axes
+
+
+def _picture(
+    jacobian: Float[np.ndarray, "rows q"],
+) -> tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]:
+    """Axes, as rows, and variances along them, of guesses and log; of the log's slopes over its noise."""
+    _, told, axes = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
+    left = np.ones(len(axes))
+    left[: told.size] = 1.0 / (1.0 + told**2)
+    return axes, left
 
 
 def spread(found: Found, noise: float) -> Steps[tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]]:
