@@ -14,7 +14,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxid.errors import InputError
 from jaxid.estimators.least_squares import Minimum, Progress, Transform, descend
-from jaxid.estimators.output_error import choose_numerics, measured_output, output_residual
+from jaxid.estimators.output_error import (
+    choose_numerics,
+    measured_output,
+    output_residual,
+    turning_steps,
+)
 from jaxid.estimators.steps import Parts, Solve, Soon, Steps
 from jaxid.io.log import Log
 from jaxid.machine import Machine
@@ -143,8 +148,9 @@ class Problem:
         """
         n, encoders = log.position.shape[1], tuple(np.flatnonzero(log.measured).tolist())
         plant = calmed(machine.plant, jnp.asarray(log.filled[0]), log.period)
-        if plant is not machine.plant:
-            numerics = replace(numerics, substeps=steps_when_calmed(numerics.substeps))
+        if plant is not machine.plant and numerics.set_valued:
+            fewer = max(steps_when_calmed(numerics.substeps), turning_steps(machine, log))
+            numerics = replace(numerics, substeps=min(fewer, numerics.substeps))
         replay = from_rest(make_replay(machine, log, numerics))
         if on != "position":
             replay = with_sensor(replay, Sensor())

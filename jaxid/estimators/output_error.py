@@ -50,7 +50,7 @@ _NOISE_LIMITED = 3.0
 # one a start at rest is tried where the start shows.
 SHORT = 2000
 _CLEARLY = 10.0
-# See `_turning_steps`: what a step misses, how much of the noise that may be, and most steps for it.
+# See `turning_steps`: what a step misses, how much of the noise that may be, and most steps for it.
 _TURNING = 0.04
 _LITTLE = 0.1
 _MOST = 4
@@ -306,7 +306,7 @@ def choose_numerics(
     kinds = {e.kind for e in machine.plant.effects}
     exact = exact_numerics(machine, log, 1 if solver else None)
     numerics = replace(
-        exact, substeps=1 if solver else max(exact.substeps, _turning_steps(machine, log)),
+        exact, substeps=1 if solver else max(exact.substeps, turning_steps(machine, log)),
         set_valued="static_friction" not in kinds and solver is None, solver=solver,
     )
     if not numerics.set_valued and solver is None:
@@ -322,7 +322,7 @@ def choose_numerics(
     return replace(numerics, segment=length)
 
 
-def _turning_steps(machine: Machine, log: Log) -> int:
+def turning_steps(machine: Machine, log: Log) -> int:
     """Steps a sample by which what a step misses where dry friction turns stays below the noise.
 
     A joint that comes to rest within a step h is off by about 0.04 F / m h^2 afterwards, F its dry
