@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxid.estimators import directions, directions_posterior, directions_rounding, directions_rounds
-from jaxid.estimators.directions_posterior import most_probable, spread
+from jaxid.estimators.directions_posterior import loss_of, most_probable, past_kinks, spread
 from jaxid.estimators.directions_precision import Told, add_profiles
 from jaxid.estimators.directions_problem import Found
 from jaxid.estimators.least_squares import Minimum
@@ -71,6 +71,24 @@ def test_a_cost_with_a_kink_ends_all_the_same():
     jacobian = lambda w: np.diag([4.0 * np.sign(w[0] - 0.4), 3.0])
     w, _, _ = alone(most_probable(problem_of(residual, jacobian, 2, 2), NOISE, np.array([0.9, -1.0])))
     np.testing.assert_allclose(w, [0.4, 0.2], atol=0.1)
+
+
+def test_a_fit_goes_on_along_a_valley_with_a_kink_at_its_floor():
+    """Where slopes end at the kink, points drawn about it show the way along the floor, a parabola."""
+    kink = lambda w0, w1: 4.0 * np.abs(w1 - w0**2) + 1.0
+    residual = lambda w: np.array([kink(*w), 1.5 * (w[0] - 2.0)])
+    jacobian = lambda w: np.array([4.0 * np.sign(w[1] - w[0] ** 2) * np.array([-2 * w[0], 1.0]), [1.5, 0.0]])
+    problem, start = problem_of(residual, jacobian, 2, 2), np.array([-1.0, 1.0])
+    floor = np.linspace(-3.0, 3.0, 10_001)
+    guessed = 0.5 * (floor**2 + floor**4)
+    least = np.min(guessed + 0.5 * (1.0 + (1.5 * (floor - 2.0)) ** 2) / NOISE**2)
+    w, here, settled = alone(most_probable(problem, NOISE, start))
+    assert not settled
+    assert loss_of(NOISE, here, w) > least + 3.0
+    on, there, settled = alone(past_kinks(problem, NOISE, start))
+    assert settled
+    assert loss_of(NOISE, there, on) < least + 0.5
+    assert int(there.steps) > int(here.steps)
 
 
 def found_at(problem, w, told):
