@@ -32,6 +32,9 @@ _REACH, _MOST = 2.5, 1.5
 _NARROWER, _WIDER = 0.3, 2.0
 # Of the first pass, over what logs drawn at the fit itself scatter by.
 _FIRST = 4.0
+# The log counts along directions whose slope over its noise is more than this, not only along those fitted:
+# what is told a little leans on what is told well, and each is seen with the others.
+_SEEN = 0.35
 # Passes, and those after which points are averaged: the line through logs drawn anew is another each time.
 _PASSES, _SETTLING = 10, 4
 # Logs so far beyond the rest, in deviations of their distance, are of a loop that ran away.
@@ -105,7 +108,7 @@ class _Summary:
         vectors: All directions, (q, q).
         point: Where the fit ended, along them, (q,).
         residual: What it left of the measured log, (rows,).
-        jacobian: Of that along the r fitted directions, (rows, r).
+        jacobian: Of that along the r directions of which the log says anything, (rows, r).
         step: From a residual to the numbers, (r, rows).
     """
 
@@ -120,13 +123,14 @@ class _Summary:
     @classmethod
     def of(cls, machine: Machine, found: Found) -> _Summary:
         """Of a fit; its minimum is in the coordinates of all directions."""
-        r, noise = found.count, found.problem.noise(found.minimum, found.count)
-        jacobian = np.asarray(found.minimum.jacobian)[:, :r]
-        over = jacobian / noise
+        noise = found.problem.noise(found.minimum, found.count)
+        over = np.asarray(found.minimum.jacobian) / noise
+        r = max(found.count, int(np.sum(np.linalg.norm(over, axis=0) > _SEEN)))
+        over = over[:, :r]
         step = np.linalg.solve(over.T @ over + np.eye(r), over.T) / noise
         return cls(
             _rounding(machine, found.problem), _counts(machine, found.problem), found.vectors,
-            np.asarray(found.minimum.theta), np.asarray(found.minimum.residual).ravel(), jacobian, step,
+            np.asarray(found.minimum.theta), np.asarray(found.minimum.residual).ravel(), noise * over, step,
         )
 
     @property
@@ -139,7 +143,7 @@ class _Summary:
     ) -> Steps[tuple[Float[np.ndarray, "draws r"], Float[np.ndarray, "draws r"]]]:
         """Logs drawn about a point: how far from it, and their numbers less the measured log's.
 
-        What is not fitted is anywhere within its prior, the start anywhere within its first count.
+        Of what the log says nothing is anywhere within its prior, the start anywhere within its first count.
         """
         r, q, places = self.count, self.point.size, len(self.problem.places)
         starts = rng.uniform(-0.5, 0.5, (DRAWN, self.resolution.size)) * self.resolution
@@ -177,7 +181,7 @@ def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told 
         of the drawn logs are taken as a line in where they were drawn, and its scatter as their covariance.
     """
     summary, rng = _Summary.of(machine, found), np.random.default_rng(0)
-    r = found.count
+    r = summary.count
     centre, reach, passed = summary.point[:r].copy(), np.zeros(r), []
     for k in range(-1, _PASSES):
         off, numbers = yield from summary.drawn(centre, reach, rng)
@@ -195,7 +199,7 @@ def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told 
     points = np.array([point for point, _ in passed])
     # Beside that of the truth about the point, that of the point, which is a mean.
     covariance = np.mean([c for _, c in passed], axis=0) + np.cov(points.T).reshape(r, r) / len(points)
-    return _told_along_axes(found, np.mean(points, axis=0), covariance)
+    return _told_along_axes(replace(found, count=r), np.mean(points, axis=0), covariance)
 
 
 def _where_alike(
