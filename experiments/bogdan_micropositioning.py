@@ -151,8 +151,7 @@ def _scatter(folder: Path, runs: int, words: str, drawn: bool, **guesses: bool) 
             f"{1 - effective / 100:.3f}", f"{np.mean(ratio <= 1):.1%}", less_probable, inside(1.96),
             inside(3.0),
         )
-        so_far = f"{inside(1.96)} within 1.96 sigma ({time.perf_counter() - start:.0f} s)"
-        print(f"  {name}, {screw}: {so_far}", flush=True)
+        print(f"  {', '.join(table.rows[-1])} ({time.perf_counter() - start:.0f} s)", flush=True)
     table.show(time.perf_counter() - start)
 
 
