@@ -24,9 +24,10 @@ _MOST_STEPS = 2000
 # Damping ratio of a spring that rings faster than a log samples, and steps in parts of those that its ring
 # asks for. Friction that falls with speed makes such a ring chatter: slopes along 2000 samples of a stage
 # grow to 1e14 times what a fit leaves, with a ratio of 0.05 too; with this one they stay below 100 times.
-# Nothing then hangs on the ring's phase, and a radian a step will do: with 31 steps a sample that stage's
-# current is as near to that of 248 as with 62; with 16 it grows without bounds on a spring much stiffer.
-_CALM, _COARSER = 0.3, 0.2
+# Nothing then hangs on the ring's phase. Half a radian a step does where a load's position is compared. For
+# the motor's current alone a radian does: with 31 steps a sample that stage's is as near to that of 248 as
+# with 62; with 16 it grows without bounds on a spring much stiffer.
+_CALM, _COARSER, _COARSEST = 0.3, 0.4, 0.2
 
 
 class TooStiffError(InputError):
@@ -137,6 +138,6 @@ def calmed(plant: Plant, q: Float[Array, " n"], period: float) -> Plant:
     return plant
 
 
-def steps_when_calmed(steps: int) -> int:
-    """Of the steps that a ring would ask for, those that do once it was calmed."""
-    return max(1, int(np.ceil(_COARSER * steps)))
+def steps_when_calmed(steps: int, on: str) -> int:
+    """Of the steps that a ring would ask for, those that do once it was calmed; `on`: what is compared."""
+    return max(1, int(np.ceil((_COARSEST if on == "force" else _COARSER) * steps)))

@@ -55,5 +55,7 @@ def test_a_fit_within_a_prior_is_of_the_calmed_plant_in_fewer_steps(tmp_path):
     problem = Problem.of(session.machine, session.fit.log, 0.5, "both", numerics)
     assert problem.places == session.machine.parameters.places
     assert len(problem.plant.effects) == len(session.machine.plant.effects) + 1
-    assert problem.replay.drive.substeps == np.ceil(0.2 * numerics.substeps)
+    assert problem.replay.drive.substeps == np.ceil(0.4 * numerics.substeps)
+    of_current = Problem.of(session.machine, session.fit.log, 0.5, "force", numerics)
+    assert of_current.replay.drive.substeps == np.ceil(0.2 * numerics.substeps)
     assert make_replay(session.machine, session.fit.log, numerics).drive.substeps == numerics.substeps

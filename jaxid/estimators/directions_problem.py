@@ -149,7 +149,7 @@ class Problem:
         n, encoders = log.position.shape[1], tuple(np.flatnonzero(log.measured).tolist())
         plant = calmed(machine.plant, jnp.asarray(log.filled[0]), log.period)
         if plant is not machine.plant and numerics.set_valued:
-            fewer = max(steps_when_calmed(numerics.substeps), turning_steps(machine, log))
+            fewer = max(steps_when_calmed(numerics.substeps, on), turning_steps(machine, log))
             numerics = replace(numerics, substeps=min(fewer, numerics.substeps))
         replay = from_rest(make_replay(machine, log, numerics))
         if on != "position":
