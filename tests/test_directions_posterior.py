@@ -182,19 +182,22 @@ def test_a_fit_begins_in_the_deeper_valley():
     np.testing.assert_allclose(w[0], 1.1)
 
 
-def through(monkeypatch, residual, *, unknowns=2, told=1, best=None):
+def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None):
     """A fit whose loop with rounding leaves another residual: where it ends, and how it is told."""
     problem = problem_of(None, None, unknowns, 8)
     problem.noise = lambda minimum, count: 1e-3
     jacobian = np.zeros((8, unknowns))
     jacobian[np.arange(told), np.arange(told)] = 1.0
+    if little is not None:
+        jacobian[told, told] = little
     e = 1e-3 * np.random.default_rng(0).standard_normal(8)
     best = np.zeros(unknowns) if best is None else best
     minimum = Minimum(best, np.asarray(0.0), np.asarray(1), np.asarray(True), e, jacobian)
 
     def at_each(problem, w, starts):
         rounded = np.zeros((len(w), 8))
-        rounded[:, :told] = residual(w, starts)
+        some = residual(w, starts)
+        rounded[:, : some.shape[1]] = some
         return rounded
         yield
 
@@ -214,6 +217,19 @@ def test_rounding_is_drawn_over_what_is_held_too(monkeypatch):
     # Beside the guess: a variance of 1 / 4 and one of 1.
     assert told.std[0] == pytest.approx(np.sqrt(1 / 5), rel=0.1)
     np.testing.assert_allclose(np.diag(told.whole), [told.std[0] ** 2, 1.0])
+
+
+def test_what_is_told_a_little_is_seen_with_what_is_told_well(monkeypatch):
+    """As above, and a second reading is of w1 alone, with noise about as large as its guess's deviation."""
+    residual = lambda w, starts: np.column_stack([w[:, 0] + 0.5 * w[:, 1], 1e-3 * w[:, 1]])
+    found, told = through(monkeypatch, residual, little=1e-3)
+    assert found.count == 1
+    np.testing.assert_allclose(found.vectors[:, 0], np.array([2.0, 1.0]) / np.sqrt(5), atol=0.01)
+    assert told.std[0] < 0.01
+    # Of w1 its guess, its reading, with noise as in the residual of the fit, and the guess of w0 = -w1 / 2.
+    noise = np.mean(np.random.default_rng(0).standard_normal(8) ** 2)
+    covariance = np.array([[0.25, -0.5], [-0.5, 1.0]]) / (1.0 + 1.0 / noise + 0.25)
+    np.testing.assert_allclose(told.whole, covariance, rtol=0.1)
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.02])
