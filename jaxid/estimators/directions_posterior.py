@@ -95,8 +95,8 @@ def past_kinks(
         about = np.resize(_ABOUT, DRAWN)[:, None] * rng.standard_normal((DRAWN, w.size))
         points = w + (about * np.sqrt(left / w.size)) @ axes
         losses = (yield from _against(problem, points, noise)) + 0.5 * np.sum(points**2, axis=1)
-        settled = bool(loss - losses.min() < _NEAR)
-        if settled:
+        settled = bool(np.isfinite(losses.min()) and loss - losses.min() < _NEAR)
+        if settled or not np.isfinite(losses.min()):
             break
         w = points[np.argmin(losses)]
     return here.theta, replace(here, steps=np.asarray(steps)), settled
