@@ -125,7 +125,10 @@ def apart(
 
     Each is a line of a file as soon as it ends, and those that the file has are not run again.
     """
-    known = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    # A run that was killed may have left half a line.
+    whole = file.read_text().split("\n")[:-1] if file.exists() else []
+    file.write_text("".join(f"{line}\n" for line in whole))
+    known = [json.loads(line) for line in whole]
     done = {row["run"] for row in known}
     wanted = [k for k in range(len(cases)) if k not in done]
     spawn = multiprocessing.get_context("spawn")
