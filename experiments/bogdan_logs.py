@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -41,18 +41,20 @@ def noise_of(data: int, resolution: float) -> float:
 
 def logs_of(
     data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT, noise: float | None = None,
-    reference: np.ndarray | None = None,
+    reference: np.ndarray | None = None, truths: Sequence[Mapping[str, float]] = (),
 ) -> tuple[list[Log], np.ndarray]:
     """Logs that differ in noise, and in where within its first count the motor stood: that too [rad].
 
-    Of the published move, or of another reference, where that begins.
+    Of the published move, or of another reference, where that begins; of the published stage, or each of its
+    own `truths`.
     """
     reference = stages.move(0.5, **stages.MOVES[data]) if reference is None else reference
     noise = noise_of(data, resolution) if noise is None else noise
-    stage, rng = stages.machine(data, rigid=rigid), np.random.default_rng(1)
+    rng = np.random.default_rng(1)
     out, starts = [], rng.uniform(-0.5, 0.5, runs) * resolution
     first = np.round(reference[0] / resolution) * resolution if resolution else reference[0]
     for k in range(runs):
+        stage = stages.machine(data, rigid=rigid, **(truths[k] if truths else {}))
         made = stages.record(
             stage, reference, noise=noise, resolution=resolution, seed=k, step=5e-6 if rigid else 2e-6,
             start=first + starts[k],
@@ -64,15 +66,17 @@ def logs_of(
     return out, starts
 
 
-def _truth(names: Sequence[str], data: int) -> np.ndarray:
-    """Table 1 in the order of some unknowns."""
-    return np.array([stages.TRUTH[data][n] for n in names])
+def _ordered(true: Mapping[str, float], names: Sequence[str]) -> np.ndarray:
+    """What is true in the order of some unknowns."""
+    return np.array([true[n] for n in names])
 
 
-def off_in_sigma(estimate: Estimate, case: Path, log: Log, start: float, data: int) -> np.ndarray:
+def off_in_sigma(
+    estimate: Estimate, case: Path, log: Log, start: float, true: Mapping[str, float]
+) -> np.ndarray:
     """By how many of its standard deviations each direction is off the truth, the motor's start included."""
     machine = open_session(case, log).machine
-    w = Prior.of(machine, PRIOR, np.zeros(0)).inward(_truth(estimate.names, data))
+    w = Prior.of(machine, PRIOR, np.zeros(0)).inward(_ordered(true, estimate.names))
     truth = dict(zip(estimate.names, w, strict=True))
     if start:
         truth["start position 1"] = start / float(np.max(machine.sensor.position_std))
@@ -81,13 +85,15 @@ def off_in_sigma(estimate: Estimate, case: Path, log: Log, start: float, data: i
     return np.array([(d["value"] - t) / d["std"] for d, t in zip(directions, at, strict=True)])
 
 
-def nats_above(estimate: Estimate, case: Path, log: Log, ratio: float, data: int) -> float:
+def nats_above(
+    estimate: Estimate, case: Path, log: Log, ratio: float, true: Mapping[str, float]
+) -> float:
     """By how much the truth is less probable than what was found, the guesses counted in; exact encoders.
 
     `ratio`: the criterion over that of the truth.
     """
     prior = Prior.of(open_session(case, log).machine, PRIOR, np.zeros(0))
-    far, near = (prior.inward(theta) for theta in (_truth(estimate.names, data), estimate.theta))
+    far, near = (prior.inward(theta) for theta in (_ordered(true, estimate.names), estimate.theta))
     freedom = log.samples - len(estimate.details["directions"])
     return 0.5 * (freedom * (1 / ratio - 1) + far @ far - near @ near)
 
@@ -103,23 +109,25 @@ def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, bel
 
 
 def studied(
-    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, data: int, on: str = "force",
+    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, true: Mapping[str, float],
+    on: str = "force",
 ) -> tuple[list[Estimate], np.ndarray, list[np.ndarray]]:
     """Estimates, criterion over that of the truth, and directions in sigma from the truth."""
     cases = [cases] * len(logs) if isinstance(cases, Path) else cases
     found = zip(identify_many(cases, logs), cases, logs, starts, strict=True)
     kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
     machine = open_session(cases[0], logs[0]).machine
-    truth = _truth(machine.parameters.names, data)
+    truth = _ordered(true, machine.parameters.names)
     opened = [open_session(case, log).fit.log for _, case, log, _ in kept]
     at = together([criterion_steps(machine, log, truth, on=on) for log in opened], 16)
     ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])
-    off = [off_in_sigma(e, case, log, start, data) for e, case, log, start in kept]
+    off = [off_in_sigma(e, case, log, start, true) for e, case, log, start in kept]
     return [e for e, *_ in kept], ratio, off
 
 
 def apart(
-    file: Path, cases: Sequence[Path], logs: Sequence[Log], starts: np.ndarray, data: int
+    file: Path, cases: Sequence[Path], logs: Sequence[Log], starts: np.ndarray,
+    truths: Sequence[Mapping[str, float]],
 ) -> list[dict[str, Any]]:
     """What came of each fit, one to a core at a time: of many steps each, they are slower side by side.
 
@@ -133,7 +141,7 @@ def apart(
     wanted = [k for k in range(len(cases)) if k not in done]
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(cores(), spawn) as pool, file.open("a") as out:
-        asked = [pool.submit(_fitted, k, cases[k], logs[k], starts[k], data) for k in wanted]
+        asked = [pool.submit(_fitted, k, cases[k], logs[k], starts[k], truths[k]) for k in wanted]
         for ended in tqdm(as_completed(asked), "fits", len(cases), initial=len(done)):
             known.append(ended.result())
             out.write(json.dumps(known[-1]) + "\n")
@@ -141,18 +149,18 @@ def apart(
     return sorted((row for row in known if row["run"] < len(cases)), key=lambda row: row["run"])
 
 
-def _fitted(run: int, case: Path, log: Log, start: float, data: int) -> dict[str, Any]:
+def _fitted(run: int, case: Path, log: Log, start: float, true: Mapping[str, float]) -> dict[str, Any]:
     """What came of one fit."""
     try:
         estimate = jaxid.identify(case, log).estimate
     except jaxid.InputError as error:
         return {"run": run, "refused": str(error)}
     opened = open_session(case, log)
-    truth = _truth(opened.machine.parameters.names, data)
+    truth = _ordered(true, opened.machine.parameters.names)
     at = alone(criterion_steps(opened.machine, opened.fit.log, truth, on="force"))
     percent = estimate.details["criterion_percent"]
     return {
         "run": run, "converged": bool(estimate.converged), "percent": percent, "ratio": percent / at,
         "effective": estimate.details["effective_parameters"],
-        "off": off_in_sigma(estimate, case, log, start, data).tolist(),
+        "off": off_in_sigma(estimate, case, log, start, true).tolist(),
     }

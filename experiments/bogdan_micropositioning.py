@@ -65,7 +65,7 @@ def published(folder: Path, runs: int) -> None:
             table.row(name, f"{true:.3g}", f"{guesses[name]:.3g}", f"{value:.3g}", told,
                       PUBLISHED[name][data - 1])
         table.show(time.perf_counter() - start)
-        sigmas = off_in_sigma(estimate, case, log, begin, data)
+        sigmas = off_in_sigma(estimate, case, log, begin, stages.TRUTH[data])
         for d, off in zip(estimate.details["directions"], sigmas, strict=True):
             parts = " ".join(f"{v:+.2f} {n}" for n, v in d["combination"].items() if abs(v) > 0.15)
             print(f"  {0.5 * d['value']:+.3f} +- {0.5 * d['std']:.3f} ({off:+.1f} sigma): {parts}")
@@ -82,7 +82,7 @@ def begun(folder: Path, runs: int) -> None:
     for name in ("guess", "inverse_dynamics", "recursive"):
         case = case_of(folder, f"from_{name}", 1, guess=1, more=f'{ON_FORCE}start = "{name}"\n')
         estimate = jaxid.identify(case, log).estimate
-        off = off_in_sigma(estimate, case, log, begin, 1)
+        off = off_in_sigma(estimate, case, log, begin, stages.TRUTH[1])
         table.row(name, f"{estimate.details['criterion_percent']:.2f}", estimate.steps,
                   ", ".join(f"{o:+.1f}" for o in off))
     table.show(time.perf_counter() - start)
@@ -137,11 +137,11 @@ def _scatter(folder: Path, runs: int, words: str, drawn: bool, **guesses: bool) 
             for seed in seeds
         ]
         logs, starts = logs_of(1, runs, rigid=rigid, resolution=resolution)
-        found, ratio, off = studied(cases, logs, starts, 1)
+        found, ratio, off = studied(cases, logs, starts, stages.TRUTH[1])
         inside = lambda bound, off=off: f"{100 * np.mean(np.abs(np.concatenate(off)) < bound):.1f} %"
         screw, less_probable = "rigid" if rigid else "elastic", ""
         if not resolution:
-            above = map(nats_above, found, cases, logs, ratio, [1] * len(found))
+            above = map(nats_above, found, cases, logs, ratio, [stages.TRUTH[1]] * len(found))
             less_probable = f"{np.mean(np.array([*above]) >= 0):.1%}"
         effective = np.mean([e.details["effective_parameters"] for e in found])
         table.row(
@@ -171,18 +171,36 @@ def nearest(folder: Path, runs: int) -> None:
 
 
 def elastic(folder: Path, runs: int) -> None:
-    """As `scatter`, of the elastic screw, in the model too; the table has no encoder.
+    """As `scatter`, of the elastic screw, in the model too; the table has no encoder."""
+    _elastic(folder, runs, "elastic", [stages.TRUTH[1]] * runs, believed=True)
 
-    Every run is a line of elastic.jsonl as it ends, and is not run again. Nothing tells which code wrote a
-    line: after a change of it the file is to be removed.
+
+def calibrated(folder: Path, runs: int) -> None:
+    """As `elastic`, but the guesses are the table, and each log is of a stage off them as the prior says.
+
+    Intervals of a fit within a prior promise what they hold of all stages that the prior takes for likely. Of
+    one stage, of which all that its logs do not tell is the same in each, they may hold more or less.
+    """
+    _elastic(folder, runs, "calibrated", [stages.believed(k) for k in range(1000, 1000 + runs)])
+
+
+def _elastic(
+    folder: Path, runs: int, name: str, truths: list[dict[str, float]], *, believed: bool = False
+) -> None:
+    """Fits of the elastic stage; guesses are the table, or, `believed`, off it as the prior says.
+
+    Every run is a line of a file as it ends, and is not run again. Nothing tells which code wrote a line:
+    after a change of it the file is to be removed.
     """
     start = time.perf_counter()
-    logs, begins = logs_of(1, runs, rigid=False)
+    logs, begins = logs_of(1, runs, rigid=False, truths=truths)
     cases = [
-        case_of(folder, f"elastic{k}", 1, guess=k, believed=True, coupling="elastic", load=False)
+        case_of(folder, f"{name}{k}", 1, guess=k if believed else None, believed=believed, coupling="elastic",
+                load=False)
         for k in range(1000, 1000 + runs)
     ]
-    found = [r for r in apart(folder / "elastic.jsonl", cases, logs, begins, 1) if "refused" not in r]
+    ended = apart(folder / f"{name}.jsonl", cases, logs, begins, truths)
+    found = [r for r in ended if "refused" not in r]
     table = Table(
         f"{runs} runs of data 1, 500 counts, the elastic screw in the model, {runs - len(found)} refused",
         ["converged", "told", "criterion %", "over truth's", "1 - effective/n", "never above",
@@ -212,7 +230,7 @@ def position(folder: Path, runs: int) -> None:
             stated = ON_FORCE.replace('"force"', f'"{on}"')
             case = case_of(folder, "position", 1, resolution=resolution, more=stated)
             logs, starts = logs_of(1, runs // 2, resolution=resolution)
-            found, ratio, off = studied(case, logs, starts, 1, on)
+            found, ratio, off = studied(case, logs, starts, stages.TRUTH[1], on)
             # Of a log that tells one only there is no second.
             two = lambda values: np.resize([*values[:2], np.nan, np.nan], 2)
             std = np.array([two([d["std"] for d in e.details["directions"]]) for e in found])
@@ -268,7 +286,8 @@ def designed(folder: Path, runs: int) -> None:
         screw = "rigid" if rigid else "elastic"
         logs, begins = logs_of(1, DESIGNED, rigid=rigid, reference=reference)
         found = identify_many(case, logs)
-        off = [off_in_sigma(e, case, log, b, 1) for e, log, b in zip(found, logs, begins, strict=True)]
+        each = zip(found, logs, begins, strict=True)
+        off = [off_in_sigma(e, case, log, b, stages.TRUTH[1]) for e, log, b in each]
         each = np.concatenate(off)
         inside = f"{np.mean(np.abs(each) < 3):.0%} within 3 sigma, at most {np.abs(each).max():.1f}"
         print(f"  {screw}: {', '.join(str(len(o)) for o in off)} combinations, {inside}", flush=True)
@@ -306,7 +325,7 @@ def load(folder: Path, runs: int) -> None:
     case.write_text(case.read_text().replace(counts, f"position_resolution = [{stages.COUNT!r}, {SCALE!r}]"))
     found = jaxid.identify(case, log)
     found.save(folder / "load", force=True)
-    off = ", ".join(f"{o:+.1f}" for o in off_in_sigma(found.estimate, case, log, begin, 1))
+    off = ", ".join(f"{o:+.1f}" for o in off_in_sigma(found.estimate, case, log, begin, stages.TRUTH[1]))
     table = 1e6 * found.gaps[0].simulation.rms[1]
     e, seconds = found.estimate, time.perf_counter() - start
     print(f"\nload: {e.message} in {e.steps} evaluations ({seconds:.0f} s)")
@@ -381,8 +400,8 @@ def short(folder: Path, runs: int) -> None:
 STUDIES: dict[str, Callable[[Path, int], None]] = {
     f.__name__: f
     for f in (
-        published, begun, unrecorded, scatter, within, nearest, elastic, position, designed, load, needles,
-        frictions, hidden, short,
+        published, begun, unrecorded, scatter, within, nearest, elastic, calibrated, position, designed, load,
+        needles, frictions, hidden, short,
     )
 }
 
