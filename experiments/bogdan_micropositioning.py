@@ -355,6 +355,18 @@ def hidden(folder: Path, runs: int) -> None:
     print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")
 
 
+def one_way(folder: Path, runs: int) -> None:
+    """As `hidden`, of a log that never turns: by its forces, and in the simulated loop."""
+    case, log = stages.long_case(folder, stages.one_way())
+    stated = case.read_text()
+    for name, more in (("one_way", ""), ("one_way_in_the_loop", ON_FORCE)):
+        start = time.perf_counter()
+        case.write_text(stated + more)
+        found = jaxid.discover(case, log)
+        found.save(folder / name, force=True)
+        print(f"\n{name}: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}", flush=True)
+
+
 def named(case: Path, log: Log) -> str:
     """What `discover` names, or its verdict."""
     found = jaxid.discover(case, log)
@@ -401,7 +413,7 @@ STUDIES: dict[str, Callable[[Path, int], None]] = {
     f.__name__: f
     for f in (
         published, begun, unrecorded, scatter, within, nearest, elastic, calibrated, position, designed, load,
-        needles, frictions, hidden, short,
+        needles, frictions, hidden, one_way, short,
     )
 }
 

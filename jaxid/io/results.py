@@ -257,12 +257,20 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
     lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.why]
     if "static_friction" not in present and result.unseen:
         lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
+    session = result.session
+    loop = session.machine.controller is not None and session.fit.log.reference is not None
+    if result.verdict == "unexplained" and loop and "prior" not in session.case.output_error:
+        # Force rows hold no sample at rest, and what depends on whether speed grows is blurred in them.
+        lines.append(
+            "what acts at rest, or where speed stands still, may show in the simulated loop: state "
+            "`[output_error] prior`, how far off the guesses may be, and effects are looked for there"
+        )
     last = [s for s in steps if s.added is None and s.dropped is None][-1]
     left = [s for s in last.scores if s.reason and s.evidence > last.threshold]
     for score in left[:most]:
         name, nats = score.candidate.label, score.evidence
         lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
-    if result.session.machine.plant.coupled and not result.proposals:
+    if session.machine.plant.coupled and not result.proposals:
         tied = [e.label for e in result.effects if e.alternatives]
         told = f"no experiment was designed that tells {', '.join(tied)} from rivals"
         lines += [f"{told}: --experiments does, in minutes"] if tied else []
