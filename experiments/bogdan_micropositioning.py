@@ -208,10 +208,12 @@ def _elastic(
     )
     off = np.abs(np.concatenate([r["off"] for r in found]))
     mean = lambda key: np.mean([r[key] for r in found])
+    # A stage far off the guesses may not simulate with the steps that those ask for: then there is none.
+    ratio = np.array([r["ratio"] for r in found if np.isfinite(r["ratio"])])
     table.row(
         f"{mean('converged'):.0%}", f"{off.size / len(found):.2f}", f"{mean('percent'):.2f}",
-        f"{mean('ratio'):.3f}", f"{1 - mean('effective') / 100:.3f}",
-        f"{np.mean([r['ratio'] <= 1 for r in found]):.1%}", f"{np.mean(off < 1.96):.1%}",
+        f"{ratio.mean():.3f}", f"{1 - mean('effective') / 100:.3f}",
+        f"{np.mean(ratio <= 1):.1%}", f"{np.mean(off < 1.96):.1%}",
         f"{np.mean(off < 3):.1%}",
     )
     table.show(time.perf_counter() - start)
