@@ -1,4 +1,4 @@
-"""Logs, cases and judged fits of the micropositioning stage, for `bogdan_micropositioning.py`."""
+"""Logs, cases and judged fits of the micropositioning stage, for its studies."""
 
 from __future__ import annotations
 
@@ -85,19 +85,6 @@ def off_in_sigma(
     return np.array([(d["value"] - t) / d["std"] for d, t in zip(directions, at, strict=True)])
 
 
-def nats_above(
-    estimate: Estimate, case: Path, log: Log, ratio: float, true: Mapping[str, float]
-) -> float:
-    """By how much the truth is less probable than what was found, the guesses counted in; exact encoders.
-
-    `ratio`: the criterion over that of the truth.
-    """
-    prior = Prior.of(open_session(case, log).machine, PRIOR, np.zeros(0))
-    far, near = (prior.inward(theta) for theta in (_ordered(true, estimate.names), estimate.theta))
-    freedom = log.samples - len(estimate.details["directions"])
-    return 0.5 * (freedom * (1 / ratio - 1) + far @ far - near @ near)
-
-
 def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, believed: bool = False,
             more: str = ON_FORCE, **stated: Any) -> Path:
     """A case file; guesses at the truth, drawn up to 50 % around it, or as the prior says that they are."""
@@ -111,8 +98,8 @@ def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, bel
 def studied(
     cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, true: Mapping[str, float],
     on: str = "force",
-) -> tuple[list[Estimate], np.ndarray, list[np.ndarray]]:
-    """Estimates, criterion over that of the truth, and directions in sigma from the truth."""
+) -> tuple[list[Estimate], list[dict[str, Any]]]:
+    """Estimates, and what `judged` says of each."""
     cases = [cases] * len(logs) if isinstance(cases, Path) else cases
     found = zip(identify_many(cases, logs), cases, logs, starts, strict=True)
     kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
@@ -120,9 +107,27 @@ def studied(
     truth = _ordered(true, machine.parameters.names)
     opened = [open_session(case, log).fit.log for _, case, log, _ in kept]
     at = together([criterion_steps(machine, log, truth, on=on) for log in opened], 16)
-    ratio = np.array([e.details["criterion_percent"] / c for (e, *_), c in zip(kept, at, strict=True)])
-    off = [off_in_sigma(e, case, log, start, true) for e, case, log, start in kept]
-    return [e for e, *_ in kept], ratio, off
+    return [e for e, *_ in kept], [judged(*of, true, c) for of, c in zip(kept, at, strict=True)]
+
+
+def judged(
+    estimate: Estimate, case: Path, log: Log, start: float, true: Mapping[str, float], percent: float
+) -> dict[str, Any]:
+    """What came of a fit: its criterion over that of the truth, its directions in sigma from the truth.
+
+    `percent`: the criterion of the truth. "nats": by how much the truth is less probable than what was found,
+    the guesses counted in; of exact encoders, for it leaves the motor's start out.
+    """
+    found = estimate.details["criterion_percent"]
+    prior = Prior.of(open_session(case, log).machine, PRIOR, np.zeros(0))
+    far, near = (prior.inward(theta) for theta in (_ordered(true, estimate.names), estimate.theta))
+    freedom = log.samples - len(estimate.details["directions"])
+    return {
+        "converged": bool(estimate.converged), "percent": found, "ratio": found / percent,
+        "effective": estimate.details["effective_parameters"],
+        "nats": float(0.5 * (freedom * (percent / found - 1) + far @ far - near @ near)),
+        "off": off_in_sigma(estimate, case, log, start, true).tolist(),
+    }
 
 
 def apart(
@@ -158,9 +163,4 @@ def _fitted(run: int, case: Path, log: Log, start: float, true: Mapping[str, flo
     opened = open_session(case, log)
     truth = _ordered(true, opened.machine.parameters.names)
     at = alone(criterion_steps(opened.machine, opened.fit.log, truth, on="force"))
-    percent = estimate.details["criterion_percent"]
-    return {
-        "run": run, "converged": bool(estimate.converged), "percent": percent, "ratio": percent / at,
-        "effective": estimate.details["effective_parameters"],
-        "off": off_in_sigma(estimate, case, log, start, true).tolist(),
-    }
+    return {"run": run, **judged(estimate, case, log, start, true, at)}

@@ -25,7 +25,8 @@ from jaxid.io.log import Log
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import bogdan_figures
 import stages
-from bogdan_logs import ON_FORCE, apart, case_of, logs_of, nats_above, noise_of, off_in_sigma, studied
+from bogdan_logs import ON_FORCE, case_of, logs_of, noise_of, off_in_sigma, studied
+from bogdan_scatter import calibrated, elastic, nearest, scatter, within
 
 # Of the published table: relative precision of data 1 and 2 [%].
 PUBLISHED = {
@@ -116,109 +117,6 @@ def unrecorded(folder: Path, runs: int) -> None:
     table.show(time.perf_counter() - start)
 
 
-def _scatter(folder: Path, runs: int, words: str, drawn: bool, **guesses: bool) -> None:
-    """Monte-Carlo runs: criterion against the truth's, coverage; by encoder and screw.
-
-    "never above": the criterion; "less probable": how often the truth is that, its guesses counted in, which
-    is what a fit within a prior minimises.
-    """
-    table = Table(
-        f"{runs} runs of data 1, guesses {words}: what is fitted against its sigma",
-        ["encoder", "screw", "converged", "told", "criterion %", "over truth's", "1 - effective/n",
-         "never above", "less probable", "in 1.96 sigma", "in 3 sigma"],
-    )
-    start = time.perf_counter()
-    for name, resolution, rigid in (
-        ("500 counts", stages.COUNT, True), ("500 counts", stages.COUNT, False), ("exact", 0.0, True),
-    ):
-        seeds = [1000 + k if drawn else None for k in range(runs)]
-        cases = [
-            case_of(folder, f"scatter{seed or ''}", 1, guess=seed, resolution=resolution, **guesses)
-            for seed in seeds
-        ]
-        logs, starts = logs_of(1, runs, rigid=rigid, resolution=resolution)
-        found, ratio, off = studied(cases, logs, starts, stages.TRUTH[1])
-        inside = lambda bound, off=off: f"{100 * np.mean(np.abs(np.concatenate(off)) < bound):.1f} %"
-        screw, less_probable = "rigid" if rigid else "elastic", ""
-        if not resolution:
-            above = map(nats_above, found, cases, logs, ratio, [stages.TRUTH[1]] * len(found))
-            less_probable = f"{np.mean(np.array([*above]) >= 0):.1%}"
-        effective = np.mean([e.details["effective_parameters"] for e in found])
-        table.row(
-            name, screw, f"{np.mean([e.converged for e in found]):.0%}",
-            f"{np.mean([len(o) for o in off]):.2f}",
-            f"{np.mean([e.details['criterion_percent'] for e in found]):.2f}", f"{ratio.mean():.3f}",
-            f"{1 - effective / 100:.3f}", f"{np.mean(ratio <= 1):.1%}", less_probable, inside(1.96),
-            inside(3.0),
-        )
-        print(f"  {', '.join(table.rows[-1])} ({time.perf_counter() - start:.0f} s)", flush=True)
-    table.show(time.perf_counter() - start)
-
-
-def scatter(folder: Path, runs: int) -> None:
-    """Guesses off by what their prior says: half of it, as a factor, in the mean square."""
-    _scatter(folder, runs, "off as the prior says", True, believed=True)
-
-
-def within(folder: Path, runs: int) -> None:
-    """Guesses drawn up to 50 % off: nearer than the prior says."""
-    _scatter(folder, runs, "up to 50 % off", True)
-
-
-def nearest(folder: Path, runs: int) -> None:
-    """Guesses at the truth."""
-    _scatter(folder, runs, "at the truth", False)
-
-
-def elastic(folder: Path, runs: int) -> None:
-    """As `scatter`, of the elastic screw, in the model too; the table has no encoder."""
-    _elastic(folder, runs, "elastic", [stages.TRUTH[1]] * runs, believed=True)
-
-
-def calibrated(folder: Path, runs: int) -> None:
-    """As `elastic`, but the guesses are the table, and each log is of a stage off them as the prior says.
-
-    Intervals of a fit within a prior promise what they hold of all stages that the prior takes for likely. Of
-    one stage, of which all that its logs do not tell is the same in each, they may hold more or less.
-    """
-    _elastic(folder, runs, "calibrated", [stages.believed(k) for k in range(1000, 1000 + runs)])
-
-
-def _elastic(
-    folder: Path, runs: int, name: str, truths: list[dict[str, float]], *, believed: bool = False
-) -> None:
-    """Fits of the elastic stage; guesses are the table, or, `believed`, off it as the prior says.
-
-    Every run is a line of a file as it ends, and is not run again. Nothing tells which code wrote a line:
-    after a change of it the file is to be removed.
-    """
-    start = time.perf_counter()
-    logs, begins = logs_of(1, runs, rigid=False, truths=truths)
-    cases = [
-        case_of(folder, f"{name}{k}", 1, guess=k if believed else None, believed=believed, coupling="elastic",
-                load=False)
-        for k in range(1000, 1000 + runs)
-    ]
-    ended = apart(folder / f"{name}.jsonl", cases, logs, begins, truths)
-    found = [r for r in ended if "refused" not in r]
-    table = Table(
-        f"{runs} runs of data 1, 500 counts, the elastic screw in the model, {runs - len(found)} refused",
-        ["converged", "told", "criterion %", "over truth's", "1 - effective/n", "never above",
-         "in 1.96 sigma", "in 3 sigma"],
-    )
-    off = np.abs(np.concatenate([r["off"] for r in found]))
-    mean = lambda key: np.mean([r[key] for r in found])
-    # A stage far off the guesses may not simulate with the steps that those ask for: then there is none.
-    ratio = np.array([r["ratio"] for r in found if np.isfinite(r["ratio"])])
-    table.row(
-        f"{mean('converged'):.0%}", f"{off.size / len(found):.2f}", f"{mean('percent'):.2f}",
-        f"{ratio.mean():.3f}", f"{1 - mean('effective') / 100:.3f}",
-        f"{np.mean(ratio <= 1):.1%}", f"{np.mean(off < 1.96):.1%}",
-        f"{np.mean(off < 3):.1%}",
-    )
-    table.show(time.perf_counter() - start)
-
-
 def position(folder: Path, runs: int) -> None:
     """The position in place of the current, which the paper says goes wrong: whether and why."""
     table = Table(
@@ -232,7 +130,8 @@ def position(folder: Path, runs: int) -> None:
             stated = ON_FORCE.replace('"force"', f'"{on}"')
             case = case_of(folder, "position", 1, resolution=resolution, more=stated)
             logs, starts = logs_of(1, runs // 2, resolution=resolution)
-            found, ratio, off = studied(case, logs, starts, stages.TRUTH[1], on)
+            found, rows = studied(case, logs, starts, stages.TRUTH[1], on)
+            off = [r["off"] for r in rows]
             # Of a log that tells one only there is no second.
             two = lambda values: np.resize([*values[:2], np.nan, np.nan], 2)
             std = np.array([two([d["std"] for d in e.details["directions"]]) for e in found])
@@ -244,7 +143,8 @@ def position(folder: Path, runs: int) -> None:
             table.row(
                 "current" if on == "force" else on, name, f"{np.mean([len(o) for o in off]):.1f}",
                 share(wrong), share(np.nanmedian(std, axis=0)),
-                f"{np.mean(np.abs(np.concatenate(off)) < 1.96):.0%}", f"{ratio.mean():.3f}",
+                f"{np.mean(np.abs(np.concatenate(off)) < 1.96):.0%}",
+                f"{np.mean([r['ratio'] for r in rows]):.3f}",
                 f"{alike['same_optimum']} of {alike['count']}",
             )
     table.show(time.perf_counter() - start)
@@ -288,8 +188,8 @@ def designed(folder: Path, runs: int) -> None:
         screw = "rigid" if rigid else "elastic"
         logs, begins = logs_of(1, DESIGNED, rigid=rigid, reference=reference)
         found = identify_many(case, logs)
-        each = zip(found, logs, begins, strict=True)
-        off = [off_in_sigma(e, case, log, b, stages.TRUTH[1]) for e, log, b in each]
+        fits = zip(found, logs, begins, strict=True)
+        off = [off_in_sigma(e, case, log, b, stages.TRUTH[1]) for e, log, b in fits]
         each = np.concatenate(off)
         inside = f"{np.mean(np.abs(each) < 3):.0%} within 3 sigma, at most {np.abs(each).max():.1f}"
         print(f"  {screw}: {', '.join(str(len(o)) for o in off)} combinations, {inside}", flush=True)

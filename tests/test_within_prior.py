@@ -98,6 +98,8 @@ def test_what_no_effect_explains_is_said_to_be_unexplained(tmp_path):
     assert found.verdict == "unexplained"
     assert found.effects == ()
     assert found.where.variable == "time"
+    # It has looked at the loop already.
+    assert "[output_error] prior" not in str(found)
 
 
 @pytest.mark.slow
