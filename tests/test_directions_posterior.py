@@ -195,7 +195,7 @@ def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None
     minimum = Minimum(best, np.asarray(0.0), np.asarray(1), np.asarray(True), e, jacobian)
 
     def at_each(problem, w, starts):
-        rounded = np.zeros((len(w), 8))
+        rounded = np.tile(e, (len(w), 1))
         some = residual(w, starts)
         rounded[:, : some.shape[1]] = some
         return rounded
@@ -221,15 +221,43 @@ def test_rounding_is_drawn_over_what_is_held_too(monkeypatch):
 
 def test_what_is_told_a_little_is_seen_with_what_is_told_well(monkeypatch):
     """As above, and a second reading is of w1 alone, with noise about as large as its guess's deviation."""
-    residual = lambda w, starts: np.column_stack([w[:, 0] + 0.5 * w[:, 1], 1e-3 * w[:, 1]])
-    found, told = through(monkeypatch, residual, little=1e-3)
+    residual = lambda w, starts: np.column_stack([w[:, 0] + 0.5 * w[:, 1], 5e-4 * w[:, 1]])
+    found, told = through(monkeypatch, residual, little=5e-4)
     assert found.count == 1
     np.testing.assert_allclose(found.vectors[:, 0], np.array([2.0, 1.0]) / np.sqrt(5), atol=0.01)
     assert told.std[0] < 0.01
     # Of w1 its guess, its reading, with noise as in the residual of the fit, and the guess of w0 = -w1 / 2.
     noise = np.mean(np.random.default_rng(0).standard_normal(8) ** 2)
-    covariance = np.array([[0.25, -0.5], [-0.5, 1.0]]) / (1.0 + 1.0 / noise + 0.25)
+    covariance = np.array([[0.25, -0.5], [-0.5, 1.0]]) / (1.0 + 0.25 / noise + 0.25)
     np.testing.assert_allclose(told.whole, covariance, rtol=0.1)
+
+
+def test_a_log_that_rounding_moves_more_than_the_measured_does_not_count(monkeypatch):
+    """A fifth of all starts move it by a thousand times the noise, and what is told by 0.3."""
+
+    def residual(w, starts):
+        far = np.abs(starts) > 0.04
+        return np.column_stack([w[:, :1] - 0.3 * far, 0.0 * w[:, 1:], far])
+
+    found, told = through(monkeypatch, residual)
+    assert found.point[0] == pytest.approx(0.0, abs=1e-3)
+    assert told.std[0] < 2e-3
+
+
+def test_noise_fills_what_rounding_leaves_of_the_measured():
+    rng = np.random.default_rng(0)
+    measured = rng.standard_normal((4000, 2)) * [1.0, 0.1]
+    size = rng.uniform(0.0, 2.0, (500, 1, 1))
+    drawn = size * measured[::-1]
+    noise, alike = directions_rounding._noise_missing(drawn, measured, rng)
+    np.testing.assert_array_equal(alike, size[:, 0, 0] <= 1.0)
+    both = np.mean((drawn + noise)[size[:, 0, 0] < 0.9] ** 2, axis=1)
+    np.testing.assert_allclose(both, np.broadcast_to(np.mean(measured**2, axis=0), both.shape), rtol=0.15)
+    # Where all leave more, those of least count.
+    _, alike = directions_rounding._noise_missing(2.0 + drawn, 0.1 * measured, rng)
+    assert alike.sum() == directions_rounding._LIKE
+    over = np.max(np.mean((2.0 + drawn) ** 2, axis=1) / np.mean(measured**2, axis=0), axis=1)
+    assert over[alike].max() < over[~alike].min()
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.02])

@@ -2,7 +2,8 @@
 
 In a loop with a coarse encoder the instant at which a reading steps is chaotic, and what it does to the
 force is neither small nor white, nor nothing on average. So logs are drawn with it, about where the truth may
-be, and the truth is taken to be where such logs look, to the fit, as the measured one does.
+be; those that rounding moves more than it moved the measured one do not count; and the truth is taken to be
+where the others look, to the fit, as the measured one does.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.estimators.directions_precision import Told, told_of
 from jaxid.estimators.directions_problem import (
@@ -39,9 +40,9 @@ _SEEN = 0.35
 _PASSES, _SETTLING = 10, 4
 # Logs so far beyond the rest, in deviations of their distance, are of a loop that ran away.
 _AWAY, _SIEVED = 6.0, 3
-# With fewer that did not run away nothing is told.
-_FEWEST = 100
-# Least part of a residual that is noise.
+# With fewer that did not run away nothing is told; of the others so many count, even if none can be the log.
+_FEWEST, _LIKE = 100, 128
+# Least part of what a fit leaves that is noise.
 _OWN = 0.1
 # Of a scatter that is none: of a direction that ended at a bound.
 _LEAST = 1e-12
@@ -139,15 +140,14 @@ class _Summary:
         return self.jacobian.shape[1]
 
     def drawn(
-        self, centre: Float[np.ndarray, " r"], reach: Float[np.ndarray, " r"], rng: np.random.Generator
-    ) -> Steps[tuple[Float[np.ndarray, "draws r"], Float[np.ndarray, "draws r"]]]:
-        """Logs drawn about a point: how far from it, and their numbers less the measured log's.
+        self, centre: Float[np.ndarray, " r"], off: Float[np.ndarray, "draws r"], rng: np.random.Generator
+    ) -> Steps[tuple[Float[np.ndarray, "alike r"], Float[np.ndarray, "alike r"]]]:
+        """Logs at `DRAWN` points off another: those that may be the measured one, and their numbers less its.
 
         Of what the log says nothing is anywhere within its prior, the start anywhere within its first count.
         """
         r, q, places = self.count, self.point.size, len(self.problem.places)
         starts = rng.uniform(-0.5, 0.5, (DRAWN, self.resolution.size)) * self.resolution
-        off = rng.uniform(-1.0, 1.0, (DRAWN, r)) * reach
         z = np.tile(self.point, (DRAWN, 1))
         z[:, :r] = centre + off
         # In units of the prior, not of the directions: one compiled call, however many of them there are.
@@ -157,11 +157,16 @@ class _Summary:
         e, shape = (yield from at_each(self.problem, w, starts)), self.problem.measured.shape
         sound = np.all(np.isfinite(e), axis=1)
         apart, off = e[sound] - self.residual, off[sound]
-        if len(apart):
-            unseen = (apart - apart @ self.step.T @ self.jacobian.T).reshape(-1, *shape)
-            own = _own_noise(self.residual.reshape(shape), unseen)
-            apart += (rng.standard_normal((len(apart), *shape)) * own).reshape(len(apart), -1)
-        return off, (apart + self.residual) @ self.step.T
+        if not len(apart):
+            return off, apart @ self.step.T
+        measured = self._unseen(self.residual[None]).reshape(shape)
+        noise, alike = _noise_missing(self._unseen(apart).reshape(-1, *shape), measured, rng)
+        apart += noise.reshape(len(apart), -1)
+        return off[alike], (apart[alike] + self.residual) @ self.step.T
+
+    def _unseen(self, left: Float[np.ndarray, "draws rows"]) -> Float[np.ndarray, "draws rows"]:
+        """What a fit leaves of such residuals."""
+        return left - left @ self.step.T @ self.jacobian.T
 
 
 def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
@@ -179,12 +184,19 @@ def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told 
     Source:
         Gourieroux, Monfort and Renault (1993), "Indirect inference", with guesses counted as normal: numbers
         of the drawn logs are taken as a line in where they were drawn, and its scatter as their covariance.
+        Logs that cannot be the measured one do not count, as in Beaumont, Zhang and Balding (2002),
+        "Approximate Bayesian computation in population genetics".
     """
     summary, rng = _Summary.of(machine, found), np.random.default_rng(0)
     r = summary.count
     centre, reach, passed = summary.point[:r].copy(), np.zeros(r), []
     for k in range(-1, _PASSES):
-        off, numbers = yield from summary.drawn(centre, reach, rng)
+        if k < _SETTLING:
+            off = rng.uniform(-1.0, 1.0, (DRAWN, r)) * reach
+        else:
+            # Where the truth may be and no wider: the line is only as straight as what it spans is small.
+            off = rng.multivariate_normal(np.zeros(r), covariance, DRAWN, method="eigh")
+        off, numbers = yield from summary.drawn(centre, off, rng)
         if len(off) < _FEWEST:
             return replace(found, count=0), None
         if k < 0:
@@ -241,10 +253,17 @@ def _told_along_axes(
     return ended, replace(told, covariance=np.diag(variances[:count]), whole=whole)
 
 
-def _own_noise(
-    residual: Float[np.ndarray, "time k"], left: Float[np.ndarray, "draws time k"]
-) -> Float[np.ndarray, " k"]:
-    """Standard deviation of what rounding does not explain of a residual, by column."""
-    power = np.mean(residual**2, axis=0)
-    explained = np.mean(np.var(left, axis=0), axis=0)
-    return np.sqrt(np.maximum(power - explained, _OWN * power))
+def _noise_missing(
+    drawn: Float[np.ndarray, "draws time k"], measured: Float[np.ndarray, "time k"], rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "draws time k"], Bool[np.ndarray, " draws"]]:
+    """White noise by which a fit leaves as much of each drawn log as of the measured, and which may be that.
+
+    A log of which rounding alone leaves more than was measured is another's: noise takes nothing away. Where
+    hardly one leaves less, those that leave least are taken, `_LIKE` of them.
+    """
+    wanted, power = np.mean(measured**2, axis=0), np.mean(drawn**2, axis=1)
+    own = np.sqrt(np.maximum(wanted - power, _OWN * wanted))
+    over = np.max(power / np.maximum(wanted, np.finfo(float).tiny), axis=1)
+    least = min(_LIKE, len(over)) - 1
+    alike = over <= max(1.0, np.partition(over, least)[least])
+    return rng.standard_normal(drawn.shape) * own[:, None, :], alike
