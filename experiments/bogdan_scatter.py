@@ -32,28 +32,29 @@ def _cells(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _scatter(folder: Path, runs: int, words: str, drawn: bool, **guesses: bool) -> None:
-    """Criterion and coverage; by encoder and screw.
+    """Criterion and coverage; by data set, encoder and screw.
 
     "less probable": how often the truth is that, its guesses counted in, which is what a fit within a prior
     minimises.
     """
     table = Table(
-        f"{runs} runs of data 1, guesses {words}: what is fitted against its sigma",
-        ["encoder", "screw", *COLUMNS, "less probable"],
+        f"{runs} runs a row, guesses {words}: what is fitted against its sigma",
+        ["data", "encoder", "screw", *COLUMNS, "less probable"],
     )
     start = time.perf_counter()
-    for name, resolution, rigid in (
-        ("500 counts", stages.COUNT, True), ("500 counts", stages.COUNT, False), ("exact", 0.0, True),
+    for data, name, resolution, rigid in (
+        (1, "500 counts", stages.COUNT, True), (2, "500 counts", stages.COUNT, True), (2, "exact", 0.0, True),
+        (1, "500 counts", stages.COUNT, False), (1, "exact", 0.0, True),
     ):
         seeds = [1000 + k if drawn else None for k in range(runs)]
         cases = [
-            case_of(folder, f"scatter{seed or ''}", 1, guess=seed, resolution=resolution, **guesses)
+            case_of(folder, f"scatter{seed or ''}", data, guess=seed, resolution=resolution, **guesses)
             for seed in seeds
         ]
-        logs, starts = logs_of(1, runs, rigid=rigid, resolution=resolution)
-        _, rows = studied(cases, logs, starts, stages.TRUTH[1])
+        logs, starts = logs_of(data, runs, rigid=rigid, resolution=resolution)
+        _, rows = studied(cases, logs, starts, stages.TRUTH[data])
         less_probable = "" if resolution else f"{np.mean([r['nats'] >= 0 for r in rows]):.1%}"
-        table.row(name, "rigid" if rigid else "elastic", *_cells(rows), less_probable)
+        table.row(str(data), name, "rigid" if rigid else "elastic", *_cells(rows), less_probable)
         print(f"  {', '.join(table.rows[-1])} ({time.perf_counter() - start:.0f} s)", flush=True)
     table.show(time.perf_counter() - start)
 
