@@ -27,8 +27,9 @@ from jaxid.estimators.steps import Soon, Steps, alone
 from jaxid.machine import Machine
 from jaxid.replay import with_sensor
 
-# Logs are drawn so many deviations about the point that was found last, or as far as the next is from it, but
-# over this part of the prior at most; from one pass to the next the width changes by these factors at most.
+# Until passes settle logs are drawn so many deviations about the point that was found last, or as far as the
+# next is from it, but over this part of the prior at most; from one pass to the next that changes by these
+# factors at most. A point never moves by more.
 _REACH, _MOST = 2.5, 1.5
 _NARROWER, _WIDER = 0.3, 2.0
 # Of the first pass, over what logs drawn at the fit itself scatter by.
