@@ -182,9 +182,10 @@ def test_a_fit_begins_in_the_deeper_valley():
     np.testing.assert_allclose(w[0], 1.1)
 
 
-def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None):
+def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None, vectors=None, places=None):
     """A fit whose loop with rounding leaves another residual: where it ends, and how it is told."""
     problem = problem_of(None, None, unknowns, 8)
+    problem.places = (None,) * (places or unknowns)
     problem.noise = lambda minimum, count: 1e-3
     jacobian = np.zeros((8, unknowns))
     jacobian[np.arange(told), np.arange(told)] = 1.0
@@ -206,8 +207,26 @@ def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None
     white = lambda found: Told(np.eye(found.count), np.ones(found.count), np.zeros(0))
     monkeypatch.setattr(directions_rounding, "told_of", white)
     machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=0.1))
-    found = Found(problem, np.eye(unknowns), told, minimum, 1, True)
+    found = Found(problem, np.eye(unknowns) if vectors is None else vectors, told, minimum, 1, True)
     return alone(directions_rounding.through_rounding(machine, found))
+
+
+def test_where_the_machine_stood_counts_once(monkeypatch):
+    """What the fit tells is the unknown and its start, alike; drawn logs begin within their first count."""
+    along = np.array([[0.8, -0.6], [0.6, 0.8]])
+
+    def residual(w, starts):
+        np.testing.assert_array_equal(w[:, 1], 0.0)
+        return 0.8 * w[:, :1] - 0.1 + 2.0 * starts
+
+    found, told = through(monkeypatch, residual, vectors=along, places=1)
+    assert found.point[0] == pytest.approx(0.1 / 0.8, abs=0.01)
+    assert told.std[0] == pytest.approx(2 * 0.1 / np.sqrt(12) / 0.8, rel=0.1)
+    np.testing.assert_allclose(found.vectors, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(told.whole, np.diag([told.std[0] ** 2, 1.0]))
+    # Where it is the start alone that the log tells nothing of the machine is.
+    found, told = through(monkeypatch, residual, vectors=np.eye(2)[::-1], places=1)
+    assert (found.count, told) == (0, None)
 
 
 def test_rounding_is_drawn_over_what_is_held_too(monkeypatch):

@@ -104,57 +104,61 @@ def drawn_roundings(
 class _Summary:
     """What a fit sees of a log in few numbers: how far one Gauss-Newton step moves along its directions.
 
+    Where the machine stood within its first count is no unknown here, for each drawn log has its own: as an
+    unknown too it would count twice, and lead beyond that count.
+
     Args:
         problem: With rounding in its loop.
         resolution: Counts of the readings, by encoder.
-        vectors: All directions, (q, q).
-        point: Where the fit ended, along them, (q,).
+        axes: Directions of the machine's unknowns alone, the best told first, (p, p).
+        count: Of those along which the log says anything, k.
+        point: Where the fit ended, along them, (p,).
         residual: What it left of the measured log, (rows,).
-        jacobian: Of that along the r directions of which the log says anything, (rows, r).
+        jacobian: Of that along the r directions of which the log says anything, the start's too, (rows, r).
         step: From a residual to the numbers, (r, rows).
+        along: From the numbers to how far that is along the k directions, (k, r).
     """
 
     problem: Problem
     resolution: Float[np.ndarray, " k"]
-    vectors: Float[np.ndarray, "q q"]
-    point: Float[np.ndarray, " q"]
+    axes: Float[np.ndarray, "p p"]
+    count: int
+    point: Float[np.ndarray, " p"]
     residual: Float[np.ndarray, " rows"]
     jacobian: Float[np.ndarray, "rows r"]
     step: Float[np.ndarray, "r rows"]
+    along: Float[np.ndarray, "k r"]
 
     @classmethod
     def of(cls, machine: Machine, found: Found) -> _Summary:
         """Of a fit; its minimum is in the coordinates of all directions."""
-        noise = found.problem.noise(found.minimum, found.count)
+        problem, p = found.problem, len(found.problem.places)
+        noise = problem.noise(found.minimum, found.count)
         over = np.asarray(found.minimum.jacobian) / noise
         r = max(found.count, int(np.sum(np.linalg.norm(over, axis=0) > _SEEN)))
-        over = over[:, :r]
-        step = np.linalg.solve(over.T @ over + np.eye(r), over.T) / noise
+        seen, own = over[:, :r], over @ found.vectors.T[:, :p]
+        step = np.linalg.solve(seen.T @ seen + np.eye(r), seen.T) / noise
+        _, told, axes = np.linalg.svd(np.linalg.qr(own, mode="r"))
+        count = int(np.sum(told > _SEEN))
         return cls(
-            _rounding(machine, found.problem), _counts(machine, found.problem), found.vectors,
-            np.asarray(found.minimum.theta), np.asarray(found.minimum.residual).ravel(), noise * over, step,
+            _rounding(machine, problem), _counts(machine, problem), axes.T, count, axes @ found.point[:p],
+            np.asarray(found.minimum.residual).ravel(), noise * seen, step,
+            axes[:count] @ found.vectors[:p, :r],
         )
 
-    @property
-    def count(self) -> int:
-        """Of the numbers."""
-        return self.jacobian.shape[1]
-
     def drawn(
-        self, centre: Float[np.ndarray, " r"], off: Float[np.ndarray, "draws r"], rng: np.random.Generator
-    ) -> Steps[tuple[Float[np.ndarray, "alike r"], Float[np.ndarray, "alike r"]]]:
+        self, centre: Float[np.ndarray, " k"], off: Float[np.ndarray, "draws k"], rng: np.random.Generator
+    ) -> Steps[tuple[Float[np.ndarray, "alike k"], Float[np.ndarray, "alike r"]]]:
         """Logs at `DRAWN` points off another: those that may be the measured one, and their numbers less its.
 
         Of what the log says nothing is anywhere within its prior, the start anywhere within its first count.
         """
-        r, q, places = self.count, self.point.size, len(self.problem.places)
         starts = rng.uniform(-0.5, 0.5, (DRAWN, self.resolution.size)) * self.resolution
-        z = np.tile(self.point, (DRAWN, 1))
-        z[:, :r] = centre + off
+        z = self.point + rng.standard_normal((DRAWN, self.point.size))
+        z[:, : self.count] = centre + off
+        w = np.zeros((DRAWN, self.problem.prior.base.size))
         # In units of the prior, not of the directions: one compiled call, however many of them there are.
-        w = z @ self.vectors.T
-        held = rng.standard_normal((DRAWN, q - r)) @ self.vectors[:, r:].T
-        w[:, :places] += held[:, :places]
+        w[:, : self.point.size] = z @ self.axes.T
         e, shape = (yield from at_each(self.problem, w, starts)), self.problem.measured.shape
         sound = np.all(np.isfinite(e), axis=1)
         apart, off = e[sound] - self.residual, off[sound]
@@ -189,69 +193,71 @@ def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told 
         "Approximate Bayesian computation in population genetics".
     """
     summary, rng = _Summary.of(machine, found), np.random.default_rng(0)
-    r = summary.count
-    centre, reach, passed = summary.point[:r].copy(), np.zeros(r), []
-    for k in range(-1, _PASSES):
-        if k < _SETTLING:
-            off = rng.uniform(-1.0, 1.0, (DRAWN, r)) * reach
+    k = summary.count
+    if not k:
+        return replace(found, count=0), None
+    centre, reach, passed = summary.point[:k].copy(), np.zeros(k), []
+    for turn in range(-1, _PASSES):
+        if turn < _SETTLING:
+            off = rng.uniform(-1.0, 1.0, (DRAWN, k)) * reach
         else:
             # Where the truth may be and no wider: the line is only as straight as what it spans is small.
-            off = rng.multivariate_normal(np.zeros(r), covariance, DRAWN, method="eigh")
+            off = rng.multivariate_normal(np.zeros(k), covariance, DRAWN, method="eigh")
         off, numbers = yield from summary.drawn(centre, off, rng)
         if len(off) < _FEWEST:
             return replace(found, count=0), None
-        if k < 0:
-            reach = np.minimum(_FIRST * np.std(numbers, axis=0), _MOST)
+        if turn < 0:
+            reach = np.minimum(_FIRST * np.std(numbers @ summary.along.T, axis=0), _MOST)
             continue
         step, covariance = _where_alike(off, numbers, centre)
-        if k >= _SETTLING:
+        if turn >= _SETTLING:
             passed.append((centre + step, covariance))
-        centre = centre + np.clip(step, -reach, reach) / max(1, k - _SETTLING + 1)
+        centre = centre + np.clip(step, -reach, reach) / max(1, turn - _SETTLING + 1)
         wanted = np.maximum(_REACH * np.sqrt(np.diag(covariance)), np.abs(step))
         reach = np.clip(wanted, _NARROWER * reach, np.minimum(_WIDER * reach, _MOST))
     points = np.array([point for point, _ in passed])
     # Beside that of the truth about the point, that of the point, which is a mean.
-    covariance = np.mean([c for _, c in passed], axis=0) + np.cov(points.T).reshape(r, r) / len(points)
-    return _told_along_axes(replace(found, count=r), np.mean(points, axis=0), covariance)
+    covariance = np.mean([c for _, c in passed], axis=0) + np.cov(points.T).reshape(k, k) / len(points)
+    return _told_along_axes(found, summary, np.mean(points, axis=0), covariance)
 
 
 def _where_alike(
-    off: Float[np.ndarray, "draws r"], numbers: Float[np.ndarray, "draws r"], centre: Float[np.ndarray, " r"]
-) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r r"]]:
+    off: Float[np.ndarray, "draws k"], numbers: Float[np.ndarray, "draws r"], centre: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     """How far from the centre the numbers are zero, the guesses counted in, and the covariance about that."""
-    r, stays = off.shape[1], np.ones(len(off), bool)
+    (_, k), r, stays = off.shape, numbers.shape[1], np.ones(len(off), bool)
     rows = np.column_stack([np.ones(len(off)), off])
     for _ in range(_SIEVED):
         line = np.linalg.lstsq(rows[stays], numbers[stays])[0]
         left = numbers - rows @ line
-        scatter = left[stays].T @ left[stays] / (stays.sum() - r - 1)
+        scatter = left[stays].T @ left[stays] / (stays.sum() - k - 1)
         scatter[np.diag_indices(r)] += _LEAST
         distance = np.sum(left * np.linalg.solve(scatter, left.T).T, axis=1)
         stays = distance < r + _AWAY * np.sqrt(2 * r)
     weighed = np.linalg.solve(scatter, line[1:].T)
-    covariance = np.linalg.inv(line[1:] @ weighed + np.eye(r))
+    covariance = np.linalg.inv(line[1:] @ weighed + np.eye(k))
     return -covariance @ (weighed.T @ line[0] + centre), covariance
 
 
 def _told_along_axes(
-    found: Found, point: Float[np.ndarray, " r"], covariance: Float[np.ndarray, "r r"]
+    found: Found, summary: _Summary, point: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"]
 ) -> tuple[Found, Told | None]:
     """A fit elsewhere, along directions that are not correlated; those that stay told."""
-    r, vectors = found.count, found.vectors.copy()
-    variances, axes = np.linalg.eigh(covariance)
-    vectors[:, :r] = signed(vectors[:, :r] @ axes)
-    whole = found.vectors[:, :r] @ covariance @ found.vectors[:, :r].T
-    whole += found.vectors[:, r:] @ found.vectors[:, r:].T
-    z = np.array(found.minimum.theta)
-    z[:r] = point
-    w, jacobian = found.vectors @ z, np.asarray(found.minimum.jacobian) @ found.vectors.T
+    k, p, q = summary.count, summary.point.size, len(found.vectors)
+    # Starts stand behind the machine's unknowns, each a direction of its own.
+    vectors, left = np.eye(q), np.eye(q)
+    vectors[:p, :p], left[:k, :k] = summary.axes, covariance
+    whole = vectors @ left @ vectors.T
+    variances, turned = np.linalg.eigh(covariance)
+    vectors[:, :k] = signed(vectors[:, :k] @ turned)
+    w, jacobian = found.point.copy(), np.asarray(found.minimum.jacobian) @ found.vectors.T
+    w[:p] = summary.axes @ np.concatenate([point, summary.point[k:]])
     minimum = replace(found.minimum, theta=vectors.T @ w, jacobian=jacobian @ vectors)
     count = int(np.sum(np.sqrt(variances) <= STAYS))
     ended = replace(found, vectors=vectors, count=count, minimum=minimum)
     if not count:
         return ended, None
-    told = told_of(ended)
-    return ended, replace(told, covariance=np.diag(variances[:count]), whole=whole)
+    return ended, replace(told_of(ended), covariance=np.diag(variances[:count]), whole=whole)
 
 
 def _noise_missing(
