@@ -35,7 +35,7 @@ from jaxid.estimators.directions_problem import (
 )
 from jaxid.estimators.directions_rounding import draws_soon, rounded, rounds, through_rounding
 from jaxid.estimators.directions_rounds import in_rounds, told_directions
-from jaxid.estimators.directions_starts import many_starts, starts_within
+from jaxid.estimators.directions_starts import likely_starts, many_starts, starts_within
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -172,7 +172,9 @@ def _searched(
     found, told = yield from _most_probable(machine, found, drawn)
     if told is None and not many:
         # A machine that sticks at the guesses, or nearly, shows nothing.
-        found, many = yield from many_starts(found, starts_within(problem, _WHERE_NOTHING_SHOWS), most)
+        points = yield from likely_starts(problem, _WHERE_NOTHING_SHOWS - 1)
+        found = yield from _ended(found, points[0], drawn)
+        found, many = yield from many_starts(found, points, most)
         found, told = yield from _most_probable(machine, found, drawn)
     return found, told, many
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxid.estimators.directions_problem import FAR, NEAR, NO_PULL, Found, Problem, fit_each
+from jaxid.estimators.directions_problem import DRAWN, FAR, NEAR, NO_PULL, Found, Problem, at_each, fit_each
 from jaxid.estimators.directions_rounds import in_rounds
 from jaxid.estimators.steps import Solve, Steps
 
@@ -24,6 +24,17 @@ def starts_within(problem: Problem, starts: int) -> np.ndarray:
     w = np.random.default_rng(0).uniform(-1.0, 1.0, (max(starts - 1, 0), size))
     w[:, len(problem.places) :] = 0.0
     return w
+
+
+def likely_starts(problem: Problem, starts: int) -> Steps[np.ndarray]:
+    """Of points drawn as the guesses say those that the log speaks least against, (starts, q).
+
+    Where the machine sticks at the guesses few points near them move, and no slope leads there.
+    """
+    w = np.random.default_rng(0).standard_normal((DRAWN, problem.prior.base.size))
+    with np.errstate(over="ignore", invalid="ignore"):
+        costs = np.sum((yield from at_each(problem, w)) ** 2, axis=1)
+    return w[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:starts]]
 
 
 def many_starts(
