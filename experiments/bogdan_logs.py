@@ -14,7 +14,8 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxid
-from jaxid.estimators.directions_problem import Prior, criterion_steps
+from jaxid.estimators.directions_prior import Prior
+from jaxid.estimators.directions_problem import criterion_steps
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import alone, cores, together
 from jaxid.identification import identify_many

@@ -19,7 +19,8 @@ from jaxid.discovery.separate import improved
 from jaxid.discovery.shapes import Shapes, basis
 from jaxid.errors import InputError
 from jaxid.estimators.directions import expected_steps
-from jaxid.estimators.directions_problem import Prior, Problem, residual_of, with_sensor
+from jaxid.estimators.directions_prior import Prior
+from jaxid.estimators.directions_problem import Problem, residual_of, with_sensor
 from jaxid.estimators.directions_rounding import rounds
 from jaxid.estimators.steps import alone
 from jaxid.excitation import Excitation, excite

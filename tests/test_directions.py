@@ -13,7 +13,8 @@ import stages
 import jaxid
 from jaxid.cli import main
 from jaxid.estimators import _beside_the_guesses, directions_rounds, steps_of
-from jaxid.estimators.directions_problem import Prior, criterion_steps
+from jaxid.estimators.directions_prior import Prior
+from jaxid.estimators.directions_problem import criterion_steps
 from jaxid.estimators.least_squares import Minimum
 from jaxid.estimators.steps import alone
 from jaxid.identification import identify_many
