@@ -97,18 +97,25 @@ def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, bel
 
 
 def studied(
-    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray, true: Mapping[str, float],
-    on: str = "force",
+    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray,
+    true: Mapping[str, float] | Sequence[Mapping[str, float]], on: str = "force",
 ) -> tuple[list[Estimate], list[dict[str, Any]]]:
-    """Estimates, and what `judged` says of each."""
+    """Estimates, and what `judged` says of each, of logs that are not refused; `true` of all or of each."""
     cases = [cases] * len(logs) if isinstance(cases, Path) else cases
-    found = zip(identify_many(cases, logs), cases, logs, starts, strict=True)
-    kept = [(e, *of) for e, *of in found if isinstance(e, Estimate)]
-    machine = open_session(cases[0], logs[0]).machine
-    truth = _ordered(true, machine.parameters.names)
-    opened = [open_session(case, log).fit.log for _, case, log, _ in kept]
-    at = together([criterion_steps(machine, log, truth, on=on) for log in opened], 16)
-    return [e for e, *_ in kept], [judged(*of, true, c) for of, c in zip(kept, at, strict=True)]
+    true = [true] * len(logs) if isinstance(true, Mapping) else true
+    found = zip(identify_many(cases, logs), cases, logs, starts, true, strict=True)
+    kept = []
+    for estimate, *of in found:
+        if isinstance(estimate, Estimate):
+            kept.append((estimate, *of))
+        elif not isinstance(estimate, jaxid.InputError):
+            raise estimate
+    machine = open_session(*kept[0][1:3]).machine
+    opened = [open_session(case, log).fit.log for _, case, log, *_ in kept]
+    theta = [_ordered(own, machine.parameters.names) for *_, own in kept]
+    steps = [criterion_steps(machine, log, t, on=on) for log, t in zip(opened, theta, strict=True)]
+    at = together(steps, 16)
+    return [e for e, *_ in kept], [judged(*of, c) for of, c in zip(kept, at, strict=True)]
 
 
 def judged(

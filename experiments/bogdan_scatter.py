@@ -80,11 +80,21 @@ def elastic(folder: Path, runs: int) -> None:
 
 
 def calibrated(folder: Path, runs: int) -> None:
-    """As `elastic`, but the guesses are the table, and each log is of a stage off them as the prior says.
+    """The guesses are the table, and each log is of a stage off them as the prior says; as `elastic` at last.
 
     Intervals of a fit within a prior promise what they hold of all stages that the prior takes for likely. Of
-    one stage, of which all that its logs do not tell is the same in each, they may hold more or less.
+    one stage, of which all that its logs do not tell is the same in each, they may hold more or less. Stages
+    that do not move are refused.
     """
+    table = Table(f"{runs} stages drawn as the prior says, 500 counts, rigid", ["data", "refused", *COLUMNS])
+    start = time.perf_counter()
+    for data in (1, 2):
+        truths = [stages.believed(k, data=data) for k in range(1000, 1000 + runs)]
+        logs, begins = logs_of(data, runs, truths=truths)
+        _, rows = studied(case_of(folder, f"calibrated{data}", data), logs, begins, truths)
+        table.row(str(data), str(runs - len(rows)), *_cells(rows))
+        print(f"  {', '.join(table.rows[-1])} ({time.perf_counter() - start:.0f} s)", flush=True)
+    table.show(time.perf_counter() - start)
     _elastic(folder, "calibrated", [stages.believed(k) for k in range(1000, 1000 + runs)], [None] * runs)
 
 
