@@ -12,6 +12,11 @@ import stages
 from bogdan_logs import apart, case_of, logs_of, studied
 from common import Table
 
+# Of `scatter` and its like: data set, encoder, its count, whether the screw is rigid.
+ROWS = (
+    (1, "500 counts", stages.COUNT, True), (2, "500 counts", stages.COUNT, True), (2, "exact", 0.0, True),
+    (1, "500 counts", stages.COUNT, False), (1, "exact", 0.0, True),
+)
 COLUMNS = [
     "converged", "told", "criterion %", "over truth's", "1 - effective/n", "never above", "in 1.96 sigma",
     "in 3 sigma",
@@ -42,10 +47,7 @@ def _scatter(folder: Path, runs: int, words: str, drawn: bool, **guesses: bool) 
         ["data", "encoder", "screw", *COLUMNS, "less probable"],
     )
     start = time.perf_counter()
-    for data, name, resolution, rigid in (
-        (1, "500 counts", stages.COUNT, True), (2, "500 counts", stages.COUNT, True), (2, "exact", 0.0, True),
-        (1, "500 counts", stages.COUNT, False), (1, "exact", 0.0, True),
-    ):
+    for data, name, resolution, rigid in ROWS:
         seeds = [1000 + k if drawn else None for k in range(runs)]
         cases = [
             case_of(folder, f"scatter{seed or ''}", data, guess=seed, resolution=resolution, **guesses)

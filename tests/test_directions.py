@@ -137,16 +137,15 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
     session = jaxid.open_session(tmp_path / "case.toml", log)
     machine, guessed = session.machine, session.machine.parameters.guess
     stuck = alone(criterion_steps(machine, session.fit.log, guessed, on="force"))
-    # Where the guesses tell nothing likely ones are tried unasked; what sticks is led to where it moves.
-    for asked, details in found.items():
+    for details in found.values():
         assert details["directions"]
         assert details["criterion_percent"] < 0.5 * stuck
-        starts = details["starts"]
-        assert starts["count"] == {1: 32, 16: 16}[asked]
-        assert 0.75 * starts["count"] <= starts["same_optimum"] <= starts["count"]
-    # The likely move by themselves. Of the others more end alike than do.
-    assert found[1]["starts"]["flat"] == 0
+    # Where the guesses tell nothing likely ones are tried unasked; what sticks is led to where it moves.
+    assert "starts" not in found[1]
     starts = found[16]["starts"]
+    assert starts["count"] == 16
+    # More than those that move by themselves.
+    assert 0.75 * starts["count"] <= starts["same_optimum"] <= starts["count"]
     assert 0.5 * starts["count"] < starts["flat"] < starts["count"]
     words = " ".join(within_prior_words(found[16]))
     assert f"{starts['flat']} from which the simulation does not" in words

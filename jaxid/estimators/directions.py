@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.estimators.directions_posterior import most_probable, past_kinks, quadratic, spread
+from jaxid.estimators.directions_posterior import (
+    loss_of,
+    most_probable,
+    past_kinks,
+    quadratic,
+    spread,
+)
 from jaxid.estimators.directions_precision import (
     Told,
     add_profiles,
@@ -35,7 +41,7 @@ from jaxid.estimators.directions_problem import (
 )
 from jaxid.estimators.directions_rounding import draws_soon, rounded, rounds, through_rounding
 from jaxid.estimators.directions_rounds import in_rounds, told_directions
-from jaxid.estimators.directions_starts import likely_starts, many_starts, starts_within
+from jaxid.estimators.directions_starts import likely_points, many_starts, starts_within
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.result import Estimate
 from jaxid.estimators.steps import Solve, Steps
@@ -44,8 +50,8 @@ from jaxid.machine import Machine
 from jaxid.precision import Precision
 from jaxid.replay import Numerics
 
-# Starts where the guesses tell nothing.
-_WHERE_NOTHING_SHOWS = 32
+# Points from which the fit begins where the guesses tell nothing.
+_ELSEWHERE = 3
 # A simulation without rounding follows a loop in which that moves what is compared by this part of its
 # variance at most.
 _FOLLOWED = 0.1
@@ -171,12 +177,20 @@ def _searched(
         found, many = yield from many_starts(found, np.array([*given, *starts_within(problem, starts)]), most)
     found, told = yield from _most_probable(machine, found, drawn)
     if told is None and not many:
-        # A machine that sticks at the guesses, or nearly, shows nothing.
-        points = yield from likely_starts(problem, _WHERE_NOTHING_SHOWS - 1)
-        found = yield from _ended(found, points[0], drawn)
-        found, many = yield from many_starts(found, points, most)
+        # A machine that sticks at the guesses, or nearly, shows nothing, nor does it near them.
+        found = yield from _begun_elsewhere(found, drawn)
         found, told = yield from _most_probable(machine, found, drawn)
     return found, told, many
+
+
+def _begun_elsewhere(found: Found, drawn: bool) -> Steps[Found]:
+    """The most probable of where the fit ends from a few likely points, and of where it did."""
+    noise, best = found.noise, found
+    loss = lambda f: loss_of(noise, f.minimum, f.point)
+    for w in (yield from likely_points(found.problem, _ELSEWHERE)):
+        found = yield from _ended(found, w, drawn)
+        best = min(best, found, key=loss)
+    return replace(best, evaluations=found.evaluations)
 
 
 def expected_steps(

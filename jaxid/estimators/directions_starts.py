@@ -26,15 +26,12 @@ def starts_within(problem: Problem, starts: int) -> np.ndarray:
     return w
 
 
-def likely_starts(problem: Problem, starts: int) -> Steps[np.ndarray]:
-    """Of points drawn as the guesses say those that the log speaks least against, (starts, q).
-
-    Where the machine sticks at the guesses few points near them move, and no slope leads there.
-    """
+def likely_points(problem: Problem, points: int) -> Steps[np.ndarray]:
+    """Of many drawn as the guesses say those that the log speaks least against, the best first."""
     w = np.random.default_rng(0).standard_normal((DRAWN, problem.prior.base.size))
     with np.errstate(over="ignore", invalid="ignore"):
         costs = np.sum((yield from at_each(problem, w)) ** 2, axis=1)
-    return w[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:starts]]
+    return w[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:points]]
 
 
 def many_starts(
