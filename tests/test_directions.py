@@ -33,11 +33,13 @@ STAGE = stages.machine(1, rigid=True)
 
 def logged(seed: int, noise: float = NOISE) -> Log:
     """A log of the exact stage whose encoder is fine: a coarse one is noise of another kind."""
-    log = stages.record(STAGE, REFERENCE, noise=noise, resolution=0.0, seed=seed)
-    return Log(
-        time=log["t"], position=log["q"][:, None], force=log["i"][:, None], reference=REFERENCE[:, None],
-        source=f"log {seed}",
-    )
+    return as_log(stages.record(STAGE, REFERENCE, noise=noise, resolution=0.0, seed=seed), f"log {seed}")
+
+
+def as_log(made: dict[str, np.ndarray], source: str = "a log") -> Log:
+    """Of what the stepper recorded, the columns that a log has."""
+    q, i, reference = (made[k][:, None] for k in ("q", "i", "ref"))
+    return Log(time=made["t"], position=q, force=i, reference=reference, source=source)
 
 
 @pytest.fixture(scope="module")
@@ -126,9 +128,7 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
     names = ("coulomb_friction[1].level", "coulomb_friction[2].level")
     guess = {n: 1.5 * truth[n] for n in names}
     log = stages.record(stages.machine(2, rigid=True), reference, noise=0.002, resolution=0.0)
-    log = Log(
-        time=log["t"], position=log["q"][:, None], force=log["i"][:, None], reference=reference[:, None]
-    )
+    log = as_log(log)
     found = {}
     for starts in (1, 16):
         text = stages.text(2, guess=guess, resolution=0.0, more=f"{STATED}starts = {starts}\n")
@@ -156,9 +156,7 @@ def test_guesses_about_which_nothing_moves_are_left_for_likely_ones(tmp_path):
     """Twice the friction: of 32 starts within a prior one moves, and not enough to lead on."""
     guess, reference = stages.believed(1008, data=2), stages.move(0.5, **stages.MOVES[2])
     made = stages.record(stages.machine(2, rigid=True), reference, noise=0.017, resolution=0.0)
-    log = Log(
-        time=made["t"], position=made["q"][:, None], force=made["i"][:, None], reference=reference[:, None]
-    )
+    log = as_log(made)
     (tmp_path / "case.toml").write_text(stages.text(2, guess=guess, resolution=0.0, more=STATED))
     session = jaxid.open_session(tmp_path / "case.toml", log)
     at = lambda theta: alone(criterion_steps(session.machine, session.fit.log, theta, on="force"))
@@ -175,9 +173,7 @@ def test_guesses_about_which_nothing_moves_are_left_for_likely_ones(tmp_path):
 def test_an_unknown_at_its_bound_does_not_take_the_others_with_it(tmp_path):
     """Plain friction on a log that shows more: the viscous part ends at zero, and no slope is left of it."""
     log = stages.record(STAGE, REFERENCE, noise=0.0005, resolution=0.0, seed=3)
-    log = Log(
-        time=log["t"], position=log["q"][:, None], force=log["i"][:, None], reference=REFERENCE[:, None]
-    )
+    log = as_log(log)
     text = stages.text(1, guess=stages.drawn(4), resolution=0.0, more=STATED)
     start = text.index('[[effects]]\nkind = "velocity_hysteresis"')
     (tmp_path / "case.toml").write_text(text[:start] + text[text.index("[actuator]") :])
@@ -384,9 +380,7 @@ def test_intervals_hold_under_a_coarse_encoder(tmp_path):
     logs = []
     for k, start in enumerate(starts):
         made = stages.record(STAGE, REFERENCE, noise=0.009, seed=k, start=start)
-        columns = {"position": made["q"], "force": made["i"], "reference": REFERENCE}
-        columns = {name: x[:, None] for name, x in columns.items()}
-        logs.append(Log(time=made["t"], **columns, source=f"log {k}"))
+        logs.append(as_log(made, f"log {k}"))
     machine = build_machine(case, period=1 / stages.RATE)
     prior = Prior.of(machine, 0.5, np.zeros(0))
     truth = prior.inward(np.array([stages.TRUTH[1][n] for n in machine.parameters.names]))
