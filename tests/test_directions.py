@@ -127,8 +127,7 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
     truth, reference = stages.TRUTH[2], stages.move(0.5, **stages.MOVES[2])
     names = ("coulomb_friction[1].level", "coulomb_friction[2].level")
     guess = {n: 1.5 * truth[n] for n in names}
-    log = stages.record(stages.machine(2, rigid=True), reference, noise=0.002, resolution=0.0)
-    log = as_log(log)
+    log = as_log(stages.record(stages.machine(2, rigid=True), reference, noise=0.002, resolution=0.0))
     found = {}
     for starts in (1, 16):
         text = stages.text(2, guess=guess, resolution=0.0, more=f"{STATED}starts = {starts}\n")
@@ -153,10 +152,9 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
 
 @pytest.mark.slow
 def test_guesses_about_which_nothing_moves_are_left_for_likely_ones(tmp_path):
-    """Twice the friction: of 32 starts within a prior one moves, and not enough to lead on."""
+    """About twice the friction: nothing near the guesses moves far enough to lead on."""
     guess, reference = stages.believed(1008, data=2), stages.move(0.5, **stages.MOVES[2])
-    made = stages.record(stages.machine(2, rigid=True), reference, noise=0.017, resolution=0.0)
-    log = as_log(made)
+    log = as_log(stages.record(stages.machine(2, rigid=True), reference, noise=0.017, resolution=0.0))
     (tmp_path / "case.toml").write_text(stages.text(2, guess=guess, resolution=0.0, more=STATED))
     session = jaxid.open_session(tmp_path / "case.toml", log)
     at = lambda theta: alone(criterion_steps(session.machine, session.fit.log, theta, on="force"))
@@ -172,8 +170,7 @@ def test_guesses_about_which_nothing_moves_are_left_for_likely_ones(tmp_path):
 
 def test_an_unknown_at_its_bound_does_not_take_the_others_with_it(tmp_path):
     """Plain friction on a log that shows more: the viscous part ends at zero, and no slope is left of it."""
-    log = stages.record(STAGE, REFERENCE, noise=0.0005, resolution=0.0, seed=3)
-    log = as_log(log)
+    log = as_log(stages.record(STAGE, REFERENCE, noise=0.0005, resolution=0.0, seed=3))
     text = stages.text(1, guess=stages.drawn(4), resolution=0.0, more=STATED)
     start = text.index('[[effects]]\nkind = "velocity_hysteresis"')
     (tmp_path / "case.toml").write_text(text[:start] + text[text.index("[actuator]") :])

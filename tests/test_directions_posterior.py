@@ -182,6 +182,36 @@ def test_a_fit_begins_in_the_deeper_valley():
     np.testing.assert_allclose(w[0], 1.1)
 
 
+@pytest.mark.parametrize("lost", [(), (0,), (0, 1, 2)])
+def test_guesses_that_do_not_simulate_are_left_for_points_that_do(monkeypatch, lost):
+    """Of three likely points those that do not simulate either are passed over."""
+    problem, a, b = linear(np.random.default_rng(2))
+    problem.noise = lambda minimum, count: float(np.sqrt(2 * minimum.cost / (30 - count)))
+    points = np.array([[1.0, 0.5, 0.0, 0.0], [-1.0, 0.0, 0.5, 0.0], [0.0, 2.0, 0.0, 0.0]])
+    whole = problem.residual
+    at = lambda w: any(np.array_equal(w, points[k]) for k in lost)
+    problem.residual = lambda w: whole(w) * (np.nan if at(w) else 1.0)
+    jacobian = problem.jacobian
+    problem.jacobian = lambda w: jacobian(w) * (np.nan if at(w) else 1.0)
+
+    def likely(problem, count):
+        return points
+        yield
+
+    monkeypatch.setattr(directions, "likely_points", likely)
+    monkeypatch.setattr(directions, "read", directions_posterior.read)
+    gone = Minimum(np.zeros(4), np.asarray(np.nan), np.asarray(1), np.asarray(False), np.full(30, np.nan),
+                   np.full((30, 4), np.nan))
+    found = alone(directions._begun_elsewhere(Found(problem, np.eye(4), 0, gone, 5, False), False))
+    if len(lost) == len(points):
+        np.testing.assert_array_equal(found.minimum.jacobian, gone.jacobian)
+        return
+    assert found.evaluations > 5
+    assert found.settled
+    left, least = problem.residual(found.point), np.linalg.lstsq(a, b)[0]
+    assert left @ left < 1.5 * np.sum((NOISE * (a @ least - b)) ** 2)
+
+
 def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None, vectors=None, places=None):
     """A fit whose loop with rounding leaves another residual: where it ends, and how it is told."""
     problem = problem_of(None, None, unknowns, 8)

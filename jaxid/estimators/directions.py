@@ -184,12 +184,20 @@ def _searched(
 
 
 def _begun_elsewhere(found: Found, drawn: bool) -> Steps[Found]:
-    """The most probable of where the fit ends from a few likely points, and of where it did."""
-    noise, best = found.noise, found
-    loss = lambda f: loss_of(noise, f.minimum, f.point)
-    for w in (yield from likely_points(found.problem, _ELSEWHERE)):
+    """The most probable of where the fit ends from a few likely points, and of where it did.
+
+    Points that do not simulate are passed over, and so is where it did if that does not.
+    """
+    problem, best = found.problem, found
+    for w in (yield from likely_points(problem, _ELSEWHERE)):
+        here = yield from read(problem, problem.ladder[-1], w)
+        if not np.all(np.isfinite(here.jacobian)):
+            continue
+        if not np.all(np.isfinite(best.minimum.jacobian)):
+            best = found = Found(problem, np.eye(w.size), 0, here, found.evaluations, False)
+        noise = best.noise
         found = yield from _ended(found, w, drawn)
-        best = min(best, found, key=loss)
+        best = min(best, found, key=lambda f: loss_of(noise, f.minimum, f.point))
     return replace(best, evaluations=found.evaluations)
 
 
