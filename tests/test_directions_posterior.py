@@ -323,6 +323,19 @@ def test_noise_fills_what_rounding_leaves_of_the_measured():
     assert over[alike].max() < over[~alike].min()
 
 
+def test_what_is_not_told_is_drawn_about_its_guess(monkeypatch):
+    """The fit without rounding left it three priors off, and the log says nothing of it."""
+    drawn = []
+
+    def residual(w, starts):
+        drawn.append(w[:, 1])
+        return w[:, :1] - 0.3
+
+    found, _ = through(monkeypatch, residual, best=np.array([0.0, 3.0]))
+    np.testing.assert_allclose(found.point, [0.3, 0.0], atol=0.01)
+    assert np.mean(drawn) == pytest.approx(0.0, abs=0.1)
+
+
 @pytest.mark.parametrize("shift", [0.3, 0.02])
 def test_what_rounding_does_on_average_is_corrected(monkeypatch, shift):
     """From a start anywhere within a count of 0.1."""

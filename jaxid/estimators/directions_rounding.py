@@ -151,10 +151,11 @@ class _Summary:
     ) -> Steps[tuple[Float[np.ndarray, "alike k"], Float[np.ndarray, "alike r"]]]:
         """Logs at `DRAWN` points off another: those that may be the measured one, and their numbers less its.
 
-        Of what the log says nothing is anywhere within its prior, the start anywhere within its first count.
+        That of which the log says nothing is anywhere within its prior, wherever the fit left it, and the
+        start anywhere within its first count.
         """
         starts = rng.uniform(-0.5, 0.5, (DRAWN, self.resolution.size)) * self.resolution
-        z = self.point + rng.standard_normal((DRAWN, self.point.size))
+        z = rng.standard_normal((DRAWN, self.point.size))
         z[:, : self.count] = centre + off
         w = np.zeros((DRAWN, self.problem.prior.base.size))
         # In units of the prior, not of the directions: one compiled call, however many of them there are.
@@ -251,7 +252,7 @@ def _told_along_axes(
     variances, turned = np.linalg.eigh(covariance)
     vectors[:, :k] = signed(vectors[:, :k] @ turned)
     w, jacobian = found.point.copy(), np.asarray(found.minimum.jacobian) @ found.vectors.T
-    w[:p] = summary.axes @ np.concatenate([point, summary.point[k:]])
+    w[:p] = summary.axes @ np.concatenate([point, np.zeros(p - k)])
     minimum = replace(found.minimum, theta=vectors.T @ w, jacobian=jacobian @ vectors)
     count = int(np.sum(np.sqrt(variances) <= STAYS))
     ended = replace(found, vectors=vectors, count=count, minimum=minimum)
