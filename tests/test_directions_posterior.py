@@ -312,12 +312,12 @@ def test_noise_fills_what_rounding_leaves_of_the_measured():
     measured = rng.standard_normal((4000, 2)) * [1.0, 0.1]
     size = rng.uniform(0.0, 2.0, (500, 1, 1))
     drawn = size * measured[::-1]
-    noise, alike = directions_rounding._noise_missing(drawn, measured, rng)
+    noise, alike = directions_rounding._noise_missing(drawn, measured)
     np.testing.assert_array_equal(alike, size[:, 0, 0] <= 1.0)
-    both = np.mean((drawn + noise)[size[:, 0, 0] < 0.9] ** 2, axis=1)
-    np.testing.assert_allclose(both, np.broadcast_to(np.mean(measured**2, axis=0), both.shape), rtol=0.15)
+    # Of one minus the square, a tenth at least, between zero and one.
+    np.testing.assert_allclose(noise, 0.67 * np.mean(measured**2, axis=0), rtol=0.05)
     # Where all leave more, those of least count.
-    _, alike = directions_rounding._noise_missing(2.0 + drawn, 0.1 * measured, rng)
+    _, alike = directions_rounding._noise_missing(2.0 + drawn, 0.1 * measured)
     assert alike.sum() == directions_rounding._LIKE
     over = np.max(np.mean((2.0 + drawn) ** 2, axis=1) / np.mean(measured**2, axis=0), axis=1)
     assert over[alike].max() < over[~alike].min()
@@ -334,6 +334,33 @@ def test_what_is_not_told_is_drawn_about_its_guess(monkeypatch):
     found, _ = through(monkeypatch, residual, best=np.array([0.0, 3.0]))
     np.testing.assert_allclose(found.point, [0.3, 0.0], atol=0.01)
     assert np.mean(drawn) == pytest.approx(0.0, abs=0.1)
+
+
+def test_what_rounding_does_beside_what_is_told_tells_how_it_moved_that(monkeypatch):
+    """Where the machine stood within a count moves what is told, and a sample that tells the fit nothing."""
+    moved = 2 * 0.1 / np.sqrt(12)
+    beside = lambda w, starts: np.column_stack([w[:, :1] + 2.0 * starts, 0.0 * starts, 0.03 * starts])
+    _, told = through(monkeypatch, beside)
+    noise = (np.sum((1e-3 * np.random.default_rng(0).standard_normal(8)[3:]) ** 2) - (0.015 * moved) ** 2) / 8
+    assert told.std[0] == pytest.approx(moved / np.sqrt(1.0 + (0.015 * moved) ** 2 / noise), rel=0.1)
+    assert told.std[0] < 0.7 * moved
+
+
+def test_a_long_log_is_seen_in_few_numbers():
+    """What a fit sees of it, what rounding does most, and no more than a hundred in all."""
+    rng = np.random.default_rng(0)
+    seen, most = np.linalg.qr(rng.standard_normal((300, 2)))[0].T, rng.standard_normal(300)
+    at = rng.standard_normal((400, 1))
+    left = at * seen[0] + 9.0 * rng.standard_normal((400, 1)) * most + rng.standard_normal((400, 300))
+    drawn = directions_rounding._Drawn(at, left, np.ones(300))
+    numbers = directions_rounding._leading(drawn, np.zeros(1), 5.0 * seen.T)
+    assert numbers.shape == (300, 100)
+    np.testing.assert_allclose(numbers.T @ numbers, np.eye(100), atol=1e-9)
+    for known in (*seen, most / np.linalg.norm(most)):
+        assert np.linalg.norm(numbers.T @ known) > 0.99
+    # Rounding that moves a log along one line only leaves nothing more.
+    drawn = directions_rounding._Drawn(at, at * seen[0] + rng.standard_normal((400, 1)) * most, np.ones(300))
+    assert directions_rounding._leading(drawn, np.zeros(1), seen.T).shape == (300, 3)
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.02])

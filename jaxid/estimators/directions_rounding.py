@@ -2,8 +2,8 @@
 
 In a loop with a coarse encoder the instant at which a reading steps is chaotic, and what it does to the
 force is neither small nor white, nor nothing on average. So logs are drawn with it, about where the truth may
-be; those that rounding moves more than it moved the measured one do not count; and the truth is taken to be
-where the others look, to the fit, as the measured one does.
+be; those that rounding moves more than it moved the measured one do not count; and the others say which log
+to expect where, and what scatters about that, sample with sample: the noise by which the truth is told.
 """
 
 from __future__ import annotations
@@ -37,12 +37,14 @@ _FIRST = 4.0
 # The log counts along directions whose slope over its noise is more than this, not only along those fitted:
 # what is told a little leans on what is told well, and each is seen with the others.
 _SEEN = 0.35
-# Passes, and those after which points are averaged: the line through logs drawn anew is another each time.
+# Passes, and those after which drawn logs count together.
 _PASSES, _SETTLING = 10, 4
 # Logs so far beyond the rest, in deviations of their distance, are of a loop that ran away.
 _AWAY, _SIEVED = 6.0, 3
 # With fewer that did not run away nothing is told; of the others so many count, even if none can be the log.
 _FEWEST, _LIKE = 100, 128
+# Numbers in which a log is seen, at most.
+_NUMBERS = 100
 # Least part of what a fit leaves that is noise.
 _OWN = 0.1
 # Of a scatter that is none: of a direction that ended at a bound.
@@ -101,8 +103,37 @@ def drawn_roundings(
 
 
 @dataclass(frozen=True)
+class _Drawn:
+    """Logs drawn with rounding that may be the measured one.
+
+    Args:
+        at: Where, along the directions of which the log says anything, (draws, k).
+        left: The measured log less each: of its rows, or numbers made of them, (draws, q).
+        noise: Covariance of the noise that they lack, (q, q), or its diagonal.
+    """
+
+    at: Float[np.ndarray, "draws k"]
+    left: Float[np.ndarray, "draws q"]
+    noise: np.ndarray
+
+    def line(self, about: Float[np.ndarray, " k"]) -> Float[np.ndarray, "draws 1+k"]:
+        """What logs are taken as a line in."""
+        return np.column_stack([np.ones(len(self.at)), self.at - about])
+
+    def along(self, numbers: Float[np.ndarray, "rows q"]) -> _Drawn:
+        """In few numbers."""
+        return _Drawn(self.at, self.left @ numbers, (numbers.T * self.noise) @ numbers)
+
+    @classmethod
+    def together(cls, several: list[_Drawn]) -> _Drawn:
+        """As one, the noise that of the mean."""
+        noise = np.average([d.noise for d in several], axis=0, weights=[len(d.at) for d in several])
+        return cls(np.concatenate([d.at for d in several]), np.concatenate([d.left for d in several]), noise)
+
+
+@dataclass(frozen=True)
 class _Summary:
-    """What a fit sees of a log in few numbers: how far one Gauss-Newton step moves along its directions.
+    """What a fit sees of a log: how far one Gauss-Newton step moves along its directions.
 
     Where the machine stood within its first count is no unknown here, for each drawn log has its own: as an
     unknown too it would count twice, and lead beyond that count.
@@ -113,10 +144,11 @@ class _Summary:
         axes: Directions of the machine's unknowns alone, the best told first, (p, p).
         count: Of those along which the log says anything, k.
         point: Where the fit ended, along them, (p,).
+        noise: Standard deviation of what it left, by which residuals are divided.
         residual: What it left of the measured log, (rows,).
         jacobian: Of that along the r directions of which the log says anything, the start's too, (rows, r).
-        step: From a residual to the numbers, (r, rows).
-        along: From the numbers to how far that is along the k directions, (k, r).
+        step: From a residual to how far that is, (r, rows).
+        along: From that to how far it is along the k directions, (k, r).
     """
 
     problem: Problem
@@ -124,6 +156,7 @@ class _Summary:
     axes: Float[np.ndarray, "p p"]
     count: int
     point: Float[np.ndarray, " p"]
+    noise: float
     residual: Float[np.ndarray, " rows"]
     jacobian: Float[np.ndarray, "rows r"]
     step: Float[np.ndarray, "r rows"]
@@ -137,19 +170,19 @@ class _Summary:
         over = np.asarray(found.minimum.jacobian) / noise
         r = max(found.count, int(np.sum(np.linalg.norm(over, axis=0) > _SEEN)))
         seen, own = over[:, :r], over @ found.vectors.T[:, :p]
-        step = np.linalg.solve(seen.T @ seen + np.eye(r), seen.T) / noise
+        step = np.linalg.solve(seen.T @ seen + np.eye(r), seen.T)
         _, told, axes = np.linalg.svd(np.linalg.qr(own, mode="r"))
         count = int(np.sum(told > _SEEN))
         return cls(
             _rounding(machine, problem), _counts(machine, problem), axes.T, count, axes @ found.point[:p],
-            np.asarray(found.minimum.residual).ravel(), noise * seen, step,
+            noise, np.asarray(found.minimum.residual).ravel() / noise, seen, step,
             axes[:count] @ found.vectors[:p, :r],
         )
 
     def drawn(
         self, centre: Float[np.ndarray, " k"], off: Float[np.ndarray, "draws k"], rng: np.random.Generator
-    ) -> Steps[tuple[Float[np.ndarray, "alike k"], Float[np.ndarray, "alike r"]]]:
-        """Logs at `DRAWN` points off another: those that may be the measured one, and their numbers less its.
+    ) -> Steps[_Drawn]:
+        """Logs at `DRAWN` points off another: those that may be the measured one.
 
         That of which the log says nothing is anywhere within its prior, wherever the fit left it, and the
         start anywhere within its first count.
@@ -162,13 +195,12 @@ class _Summary:
         w[:, : self.point.size] = z @ self.axes.T
         e, shape = (yield from at_each(self.problem, w, starts)), self.problem.measured.shape
         sound = np.all(np.isfinite(e), axis=1)
-        apart, off = e[sound] - self.residual, off[sound]
-        if not len(apart):
-            return off, apart @ self.step.T
+        e, z = e[sound] / self.noise, z[sound, : self.count]
+        if not len(e):
+            return _Drawn(z, e, np.zeros(e.shape[1]))
         measured = self._unseen(self.residual[None]).reshape(shape)
-        noise, alike = _noise_missing(self._unseen(apart).reshape(-1, *shape), measured, rng)
-        apart += noise.reshape(len(apart), -1)
-        return off[alike], (apart[alike] + self.residual) @ self.step.T
+        noise, alike = _noise_missing(self._unseen(e - self.residual).reshape(-1, *shape), measured)
+        return _Drawn(z[alike], e[alike], np.broadcast_to(noise, shape).ravel())
 
     def _unseen(self, left: Float[np.ndarray, "draws rows"]) -> Float[np.ndarray, "draws rows"]:
         """What a fit leaves of such residuals."""
@@ -188,56 +220,86 @@ def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told 
         the logs drawn ran away or none is told.
 
     Source:
-        Gourieroux, Monfort and Renault (1993), "Indirect inference", with guesses counted as normal: numbers
-        of the drawn logs are taken as a line in where they were drawn, and its scatter as their covariance.
-        Logs that cannot be the measured one do not count, as in Beaumont, Zhang and Balding (2002),
-        "Approximate Bayesian computation in population genetics".
+        Wood (2010), "Statistical inference for noisy nonlinear ecological dynamic systems": logs are taken as
+        normal, of a mean and a covariance that are simulated; here the mean is a line in where they were
+        drawn, and guesses count as normal. Logs that cannot be the measured one do not count, as in Beaumont,
+        Zhang and Balding (2002), "Approximate Bayesian computation in population genetics". What a covariance
+        of few draws adds: Dodelson and Schneider (2013), "The effect of covariance estimator error on
+        cosmological parameter constraints".
     """
     summary, rng = _Summary.of(machine, found), np.random.default_rng(0)
     k = summary.count
     if not k:
         return replace(found, count=0), None
     centre, reach, passed = summary.point[:k].copy(), np.zeros(k), []
+    covariance = np.zeros((k, k))
     for turn in range(-1, _PASSES):
         if turn < _SETTLING:
             off = rng.uniform(-1.0, 1.0, (DRAWN, k)) * reach
         else:
             # Where the truth may be and no wider: the line is only as straight as what it spans is small.
             off = rng.multivariate_normal(np.zeros(k), covariance, DRAWN, method="eigh")
-        off, numbers = yield from summary.drawn(centre, off, rng)
-        if len(off) < _FEWEST:
+        drawn = yield from summary.drawn(centre, off, rng)
+        if len(drawn.at) < _FEWEST:
             return replace(found, count=0), None
         if turn < 0:
-            reach = np.minimum(_FIRST * np.std(numbers @ summary.along.T, axis=0), _MOST)
+            moved = drawn.along((summary.along @ summary.step).T)
+            reach = np.minimum(_FIRST * np.sqrt(np.var(moved.left, axis=0) + np.diag(moved.noise)), _MOST)
             continue
-        step, covariance = _where_alike(off, numbers, centre)
-        if turn >= _SETTLING:
-            passed.append((centre + step, covariance))
-        centre = centre + np.clip(step, -reach, reach) / max(1, turn - _SETTLING + 1)
+        if turn <= _SETTLING:
+            # Logs from farther off lie on another line: only those of settled passes count together.
+            numbers, passed = _leading(drawn, centre, summary.jacobian), []
+        passed.append(drawn.along(numbers))
+        point, covariance = _where_alike(_Drawn.together(passed), centre)
+        step = point - centre
+        centre = centre + np.clip(step, -reach, reach)
         wanted = np.maximum(_REACH * np.sqrt(np.diag(covariance)), np.abs(step))
         reach = np.clip(wanted, _NARROWER * reach, np.minimum(_WIDER * reach, _MOST))
-    points = np.array([point for point, _ in passed])
-    # Beside that of the truth about the point, that of the point, which is a mean.
-    covariance = np.mean([c for _, c in passed], axis=0) + np.cov(points.T).reshape(k, k) / len(points)
-    return _told_along_axes(found, summary, np.mean(points, axis=0), covariance)
+    return _told_along_axes(found, summary, point, covariance)
 
 
 def _where_alike(
-    off: Float[np.ndarray, "draws k"], numbers: Float[np.ndarray, "draws r"], centre: Float[np.ndarray, " k"]
+    drawn: _Drawn, about: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """How far from the centre the numbers are zero, the guesses counted in, and the covariance about that."""
-    (_, k), r, stays = off.shape, numbers.shape[1], np.ones(len(off), bool)
-    rows = np.column_stack([np.ones(len(off)), off])
+    """Where logs are the measured one, guesses counted in, by a line about a point; and the covariance."""
+    rows, (n, q), k = drawn.line(about), drawn.left.shape, about.size
+    stays = np.ones(n, bool)
     for _ in range(_SIEVED):
-        line = np.linalg.lstsq(rows[stays], numbers[stays])[0]
-        left = numbers - rows @ line
-        scatter = left[stays].T @ left[stays] / (stays.sum() - k - 1)
-        scatter[np.diag_indices(r)] += _LEAST
-        distance = np.sum(left * np.linalg.solve(scatter, left.T).T, axis=1)
-        stays = distance < r + _AWAY * np.sqrt(2 * r)
+        line = np.linalg.lstsq(rows[stays], drawn.left[stays])[0]
+        off = drawn.left - rows @ line
+        scatter = off[stays].T @ off[stays] / (stays.sum() - k - 1) + drawn.noise
+        scatter[np.diag_indices(q)] += _LEAST
+        distance = np.sum(off * np.linalg.solve(scatter, off.T).T, axis=1)
+        stays = distance < q + _AWAY * np.sqrt(2 * q)
     weighed = np.linalg.solve(scatter, line[1:].T)
     covariance = np.linalg.inv(line[1:] @ weighed + np.eye(k))
-    return -covariance @ (weighed.T @ line[0] + centre), covariance
+    point = about - covariance @ (weighed.T @ line[0] + about)
+    # Weights by a scatter that is itself of so many draws only lead to more than they promise.
+    spare = stays.sum() - q
+    return point, (1.0 + (q - k) * (spare - 2) / ((spare - 1) * (spare - 4))) * covariance
+
+
+def _leading(
+    drawn: _Drawn, about: Float[np.ndarray, " k"], seen: Float[np.ndarray, "rows r"]
+) -> Float[np.ndarray, "rows q"]:
+    """Numbers to see logs in: all samples, or what a fit sees of them, and beside it what rounding does most.
+
+    Args:
+        drawn: Logs.
+        about: About where.
+        seen: What a fit without rounding sees, as columns.
+    """
+    n, samples = drawn.left.shape
+    most = min(_NUMBERS, n // 2)
+    if samples <= most:
+        return np.eye(samples)
+    rows, (seen, _) = drawn.line(about), np.linalg.qr(seen)
+    beside = drawn.left - rows @ np.linalg.lstsq(rows, drawn.left)[0]
+    beside -= (beside @ seen) @ seen.T
+    power, which = np.linalg.eigh(beside @ beside.T)
+    least = np.sort(power)[-max(1, most - seen.shape[1])]
+    leads = power >= max(least, _LEAST * power[-1])
+    return np.column_stack([seen, beside.T @ which[:, leads] / np.sqrt(power[leads])])
 
 
 def _told_along_axes(
@@ -262,16 +324,15 @@ def _told_along_axes(
 
 
 def _noise_missing(
-    drawn: Float[np.ndarray, "draws time k"], measured: Float[np.ndarray, "time k"], rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "draws time k"], Bool[np.ndarray, " draws"]]:
-    """White noise by which a fit leaves as much of each drawn log as of the measured, and which may be that.
+    drawn: Float[np.ndarray, "draws time k"], measured: Float[np.ndarray, "time k"]
+) -> tuple[Float[np.ndarray, " k"], Bool[np.ndarray, " draws"]]:
+    """Variance of white noise with which a fit leaves as much of drawn logs as of the measured; which count.
 
     A log of which rounding alone leaves more than was measured is another's: noise takes nothing away. Where
     hardly one leaves less, those that leave least are taken, `_LIKE` of them.
     """
     wanted, power = np.mean(measured**2, axis=0), np.mean(drawn**2, axis=1)
-    own = np.sqrt(np.maximum(wanted - power, _OWN * wanted))
     over = np.max(power / np.maximum(wanted, np.finfo(float).tiny), axis=1)
     least = min(_LIKE, len(over)) - 1
     alike = over <= max(1.0, np.partition(over, least)[least])
-    return rng.standard_normal(drawn.shape) * own[:, None, :], alike
+    return np.mean(np.maximum(wanted - power[alike], _OWN * wanted), axis=0), alike
