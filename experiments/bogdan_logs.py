@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -152,6 +153,9 @@ def apart(
     known = [json.loads(line) for line in whole]
     done = {row["run"] for row in known}
     wanted = [k for k in range(len(cases)) if k not in done]
+    # A thread each: theirs would wait for one another.
+    for library in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(library, "1")
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(cores(), spawn) as pool, file.open("a") as out:
         asked = [pool.submit(_fitted, k, cases[k], logs[k], starts[k], truths[k]) for k in wanted]
