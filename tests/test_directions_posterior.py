@@ -346,21 +346,26 @@ def test_what_rounding_does_beside_what_is_told_tells_how_it_moved_that(monkeypa
     assert told.std[0] < 0.7 * moved
 
 
-def test_a_long_log_is_seen_in_few_numbers():
-    """What a fit sees of it, what rounding does most, and no more than a hundred in all."""
+def numbers_of(samples, draws):
+    """Of logs that rounding moves along one line most; and what the fit sees, and that line."""
     rng = np.random.default_rng(0)
-    seen, most = np.linalg.qr(rng.standard_normal((300, 2)))[0].T, rng.standard_normal(300)
-    at = rng.standard_normal((400, 1))
-    left = at * seen[0] + 9.0 * rng.standard_normal((400, 1)) * most + rng.standard_normal((400, 300))
-    drawn = directions_rounding._Drawn(at, left, np.ones(300))
-    numbers = directions_rounding._leading(drawn, np.zeros(1), 5.0 * seen.T)
-    assert numbers.shape == (300, 100)
-    np.testing.assert_allclose(numbers.T @ numbers, np.eye(100), atol=1e-9)
-    for known in (*seen, most / np.linalg.norm(most)):
+    seen, most = np.linalg.qr(rng.standard_normal((samples, 2)))[0].T, rng.standard_normal(samples)
+    at = rng.standard_normal((draws, 1))
+    left = at * seen[0] + 9.0 * rng.standard_normal((draws, 1)) * most + rng.standard_normal((draws, samples))
+    drawn = directions_rounding._Drawn(at, left, np.ones(samples))
+    return directions_rounding._leading(drawn, np.zeros(1), 5.0 * seen.T), seen, most / np.linalg.norm(most)
+
+
+def test_a_log_is_seen_in_all_its_samples_or_in_those_numbers_that_the_draws_tell():
+    np.testing.assert_array_equal(numbers_of(100, 200)[0], np.eye(100))
+    numbers, seen, most = numbers_of(100, 130)
+    assert numbers.shape == (100, 65)
+    np.testing.assert_allclose(numbers.T @ numbers, np.eye(65), atol=1e-9)
+    for known in (*seen, most):
         assert np.linalg.norm(numbers.T @ known) > 0.99
-    # Rounding that moves a log along one line only leaves nothing more.
-    drawn = directions_rounding._Drawn(at, at * seen[0] + rng.standard_normal((400, 1)) * most, np.ones(300))
-    assert directions_rounding._leading(drawn, np.zeros(1), seen.T).shape == (300, 3)
+    # A long one in what the fit sees.
+    numbers, seen, _ = numbers_of(300, 500)
+    np.testing.assert_allclose(numbers @ numbers.T, seen.T @ seen, atol=1e-9)
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.02])

@@ -43,8 +43,8 @@ _PASSES, _SETTLING = 10, 4
 _AWAY, _SIEVED = 6.0, 3
 # With fewer that did not run away nothing is told; of the others so many count, even if none can be the log.
 _FEWEST, _LIKE = 100, 128
-# Numbers in which a log is seen, at most.
-_NUMBERS = 100
+# Samples of a log of which each is compared, at most.
+_LONG = 100
 # Least part of what a fit leaves that is noise.
 _OWN = 0.1
 # Of a scatter that is none: of a direction that ended at a bound.
@@ -282,18 +282,23 @@ def _where_alike(
 def _leading(
     drawn: _Drawn, about: Float[np.ndarray, " k"], seen: Float[np.ndarray, "rows r"]
 ) -> Float[np.ndarray, "rows q"]:
-    """Numbers to see logs in: all samples, or what a fit sees of them, and beside it what rounding does most.
+    """Numbers to see logs in: all samples, or half as many as logs, of what rounding does most.
+
+    How rounding moves one sample with each other says how it moved what is told. Of a long log the draws do
+    not tell that, and what the model lacks would show in it first: there it is what a fit sees and no more.
 
     Args:
         drawn: Logs.
         about: About where.
         seen: What a fit without rounding sees, as columns.
     """
-    n, samples = drawn.left.shape
-    most = min(_NUMBERS, n // 2)
+    (n, samples), (seen, _) = drawn.left.shape, np.linalg.qr(seen)
+    if samples > _LONG:
+        return seen
+    most = n // 2
     if samples <= most:
         return np.eye(samples)
-    rows, (seen, _) = drawn.line(about), np.linalg.qr(seen)
+    rows = drawn.line(about)
     beside = drawn.left - rows @ np.linalg.lstsq(rows, drawn.left)[0]
     beside -= (beside @ seen) @ seen.T
     power, which = np.linalg.eigh(beside @ beside.T)
