@@ -275,7 +275,7 @@ def _where_alike(
     covariance = np.linalg.inv(line[1:] @ weighed + np.eye(k))
     point = about - covariance @ (weighed.T @ line[0] + about)
     # Weights by a scatter that is itself of so many draws only lead to more than they promise.
-    spare = stays.sum() - q
+    spare = max(stays.sum() - q, 5)
     return point, (1.0 + (q - k) * (spare - 2) / ((spare - 1) * (spare - 4))) * covariance
 
 
