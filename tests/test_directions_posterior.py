@@ -212,7 +212,10 @@ def test_guesses_that_do_not_simulate_are_left_for_points_that_do(monkeypatch, l
     assert left @ left < 1.5 * np.sum((NOISE * (a @ least - b)) ** 2)
 
 
-def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None, vectors=None, places=None):
+def through(
+    monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None, vectors=None, places=None,
+    course=None,
+):
     """A fit whose loop with rounding leaves another residual: where it ends, and how it is told."""
     problem = problem_of(None, None, unknowns, 8)
     problem.places = (None,) * (places or unknowns)
@@ -236,7 +239,7 @@ def through(monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None
     monkeypatch.setattr(directions_rounding, "_rounding", lambda machine, problem: problem)
     white = lambda found: Told(np.eye(found.count), np.ones(found.count), np.zeros(0))
     monkeypatch.setattr(directions_rounding, "told_of", white)
-    machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=0.1))
+    machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=0.1), course=course)
     found = Found(problem, np.eye(unknowns) if vectors is None else vectors, told, minimum, 1, True)
     return alone(directions_rounding.through_rounding(machine, found))
 
@@ -344,6 +347,10 @@ def test_what_rounding_does_beside_what_is_told_tells_how_it_moved_that(monkeypa
     noise = (np.sum((1e-3 * np.random.default_rng(0).standard_normal(8)[3:]) ** 2) - (0.015 * moved) ** 2) / 8
     assert told.std[0] == pytest.approx(moved / np.sqrt(1.0 + (0.015 * moved) ** 2 / noise), rel=0.1)
     assert told.std[0] < 0.7 * moved
+    # Not where the reference is unknown: logs that it moves in time lie on no line. Starts near the end of
+    # the first count move that sample more than was measured, and do not count.
+    _, told = through(monkeypatch, beside, course=SimpleNamespace(names=("onset",)))
+    assert 0.85 * moved < told.std[0] < moved
 
 
 def numbers_of(samples, draws):
@@ -352,8 +359,12 @@ def numbers_of(samples, draws):
     seen, most = np.linalg.qr(rng.standard_normal((samples, 2)))[0].T, rng.standard_normal(samples)
     at = rng.standard_normal((draws, 1))
     left = at * seen[0] + 9.0 * rng.standard_normal((draws, 1)) * most + rng.standard_normal((draws, samples))
+    none = dict.fromkeys(("problem", "resolution", "axes", "count", "point", "noise", "step", "along"))
+    summary = directions_rounding._Summary(
+        **none, residual=np.zeros(samples), jacobian=5.0 * seen.T, shifts=False
+    )
     drawn = directions_rounding._Drawn(at, left, np.ones(samples))
-    return directions_rounding._leading(drawn, np.zeros(1), 5.0 * seen.T), seen, most / np.linalg.norm(most)
+    return summary.numbers(drawn, np.zeros(1)), seen, most / np.linalg.norm(most)
 
 
 def test_a_log_is_seen_in_all_its_samples_or_in_those_numbers_that_the_draws_tell():

@@ -149,6 +149,7 @@ class _Summary:
         jacobian: Of that along the r directions of which the log says anything, the start's too, (rows, r).
         step: From a residual to how far that is, (r, rows).
         along: From that to how far it is along the k directions, (k, r).
+        shifts: Whether unknowns of the reference move the log in time.
     """
 
     problem: Problem
@@ -161,6 +162,7 @@ class _Summary:
     jacobian: Float[np.ndarray, "rows r"]
     step: Float[np.ndarray, "r rows"]
     along: Float[np.ndarray, "k r"]
+    shifts: bool
 
     @classmethod
     def of(cls, machine: Machine, found: Found) -> _Summary:
@@ -176,7 +178,7 @@ class _Summary:
         return cls(
             _rounding(machine, problem), _counts(machine, problem), axes.T, count, axes @ found.point[:p],
             noise, np.asarray(found.minimum.residual).ravel() / noise, seen, step,
-            axes[:count] @ found.vectors[:p, :r],
+            axes[:count] @ found.vectors[:p, :r], machine.course is not None and bool(machine.course.names),
         )
 
     def drawn(
@@ -201,6 +203,18 @@ class _Summary:
         measured = self._unseen(self.residual[None]).reshape(shape)
         noise, alike = _noise_missing(self._unseen(e - self.residual).reshape(-1, *shape), measured)
         return _Drawn(z[alike], e[alike], np.broadcast_to(noise, shape).ravel())
+
+    def numbers(self, drawn: _Drawn, about: Float[np.ndarray, " k"]) -> Float[np.ndarray, "rows q"]:
+        """In which logs are compared: all samples, or half as many as there are logs.
+
+        How rounding moves one sample with each other says how it moved what is told. Of a long log the draws
+        do not tell that, and what the model lacks would show in it first; and logs that move in time lie on
+        no line. Those are compared in what the fit sees.
+        """
+        seen, rows, most = np.linalg.qr(self.jacobian)[0], self.residual.size, len(drawn.at) // 2
+        if rows > _LONG or self.shifts:
+            return seen
+        return np.eye(rows) if rows <= most else _leading(drawn, about, seen, most)
 
     def _unseen(self, left: Float[np.ndarray, "draws rows"]) -> Float[np.ndarray, "draws rows"]:
         """What a fit leaves of such residuals."""
@@ -248,7 +262,7 @@ def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told 
             continue
         if turn <= _SETTLING:
             # Logs from farther off lie on another line: only those of settled passes count together.
-            numbers, passed = _leading(drawn, centre, summary.jacobian), []
+            numbers, passed = summary.numbers(drawn, centre), []
         passed.append(drawn.along(numbers))
         point, covariance = _where_alike(_Drawn.together(passed), centre)
         step = point - centre
@@ -280,24 +294,9 @@ def _where_alike(
 
 
 def _leading(
-    drawn: _Drawn, about: Float[np.ndarray, " k"], seen: Float[np.ndarray, "rows r"]
+    drawn: _Drawn, about: Float[np.ndarray, " k"], seen: Float[np.ndarray, "rows r"], most: int
 ) -> Float[np.ndarray, "rows q"]:
-    """Numbers to see logs in: all samples, or half as many as logs, of what rounding does most.
-
-    How rounding moves one sample with each other says how it moved what is told. Of a long log the draws do
-    not tell that, and what the model lacks would show in it first: there it is what a fit sees and no more.
-
-    Args:
-        drawn: Logs.
-        about: About where.
-        seen: What a fit without rounding sees, as columns.
-    """
-    (n, samples), (seen, _) = drawn.left.shape, np.linalg.qr(seen)
-    if samples > _LONG:
-        return seen
-    most = n // 2
-    if samples <= most:
-        return np.eye(samples)
+    """Numbers to see logs in: what a fit without rounding sees, and beside it what rounding does most."""
     rows = drawn.line(about)
     beside = drawn.left - rows @ np.linalg.lstsq(rows, drawn.left)[0]
     beside -= (beside @ seen) @ seen.T
