@@ -44,7 +44,7 @@ def sets(kind: str, count: int, numerics: str) -> dict:
     import axis
     import jax
 
-    from jaxid.replay import Numerics
+    from jaxid.simulation.replay import Numerics
 
     reference, measured = axis.log()
     run = axis.replay(reference, Numerics(set_valued=numerics == "ideal"))

@@ -19,13 +19,13 @@ import stepper_machines as machines
 
 from jaxid.controllers import CascadePD
 from jaxid.effects import EFFECTS
-from jaxid.estimators.least_squares import Minimum, Transform
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
 from jaxid.estimators.output_error import _fit
-from jaxid.parameters import scatter
+from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
-from jaxid.replay import Numerics, Replay
-from jaxid.sensors import Sensor
-from jaxid.simulation import Drive
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.loops import Drive
+from jaxid.simulation.replay import Numerics, Replay
 
 PERIOD, GAIN = 1e-3, 35.15065
 NOISE = 1e-6  # of a reading [m]

@@ -11,10 +11,10 @@ from axis import PLACES, TRANSFORM
 from axis_loops import ideal_forward, rk4_forward
 from numba import njit
 
-from jaxid.parameters import scatter
+from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
-from jaxid.replay import Replay
-from jaxid.simulation import with_diffrax
+from jaxid.simulation.loops import with_diffrax
+from jaxid.simulation.replay import Replay
 
 
 def lm_fit(loop_name: str, reference: np.ndarray, measured: np.ndarray, loop: tuple, start):

@@ -11,7 +11,7 @@ import axis
 import jax
 import jax.numpy as jnp
 
-from jaxid.replay import Numerics
+from jaxid.simulation.replay import Numerics
 
 reference, measured = axis.log()
 run = axis.replay(reference, Numerics(set_valued=sys.argv[1] == "ideal"))

@@ -44,7 +44,7 @@ def two_links(folder: Path, ticks: int) -> Path:
 
 def measured(case: Path, ticks: int) -> tuple[np.ndarray, float]:
     """Wall and processor time of calls, (ticks, 2), and time of a tick in one compiled loop [us]."""
-    from jaxid.live import Live
+    from jaxid.commands.live import Live
 
     live = Live(case)
     ticks = min(ticks, len(live.reference))

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import stepper_machines as machines
 from search_setup import case_text, log_of, write_case
 
-from jaxid.discovery.discover import discover
+from jaxid.commands.discover import discover
 
 NOISE = (0.3, 1.0, 3.0)
 # Name -> preset, motion, and seconds of the log of each seed in turn.

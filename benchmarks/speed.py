@@ -30,7 +30,7 @@ import speed_scale
 from speed_peers import against_peers, installed
 from speed_rows import HEAD, Row, compare, in_process, line, table
 
-from jaxid.replay import Numerics
+from jaxid.simulation.replay import Numerics
 
 HERE = Path(__file__).parent
 WIDTH = 1e-3
@@ -257,7 +257,7 @@ def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
 def start_times(repeats: int) -> dict[str, float]:
     """Import and help in a fresh process, less what Python itself takes [s]."""
     words = {"nothing": ("-c", "pass"), "import jaxid": ("-c", "import jaxid")}
-    words["import jaxid, with JAX"] = ("-c", "import jaxid, jaxid.simulation")
+    words["import jaxid, with JAX"] = ("-c", "import jaxid, jaxid.simulation.loops")
     if (HERE.parent / "jaxid" / "cli.py").exists():
         words["jaxid --help"] = ("-c", "from jaxid.cli import main; main(['--help'])")
     seconds = {

@@ -14,7 +14,7 @@ import numpy as np
 from speed_rows import Row, compare
 
 from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns
-from jaxid.signals import Decimator
+from jaxid.numerics.filters import Decimator
 
 KP, KV, WIDTH = 160.18, 243.45, 1e-3
 

@@ -52,7 +52,7 @@ def study(name: str, runs: int, processes: int = 0) -> dict:
 
 def _study(name: str, runs: int, scheduler: str | None = None) -> dict:
     import jaxid
-    from jaxid.estimators.steps import cores
+    from jaxid.numerics.lanes import cores
     from jaxid.studies.plan import Plan
 
     path, counts = CASES[name]
@@ -73,7 +73,7 @@ def fit(samples: int, repeats: int) -> dict:
     """One log of so many samples: seconds of simulating, preparing and fitting, cold and warm."""
     import jaxid
     from jaxid.estimators import METHODS
-    from jaxid.estimators.steps import alone
+    from jaxid.numerics.lanes import alone
 
     with tempfile.TemporaryDirectory() as folder:
         case = Path(folder) / "case.toml"
@@ -109,8 +109,8 @@ def joints(kind: str, count: int, samples: int, repeats: int) -> dict:
 
     import jaxid
     from jaxid.estimators.output_error import choose_numerics, output_residual
-    from jaxid.replay import make_replay
     from jaxid.session import open_session
+    from jaxid.simulation.replay import make_replay
 
     with tempfile.TemporaryDirectory() as folder:
         case = Path(folder) / "case.toml"

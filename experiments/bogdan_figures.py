@@ -14,14 +14,14 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxid.identification import Identification
-from jaxid.io.case import Case, load_case
+from jaxid.case.case import Case, load_case
+from jaxid.commands.identify import Identification
 from jaxid.machine import build_machine
-from jaxid.model import Plant
-from jaxid.parameters import scatter
-from jaxid.sensors import Sensor
-from jaxid.simulation import closed_loop
-from jaxid.virtual import Scene
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import scatter
+from jaxid.scene import Scene
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.loops import closed_loop
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import stages

@@ -15,12 +15,12 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxid
-from jaxid.estimators.directions_prior import Prior
-from jaxid.estimators.directions_problem import criterion_steps
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import alone, cores, together
-from jaxid.identification import identify_many
-from jaxid.io.log import Log
+from jaxid.commands.identify import identify_many
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.within_prior.prior import Prior
+from jaxid.estimators.within_prior.problem import criterion_steps
+from jaxid.logs.log import Log
+from jaxid.numerics.lanes import alone, cores, together
 from jaxid.session import open_session
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

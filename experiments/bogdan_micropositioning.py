@@ -19,8 +19,8 @@ import numpy as np
 from common import Table, parser_of
 
 import jaxid
-from jaxid.identification import identify_many
-from jaxid.io.log import Log
+from jaxid.commands.identify import identify_many
+from jaxid.logs.log import Log
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import bogdan_figures

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from jaxid.io.tables import aligned
+from jaxid.results.as_text import aligned
 
 
 def parser_of(doc: str, default: str) -> argparse.ArgumentParser:

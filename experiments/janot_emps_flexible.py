@@ -20,10 +20,10 @@ import numpy as np
 from common import Table, parser_of
 
 import jaxid
-from jaxid.estimators.minimal_model import filtering_of
-from jaxid.estimators.result import Estimate
-from jaxid.io.results import derived_json
-from jaxid.report.minimal_plots import plot_filtering
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.minimal.fit import filtering_of
+from jaxid.results.as_json import derived_json
+from jaxid.results.report.minimal_plots import plot_filtering
 from jaxid.session import Session, open_session
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

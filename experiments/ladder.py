@@ -22,7 +22,7 @@ import numpy as np
 from common import Table, arguments, copied
 
 import jaxid
-from jaxid.report.study_plots import plot_errors
+from jaxid.results.report.study_plots import plot_errors
 
 
 def main() -> int:

@@ -42,8 +42,8 @@ from pa10_joint import (
 )
 
 import jaxid
-from jaxid.dominant_inertia import of_swing
-from jaxid.io.log import Log
+from jaxid.arms.dominant_inertia import of_swing
+from jaxid.logs.log import Log
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from chain_stepper import ChainMachine, simulate_chain

@@ -12,17 +12,17 @@ import numpy as np
 from common import Table
 
 import jaxid
-from jaxid.base_parameters import base_parameters, inertial_regressor
+from jaxid.arms.base_by_rules import base_parameters_by_rules
+from jaxid.arms.base_parameters import base_parameters, inertial_regressor
+from jaxid.dynamics.residuals import balance_along
 from jaxid.estimators import steps_of
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.estimators.steps import alone
-from jaxid.excitation import Excitation
-from jaxid.io.log import Log
+from jaxid.experiment_design.along_reference import Excitation
+from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.parameters import scatter
+from jaxid.model.unknowns import scatter
+from jaxid.numerics.lanes import alone
 from jaxid.plants import SerialArm, pa10
-from jaxid.regrouping import base_parameters_by_rules
-from jaxid.residuals import balance_along
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import arm_oracle

@@ -15,9 +15,9 @@ from pa10_arm import COULOMB, KNOWN, VISCOUS, arm_of, random_bodies
 from pa10_joint import CROSSING, EXACT, FAST, RATE, case_text, settled, unknown
 
 import jaxid
-from jaxid.base_parameters import BaseParameters, base_parameters
-from jaxid.dominant_inertia import DominantInertias, from_dominant_inertias, of_swing
-from jaxid.io.log import Log
+from jaxid.arms.base_parameters import BaseParameters, base_parameters
+from jaxid.arms.dominant_inertia import DominantInertias, from_dominant_inertias, of_swing
+from jaxid.logs.log import Log
 from jaxid.plants import SerialArm, pa10
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

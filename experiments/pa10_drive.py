@@ -12,7 +12,7 @@ from common import Table
 from pa10_joint import COULOMB, FASTEST, RATE, VISCOUS, case_text, unknown
 
 import jaxid
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from stepper import Loop, Machine, Sensor, simulate

@@ -12,7 +12,7 @@ from common import Table
 from five_bar_robot import PD, Ran, driven, robot
 
 import jaxid
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 
 # Noise of the torque in a log, at the motor [N m]; for how long the loop holds a command [s].
 LOGGED, HELD = 0.02, 1e-3

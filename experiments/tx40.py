@@ -20,7 +20,7 @@ import scipy.signal
 from common import Table, copied, parser_of
 
 import jaxid
-from jaxid.io.output import write_whole
+from jaxid.files import write_whole
 
 JOINTS = 6
 # Samples a second of the files, and of which one in so many is kept, after the same filter for all columns;

@@ -26,10 +26,10 @@ from common import Table, copied, parser_of
 
 import jaxid
 from jaxid.estimators import METHODS
-from jaxid.estimators.online import Online, Told, window_rows
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import alone
+from jaxid.estimators.algebraic.online import Online, Told, window_rows
+from jaxid.estimators.estimate import Estimate
 from jaxid.machine import build_machine
+from jaxid.numerics.lanes import alone
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import wi_figures

@@ -7,36 +7,36 @@ from jaxid import _platform
 _platform.configure()
 
 if TYPE_CHECKING:
-    from jaxid.discovery.discover import discover as discover
+    from jaxid.case.case import load_case as load_case
+    from jaxid.commands.discover import discover as discover
+    from jaxid.commands.live import Live as Live
+    from jaxid.commands.live import follow as follow
+    from jaxid.commands.study import study as study
     from jaxid.effects import EFFECTS as EFFECTS
     from jaxid.effects import register as register_effect  # noqa: F401
     from jaxid.errors import InputError as InputError
-    from jaxid.estimators.real_time import RealTime as RealTime
-    from jaxid.experiment import design as design
-    from jaxid.io.case import load_case as load_case
-    from jaxid.io.log import Log as Log
-    from jaxid.io.log import read_log as read_log
-    from jaxid.live import Live as Live
-    from jaxid.live import follow as follow
+    from jaxid.estimators.recursive.real_time import RealTime as RealTime
+    from jaxid.experiment_design.in_loop import design as design
+    from jaxid.logs.log import Log as Log
+    from jaxid.logs.log import read_log as read_log
     from jaxid.plants import PLANTS as PLANTS
     from jaxid.session import open_session as open_session
-    from jaxid.studies.study import study as study
 
 # Loaded on first use: importing JAX takes a second, and much of jaxid (its help, its checks of
 # bad input) does without.
 _HOMES = {
-    "discover": ("jaxid.discovery.discover", "discover"),
-    "identify": ("jaxid.identification", "identify"),
-    "simulate": ("jaxid.virtual", "simulate"),
-    "check": ("jaxid.checks", "check"),
-    "design": ("jaxid.experiment", "design"),
-    "study": ("jaxid.studies.study", "study"),
-    "load_case": ("jaxid.io.case", "load_case"),
-    "read_log": ("jaxid.io.log", "read_log"),
-    "Log": ("jaxid.io.log", "Log"),
-    "Live": ("jaxid.live", "Live"),
-    "follow": ("jaxid.live", "follow"),
-    "RealTime": ("jaxid.estimators.real_time", "RealTime"),
+    "discover": ("jaxid.commands.discover", "discover"),
+    "identify": ("jaxid.commands.identify", "identify"),
+    "simulate": ("jaxid.scene", "simulate"),
+    "check": ("jaxid.commands.check", "check"),
+    "design": ("jaxid.experiment_design.in_loop", "design"),
+    "study": ("jaxid.commands.study", "study"),
+    "load_case": ("jaxid.case.case", "load_case"),
+    "read_log": ("jaxid.logs.log", "read_log"),
+    "Log": ("jaxid.logs.log", "Log"),
+    "Live": ("jaxid.commands.live", "Live"),
+    "follow": ("jaxid.commands.live", "follow"),
+    "RealTime": ("jaxid.estimators.recursive.real_time", "RealTime"),
     "open_session": ("jaxid.session", "open_session"),
     "InputError": ("jaxid.errors", "InputError"),
     "EFFECTS": ("jaxid.effects", "EFFECTS"),

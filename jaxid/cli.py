@@ -197,34 +197,34 @@ def _progress(args: argparse.Namespace, stages: int):
 def _ready(args: argparse.Namespace, *files: str) -> None:
     """Refuse before the work what could not be written after it."""
     if args.o is not None:
-        from jaxid.io.output import check_folder
+        from jaxid.files import check_folder
 
         check_folder(Path(args.o), files, force=args.force)
 
 
 def _run_plants(args: argparse.Namespace) -> int:
-    from jaxid.catalogue import plants_table
+    from jaxid.results.catalogue import plants_table
 
     print(plants_table())
     return 0
 
 
 def _run_effects(args: argparse.Namespace) -> int:
-    from jaxid.catalogue import effects_table
+    from jaxid.results.catalogue import effects_table
 
     print(effects_table())
     return 0
 
 
 def _run_simulate(args: argparse.Namespace) -> int:
-    from jaxid.io.output import ready_file
+    from jaxid.files import ready_file
 
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}", mend="give zero or more")
     path = ready_file(Path(args.o), force=args.force)
     with _progress(args, 2) as tell:
         tell("simulating")
-        from jaxid.virtual import simulate
+        from jaxid.scene import simulate
 
         virtual = simulate(args.case, seed=args.seed)
     virtual.save(path)
@@ -233,11 +233,11 @@ def _run_simulate(args: argparse.Namespace) -> int:
 
 
 def _run_design(args: argparse.Namespace) -> int:
-    from jaxid.io.output import ready_file
+    from jaxid.files import ready_file
 
     path = ready_file(Path(args.o), force=args.force)
     with _progress(args, 4) as tell:
-        from jaxid.experiment import design
+        from jaxid.experiment_design.in_loop import design
 
         found = design(args.case, progress=tell)
     found.save(path)
@@ -249,7 +249,7 @@ def _run_check(args: argparse.Namespace) -> int:
     _ready(args, "check.json")
     with _progress(args, 2) as tell:
         tell("checking")
-        from jaxid.checks import check
+        from jaxid.commands.check import check
 
         result = check(args.case, args.log)
     print(result)
@@ -268,7 +268,7 @@ def _run_identify(args: argparse.Namespace) -> int:
     _ready(args, "result.json", "report.html")
     with _progress(args, 4) as tell:
         tell("starting")
-        from jaxid.identification import identify
+        from jaxid.commands.identify import identify
 
         result = identify(
             args.case, args.log, method=args.method, solver=args.solver, on=args.on,
@@ -286,14 +286,14 @@ def _run_discover(args: argparse.Namespace) -> int:
     _ready(args, "discovery.json", "report.html", *there)
     with _progress(args, 40) as tell:
         tell("starting")
-        from jaxid.discovery.discover import discover
+        from jaxid.commands.discover import discover
 
         result = discover(
             args.case, args.log, validate=args.validate, max_effects=args.max_effects,
             experiments=args.experiments, progress=tell,
         )
     print(result)
-    from jaxid.io.results import discovery_files
+    from jaxid.results.as_json import discovery_files
 
     return _finish(args, result, *discovery_files(result))
 
@@ -301,7 +301,7 @@ def _run_discover(args: argparse.Namespace) -> int:
 def _run_study(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from jaxid.studies.study import study
+    from jaxid.commands.study import study
 
     with tqdm(disable=args.quiet or not sys.stderr.isatty(), leave=False, unit="run") as bar:
 

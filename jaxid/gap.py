@@ -16,11 +16,11 @@ from jaxid.estimators.inverse_dynamics import (
     measured_force,
     sharpened,
 )
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine, position_noise
-from jaxid.model import Plant
-from jaxid.preprocess import Prepared
-from jaxid.replay import Replay
+from jaxid.model.plant import Plant
+from jaxid.simulation.replay import Replay
 
 
 @dataclass(frozen=True)

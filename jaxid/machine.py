@@ -11,23 +11,23 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid import signals
+from jaxid.case.case import Case
+from jaxid.case.entries import EffectEntry
+from jaxid.case.reference import info_of
+from jaxid.case.tables import ON_LINE
+from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS, Controller
 from jaxid.errors import InputError
-from jaxid.inertial import Inertial, InertialSensors
-from jaxid.io.case import Case
-from jaxid.io.case_entries import EffectEntry
-from jaxid.io.case_reference import info_of
-from jaxid.io.case_tables import ON_LINE
-from jaxid.io.case_values import Value
-from jaxid.io.log import Log
-from jaxid.model import ParameterInfo, Plant, as_array, parameters_of
-from jaxid.parameters import REFERENCE, Free, Parameters, effect_name, label
+from jaxid.logs.log import Log
+from jaxid.logs.readers import read_columns
+from jaxid.model.plant import ParameterInfo, Plant, as_array, parameters_of
+from jaxid.model.units import Units
+from jaxid.model.unknowns import REFERENCE, Free, Parameters, effect_name, label
+from jaxid.numerics import filters as signals
 from jaxid.references import REFERENCES
-from jaxid.references.course import Course
-from jaxid.sensors import Sensor
-from jaxid.tables import read_columns
-from jaxid.units import Units
+from jaxid.references.unknown import Course
+from jaxid.sensors.encoder import Sensor
+from jaxid.sensors.inertial import Inertial, InertialSensors
 
 # Velocity above which a joint's row counts for a law that identifies, where the case states none.
 _GATE = 1e-2
@@ -326,7 +326,7 @@ def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controlle
 
 def _estimator(case: Case, machine: Machine, period: float, stated: Mapping[str, Any]) -> Any:
     """Of a law that identifies: what finds the unknowns; how certain its start is, the law says."""
-    from jaxid.estimators.real_time import RealTime
+    from jaxid.estimators.recursive.real_time import RealTime
 
     where, count = f"{case.path}, [controller]", len(machine.parameters.free)
     if not count:

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.case.case import Case, load_case
 from jaxid.errors import InputError
-from jaxid.io.case import Case, load_case
-from jaxid.io.log import Log, read_log, with_load
-from jaxid.io.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
+from jaxid.logs.log import Log, read_log, with_load
+from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
+from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine, build_machine
-from jaxid.preprocess import Prepared, Recipe, choose_recipe, prepare
 from jaxid.references import make_reference
-from jaxid.stiffness import needed_steps
+from jaxid.simulation.step_size import needed_steps
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def open_session(
         case: The case, or its file.
         log: The log to fit, or its file.
         validate: More logs to validate on, beside the case's own.
-        align_hold: See `jaxid.preprocess.Recipe`; absent: what the case's recipe implies.
+        align_hold: See `jaxid.logs.prepare.Recipe`; absent: what the case's recipe implies.
         method: That is to fit the log: only `output_error` can do with a short one, within a prior, and
             "discover" by it.
 

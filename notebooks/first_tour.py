@@ -36,10 +36,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxid
-from jaxid.replay import make_replay
-from jaxid.report import plots
-from jaxid.report.build import units_of, views
-from jaxid.sensors import Sensor
+from jaxid.results.report import plots
+from jaxid.results.report.build import units_of, views
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.replay import make_replay
 
 FAST = os.environ.get("JAXID_FAST") == "1"
 

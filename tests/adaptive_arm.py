@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from two_links import TwoLinks
 
-from jaxid.live import Live
+from jaxid.commands.live import Live
 
 # Drive gains, viscous and Coulomb friction, as the case lists them; nothing of it in its guesses.
 TRUTH = np.array([0.93, 1.06, 1.5, 0.8, 4.0, 2.4])

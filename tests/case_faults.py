@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from jaxid.case.case import load_case
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
 
 GOOD = """
 [plant]

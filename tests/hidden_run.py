@@ -16,9 +16,9 @@ from hidden_chains import ChainCase
 from search_setup import case_text, log_of, write_case
 
 import jaxid
+from jaxid.commands.identify import Gap
 from jaxid.gap import force_gap
-from jaxid.identification import Gap
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 
 Record = dict
 Case = HiddenCase | ChainCase

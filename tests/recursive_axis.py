@@ -8,7 +8,7 @@ from stepper import Sensor
 from stepper_machines import emps_like
 
 from jaxid.estimators import METHODS
-from jaxid.estimators.steps import alone
+from jaxid.numerics.lanes import alone
 from jaxid.session import open_session
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from stepper_machines import Setup
 
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 
 Declared = Sequence[tuple[str, Mapping[str, float]]]
 

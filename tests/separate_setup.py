@@ -10,11 +10,11 @@ from search_setup import Declared, case_text, log_of, write_case
 from stepper import Loop
 from stepper_machines import Setup
 
+from jaxid.commands.discover import start_search
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.discover import start_search
 from jaxid.discovery.screen import Score
 from jaxid.discovery.search import Search
-from jaxid.discovery.separate import Proposal, propose
+from jaxid.discovery.separating.propose import Proposal, propose
 from jaxid.session import open_session
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})

@@ -11,10 +11,10 @@ import numpy as np
 from chain_stepper import ChainMachine, simulate_under
 from stepper import Sensor
 
-from jaxid.estimators.online import Told
-from jaxid.io.case import load_case
-from jaxid.io.log import Log
-from jaxid.live import Live
+from jaxid.case.case import load_case
+from jaxid.commands.live import Live
+from jaxid.estimators.algebraic.online import Told
+from jaxid.logs.log import Log
 from jaxid.machine import build_machine
 
 CASE = Path(__file__).parent.parent / "experiments" / "cases" / "chain6.toml"

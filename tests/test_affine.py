@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.affine import affine
+from jaxid.dynamics.dry_friction import set_valued_step
+from jaxid.dynamics.rhs import State, affine_flow, course, step
 from jaxid.effects import EFFECTS
-from jaxid.model import Action, Effect
+from jaxid.model.plant import Action, Effect
+from jaxid.numerics.affine import affine
 from jaxid.plants import Axis
-from jaxid.readings import State, affine_flow, course, step
-from jaxid.sticking import set_valued_step
 
 STEP = jnp.asarray(2e-3)
 LINEAR = {

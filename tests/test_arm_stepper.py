@@ -11,10 +11,10 @@ from arm_oracle import NAMES, bodies
 from arm_stepper import Arm, followed
 
 from jaxid.controllers.linear import PD
+from jaxid.dynamics.rhs import State, acceleration
 from jaxid.effects import EFFECTS
 from jaxid.plants import SerialArm, pa10
-from jaxid.readings import State, acceleration
-from jaxid.simulation import Drive, closed_loop
+from jaxid.simulation.loops import Drive, closed_loop
 
 pytest.importorskip("pinocchio", reason="Pinocchio (pip install pin) is not there")
 RATE = 200.0

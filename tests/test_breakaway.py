@@ -5,7 +5,7 @@ import pytest
 import stepper_machines as machines
 from search_setup import case_text, log_of, write_case
 
-from jaxid.discovery.breakaway import break_away
+from jaxid.discovery.at_rest.break_away import break_away
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.session import open_session
 

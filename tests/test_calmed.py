@@ -8,13 +8,13 @@ import pytest
 import stages
 
 import jaxid
-from jaxid.estimators.directions_problem import Problem
 from jaxid.estimators.output_error import choose_numerics
-from jaxid.io.log import Log
+from jaxid.estimators.within_prior.problem import Problem
+from jaxid.logs.log import Log
 from jaxid.machine import build_machine
-from jaxid.replay import make_replay
 from jaxid.session import open_session
-from jaxid.stiffness import calmed
+from jaxid.simulation.replay import make_replay
+from jaxid.simulation.step_size import calmed
 
 REST = jnp.zeros(2)
 

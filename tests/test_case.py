@@ -5,10 +5,10 @@ import math
 import pytest
 from case_faults import CASCADE, FAULTS, GOOD, message, more, swapped, write
 
+from jaxid.case.case import load_case
+from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
-from jaxid.io.case_values import Value
 
 # The example of the documentation, to the letter.
 DOCUMENTED = """

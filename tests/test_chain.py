@@ -13,24 +13,24 @@ import numpy as np
 import pytest
 from hidden_chains import ChainCase, text_of_chain
 
+from jaxid.case.case import load_case
+from jaxid.commands.discover import discover
+from jaxid.commands.identify import identify
 from jaxid.discovery.candidates import Samples as SearchSamples
 from jaxid.discovery.candidates import evaluate, points
-from jaxid.discovery.discover import discover
-from jaxid.discovery.union import build_union
+from jaxid.discovery.superset import build_union
+from jaxid.dynamics.dry_friction import set_valued_step
+from jaxid.dynamics.rhs import State, acceleration, course
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.gap import force_gap
-from jaxid.identification import identify
-from jaxid.io.case import load_case
-from jaxid.io.log import Log
-from jaxid.io.results import identification_json
+from jaxid.logs.log import Log
 from jaxid.machine import build_machine
 from jaxid.plants.chain import Chain
-from jaxid.readings import State, acceleration, course
+from jaxid.results.as_json import identification_json
+from jaxid.scene import simulate
 from jaxid.session import open_session
-from jaxid.simulation import Drive, interval_forces, open_loop
-from jaxid.sticking import set_valued_step
-from jaxid.virtual import simulate
+from jaxid.simulation.loops import Drive, interval_forces, open_loop
 
 MASS, DAMPING = np.array([2.0, 1.4, 2.6]), np.array([8.0, 7.0, 9.0])
 STIFFNESS = np.array([1700.0, 1600.0, 1900.0, 1500.0])

@@ -146,7 +146,7 @@ def test_what_stops_a_command_ends_with_1(tmp_path, files, capsys, monkeypatch, 
     def stopped(*_, **__):
         raise error
 
-    monkeypatch.setattr("jaxid.checks.check", stopped)
+    monkeypatch.setattr("jaxid.commands.check.check", stopped)
     ran = run(capsys, "check", *files, folder=tmp_path / "out")
     assert (ran.status, ran.err, ran.out) == (1, told, "")
     assert not (tmp_path / "out").exists()

@@ -7,16 +7,16 @@ import pytest
 from adaptive_arm import TEXT, TRUTH, driven, written
 from two_links import TwoLinks
 
+from jaxid.case.case import load_case
+from jaxid.commands.live import Live
 from jaxid.controllers import Tick
 from jaxid.controllers.computed_torque import ComputedTorque, inverse_dynamics
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
-from jaxid.live import Live
 from jaxid.machine import build_machine
 from jaxid.plants import Axis
-from jaxid.simulation import Drive, closed_loop
-from jaxid.virtual import simulate
+from jaxid.scene import simulate
+from jaxid.simulation.loops import Drive, closed_loop
 
 ENCODER = "velocity_average = 4\nreach = 8"
 

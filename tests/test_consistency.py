@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.estimators import _start, need_consistent
-from jaxid.estimators.consistency import need_bodies
-from jaxid.estimators.interior import inner_start
-from jaxid.estimators.least_squares import eliminated
-from jaxid.estimators.steps import alone
-from jaxid.io.case import load_case
-from jaxid.io.log import Log
+from jaxid.estimators.common.consistency import need_bodies
+from jaxid.estimators.common.interior import inner_start
+from jaxid.estimators.common.levenberg_marquardt import eliminated
+from jaxid.logs.log import Log
 from jaxid.machine import build_machine
-from jaxid.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.numerics.lanes import alone
 
 RNG = np.random.default_rng(4)
 GRAVITY = np.array([0.0, 0.0, -9.81])

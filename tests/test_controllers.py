@@ -9,8 +9,8 @@ import pytest
 from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
 from jaxid.plants import Axis
-from jaxid.sensors import Sensor
-from jaxid.simulation import Drive, closed_loop
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.loops import Drive, closed_loop
 
 PERIOD, TICKS, MASS, GAIN = 2e-3, 250, 2.0, 5.0
 TIME = PERIOD * np.arange(TICKS)

@@ -6,8 +6,8 @@ from stepper import Loop, Machine, Sensor, simulate
 
 import jaxid
 from jaxid.cli import main
-from jaxid.experiment import _Bench
-from jaxid.io.log import Log
+from jaxid.experiment_design.in_loop import _Bench
+from jaxid.logs.log import Log
 
 CASE = """
 [plant]

@@ -12,18 +12,19 @@ import stages
 
 import jaxid
 from jaxid.cli import main
-from jaxid.estimators import _beside_the_guesses, directions_rounds, steps_of
-from jaxid.estimators.directions_prior import Prior
-from jaxid.estimators.directions_problem import criterion_steps
-from jaxid.estimators.least_squares import Minimum
-from jaxid.estimators.steps import alone
-from jaxid.identification import identify_many
-from jaxid.io.log import Log
+from jaxid.commands.identify import identify_many
+from jaxid.estimators import _beside_the_guesses, steps_of
+from jaxid.estimators.common.levenberg_marquardt import Minimum
+from jaxid.estimators.within_prior import rounds as directions_rounds
+from jaxid.estimators.within_prior.prior import Prior
+from jaxid.estimators.within_prior.problem import criterion_steps
+from jaxid.logs.log import Log
 from jaxid.machine import build_machine
-from jaxid.parameters import scatter
-from jaxid.replay import Numerics, make_replay
-from jaxid.report.tables import within_prior_words
+from jaxid.model.unknowns import scatter
+from jaxid.numerics.lanes import alone
+from jaxid.results.report.words import within_prior_words
 from jaxid.session import open_session
+from jaxid.simulation.replay import Numerics, make_replay
 
 NOISE = 0.0135  # A
 STATED = '[output_error]\non = "force"\nprior = 0.5\n'

@@ -5,12 +5,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxid.estimators import directions, directions_posterior, directions_rounding, directions_rounds
-from jaxid.estimators.directions_posterior import loss_of, most_probable, past_kinks, spread
-from jaxid.estimators.directions_precision import Told, add_profiles
-from jaxid.estimators.directions_problem import Found
-from jaxid.estimators.least_squares import Minimum
-from jaxid.estimators.steps import alone
+from jaxid.estimators.common.levenberg_marquardt import Minimum
+from jaxid.estimators.within_prior import (
+    fit as directions,
+)
+from jaxid.estimators.within_prior import (
+    posterior as directions_posterior,
+)
+from jaxid.estimators.within_prior import (
+    rounding as directions_rounding,
+)
+from jaxid.estimators.within_prior import (
+    rounds as directions_rounds,
+)
+from jaxid.estimators.within_prior.posterior import loss_of, most_probable, past_kinks, spread
+from jaxid.estimators.within_prior.precision import Told, add_profiles
+from jaxid.estimators.within_prior.problem import Found
+from jaxid.numerics.lanes import alone
 
 NOISE = 0.3
 

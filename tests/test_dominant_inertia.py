@@ -7,8 +7,8 @@ import pytest
 from test_base_parameters import pa10_arm
 from test_serial_arm import ROWS, arm
 
-from jaxid.base_parameters import base_parameters, standard_parameters
-from jaxid.dominant_inertia import from_dominant_inertias, inertia_regressor, of_swing
+from jaxid.arms.base_parameters import base_parameters, standard_parameters
+from jaxid.arms.dominant_inertia import from_dominant_inertias, inertia_regressor, of_swing
 from jaxid.errors import InputError
 from jaxid.plants import Axis
 

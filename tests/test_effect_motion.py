@@ -12,8 +12,8 @@ from stepper import Loop, Machine, Sensor, simulate
 from test_effects import differences, places_of, plant_of
 
 from jaxid.controllers import CONTROLLERS
-from jaxid.parameters import scatter
-from jaxid.simulation import Drive, closed_loop, needed_substeps
+from jaxid.model.unknowns import scatter
+from jaxid.simulation.loops import Drive, closed_loop, needed_substeps
 
 PERIOD, TICKS, GAIN = 1e-3, 300, 35.0
 KP, KV, AVERAGE = 40.0, 200.0, 2

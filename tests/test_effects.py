@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from effect_cases import GRAVITY, MASS, ROWS, Instant, Row
 
+from jaxid.dynamics.dry_friction import set_valued_step
+from jaxid.dynamics.residuals import residual_along
+from jaxid.dynamics.rhs import State
 from jaxid.effects import EFFECTS
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
-from jaxid.parameters import scatter
+from jaxid.model.unknowns import scatter
+from jaxid.numerics.filters import Decimator
 from jaxid.plants import Axis
-from jaxid.readings import State
-from jaxid.residuals import residual_along
-from jaxid.signals import Decimator
-from jaxid.sticking import set_valued_step
 
 each_row = pytest.mark.parametrize("row", ROWS.values(), ids=[*ROWS])
 

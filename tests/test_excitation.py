@@ -7,7 +7,7 @@ from test_serial_arm_case import text
 
 import jaxid
 from jaxid.cli import main
-from jaxid.excitation import _Series
+from jaxid.experiment_design.along_reference import _Series
 
 ROWS = [("revolute", 0.0, 0.0, 0.0, 0.0), ("revolute", 0.0, 0.5, 0.0, 0.0)]
 STROKE, SPEED, ACCELERATION, NOISE = ((-1.0, 2.0), (-2.0, 2.0)), (2.0, 3.0), (8.0, 20.0), (0.5, 0.1)

@@ -11,13 +11,13 @@ import pytest
 from five_bar_oracle import HINGES, ORDERS, Robot, possible_states
 from five_bar_stepper import acceleration as stepped
 
-from jaxid.base_parameters import base_parameters, inertial_regressor
+from jaxid.arms.base_parameters import base_parameters, inertial_regressor
+from jaxid.dynamics.rhs import State, acceleration
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.model import port_motion
+from jaxid.model.plant import port_motion
 from jaxid.plants import FiveBar, righettini_five_bar
-from jaxid.readings import State, acceleration
-from jaxid.simulation import with_diffrax
+from jaxid.simulation.loops import with_diffrax
 
 # Unlike in every entry, so that no two can be exchanged unseen.
 UNEVEN = Robot(

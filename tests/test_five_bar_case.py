@@ -10,13 +10,13 @@ from five_bar_oracle import PLANT, Robot
 from five_bar_stepper import followed
 from written_logs import write_csv
 
+from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.estimators.recursive import recursive_steps
-from jaxid.estimators.steps import alone
-from jaxid.experiment import _Bench
-from jaxid.io.case import load_case
+from jaxid.estimators.recursive.estimate import recursive_steps
+from jaxid.experiment_design.in_loop import _Bench
 from jaxid.machine import build_machine
+from jaxid.numerics.lanes import alone
 from jaxid.session import open_session
 
 NAMES = {"actuator_gain": "gain", "coulomb_friction": "level", "viscous_friction": "coefficient"}

@@ -9,7 +9,7 @@ from five_bar_stepper import followed
 from test_five_bar_case import LOG, NOISE, effect, unknown
 from written_logs import write_csv
 
-from jaxid.discovery.discover import discover
+from jaxid.commands.discover import discover
 
 DECLARED = {"coulomb_friction": [6.0, 5.0, 0.0, 0.0, 0.0], "viscous_friction": [4.0, 3.0, 0.0, 0.0, 0.0]}
 CASE = PLANT + "".join(effect(kind, unknown(1.0, 2)) for kind in DECLARED) + LOG

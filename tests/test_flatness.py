@@ -7,15 +7,15 @@ import pytest
 import scipy.linalg
 from six_masses import CASE, KINDS, driven, errors, text, true_values
 
+from jaxid.case.case import load_case
+from jaxid.commands.live import Live, follow
 from jaxid.controllers import Flatness, Path, Tick, flat_inputs
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
-from jaxid.live import Live, follow
 from jaxid.plants import Axis
 from jaxid.plants.chain import Chain
-from jaxid.sensors import Sensor
-from jaxid.simulation import Drive, closed_loop, open_loop
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.loops import Drive, closed_loop, open_loop
 
 PERIOD, MASS, STIFF, DRAG, GAIN = 1e-4, 2.0, 300.0, 5.0, 4.0
 

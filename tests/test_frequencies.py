@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
+from jaxid.dynamics.frequencies import Modes, natural_frequencies
 from jaxid.effects import EFFECTS
-from jaxid.frequencies import Modes, natural_frequencies
 from jaxid.plants import PLANTS
 
 J1, J2, K = 72.3, 34.8, 8e5

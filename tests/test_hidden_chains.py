@@ -19,8 +19,8 @@ from hidden_oracle import Sight, Whitener
 from hidden_run import logged, text_of
 from search_setup import write_case
 
+from jaxid.commands.discover import discover, start_search, where_of
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.discover import discover, start_search, where_of
 from jaxid.discovery.search import Step
 from jaxid.discovery.where import variables
 from jaxid.plants.chain import Chain

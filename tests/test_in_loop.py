@@ -6,10 +6,10 @@ import pytest
 from search_setup import write_case
 
 import jaxid
-from jaxid.discovery.discover import start_search
-from jaxid.discovery.in_loop import WHY, hindering
+from jaxid.commands.discover import start_search
+from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.effects import EFFECTS
-from jaxid.parameters import free_effect
+from jaxid.model.unknowns import free_effect
 
 
 def opened(seed: int, folder, *, closed: bool = True):

@@ -9,11 +9,11 @@ import scipy.spatial.transform
 from adaptive_arm import TRUTH, written
 from test_serial_arm import GRAVITY, ROWS, arm, case, mujoco_model
 
+from jaxid.case.case import load_case
 from jaxid.errors import InputError
-from jaxid.inertial import Inertial, InertialSensors, calibrate, scale_factor
-from jaxid.io.case import load_case
 from jaxid.machine import build_machine
-from jaxid.virtual import simulate
+from jaxid.scene import simulate
+from jaxid.sensors.inertial import Inertial, InertialSensors, calibrate, scale_factor
 
 BOTH = ("gyroscope", "accelerometer")
 

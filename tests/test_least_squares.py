@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.estimators.least_squares import Transform, levenberg_marquardt
-from jaxid.parameters import Free, Parameters
+from jaxid.estimators.common.levenberg_marquardt import Transform, levenberg_marquardt
+from jaxid.model.unknowns import Free, Parameters
 
 TIME = np.linspace(0.0, 2.0, 80)
 # amplitude and rate positive, offset free, drag nonnegative
@@ -162,7 +162,7 @@ def test_signs_give_bounds_and_guesses_survive_the_round_trip():
 TOGETHER = """
 import threading
 import jaxid, jax, jax.numpy as jnp, numpy as np
-from jaxid.estimators.least_squares import Transform, levenberg_marquardt
+from jaxid.estimators.common.levenberg_marquardt import Transform, levenberg_marquardt
 p = 40
 columns = jnp.asarray(np.random.default_rng(0).standard_normal((200, p)))
 free = (jnp.full(p, -jnp.inf), jnp.full(p, jnp.inf))

@@ -12,7 +12,7 @@ from scipy.io import savemat
 from written_logs import COLUMNS, ROWS, edit, refuse, signals, write_csv
 
 from jaxid.errors import InputError
-from jaxid.io.log import Log, read_log
+from jaxid.logs.log import Log, read_log
 
 
 @pytest.fixture
@@ -153,7 +153,7 @@ def test_reading_is_quick(tmp_path):
 
 def test_reading_does_not_wait_for_jax():
     code = (
-        "import sys, jaxid.io.soundness, jaxid.references;"
+        "import sys, jaxid.logs.soundness, jaxid.references;"
         "sys.exit('jax' in sys.modules or 'scipy' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

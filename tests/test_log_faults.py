@@ -8,7 +8,7 @@ import pytest
 from written_logs import COLUMNS, ROWS, edit, refuse, signals, write_csv
 
 from jaxid.errors import suggest
-from jaxid.io.log import read_log
+from jaxid.logs.log import read_log
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import stepper
 from flexible_axes import RIGID
 
 import jaxid
-from jaxid.replay import start_shows
+from jaxid.simulation.replay import start_shows
 
 RATE = 200.0
 TRUE = {"inertia": 90.0, "viscous_friction.coefficient": 200.0, "coulomb_friction.level": 20.0}

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
+from jaxid.case.case import load_case
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 from jaxid.machine import build_machine, disturbance_at
-from jaxid.model import Effect, Plant, as_array, parameter
+from jaxid.model.plant import Effect, Plant, as_array, parameter
 from jaxid.plants import PLANTS
 
 CASE = """

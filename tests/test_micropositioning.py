@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import stages
 
+from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 from jaxid.machine import build_machine
-from jaxid.parameters import label
+from jaxid.model.unknowns import label
 from jaxid.plants.chain import Chain
 from jaxid.plants.micropositioning_stage import MicropositioningStage
-from jaxid.replay import Numerics, make_replay
-from jaxid.stiffness import needed_steps
+from jaxid.simulation.replay import Numerics, make_replay
+from jaxid.simulation.step_size import needed_steps
 
 
 def replayed(case, log: dict, columns: tuple[str, ...], substeps: int):

@@ -9,10 +9,10 @@ import pytest
 
 from jaxid.cli import main
 from jaxid.estimators import METHODS
-from jaxid.estimators.minimal_model import filtering_of
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import alone
-from jaxid.report.minimal_plots import plot_filtering
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.minimal.fit import filtering_of
+from jaxid.numerics.lanes import alone
+from jaxid.results.report.minimal_plots import plot_filtering
 from jaxid.session import open_session
 
 T = flexible.TRUTH

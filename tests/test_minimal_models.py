@@ -7,18 +7,18 @@ import jax
 import numpy as np
 import pytest
 
-from jaxid import signals
+from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
-from jaxid.estimators.steps import alone
-from jaxid.io.case import load_case
+from jaxid.estimators.minimal.basis import basis_of, chi_of
+from jaxid.estimators.minimal.columns import decimator_of, reach_of
+from jaxid.estimators.minimal.matrices import linear_balance
+from jaxid.estimators.minimal.models import form_of, structure_of
+from jaxid.estimators.minimal.polynomials import adjugate, determinant, product, scaled
+from jaxid.logs.prepare import Recipe
 from jaxid.machine import build_machine
-from jaxid.minimal.basis import basis_of, chi_of
-from jaxid.minimal.columns import decimator_of, reach_of
-from jaxid.minimal.matrices import linear_balance
-from jaxid.minimal.models import form_of, structure_of
-from jaxid.minimal.polynomials import adjugate, determinant, product, scaled
-from jaxid.preprocess import Recipe
+from jaxid.numerics import filters as signals
+from jaxid.numerics.lanes import alone
 from jaxid.session import open_session
 
 T = flexible.TRUTH

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from six_masses import KINDS, driven, errors, first_instants, machine, text
 
+from jaxid.commands.identify import identify
 from jaxid.errors import InputError
-from jaxid.estimators.one_window import _homogeneous, ratio, single_time, without_friction
-from jaxid.identification import identify
-from jaxid.io.log import Log
-from jaxid.io.results import identification_json
+from jaxid.estimators.algebraic.one_window import _homogeneous, ratio, single_time, without_friction
+from jaxid.logs.log import Log
+from jaxid.results.as_json import identification_json
 
 FORMS = ("algebraic_single_time", "algebraic_ratio", "algebraic_sign_changed", "algebraic_sign_unchanged")
 

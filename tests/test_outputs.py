@@ -7,7 +7,7 @@ from search_setup import case_text, log_of, write_case
 from stepper_machines import emps_like
 
 import jaxid
-from jaxid.precision import assess
+from jaxid.numerics.precision import assess
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})
 COULOMB = ("coulomb_friction", {"level": 20.39})

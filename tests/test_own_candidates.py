@@ -7,8 +7,8 @@ import stepper_machines as machines
 from search_cases import COULOMB, VISCOUS
 from search_setup import case_text, log_of, write_case
 
-from jaxid.discovery.discover import discover
-from jaxid.discovery.union import build_union
+from jaxid.commands.discover import discover
+from jaxid.discovery.superset import build_union
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.session import open_session
@@ -16,7 +16,7 @@ from jaxid.session import open_session
 # A force in time at a known frequency: nothing that is registered does that.
 OWN = """
 import jax.numpy as jnp
-from jaxid.model import Action, Effect, parameter
+from jaxid.model.plant import Action, Effect, parameter
 
 
 class Hum(Effect):

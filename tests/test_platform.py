@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from rooms import AGAINST, ROOMS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxid"
@@ -77,7 +78,7 @@ LOOP = """
 import jaxid, jax, jax.numpy as jnp
 from jaxid.effects import EFFECTS
 from jaxid.plants import Axis
-from jaxid.simulation import Drive, open_loop
+from jaxid.simulation.loops import Drive, open_loop
 def end(level):
     plant = Axis(2.0, effects=(EFFECTS["coulomb_friction"](level=level),))
     u = jnp.ones((50, 1))
@@ -105,45 +106,30 @@ def imports(path: Path) -> set[str]:
     return found
 
 
-def files(*places: str) -> list[Path]:
-    out = []
-    for place in places:
-        path = PACKAGE / place
-        out += sorted(path.rglob("*.py")) if path.is_dir() else [path]
-    assert out, f"{places} is gone: this test guards nothing"
-    return out
+def room(module: str) -> str | None:
+    """The room of a module's full name; None for `jaxid` itself."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == "jaxid" and len(parts) > 1 and parts[1] in ROOMS else None
 
 
-ABOVE_PHYSICS = (
-    "estimators", "discovery", "io", "report", "cli", "identify", "session", "machine", "replay",
-    "gap", "precision", "preprocess", "studies", "check", "virtual",
-)  # fmt: skip
-READINGS = ("readings", "residuals", "sticking")
-BESIDE = ("effects", "plants", "controllers", "sensors", "simulation")
+def test_every_module_has_its_room_and_every_room_is_there():
+    there = {p.stem for p in PACKAGE.glob("*.py")} | {p.parent.name for p in PACKAGE.glob("*/__init__.py")}
+    assert there - {"__init__"} == set(ROOMS)
 
 
-@pytest.mark.parametrize(
-    ("places", "forbidden"),
-    [
-        (("smooth.py", "units.py", "_platform.py", "errors.py"), ("",)),  # nothing of jaxid
-        (("model.py",), (*READINGS, *BESIDE, *ABOVE_PHYSICS)),
-        (("readings.py", "residuals.py", "sticking.py"), (*BESIDE, *ABOVE_PHYSICS)),
-        (("effects",), ("plants", "controllers", "simulation", *READINGS, *ABOVE_PHYSICS)),
-        (("plants", "controllers", "sensors.py"), ("effects", "simulation", *ABOVE_PHYSICS)),
-        (("simulation.py", "signals.py", "parameters.py"), ABOVE_PHYSICS),
-        (("references",), ABOVE_PHYSICS),
-        (("estimators",), ("plants", "discovery", "report", "cli", "studies")),
-        (("precision.py",), ("plants", "discovery", "report", "cli", "io", "estimators")),
-        (("discovery",), ("plants", "report", "cli", "studies")),
-    ],
-    ids=lambda value: value[0] if isinstance(value, tuple) else None,
-)
-def test_imports_point_up_the_list_only(places, forbidden):
-    for path in files(*places):
-        own = {m for m in imports(path) if m.startswith("jaxid.")}
-        for name in forbidden:
-            bad = {m for m in own if f"{m}.".startswith(f"jaxid.{name}." if name else "jaxid.")}
-            assert not bad, f"{path.relative_to(ROOT)} imports {bad}"
+def test_imports_follow_the_order_of_rooms():
+    order = list(ROOMS)
+    against = set()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        here = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if here == "__init__":
+            continue
+        for module in imports(path):
+            there = room(module)
+            if there and order.index(there) > order.index(here):
+                assert (here, there) in AGAINST, f"{path.relative_to(ROOT)} imports {module}"
+                against.add((here, there))
+    assert against == set(AGAINST), "an exception that nothing needs any more"
 
 
 def test_the_package_does_not_import_its_tests_or_experiments():

@@ -15,13 +15,13 @@ from stepper_machines import emps_like, moves
 
 from jaxid.errors import InputError
 from jaxid.estimators.power import power
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared, Recipe
 from jaxid.machine import Machine
-from jaxid.model import Effect, Plant, parameter
-from jaxid.parameters import Free, Parameters
-from jaxid.preprocess import Prepared, Recipe
+from jaxid.model.plant import Effect, Plant, parameter
+from jaxid.model.units import Units
+from jaxid.model.unknowns import Free, Parameters
 from jaxid.session import open_session
-from jaxid.units import Units
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})
 COULOMB = ("coulomb_friction", {"level": 20.39})

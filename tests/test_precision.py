@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from jaxid.dynamics.residuals import residual_along
 from jaxid.effects import EFFECTS
-from jaxid.parameters import scatter
+from jaxid.model.unknowns import scatter
+from jaxid.numerics.precision import NoiseModel, assess, full_hessian, sandwich
 from jaxid.plants import Axis
-from jaxid.precision import NoiseModel, assess, full_hessian, sandwich
-from jaxid.residuals import residual_along
 
 AR2 = np.array([1.4, -0.6])
 

@@ -13,11 +13,11 @@ from stepper_machines import emps_like
 import jaxid
 from jaxid.errors import InputError
 from jaxid.gap import noise_floor
-from jaxid.io.log import Log
-from jaxid.io.results import recipe_json
-from jaxid.preprocess import choose_recipe, differentiate, prepare
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import choose_recipe, differentiate, prepare
+from jaxid.numerics.filters import parabolic_cutoff
+from jaxid.results.as_json import recipe_json
 from jaxid.session import open_session
-from jaxid.signals import parabolic_cutoff
 
 RATE = 1000.0
 TIME = np.arange(8000) / RATE

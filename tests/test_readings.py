@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from stepper import Sensor
 
+from jaxid.dynamics.dry_friction import set_valued_step
+from jaxid.dynamics.residuals import _recurrence, residual_along
+from jaxid.dynamics.rhs import State, small_solve, step
 from jaxid.effects import EFFECTS
-from jaxid.estimators.algebraic import iterated_integral, weak_motion
-from jaxid.parameters import scatter
+from jaxid.estimators.algebraic.windows import iterated_integral, weak_motion
+from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
-from jaxid.readings import State, small_solve, step
-from jaxid.residuals import _recurrence, residual_along
-from jaxid.simulation import Drive, open_loop
-from jaxid.sticking import set_valued_step
+from jaxid.simulation.loops import Drive, open_loop
 
 MASS, DAMPING, STIFFNESS = 2.0, 3.0, 800.0
 OSCILLATOR = (

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.estimators.recursion import TOLD, Recursion, instants, run
+from jaxid.estimators.recursive.recursion import TOLD, Recursion, instants, run
 
 TRUTH = np.array([95.0, 203.0, 20.0, 0.85])
 START = np.array([40.0, 0.0, 0.0, 1.0])

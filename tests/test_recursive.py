@@ -15,15 +15,15 @@ from stepper import Loop, Sensor
 from stepper_machines import moves, servo
 from test_recursion import gain_regression
 
+from jaxid.commands.identify import identify, identify_many
 from jaxid.errors import InputError
-from jaxid.estimators.recursion import Recursion, run
-from jaxid.estimators.recursive import start_of
-from jaxid.estimators.recursive_precision import precision_of
-from jaxid.estimators.recursive_rows import Rows
-from jaxid.identification import identify, identify_many
-from jaxid.io.log import Log
-from jaxid.report.build import history_of, identification_report
-from jaxid.report.history_plots import plot_history
+from jaxid.estimators.recursive.estimate import start_of
+from jaxid.estimators.recursive.precision import precision_of
+from jaxid.estimators.recursive.recursion import Recursion, run
+from jaxid.estimators.recursive.rows import Rows
+from jaxid.logs.log import Log
+from jaxid.results.report.build import history_of, identification_report
+from jaxid.results.report.history_plots import plot_history
 from jaxid.session import open_session
 
 

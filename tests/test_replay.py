@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxid.io.log import Log
-from jaxid.replay import local_line
+from jaxid.logs.log import Log
+from jaxid.simulation.replay import local_line
 
 PERIOD, SPEED, NOISE = 1e-3, 0.05, 1e-6
 TIME = PERIOD * np.arange(400)

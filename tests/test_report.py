@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxid.report import (
+from jaxid.results.report import (
     CandidateScore,
     LogView,
     ParameterRow,
@@ -298,5 +298,5 @@ def test_writing_is_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 def test_importing_the_report_leaves_jax_and_pyplot_alone():
-    code = "import sys, jaxid.report; sys.exit(len({'jax', 'matplotlib.pyplot'} & {*sys.modules}))"
+    code = "import sys, jaxid.results.report; sys.exit(len({'jax', 'matplotlib.pyplot'} & {*sys.modules}))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

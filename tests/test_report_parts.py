@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from jaxid.estimators import METHODS
-from jaxid.report import CandidateScore, LogView, SearchStep
-from jaxid.report.curves import binned_mean, envelope
-from jaxid.report.numbers import plain, pretty_unit, scaled_unit, with_std
-from jaxid.report.plots import plot_candidates, plot_fit, plot_residual_against
-from jaxid.report.study import _answer
-from jaxid.report.study_plots import _look, plot_coverage, plot_errors
-from jaxid.report.tables import GapRow, _gaps_words
+from jaxid.results.report import CandidateScore, LogView, SearchStep
+from jaxid.results.report.curves import binned_mean, envelope
+from jaxid.results.report.numbers import plain, pretty_unit, scaled_unit, with_std
+from jaxid.results.report.plots import plot_candidates, plot_fit, plot_residual_against
+from jaxid.results.report.study import _answer
+from jaxid.results.report.study_plots import _look, plot_coverage, plot_errors
+from jaxid.results.report.words import GapRow, _gaps_words
 
 
 def _view(**changes):

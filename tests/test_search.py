@@ -8,7 +8,7 @@ import stepper_machines as machines
 from search_cases import AT_REST, COULOMB, PAIRS, SEARCH_CASES, VISCOUS, SearchCase
 from search_setup import case_text, log_of, write_case
 
-from jaxid.discovery.discover import discover
+from jaxid.commands.discover import discover
 from jaxid.effects import EFFECTS
 
 FAST = ("coulomb_friction", "static_friction", "cogging", "input_delay", "hysteresis")

@@ -11,15 +11,15 @@ from cli_setup import run
 from search_setup import case_text, log_of, write_case
 from stepper import write_csv
 
-from jaxid.discovery import separate
-from jaxid.discovery.discover import discover
-from jaxid.discovery.rivals import loss
-from jaxid.discovery.shapes import Shapes, basis
+from jaxid.case.case import load_case
+from jaxid.commands.discover import discover
+from jaxid.discovery.separating import propose as separate
+from jaxid.discovery.separating.rivals import loss
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
-from jaxid.io.proposals import proposal_json, sentence, signal_csv
+from jaxid.experiment_design.shapes import Shapes, basis
+from jaxid.model.units import Units
 from jaxid.references import make_reference
-from jaxid.units import Units
+from jaxid.results.proposals import proposal_json, sentence, signal_csv
 
 SPRINGS = ("cubic_stiffness", "quadratic_stiffness")
 

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxid.dynamics.rhs import State, acceleration, step
 from jaxid.effects import EFFECTS
-from jaxid.model import parameters_of
+from jaxid.model.plant import parameters_of
 from jaxid.plants import DenavitHartenberg, SerialArm, pa10
-from jaxid.readings import State, acceleration, step
 
 PA10 = [
     (joint, *numbers) for joint, *numbers in zip(

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import stepper
 
+from jaxid.dynamics.dry_friction import set_valued_step
+from jaxid.dynamics.rhs import State, course
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.plants import Axis, Chain
-from jaxid.readings import State, course
-from jaxid.simulation import Drive, open_loop
-from jaxid.sticking import set_valued_step
+from jaxid.simulation.loops import Drive, open_loop
 
 MASS, RATE, SECONDS = 2.5, 500.0, 0.6
 COULOMB = {"coulomb_friction": {"level": 11.8}}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from jaxid import signals
+from jaxid.numerics import filters as signals
 
 PERIOD = 1e-3
 TIME = PERIOD * np.arange(3000)

@@ -15,7 +15,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.didim import didim
 from jaxid.estimators.instrumental_variable import instrumental_variable
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 from jaxid.session import open_session
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})

@@ -9,10 +9,10 @@ import pytest
 
 from jaxid.controllers.linear import CascadePD
 from jaxid.effects import EFFECTS
-from jaxid.parameters import scatter
+from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
-from jaxid.sensors import Sensor
-from jaxid.simulation import (
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.loops import (
     Drive,
     closed_loop,
     interval_forces,

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxid.identification import identify
-from jaxid.io.case import load_case
+from jaxid.case.case import load_case
+from jaxid.commands.identify import identify
 from jaxid.machine import build_machine
-from jaxid.replay import make_replay
-from jaxid.virtual import simulate
+from jaxid.scene import simulate
+from jaxid.simulation.replay import make_replay
 
 STUDY = Path(__file__).parent.parent / "experiments" / "cases" / "study.toml"
 

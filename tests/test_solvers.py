@@ -12,17 +12,17 @@ import pytest
 import jaxid
 from jaxid import cli
 from jaxid.controllers.linear import CascadePD
+from jaxid.dynamics.rhs import State
 from jaxid.effects import EFFECTS
 from jaxid.estimators.output_error import choose_numerics, output_error
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.parameters import Free, Parameters
+from jaxid.model.units import Units
+from jaxid.model.unknowns import Free, Parameters
 from jaxid.plants import Axis
-from jaxid.readings import State
-from jaxid.replay import Numerics, make_replay
-from jaxid.simulation import with_diffrax
-from jaxid.solvers import SOLVERS, Adaptive
-from jaxid.units import Units
+from jaxid.simulation.loops import with_diffrax
+from jaxid.simulation.replay import Numerics, make_replay
+from jaxid.simulation.solvers import SOLVERS, Adaptive
 
 PERIOD, SAMPLES, GAIN = 5e-3, 300, 3.0
 TIMES = PERIOD * np.arange(SAMPLES)

@@ -9,9 +9,9 @@ import pytest
 from stepper import Loop, Machine, Sensor, simulate
 
 from jaxid.errors import InputError
-from jaxid.io.log import Log, read_log
-from jaxid.io.rough import correlation, implied_inertia, smooth
-from jaxid.io.soundness import Finding, check_log, plausible_inertia, raise_on_error
+from jaxid.logs.log import Log, read_log
+from jaxid.logs.rough_inertia import correlation, implied_inertia, smooth
+from jaxid.logs.soundness import Finding, check_log, plausible_inertia, raise_on_error
 
 INERTIA, VISCOUS, COULOMB = 12.0, 30.0, 8.0
 GAIN = 4.0

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from jaxid.estimators.steps import Parts, Solve, Soon, alone, together
+from jaxid.numerics.lanes import Parts, Solve, Soon, alone, together
 
 
 def double(x):

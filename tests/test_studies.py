@@ -16,7 +16,7 @@ from search_setup import write_case
 
 import jaxid
 from jaxid.errors import InputError
-from jaxid.estimators.steps import Solve, alone, together
+from jaxid.numerics.lanes import Solve, alone, together
 from jaxid.studies import plan as planned
 from jaxid.studies.plan import Plan
 from jaxid.studies.result import summarised

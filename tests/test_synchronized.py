@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from jaxid.references import make_reference
 from jaxid.references.s_curve import Bounds, plan_s_curve
 from jaxid.references.synchronized import plan_line
-from jaxid.virtual import simulate
+from jaxid.scene import simulate
 
 RATE = 4000.0
 # Table 3 of the five-bar's paper, in degrees: 210/s, 1680/s^2, 25200/s^3, lower bounds negative.

@@ -6,9 +6,9 @@ import stepper_machines as machines
 from search_cases import COULOMB, VISCOUS
 from search_setup import case_text, log_of, write_case
 
+from jaxid.commands import discover as discovery
 from jaxid.discovery import candidates as cand
-from jaxid.discovery import discover as discovery
-from jaxid.discovery.union import build_union
+from jaxid.discovery.superset import build_union
 from jaxid.session import open_session
 
 

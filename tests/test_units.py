@@ -3,9 +3,9 @@
 import pytest
 
 from jaxid.effects import EFFECTS
-from jaxid.model import Scales, parameters_of
+from jaxid.model.plant import Scales, parameters_of
+from jaxid.model.units import Units
 from jaxid.plants import PLANTS
-from jaxid.units import Units
 
 LABELS = {
     # dimension: linear, rotary, in volts

@@ -10,9 +10,9 @@ from stepper import Loop, Machine, Sensor, simulate
 
 import jaxid
 from jaxid.cli import main
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
 from jaxid.references import make_reference
-from jaxid.references.course import Course
+from jaxid.references.unknown import Course
 
 TRUE = {"onset": 0.31, "speed": 0.42, "acceleration": 3.1}
 GUESS = {"onset": 0.22, "speed": 0.6, "acceleration": 5.0}

@@ -11,8 +11,8 @@ from two_links import TwoLinks, followed
 from written_logs import write_csv
 
 import jaxid
-from jaxid.io.case import load_case
-from jaxid.io.urdf import read_urdf
+from jaxid.case.case import load_case
+from jaxid.case.urdf import read_urdf
 from jaxid.machine import build_machine
 from jaxid.plants import SerialArm
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 from case_faults import message, more, write
 
+from jaxid.case.case import load_case
 from jaxid.effects import EFFECTS
-from jaxid.io.case import load_case
 from jaxid.machine import build_machine
 
 OWN_EFFECT = """
-from jaxid.model import Action, Effect, parameter
+from jaxid.model.plant import Action, Effect, parameter
 
 class Wind(Effect):
     {kind}
@@ -88,7 +88,7 @@ OWN_FAULTS = {
     "no such file": ('"my.py:Wind"', ["my.py", "does not exist", "there is: mine.py"]),
     "no such class": ('"mine.py:Wnid"', ["Wnid is not there", "'Wind'"]),
     "no class": ('"mine.py"', ["names no class", "my_effects.py:MyEffect"]),
-    "not an effect": ('"mine.py:NotAnEffect"', ["not a subclass of jaxid.model.Effect"]),
+    "not an effect": ('"mine.py:NotAnEffect"', ["not a subclass of jaxid.model.plant.Effect"]),
     "no act": ('"mine.py:Idle"', ["no method act", "define act"]),
 }
 
@@ -118,7 +118,7 @@ def test_own_effect_does_not_take_a_name_there_is(tmp_path):
     assert "takes the name of an effect there is: viscous_friction" in told
     write(
         tmp_path,
-        "from jaxid.effects import register\nfrom jaxid.model import Effect\n"
+        "from jaxid.effects import register\nfrom jaxid.model.plant import Effect\n"
         '@register("viscous_friction")\nclass ViscousFriction(Effect):\n    pass\n',
         "theirs.py",
     )

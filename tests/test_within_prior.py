@@ -7,8 +7,8 @@ import pytest
 import stages
 
 import jaxid
-from jaxid.discovery.looks import Fit, Loop
-from jaxid.io.log import Log
+from jaxid.discovery.in_loop.candidates import Fit, Loop
+from jaxid.logs.log import Log
 
 PRIOR = '[output_error]\non = "force"\nprior = 0.5\n'
 STAGE = {data: stages.machine(data, rigid=True) for data in stages.MOVES}

@@ -10,16 +10,16 @@ from search_cases import COULOMB, VISCOUS
 from search_setup import case_text, log_of, write_case
 from stepper import Sensor
 
+from jaxid.commands.discover import start_search
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.discover import start_search
+from jaxid.discovery.acceptance import Worth
 from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import _felt
 from jaxid.discovery.where import _between
-from jaxid.discovery.worth import Worth
 from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.gap import noise_density
-from jaxid.precision import NoiseModel
+from jaxid.numerics.precision import NoiseModel
 from jaxid.session import open_session
 
 DELAY, LAG = "input_delay", "actuator_lag"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxid.errors import InputError
-from jaxid.io.log import read_log
+from jaxid.logs.log import read_log
 
 COLUMNS = {"time": "t", "position": "q", "force": "u"}
 ROWS = 200

@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxid.controllers.base import Path, Tick
 from jaxid.controllers.computed_torque import FeedForward
-from jaxid.parameters import scatter
+from jaxid.model.unknowns import scatter
 
-# A law is given its estimator, and imports none: `jaxid.estimators.real_time.RealTime`, with the memory and
-# what it tells of `jaxid.estimators.recursion`.
+# A law is given its estimator, and imports none: `RealTime` of `jaxid.estimators.recursive.real_time`, with
+# the memory and what it tells of `jaxid.estimators.recursive.recursion`.
 RealTime = Memory = Told = Any
 
 # Instants of the reference at which columns are looked at, at most.
@@ -40,7 +40,7 @@ class Learning(eqx.Module):
     Args:
         feedback: Of the PD law.
         recursion: Of the estimator.
-        information: Of its start (see `jaxid.estimators.recursion.Recursion`).
+        information: Of its start (see `jaxid.estimators.recursive.recursion.Recursion`).
         share: By how much an unknown's error of one moves the force, over the force: root mean squares along
             the reference.
         found: So far.

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxid.smooth import sharp_clip
+from jaxid.numerics.smooth import sharp_clip
 
 
 class Path(eqx.Module):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxid.controllers.base import Controller, Path, Tick
-from jaxid.model import Plant
+from jaxid.model.plant import Plant
 
 # Least gain of a drive that a command is divided by.
 _LEAST_GAIN = 0.1

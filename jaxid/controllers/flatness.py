@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.controllers.base import Controller, Path, Tick
-from jaxid.model import Plant, port_motion
-from jaxid.readings import State, acceleration
-from jaxid.smooth import sharp_clip
+from jaxid.dynamics.rhs import State, acceleration
+from jaxid.model.plant import Plant, port_motion
+from jaxid.numerics.smooth import sharp_clip
 
 
 def flat_inputs(plant: Plant, path: Path, drives: int) -> Float[Array, "time m"]:

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
-from jaxid.checks import check
-from jaxid.discovery.discover import discover
-from jaxid.identification import identify
-from jaxid.io.output import ready_folder
+from jaxid.commands.check import check
+from jaxid.commands.discover import discover
+from jaxid.commands.identify import identify
+from jaxid.files import ready_folder
 
 _FILES = ("case.toml", "log.csv", "validation.csv")
 

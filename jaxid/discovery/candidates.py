@@ -16,13 +16,13 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Bool, Float
 
+from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual
-from jaxid.estimators.least_squares import Transform
-from jaxid.estimators.steps import in_threads
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model import Effect, Plant, parameters_of
-from jaxid.parameters import Free, Parameters, scatter, seeds
-from jaxid.preprocess import Prepared
+from jaxid.model.plant import Effect, Plant, parameters_of
+from jaxid.model.unknowns import Free, Parameters, scatter, seeds
+from jaxid.numerics.lanes import in_threads
 
 # An effect with more starts than this is evaluated on a plant of its own, all starts at once.
 _FEW = 8

@@ -13,7 +13,7 @@ import scipy.fft
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from jaxid.precision import NoiseModel
+from jaxid.numerics.precision import NoiseModel
 
 BLOCKS = 10
 # Rows that whitening may leave correlated; fewest stretches of a surrogate.

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxid import signals
 from jaxid.discovery.columns import left_over, span, stacked
 from jaxid.discovery.evidence import Whitener
 from jaxid.gap import noise_density
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.precision import NoiseModel
-from jaxid.preprocess import Prepared
+from jaxid.numerics import filters as signals
+from jaxid.numerics.precision import NoiseModel
 
 # Part of the force that filtering, holding and integrating leave wrong in any model: an effect
 # that brings less (in RMS) cannot be told from them.

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxid.commands.identify import Gap
 from jaxid.discovery.screen import Score
 from jaxid.discovery.where import Where
-from jaxid.estimators.result import Estimate
-from jaxid.identification import Gap
+from jaxid.estimators.estimate import Estimate
 from jaxid.session import Session
 
 if TYPE_CHECKING:
     from jaxid.discovery.search import Step
-    from jaxid.discovery.separate import Proposal
+    from jaxid.discovery.separating.propose import Proposal
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Discovery:
         return self.after.converged
 
     def __str__(self) -> str:
-        from jaxid.io.tables import discovery_table
+        from jaxid.results.as_text import discovery_table
 
         return discovery_table(self)
 
@@ -108,6 +108,6 @@ class Discovery:
         Raises:
             InputError: If the folder holds what jaxid did not make and `force` is not given.
         """
-        from jaxid.io.results import save_discovery
+        from jaxid.results.as_json import save_discovery
 
         return save_discovery(self, Path(folder), force=force)

@@ -10,11 +10,11 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
-from jaxid.discovery.choice import MODEST, few, margin, modest, simplest
+from jaxid.discovery.acceptance import RELEVANT, Worth
 from jaxid.discovery.screen import Score, Screen, guess_pair, screen_candidates
-from jaxid.discovery.worth import RELEVANT, Worth
-from jaxid.precision import NoiseModel
-from jaxid.preprocess import Prepared
+from jaxid.discovery.selection import MODEST, few, margin, modest, simplest
+from jaxid.logs.prepare import Prepared
+from jaxid.numerics.precision import NoiseModel
 
 # What the case has is gone where less than this part of it is left beside an effect.
 _GONE = 1e-2

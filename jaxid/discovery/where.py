@@ -14,9 +14,9 @@ from jaxtyping import Float
 
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.noise import fit_whitener
-from jaxid.model import Plant
-from jaxid.precision import NoiseModel
-from jaxid.preprocess import Prepared
+from jaxid.logs.prepare import Prepared
+from jaxid.model.plant import Plant
+from jaxid.numerics.precision import NoiseModel
 
 _KNOTS = 12
 # A window of this many samples is loud where its energy exceeds the median's by this factor: in

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from jaxtyping import Array
 
-from jaxid import smooth
 from jaxid.effects.registry import register
-from jaxid.model import Action, Effect, Scales, Signals, parameter
+from jaxid.model.plant import Action, Effect, Scales, Signals, parameter
+from jaxid.numerics import smooth
 
 # Corner of the saturation, relative to its limit: 0.7e-3 of the limit is missing at the corner.
 _CORNER = 1e-3

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxid import smooth
 from jaxid.effects.registry import register
-from jaxid.model import Action, Effect, Scales, Signals, parameter
+from jaxid.model.plant import Action, Effect, Scales, Signals, parameter
+from jaxid.numerics import smooth
 
 # Corner of the clearance, relative to it.
 _CORNER = 1e-2

@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxid import smooth
 from jaxid.effects.registry import register
-from jaxid.model import Action, Effect, Scales, Signals, parameter
+from jaxid.model.plant import Action, Effect, Scales, Signals, parameter
+from jaxid.numerics import smooth
 
 
 @register("viscous_friction")

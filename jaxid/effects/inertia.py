@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Array
 
 from jaxid.effects.registry import register
-from jaxid.model import Action, Effect, Signals, parameter
+from jaxid.model.plant import Action, Effect, Signals, parameter
 
 
 @register("added_mass")

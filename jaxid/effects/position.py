@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxid.effects.registry import register
-from jaxid.model import Action, Effect, Scales, Signals, parameter
+from jaxid.model.plant import Action, Effect, Scales, Signals, parameter
 
 
 @register("constant_force")

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Steps
-from jaxid.parameters import REFERENCE
+from jaxid.estimators.estimate import Estimate
+from jaxid.model.unknowns import REFERENCE
+from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:
-    from jaxid.io.case import Case
-    from jaxid.replay import Numerics
+    from jaxid.case.case import Case
     from jaxid.session import Session
+    from jaxid.simulation.replay import Numerics
 
 
 def _inverse_dynamics(session: Session) -> Steps[Estimate]:
@@ -38,7 +38,7 @@ def _output_error(
 
     log, on = session.fit.log, on or session.case.output_error.get("on", "position")
     if "prior" in session.case.output_error:
-        from jaxid.estimators.directions import directions_steps
+        from jaxid.estimators.within_prior.fit import directions_steps
 
         if solver is not None:
             raise InputError(
@@ -72,7 +72,7 @@ def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
     method, unknown = session.case.output_error.get("start", "guess"), session.machine.parameters
     if method == "guess":
         return []
-    from jaxid.estimators.recursive_rows import in_proportion_steps
+    from jaxid.estimators.recursive.rows import in_proportion_steps
 
     machine = yield from in_proportion_steps(session.machine, session.fit.data)
     case = replace(session.case, recursive=session.case.recursive | {"start": "guess"})
@@ -103,8 +103,8 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
 
 
 def _recursive(session: Session) -> Steps[Estimate]:
-    from jaxid.estimators.recursive import recursive_steps
-    from jaxid.io.memory import read_memory
+    from jaxid.estimators.recursive.estimate import recursive_steps
+    from jaxid.estimators.recursive.memory import read_memory
 
     case, run = session.case, session.fit
     run.log.need_every_encoder("recursive")
@@ -138,8 +138,8 @@ def _power(session: Session) -> Steps[Estimate]:
 
 
 def _algebraic(session: Session) -> Steps[Estimate]:
-    from jaxid.estimators.algebraic import algebraic_steps
-    from jaxid.estimators.one_window import least_squares_steps
+    from jaxid.estimators.algebraic.one_window import least_squares_steps
+    from jaxid.estimators.algebraic.windows import algebraic_steps
 
     run, window = session.fit, session.case.algebraic.get("window")
     run.log.need_every_encoder("algebraic")
@@ -152,7 +152,7 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
     """One of the forms that solve a joint's equations by themselves."""
 
     def steps(session: Session) -> Steps[Estimate]:
-        from jaxid.estimators.one_window import FORMS
+        from jaxid.estimators.algebraic.one_window import FORMS
 
         run, window = session.fit, session.case.algebraic.get("window")
         run.log.need_every_encoder(name)
@@ -164,7 +164,7 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
 def _minimal_model(
     session: Session, *, printed: bool = False, weight: float | None = None
 ) -> Steps[Estimate]:
-    from jaxid.estimators.minimal_model import minimal_model_steps
+    from jaxid.estimators.minimal.fit import minimal_model_steps
 
     return minimal_model_steps(session, printed, weight)
 
@@ -214,7 +214,7 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         need_known_reference(session, f"{method} takes them as they are")
     if not session.case.identification.get("physically_consistent"):
         return METHODS[method](session, **options)
-    from jaxid.estimators.consistency import need_bodies, with_links
+    from jaxid.estimators.common.consistency import need_bodies, with_links
 
     need_consistent(method, session.case)
     return with_links(METHODS[method](need_bodies(session), **options))

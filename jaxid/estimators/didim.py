@@ -22,8 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid import signals
 from jaxid.errors import InputError
+from jaxid.estimators.common.rerun import Rerun, best_step, settled, span
+from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import (
     ForceData,
     force_and_columns,
@@ -32,16 +33,15 @@ from jaxid.estimators.inverse_dynamics import (
     inverse_dynamics_steps,
     sharpened,
 )
-from jaxid.estimators.rerun import Rerun, best_step, settled, span
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Solve, Steps, alone
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model import Plant
-from jaxid.parameters import scatter
-from jaxid.precision import Precision
-from jaxid.preprocess import Prepared
-from jaxid.replay import Numerics, Replay
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import scatter
+from jaxid.numerics import filters as signals
+from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.precision import Precision
+from jaxid.simulation.replay import Numerics, Replay
 
 _MOST_STEPS = 30
 _HALVINGS = 8

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.estimators.common.rerun import Rerun, best_step, settled, span
+from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import (
     ForceData,
     force_and_columns,
@@ -21,15 +23,13 @@ from jaxid.estimators.inverse_dynamics import (
     inverse_dynamics_steps,
     sharpened,
 )
-from jaxid.estimators.rerun import Rerun, best_step, settled, span
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Solve, Steps, alone
-from jaxid.io.log import Log
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model import Plant
-from jaxid.parameters import Parameters
-from jaxid.preprocess import Prepared
-from jaxid.replay import Numerics
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import Parameters
+from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.simulation.replay import Numerics
 
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
 # deviation says little of its motion.

@@ -14,17 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxid import signals
-from jaxid.estimators.least_squares import DAMPING, Minimum, Transform, levenberg_marquardt
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Solve, Steps, alone
+from jaxid.dynamics.hidden_joints import complete_motion
+from jaxid.dynamics.residuals import residual_along
+from jaxid.estimators.common.levenberg_marquardt import DAMPING, Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.estimate import Estimate
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model import Effect, ParameterInfo, Plant, carries_force, parameters_of
-from jaxid.parameters import Free, scatter
-from jaxid.precision import Precision, assess
-from jaxid.preprocess import Prepared
-from jaxid.residuals import residual_along
-from jaxid.unmeasured import complete_motion
+from jaxid.model.plant import Effect, ParameterInfo, Plant, carries_force, parameters_of
+from jaxid.model.unknowns import Free, scatter
+from jaxid.numerics import filters as signals
+from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.precision import Precision, assess
 
 # Of the solver where the balance is linear in all unknowns: the first step is then the last.
 _UNDAMPED = 1e-10

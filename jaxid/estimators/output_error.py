@@ -16,15 +16,16 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxid.errors import InputError
-from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Solve, Steps, alone
-from jaxid.io.log import Log
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.estimate import Estimate
+from jaxid.logs.log import Log
 from jaxid.machine import Machine, position_noise
-from jaxid.model import Plant
-from jaxid.parameters import REFERENCE, scatter
-from jaxid.precision import assess, full_hessian
-from jaxid.replay import (
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import REFERENCE, scatter
+from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.precision import assess, full_hessian
+from jaxid.simulation.loops import Drive, needed_substeps
+from jaxid.simulation.replay import (
     Numerics,
     Replay,
     exact_numerics,
@@ -33,8 +34,7 @@ from jaxid.replay import (
     start_shows,
     with_fitted_start,
 )
-from jaxid.simulation import Drive, needed_substeps
-from jaxid.solvers import RELATIVE
+from jaxid.simulation.solvers import RELATIVE
 
 # What a fit may compare.
 OUTPUTS = ("position", "force", "both")
@@ -301,7 +301,7 @@ def choose_numerics(
         machine: The machine.
         log: The log.
         segments: Whether an open-loop run may be cut into segments.
-        solver: One of `jaxid.solvers.SOLVERS`; None: fixed steps.
+        solver: One of `jaxid.simulation.solvers.SOLVERS`; None: fixed steps.
     """
     kinds = {e.kind for e in machine.plant.effects}
     exact = exact_numerics(machine, log, 1 if solver else None)

@@ -25,19 +25,19 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Array, Bool, Float
 
-from jaxid import signals
-from jaxid.base_parameters import base_parameters
+from jaxid.arms.base_parameters import base_parameters
+from jaxid.dynamics.residuals import drive_own_states, drive_ratio
 from jaxid.errors import InputError
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import ForceData, linear_scale, sharpened
-from jaxid.estimators.least_squares import Minimum, Transform, levenberg_marquardt
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Solve, Steps, alone
+from jaxid.logs.prepare import Prepared, lasting
 from jaxid.machine import Machine
-from jaxid.model import Balance, Plant
-from jaxid.parameters import scatter
-from jaxid.precision import assess
-from jaxid.preprocess import Prepared, lasting
-from jaxid.residuals import drive_own_states, drive_ratio
+from jaxid.model.plant import Balance, Plant
+from jaxid.model.unknowns import scatter
+from jaxid.numerics import filters as signals
+from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.precision import assess
 
 # A hill of speed stands out by this part of the RMS speed.
 _HILL = 0.5

@@ -3,7 +3,7 @@
 To add one: write its class in a file of its own and register it here.
 """
 
-from jaxid.model import Plant
+from jaxid.model.plant import Plant
 from jaxid.plants.axis import Axis as Axis
 from jaxid.plants.chain import Chain as Chain
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg as DenavitHartenberg

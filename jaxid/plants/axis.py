@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxid.model import Effect, Plant, as_array, parameter
+from jaxid.model.plant import Effect, Plant, as_array, parameter
 
 
 class Axis(Plant):

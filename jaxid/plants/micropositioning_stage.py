@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxid.model import Effect, Plant, as_array, parameter
+from jaxid.model.plant import Effect, Plant, as_array, parameter
 
 _INERTIAS = ("motor_inertia", "table_mass")
 _MOTIONS = ("rotary", "linear", "linear")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.model import Effect, Plant, as_array, parameter
+from jaxid.model.plant import Effect, Plant, as_array, parameter
 from jaxid.plants.geometry import Geometry
 
 _FIRST = ("inertia*position", "free")
@@ -23,7 +23,7 @@ class SerialArm(Plant):
 
     What stands in `inertial` is linear in the parameters: mass, first moments and inertia of a link
     count about the origin of its frame and along its axes. Which of their combinations the torques
-    tell is for `jaxid.base_parameters` to say. Ports are the joints, and behind them the shafts: drives
+    tell is for `jaxid.arms.base_parameters` to say. Ports are the joints, and behind them the shafts: drives
     that turn with several joints, as where a belt to the last joint of a wrist runs over the one before.
 
     Args:

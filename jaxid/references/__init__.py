@@ -21,7 +21,7 @@ from jaxid.references.quarter_sine import QUARTER_SINE
 from jaxid.references.synchronized import SYNCHRONIZED
 
 if TYPE_CHECKING:
-    from jaxid.model import Plant
+    from jaxid.model.plant import Plant
 
 __all__ = ["REFERENCES", "Family", "Key", "make_reference"]
 

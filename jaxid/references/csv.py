@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.logs.readers import read_columns
 from jaxid.references.family import Family, Grid, Key
-from jaxid.tables import read_columns
 
 
 def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxid.errors import InputError, suggest
 
 if TYPE_CHECKING:
-    from jaxid.model import Plant
+    from jaxid.model.plant import Plant
 
 REQUIRED = object()
 Shape = Literal["number", "whole", "flag", "text", "list", "range", "points"]

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 
+from jaxid.case.case import Case
 from jaxid.errors import InputError
-from jaxid.io.case import Case
 from jaxid.machine import Machine, build_machine
+from jaxid.scene import Scene
 from jaxid.studies.settings import SETTINGS
-from jaxid.virtual import Scene
 
 
 @dataclass(frozen=True)

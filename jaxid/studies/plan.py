@@ -13,13 +13,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.estimators import need_consistent
-from jaxid.estimators.steps import cores
-from jaxid.io.case import Case
 from jaxid.machine import Machine
+from jaxid.numerics.lanes import cores
+from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
-from jaxid.virtual import Scene
 
 # What may stand among the estimators beside the methods: the search, and what a law found by itself.
 DISCOVER, IN_LOOP = "discover", "in_loop"

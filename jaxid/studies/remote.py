@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from jaxid.case.case import load_case
 from jaxid.errors import InputError
-from jaxid.io.case import load_case
 from jaxid.studies.plan import Plan, digest_of, fingerprint, named_files
 from jaxid.studies.runs import Arrays, Runner
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.stats
 import xarray as xr
 
-from jaxid.io.output import ready_folder, write_json, write_whole
+from jaxid.files import ready_folder, write_json, write_whole
 from jaxid.studies.settings import SETTINGS
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class Study:
         ]
 
     def __str__(self) -> str:
-        from jaxid.io.tables import study_table
+        from jaxid.results.as_text import study_table
 
         return study_table(self)
 
@@ -113,7 +113,7 @@ class Study:
         Raises:
             InputError: If the folder holds what jaxid did not make and `force` is not given.
         """
-        from jaxid.report.study import study_report
+        from jaxid.results.report.study import study_report
 
         folder = ready_folder(Path(folder), FILES, force=force)
         write_whole(folder / "study.nc", bytes(self.table.to_netcdf(engine="scipy")))

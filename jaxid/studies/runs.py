@@ -10,14 +10,14 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.estimators import SIMULATING, steps_of
+from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
-from jaxid.estimators.result import Estimate
-from jaxid.estimators.steps import Steps, alone, together
-from jaxid.preprocess import Recipe
-from jaxid.replay import Numerics
+from jaxid.logs.prepare import Recipe
+from jaxid.numerics.lanes import Steps, alone, together
 from jaxid.session import Session, session_around
-from jaxid.simulation import Trajectory
+from jaxid.simulation.loops import Trajectory
+from jaxid.simulation.replay import Numerics
 from jaxid.studies.plan import DISCOVER, IN_LOOP, Plan
 
 Arrays = dict[str, np.ndarray]
@@ -152,7 +152,7 @@ def _tracking(reference: np.ndarray | None, followed: np.ndarray) -> np.ndarray:
 
 def _found(plan: Plan, session: Session) -> Arrays:
     """What `discover` makes of a run: the model's own parameters, and what it names beside them."""
-    from jaxid.discovery.discover import explore
+    from jaxid.commands.discover import explore
 
     found = explore(session, refit=False, experiments=False)
     at = [found.after.names.index(name) for name in plan.names]

@@ -1,0 +1,1 @@
+"""Inertial parameters of linkages: base parameters, physical consistency, the dominant inertia."""

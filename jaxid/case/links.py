@@ -1,0 +1,193 @@
+"""The links of an arm, from the base to the tip: [[plant.links]] of a case, or a URDF file that it names."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.arms.base_by_rules import base_parameters_by_rules
+from jaxid.arms.pseudo_inertia import TEN
+from jaxid.case.places import check_places
+from jaxid.case.schema import Key, Keys, Spot, choice, number, read_table, several, text, whole
+from jaxid.case.urdf import Urdf, read_urdf
+from jaxid.case.values import Value, read_value, read_values
+from jaxid.model.plant import Plant, parameters_of
+from jaxid.plants.denavit_hartenberg import DenavitHartenberg
+from jaxid.plants.geometry import JOINTS, Geometry
+
+# Chosen: beyond any arm; what lies behind it is a slip.
+_MOST_LINKS = 50
+# Entries of a list of the case, by the plant's parameters that they are.
+_LISTS = {"first_moment": TEN[1:4], "inertia": TEN[4:]}
+# Angles, which may be in degrees: a right angle in rad has no end.
+_ANGLES = ("alpha", "theta")
+
+# Keys of [[plant.shafts]].
+_SHAFT: Keys = {
+    "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
+    "ratios": Key(several(number()), "by how much, a number a joint; 1 each where absent"),
+}
+# Below it the sine of an angle of a URDF file is nothing: 1.5708 stands there for a right angle.
+_ANGLE = 1e-4
+# What of the links that a URDF file describes is to be identified.
+UNKNOWN = ("none", "base", "all")
+# Keys of [plant] that only an arm has.
+LINKED: Keys = {
+    "links": Key(lambda value, spot: value, "a table [[plant.links]] for each link"),
+    "urdf": Key(text, "file that describes the arm, relative to the case"),
+    "tip": Key(text, "name of its last link in that file"),
+    "unknown": Key(choice(UNKNOWN), "which parameters of its links"),
+    "shafts": Key(lambda value, spot: value, "a table [[plant.shafts]] for each"),
+    "gravity_vector": Key(several(number(), shortest=3, longest=3), "in the frame of the base [m/s^2]"),
+}
+
+
+def check_links(table: dict[str, Any], spot: Spot) -> None:
+    """Refuse a [plant] without links.
+
+    Raises:
+        InputError: If there is none, or no table is where one should be.
+    """
+    links = table.get("links")
+    if links is None:
+        mend = 'add a table [[plant.links]] for each, from the base to the tip, or urdf = "<its file>"'
+        raise spot.fault("'links' is missing", mend)
+    if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
+        raise spot.at("links").fault("is not a list of tables", "write [[plant.links]], in double brackets")
+    if not 1 <= len(links) <= _MOST_LINKS:
+        raise spot.at("links").fault(f"has {len(links)} entries", f"an arm has 1 to {_MOST_LINKS}")
+
+
+def read_links(
+    links: list[dict[str, Any]], cls: type[Plant], file: str
+) -> tuple[dict[str, tuple[Value, ...]], DenavitHartenberg]:
+    """Inertial parameters of the links by name, one value a link, and their geometry.
+
+    Raises:
+        InputError: If a link states what it cannot have, or not what it must.
+    """
+    rows, parameters = [], {}
+    for k, link in enumerate(links, start=1):
+        spot = Spot(file, f"[[plant.links]] {k}")
+        given = read_table(_in_rad(link, spot), _keys(cls), spot)
+        rows.append([given["joint"], *(given.get(name, 0.0) for name in ("alpha", "a", "d", "theta"))])
+        for name, values in given.items():
+            if name in _LISTS:
+                for part, value in zip(_LISTS[name], values, strict=True):
+                    parameters.setdefault(part, []).append(value)
+            elif isinstance(values, Value):
+                parameters.setdefault(name, []).append(values)
+        if any("rotor_inertia" in other for other in links) and "rotor_inertia" not in given:
+            parameters.setdefault("rotor_inertia", []).append(Value(0.0))
+    return {name: tuple(values) for name, values in parameters.items()}, DenavitHartenberg.of_rows(rows)
+
+
+def read_links_of_urdf(
+    given: dict[str, Any], cls: type[Plant], spot: Spot
+) -> tuple[dict[str, tuple[Value, ...]], Urdf]:
+    """The same of the URDF file that [plant] names: parameters of the links, and what the file says.
+
+    Raises:
+        InputError: If [plant] describes the links as well, or the file no arm.
+    """
+    if "links" in given:
+        raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
+    arm = read_urdf(Path(spot.file).parent / given["urdf"], given.get("tip"))
+    if len(arm.names) > _MOST_LINKS:
+        raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {_MOST_LINKS}")
+    unknown = given.get("unknown", "none")
+    values = dict(zip(TEN, arm.bodies.T, strict=True))
+    free = {name: np.full(len(arm.names), unknown == "all") for name in TEN}
+    if unknown == "base":
+        weight = {name: given[name] for name in ("gravity_vector",) if name in given}
+        plant = cls(**values, geometry=arm.geometry, **weight)
+        if not np.any(np.asarray(plant.gravity_vector)):
+            mend = 'state a gravity_vector other than zero, or unknown = "all"'
+            raise spot.at("unknown").refuse("base", "needs weight", mend)
+        base = base_parameters_by_rules(plant, _ANGLE)
+        values = {name: np.zeros(len(arm.names)) for name in TEN}
+        for (name, k), value in zip(base.places, base.of(plant), strict=True):
+            values[name][k], free[name][k] = value, True
+    return {
+        name: tuple(Value(float(v), bool(f)) for v, f in zip(values[name], free[name], strict=True))
+        for name in TEN
+    }, arm
+
+
+def read_shafts(
+    shafts: Any, geometry: Geometry, spot: Spot
+) -> tuple[tuple[float, ...], ...]:
+    """[[plant.shafts]]: by how much each turns with every joint.
+
+    Raises:
+        InputError: If one names joints that are not there, or of which some turn and some slide.
+    """
+    if not isinstance(shafts, list) or not all(isinstance(shaft, dict) for shaft in shafts):
+        raise spot.at("shafts").fault("is not a list of tables", "write [[plant.shafts]], in double brackets")
+    joints, out = len(geometry.joints), []
+    for k, shaft in enumerate(shafts, start=1):
+        own = Spot(spot.file, f"[[plant.shafts]] {k}")
+        given = read_table(shaft, _SHAFT, own)
+        named = given["joints"]
+        check_places(shaft["joints"], named, joints, "joint", own.at("joints"))
+        if len({geometry.joints[j - 1] for j in named}) > 1:
+            raise own.at("joints").refuse(shaft["joints"], "names joints that turn and joints that slide",
+                                          "a shaft goes with joints of one kind")
+        ratios = given.get("ratios", (1.0,) * len(named))
+        if len(ratios) != len(named) or 0.0 in ratios:
+            raise own.at("ratios").refuse(shaft["ratios"], f"does not go with {len(named)} joints",
+                                          "give a ratio other than zero for each")
+        row = dict(zip(named, ratios, strict=True))
+        out.append(tuple(float(row.get(j + 1, 0.0)) for j in range(joints)))
+    return tuple(out)
+
+
+def _keys(cls: type[Plant]) -> Keys:
+    """Keys of one link."""
+    infos = parameters_of(cls)
+    value = "a number, or { guess = ... }"
+    keys = {
+        "joint": Key(choice(JOINTS), '"revolute" or "prismatic"', True),
+        "alpha": Key(number(), "twist from the axis before to this one [rad], or alpha_deg", True),
+        "a": Key(number(), "distance from the axis before to this one [m]", True),
+        "d": Key(number(), "offset along the axis [m]"),
+        "theta": Key(number(), "angle about the axis [rad], or theta_deg"),
+    }
+    for name in ("mass", "first_moment", "inertia", "rotor_inertia"):
+        parts = _LISTS.get(name, (name,))
+        info = infos[parts[0]]
+        if name in _LISTS:
+            axes = ", ".join(part.rpartition("_")[2] for part in parts)
+            read, doc = _listed(info, parts), f"the list {axes}; each {value}"
+        else:
+            read, doc = (lambda v, s, info=info: read_value(v, info, s)), f"{info.doc}; {value}"
+        keys[name] = Key(read, doc, not info.optional)
+    return keys
+
+
+def _listed(info: Any, parts: tuple[str, ...]) -> Any:
+    """A list with an entry for each axis, or pair of axes."""
+
+    def read(value: Any, spot: Spot) -> tuple[Value, ...]:
+        inner = isinstance(value, dict) and any(isinstance(v, list) for v in value.values())
+        if not isinstance(value, list) and not inner:
+            axes = ", ".join(part.rpartition("_")[2] for part in parts)
+            raise spot.refuse(value, "is not a list", f"give {len(parts)} entries: {axes}")
+        return read_values(value, info, len(parts), spot, "component")
+
+    return read
+
+
+def _in_rad(link: dict[str, Any], spot: Spot) -> dict[str, Any]:
+    """The table with its angles in rad."""
+    out = dict(link)
+    for name in _ANGLES:
+        degrees = f"{name}_deg"
+        if degrees in link:
+            if name in link:
+                raise spot.fault(f"both {name} and {degrees} are given", "keep one of them")
+            out[name] = math.radians(number()(out.pop(degrees), spot.at(degrees)))
+    return out

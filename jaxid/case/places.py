@@ -1,0 +1,116 @@
+"""Where the effects of a case act: on joints, springs, shafts, passive angles, tools; all count from 1."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from jaxid.case.schema import Spot, count, several, whole
+from jaxid.errors import suggest
+from jaxid.model.plant import PLACES, Effect
+
+if TYPE_CHECKING:
+    from jaxid.case.entries import PlantEntry
+
+
+# What a place is called, where that is not its key.
+_NOUNS = {"passive": "passive angle"}
+
+
+def read_ports(
+    table: dict[str, Any], cls: type[Effect], plant: PlantEntry, spot: Spot
+) -> tuple[tuple[int, ...], str]:
+    """Ports on which an effect acts, 0-based, and what they are: all that suit where none is named.
+
+    Raises:
+        InputError: If a place that is named is none of the plant's, or none for such an effect.
+    """
+    places = [name for name in PLACES if name in table]
+    if len(places) > 1:
+        raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
+    parts, springs = plant.cls.parts(plant.joints), plant.cls.springs(plant.joints)
+    if cls.with_springs not in (None, springs > 0):
+        has, mend = ("no springs", "chain or flexible_axis") if cls.with_springs else (
+            "springs of its own", "axis, or state the spring there",
+        )
+        raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {mend}")
+    shafts = len(plant.options.get("shafts", ()))
+    passives, tools = plant.cls.passives, plant.cls.tools
+    there = {"spring": springs, "shaft": shafts, "passive": passives, "tool": tools}
+    for name in (name for name in places if name in there):
+        if not there[name]:
+            mend = f"leave {name} out: the effect then acts on the joint"
+            if name == "shaft" and plant.cls.linked:
+                mend = "add [[plant.shafts]] with the joints that it turns with, or name joints"
+            what = f"does not exist on kind = '{plant.cls.kind}'"
+            raise spot.at(name).refuse(table[name], what, mend)
+    if "spring" in table:
+        if not cls.of_spring:
+            mend = "name a joint; on springs act the stiffness effects"
+            raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", mend)
+        chosen = _places(table, "spring", springs, spot)
+        return tuple(parts + k for k in chosen), "spring"
+    for name, before in (("shaft", parts), ("passive", parts), ("tool", parts + passives)):
+        if name not in table:
+            continue
+        if cls.in_drive:
+            what, mend = f"has no command for {cls.kind} to act on", "name the joint of the drive"
+            raise spot.at(name).refuse(table[name], what, mend)
+        if name == "tool" and not cls.any_direction:
+            alike = "what is the same in all directions (added_mass, viscous_friction)"
+            mend = f"name a joint; on a tool acts {alike}"
+            raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", mend)
+        return tuple(before + k for k in _places(table, name, there[name], spot)), name
+    if "joint" in table:
+        chosen = _places(_numbered(table, plant.names, spot), "joint", parts, spot)
+        undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]
+        if cls.in_drive and undriven:
+            driven = ", ".join(str(k + 1) for k in plant.actuated)
+            what = f"has no drive for {cls.kind} to sit in"
+            raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
+        return chosen, "joint"
+    if cls.of_spring and springs:
+        return tuple(range(parts, parts + springs)), "spring"
+    if cls.in_drive and plant.actuated is not None:
+        return plant.actuated, "joint"
+    return tuple(range(parts)), "joint"
+
+
+def _numbered(table: dict[str, Any], names: tuple[str, ...], spot: Spot) -> dict[str, Any]:
+    """The table with joints by number, of which a URDF file has told the names.
+
+    Raises:
+        InputError: If it names one that is not there.
+    """
+    given = table["joint"]
+    listed = given if isinstance(given, list) else [given]
+    for name in listed:
+        if names and isinstance(name, str) and name not in names:
+            raise spot.at("joint").refuse(name, "is no joint of the arm", suggest(name, names))
+    numbers = [names.index(j) + 1 if names and isinstance(j, str) else j for j in listed]
+    return table | {"joint": numbers if isinstance(given, list) else numbers[0] if numbers else given}
+
+
+def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[int, ...]:
+    """The joints or springs that a table names, 0-based."""
+    given, place = table[what], spot.at(what)
+    several_places = isinstance(given, list)
+    named = several(whole(1))(given, place) if several_places else (whole(1)(given, place),)
+    check_places(given, named, there, what, place)
+    return tuple(k - 1 for k in named)
+
+
+def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot: Spot) -> None:
+    """Refuse places beyond those that there are, or named twice.
+
+    Raises:
+        InputError: If there are any.
+    """
+    noun = _NOUNS.get(what, what)
+    if max(named) > there:
+        fault = f"is out of range: the plant has {count(there, noun)}"
+        # Without its place an effect is on the joints, not on the only shaft.
+        alone = f"leave {what} out" if what in ("joint", "spring") else f"name {what} 1"
+        mend = f"{noun}s count from 1 to {there}" if there > 1 else alone
+        raise spot.refuse(given, fault, mend)
+    if len(set(named)) < len(named):
+        raise spot.refuse(given, f"names a {noun} twice", f"name each {noun} once")

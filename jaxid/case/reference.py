@@ -1,0 +1,65 @@
+"""[reference] and [input] of a case."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from jaxid.case.entries import read_kind
+from jaxid.case.schema import Spot
+from jaxid.case.values import Value, read_value
+from jaxid.errors import InputError
+from jaxid.model.plant import ParameterInfo
+from jaxid.references import REFERENCES
+from jaxid.references import Key as ReferenceKey
+
+
+def read_signal(
+    name: str, tables: Mapping[str, Any], drives: int, file: str
+) -> dict[str, Any] | None:
+    """[reference] or [input], checked by the family that it names; None where it says nothing."""
+    if not tables.get(name):
+        return None
+    table, spot = tables[name], Spot(file, f"[{name}]")
+    kind = read_kind(table, REFERENCES, spot)
+    try:
+        read = REFERENCES[kind].read(table, f"[{name}]")
+    except InputError as error:
+        raise InputError(f"{file}, {error}") from error
+    if len(read) not in (1, drives):
+        raise spot.fault(f"has values for {len(read)} joints", f"the plant drives {drives}")
+    return dict(table)
+
+
+def read_unknown_reference(
+    tables: Mapping[str, Any], drives: int, file: str
+) -> tuple[dict[str, Any], dict[str, Value]]:
+    """[reference] at its guesses (nothing where it has none), and its unknowns."""
+    table, spot = tables.get("reference", {}), Spot(file, "[reference]")
+    given = {k: v for k, v in table.items() if isinstance(v, dict)}
+    if not given:
+        return {}, {}
+    family = REFERENCES[read_kind(table, REFERENCES, spot)]
+    for name in given:
+        if name not in family.unknown:
+            mend = f"of {family.kind} may be: {', '.join(family.unknown) or 'nothing'}"
+            raise spot.at(name).fault("cannot be unknown", f"give a number; unknown {mend}")
+    if drives > 1:
+        mend = "log it, and name its columns in [log]"
+        raise spot.fault("is unknown, of a plant with several drives", mend)
+    if table.get("repeat", True):
+        raise spot.fault("is unknown, and has no end", "add repeat = false")
+    if "reference" in tables.get("log", {}):
+        mend = "leave reference out of [log], or give numbers in [reference]"
+        raise spot.fault("has unknowns, and [log] names a column for it", mend)
+    unknown = {k: read_value(v, info_of(family.keys[k]), spot.at(k)) for k, v in given.items()}
+    return {"reference": {**table, **{k: v.guess for k, v in unknown.items()}}}, unknown
+
+
+def info_of(key: ReferenceKey) -> ParameterInfo:
+    """A number of a reference as a parameter."""
+    over, _, under = key.unit.partition("/")
+    words = {"": "", "s": "time", "s^2": "time2", "s^3": "time3"}
+    dimension = f"{over}/{words[under]}" if under else words.get(over, over)
+    sign = "positive" if key.positive else "nonnegative" if key.minimum == 0.0 else "free"
+    return ParameterInfo(dimension, sign, key.doc)

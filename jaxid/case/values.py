@@ -1,0 +1,110 @@
+"""Values of a case that may be known or unknown."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from jaxid.case.schema import Key, Spot, count, number, read_table, shown
+from jaxid.model.plant import ParameterInfo
+
+
+@dataclass(frozen=True)
+class Value:
+    """One number of a machine.
+
+    Args:
+        guess: The known value, or where a fit starts.
+        free: Whether it is to be identified.
+        lower, upper: Bounds, where it is.
+        true: What a simulation uses in its place; None: `guess`.
+    """
+
+    guess: float
+    free: bool = False
+    lower: float = -math.inf
+    upper: float = math.inf
+    true: float | None = None
+
+    def start(self, true: bool) -> float:
+        """Value for a fit, or (`true`) for a simulation."""
+        return self.true if true and self.true is not None else self.guess
+
+
+def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
+    """Check a value against what its parameter may be.
+
+    Args:
+        value: `3.0`, or a table of guess, min, max, true.
+        info: The parameter.
+        spot: Where it stands.
+
+    Raises:
+        InputError: If it is no finite number, of the wrong sign, or outside its own bounds.
+    """
+    signed = number(info.sign)
+    if isinstance(value, list):
+        raise spot.refuse(value, "is a list", "this parameter takes one value")
+    if isinstance(value, dict) and info.known:
+        mend = f"give the number, and let an effect in the drive (actuator_gain) be unknown: {info.doc}"
+        raise spot.refuse(value, "must be a known number", mend)
+    if not isinstance(value, dict):
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            mend = "give a number where it is known, { guess = ... } where it is not"
+            raise spot.refuse(value, "is not a number", mend)
+        return Value(signed(value, spot))
+    keys = {
+        "guess": Key(signed, "where the fit starts", required=True),
+        "min": Key(number(), "lower bound"),
+        "max": Key(number(), "upper bound"),
+        "true": Key(signed, "for simulate and study"),
+    }
+    given = read_table(value, keys, spot)
+    lower, upper = given.get("min", -math.inf), given.get("max", math.inf)
+    if lower > upper:
+        raise spot.refuse(value, f"has min {lower:g} above max {upper:g}", "exchange min and max")
+    if lower == upper:
+        mend = f"give the number itself: {spot.key} = {shown(lower)}"
+        raise spot.refuse(value, "has min equal to max, which leaves nothing to identify", mend)
+    if not lower <= given["guess"] <= upper:
+        mend = f"move guess into [{lower:g}, {upper:g}], or widen min and max"
+        raise spot.refuse(value, f"has its guess {given['guess']:g} outside of min and max", mend)
+    return Value(given["guess"], True, lower, upper, given.get("true"))
+
+
+def read_values(
+    value: Any, info: ParameterInfo, places: int, spot: Spot, what: str = "joint"
+) -> tuple[Value, ...]:
+    """Check a value for several places: one for each of them, or a list.
+
+    Args:
+        value: A value, a list of values, or a table of lists.
+        info: The parameter.
+        places: How many there are.
+        spot: Where it stands.
+        what: What a place is, for messages.
+
+    Returns:
+        One value a place.
+
+    Raises:
+        InputError: If a list is not as long as there are places, or an entry cannot be.
+    """
+    if isinstance(value, dict):
+        lists = {key: entry for key, entry in value.items() if isinstance(entry, list)}
+        for key, entries in lists.items():
+            _check_length(entries, places, spot.inside(key), what)
+        if lists:
+            rows = range(places)
+            value = [{k: v[i] if k in lists else v for k, v in value.items()} for i in rows]
+    if not isinstance(value, list):
+        return (read_value(value, info, spot),) * places
+    _check_length(value, places, spot, what)
+    return tuple(read_value(v, info, spot.entry(k)) for k, v in enumerate(value, start=1))
+
+
+def _check_length(value: list, places: int, spot: Spot, what: str) -> None:
+    if len(value) != places:
+        mend = f"give one value, or {places} in a list: one a {what}"
+        raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", mend)

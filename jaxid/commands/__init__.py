@@ -1,0 +1,1 @@
+"""The commands, one file each: check, identify, discover and study, and following a machine live."""

@@ -1,0 +1,264 @@
+"""The whole way: gap, where, what, refit, simulate again, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.case.case import Case
+from jaxid.commands.identify import Gap, gaps
+from jaxid.discovery import candidates as cand
+from jaxid.discovery.at_rest.break_away import BreakAway, break_away
+from jaxid.discovery.in_loop.confirm import WHY, hindering
+from jaxid.discovery.in_loop.search import explore_within
+from jaxid.discovery.noise import sensor_colour
+from jaxid.discovery.result import Discovery, Found, Round
+from jaxid.discovery.screen import Score
+from jaxid.discovery.search import Search, Step
+from jaxid.discovery.separating.propose import proposals
+from jaxid.discovery.superset import build_union
+from jaxid.discovery.where import Where, locate
+from jaxid.effects.friction import StaticFriction
+from jaxid.estimators import need_known_reference
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
+from jaxid.estimators.output_error import output_error
+from jaxid.gap import noise_floor
+from jaxid.logs.log import Log
+from jaxid.machine import Machine
+from jaxid.model.unknowns import free_effect
+from jaxid.session import Session, open_session
+from jaxid.simulation.step_size import TooStiffError
+
+# A refit in simulation may cost this factor in the force domain, not more: then it has bent the
+# parameters around something else, such as a reference that is not known between samples.
+_WORSE = 1.5
+# A residual counts as a disagreement only where it stands this far above the noise floor.
+_ABOVE_FLOOR = 1.3
+# So many effects that hinder the simulation are replaced; further ones are only taken out.
+_BARRED = 3
+
+
+def discover(
+    case: Case | str | Path,
+    log: Log | str | Path,
+    *,
+    validate: Sequence[Log | str | Path] = (),
+    max_effects: int = 5,
+    refit: bool = True,
+    experiments: bool | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Discovery:
+    """Find the effects that a case's model is missing, on a log.
+
+    Args:
+        case: The case, or its file.
+        log: The log, or its file.
+        validate: Logs that must confirm each effect, beside the case's own.
+        max_effects: Most effects to add.
+        refit: Refit the parameters in simulation too; without, they are inverse dynamics'.
+        experiments: Whether experiments are designed that tell rivals apart. Absent: not where joints push
+            one another, as of an arm, whose simulation takes minutes to compile for it.
+        progress: Called with a line at every stage.
+
+    Raises:
+        InputError: If case or log are unsound.
+    """
+    session = open_session(case, log, validate, align_hold=True, method="discover")
+    return explore(
+        session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress
+    )
+
+
+def explore(
+    session: Session, *, max_effects: int = 5, refit: bool = True, experiments: bool | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Discovery:
+    """`discover` on what is open already.
+
+    Args:
+        session: Case and logs, prepared with the hold aligned.
+        max_effects, refit, experiments, progress: As there.
+
+    Raises:
+        InputError: If the reference has unknowns.
+    """
+    need_known_reference(session, "what it is would be taken for an effect")
+    if "prior" in session.case.output_error:
+        return explore_within(session, max_effects=max_effects, progress=progress)
+    data = session.fit.data
+    progress("fitting what is there")
+    baseline, search = start_search(session, progress)
+    steps = search.run(max_effects)
+    alternatives = search.alternatives(steps)
+    where = where_of(search, steps[0], session.fit.log)
+    final, effects = _final_machine(baseline.machine, search, alternatives, steps)
+    progress("simulating what was found")
+    while (c := hindering(search, session, final)) is not None:
+        # After some, nothing takes the place of what goes: a search must end.
+        steps += search.bar(c, WHY, max_effects if len(search.barred) < _BARRED else 0)
+        alternatives = search.alternatives(steps)
+        final, effects = _final_machine(baseline.machine, search, alternatives, steps)
+    verdict = _verdict(effects, where, steps, search)
+    before = baseline
+    after = inverse_dynamics(final, data) if effects else before
+    if refit:
+        progress("refitting in simulation")
+        before = _refit(session.with_machine(before.machine), before)
+        after = _refit(session.with_machine(after.machine), after) if effects else before
+    designs = not session.machine.plant.coupled if experiments is None else experiments
+    separating = proposals(session, search, effects, progress) if designs else ()
+    unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
+    missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]
+    while missing:
+        progress("looking at the starts from rest")
+        leaving = break_away(after, session.runs, [c.port for c in missing])
+        unseen = next((b for b in leaving if isinstance(b, str)), "")
+        held = [b for b in leaving if isinstance(b, BreakAway) and b.holds]
+        if not held or len(effects) >= max_effects:
+            break
+        # The clearest first: what sticks at one joint makes its neighbours start late.
+        b = max(held, key=lambda b: b.evidence)
+        c = missing.pop(leaving.index(b))
+        where = where if effects else _at_starts(where, c, b)
+        after, found, step = _with_break_away(after, search, c, b)
+        steps.append(step)
+        effects, verdict = (*effects, found), "found"
+    progress("simulating")
+    old = gaps(before.machine, session.runs)
+    new = gaps(after.machine, session.runs) if effects else old
+    return Discovery(
+        session, verdict, None if verdict == "nothing_missing" else where, effects,
+        tuple(_round(search, s) for s in steps), before, after, old, new, search.floor, separating,
+        unseen,
+    )
+
+
+def start_search(
+    session: Session, progress: Callable[[str], None] = lambda text: None
+) -> tuple[Estimate, Search]:
+    """The baseline of a session in the force domain, and the search for what it lacks."""
+    machine, log, data = session.machine, session.fit.log, session.fit.data
+    baseline = inverse_dynamics(machine, data)
+    floor = noise_floor(baseline.machine, log, data)
+    colour = sensor_colour(baseline.machine, log, data)
+    union = build_union(baseline.machine, data, session.case.searched)
+    others = tuple(v.data for v in session.validations)
+    return baseline, Search(union, data, floor, colour, others, progress)
+
+
+def _with_break_away(
+    estimate: Estimate, search: Search, c: cand.Candidate, b: BreakAway
+) -> tuple[Estimate, Found, Step]:
+    """An estimate with break-away friction beside it, as the starts from rest tell it."""
+    machine = estimate.machine
+    effect = StaticFriction(level=b.level, port=c.port)
+    plant, free = free_effect(machine.plant, effect, machine.units)
+    theta = np.append(estimate.theta, b.level)
+    machine = machine.with_plant(plant, machine.parameters.extended(free)).with_estimate(theta)
+    new = replace(estimate, machine=machine, theta=theta, precision=estimate.precision.beside(b.std))
+    score = Score(c, 0, np.array([b.level]), b.evidence)
+    found = Found(c.kind, c.label, plant.place(c.port), (free[0].name,), score, ())
+    return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
+
+
+def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
+    """Where break-away friction shows: at the starts from rest. There is no curve to it."""
+    text = f"joint {c.port + 1}: {b.count} starts from rest come later than sliding friction explains"
+    spans = tuple((float(t), float(t)) for t in b.times)
+    region = (float(b.times.min()), float(b.times.max())) if len(b.times) else where.region
+    none = np.zeros(0)
+    return replace(
+        where, joint=c.port + 1, variable="time", region=region, intervals=spans, text=text,
+        evidence=b.evidence, threshold=b.threshold, x=none, mean=none, low=none, high=none,
+        frequency_hz=None,
+    )
+
+
+def where_of(search: Search, baseline: Step, log: Log) -> Where:
+    """Where the baseline's residual lies, on the whole log."""
+    whole = [ForceData.of(search.data)]
+    e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta, baseline.active)
+    wanted = None
+    if log.reference is not None:
+        # A mass that is not driven has no wanted motion but its own.
+        wanted = search.data.at_kept(search.data.qd).copy()
+        driven = search.union.machine.plant.at_drives(np.arange(wanted.shape[1]))
+        wanted[:, driven] = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
+    # What joints share cannot be moved for one of them alone.
+    alone = np.sum(search.union.enters[:, baseline.active], axis=0) == 1
+    own = jacobian[..., baseline.active[alone]]
+    return locate(-e, own, search.data, search.colour, wanted, search.union.machine.plant)
+
+
+def _verdict(
+    effects: tuple[Found, ...], where: Where, steps: list[Step], search: Search
+) -> str:
+    if effects:
+        return "found"
+    baseline = steps[0].theta
+    rms = _rms(search, search.samples, baseline)
+    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.worth.above_numerics(baseline)
+    return "unexplained" if above and where.significant else "nothing_missing"
+
+
+def _final_machine(
+    machine: Machine, search: Search, alternatives: dict[int, tuple[Score, ...]], steps: list[Step]
+) -> tuple[Machine, tuple[Found, ...]]:
+    """The case's machine with only the effects that were added, at their refitted values."""
+    plant, parameters = machine.plant, machine.parameters
+    theta = [*search.theta[search.union.base]]
+    effects = []
+    for k, c in enumerate(search.added):
+        effect = cand.effect_at(search.union, c, search.theta[c.index])
+        plant, free = free_effect(plant, effect, machine.units)
+        parameters = parameters.extended(free)
+        theta.extend(search.theta[c.index])
+        score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
+        names = tuple(f.name for f in free)
+        place = plant.place(c.port)
+        effects.append(Found(c.kind, c.label, place, names, score, alternatives.get(k, ())))
+    final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
+    return final, tuple(effects)
+
+
+def _refit(session: Session, start: Estimate) -> Estimate:
+    """Output error from the force-domain fit; the latter stands where simulation cannot follow."""
+    blind = not bool(np.all(start.identifiable))
+    if blind or session.fit.log.reference is None and session.machine.controller is not None:
+        return start
+    try:
+        estimate = output_error(session.machine, session.fit.log)
+    except TooStiffError as error:
+        return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
+    if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
+        note = f"output error: {estimate.message}; parameters are inverse dynamics'"
+        return replace(start, notes=(*start.notes, note))
+    old, new = (gaps(e.machine, (session.fit,))[0] for e in (start, estimate))
+    worse = np.any(new.force.rms > _WORSE * old.force.rms)
+    nearer = old.simulation is None or _length(new) < _length(old)
+    if new.simulation is None or worse or not nearer:
+        note = "output error did not bring the simulation nearer; parameters are inverse dynamics'"
+        return replace(start, notes=(*start.notes, note))
+    return estimate
+
+
+def _length(gap: Gap) -> float:
+    return float(np.sqrt(np.nansum(gap.simulation.rms**2)))
+
+
+def _round(search: Search, step: Step) -> Round:
+    fit, *others = (
+        _rms(search, samples, step.theta)
+        for samples in [search.samples, *search.worth.others]
+    )
+    return Round(step, fit, np.max(others, axis=0) if others else None)
+
+
+def _rms(search: Search, samples: cand.Samples, theta: np.ndarray) -> np.ndarray:
+    e, _ = cand.evaluate(search.union, samples, theta, ())
+    return np.sqrt(np.nanmean(np.where(samples.moving, e, np.nan) ** 2, axis=0))
+

@@ -1,0 +1,229 @@
+"""Identification of a case's unknowns from a log: estimate, gap, noise floor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxid.case.case import Case, load_case
+from jaxid.errors import InputError, suggest
+from jaxid.estimators import METHODS, steps_of
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.output_error import OUTPUTS, SHORT
+from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
+from jaxid.logs.log import Log
+from jaxid.machine import Machine
+from jaxid.numerics.lanes import Soon, Steps, alone, together
+from jaxid.session import Run, Session, open_session
+from jaxid.simulation.replay import exact_numerics, from_rest, make_replay, start_shows, with_fitted_start
+from jaxid.simulation.solvers import SOLVERS
+from jaxid.simulation.step_size import TooStiffError
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How far a machine is from one log.
+
+    Args:
+        name: Of the log.
+        force: In force, by inverse dynamics.
+        simulation: In position, by simulation; None where it diverges.
+    """
+
+    name: str
+    force: ForceGap
+    simulation: SimulationGap | None
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What `identify` returns.
+
+    Args:
+        session: Case and logs.
+        estimate: Parameters and their precision.
+        gaps: The fitted log's first, then the validations'.
+        noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
+    """
+
+    session: Session
+    estimate: Estimate
+    gaps: tuple[Gap, ...]
+    noise_floor: np.ndarray
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solver did."""
+        return self.estimate.converged
+
+    def value(self, name: str) -> float:
+        """Estimate of one parameter, by its name in results."""
+        return self.estimate.value(name)
+
+    def __str__(self) -> str:
+        from jaxid.results.as_text import identification_table
+
+        return identification_table(self)
+
+    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+        """Write `result.json` and `report.html` to a folder.
+
+        Raises:
+            InputError: If the folder holds what jaxid did not make and `force` is not given.
+        """
+        from jaxid.results.as_json import save_identification
+
+        return save_identification(self, Path(folder), force=force)
+
+
+def identify(
+    case: Case | str | Path,
+    log: Log | str | Path,
+    *,
+    method: str = "output_error",
+    solver: str | None = None,
+    on: str | None = None,
+    validate: Sequence[Log | str | Path] = (),
+    progress: Callable[[str], None] = lambda text: None,
+) -> Identification:
+    """Identify the unknowns of a case from a log.
+
+    Args:
+        case: The case, or its file.
+        log: The log, or its file.
+        method: One of `jaxid.estimators.METHODS`.
+        solver: For `output_error`, one of `jaxid.simulation.solvers.SOLVERS`: diffrax then integrates between
+            samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
+            of the fixed steps either way.
+        on: For `output_error`, what of the simulated loop is to meet its log: one of
+            `jaxid.estimators.output_error.OUTPUTS`; None: as the case says, or position.
+        validate: Logs to validate on, beside the case's own.
+        progress: Called with a line at every stage.
+
+    Raises:
+        InputError: If case, log, method, solver or `on` are unsound.
+    """
+    if method not in METHODS:
+        raise InputError(
+            f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
+        )
+    options = {}
+    if solver is not None:
+        options["solver"] = _checked("solver", solver, SOLVERS, method)
+    if on is not None:
+        options["on"] = _checked("on", on, OUTPUTS, method)
+    session = open_session(case, log, validate, method=method)
+    if not session.machine.parameters.free:
+        raise InputError(
+            "nothing is unknown", where=str(session.case.path),
+            mend="give at least one parameter as { guess = ... }",
+        )
+    progress(f"fitting by {method}")
+    estimate = alone(steps_of(method, session, **options), _gaps_of(session))
+    progress("simulating")
+    return Identification(
+        session, estimate, gaps(estimate.machine, session.runs),
+        noise_floor(estimate.machine, session.fit.log, session.fit.data),
+    )
+
+
+def identify_many(
+    case: Case | str | Path | Sequence[Case | str | Path], logs: Sequence[Log | str | Path], *,
+    method: str = "output_error", lanes: int = 16,
+) -> list[Estimate | Exception]:
+    """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
+
+    Args:
+        case: The case, or its file; or one for each log, which may differ in their guesses.
+        logs: Logs, or their files.
+        method: One of `jaxid.estimators.METHODS`.
+        lanes: Logs in a compiled call.
+
+    Returns:
+        The estimate of each log, or what kept it from one: no log fails for another.
+
+    Raises:
+        InputError: If a case or the method is unsound, or cases are not as many as logs.
+    """
+    if method not in METHODS:
+        raise InputError(f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}")
+    loaded = lambda c: c if isinstance(c, Case) else load_case(c)
+    if isinstance(case, Case | str | Path):
+        cases = [loaded(case)] * len(logs)
+    elif len(case) == len(logs):
+        cases = [loaded(c) for c in case]
+    else:
+        raise InputError(f"{len(case)} cases for {len(logs)} logs", mend="give one case, or one for each log")
+
+    def steps(case: Case, log: Log | str | Path) -> Steps[Estimate]:
+        return (yield from steps_of(method, open_session(case, log, method=method)))
+
+    return together([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
+
+
+def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
+    if method != "output_error":
+        raise InputError(
+            f"{option} {value!r} goes only with output_error",
+            mend=f"leave out {option}, or method {method!r}",
+        )
+    if value not in known:
+        raise InputError(f"{option} {value!r} is not known", mend=suggest(value, known))
+    return value
+
+
+# Samples beyond which the gap would take memory beside the fit that a fit may need.
+_COMPILED_BESIDE = 100_000
+
+
+def _gaps_of(session: Session) -> Soon | None:
+    """What a fit is followed by."""
+    machine, samples = session.machine, tuple(r.log.samples for r in session.runs)
+    if sum(samples) > _COMPILED_BESIDE:
+        return None
+    key = (gaps, jax.tree.structure((machine.plant, machine.controller)), samples)
+    return Soon(gaps, (machine, session.runs), key)
+
+
+def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:
+    """Gap of a machine on each log."""
+    return tuple(
+        Gap(r.name, force_gap(r.machine(machine), r.data), _shown(r.machine(machine), r.log))
+        for r in runs
+    )
+
+
+def _shown(machine: Machine, log: Log) -> SimulationGap | None:
+    """The gap in position; in a loop that of a start at rest where it shows, or may, and is nearer.
+
+    Where a log begins with a jerk, a parabola through its first readings is no velocity, however few:
+    six masses that start from rest were off by up to half a millimetre, whatever the parameters.
+    """
+    gap = simulated(machine, log)
+    if gap is None or gap.command is None:
+        return gap
+    if log.samples > SHORT and not start_shows((log.position - gap.position)[:, list(log.measured)]):
+        return gap
+    rested = simulated(machine, log, at_rest=True)
+    nearer = rested is not None and np.nansum(rested.rms**2) < np.nansum(gap.rms**2)
+    return rested if nearer else gap
+
+
+def simulated(machine: Machine, log: Log, *, at_rest: bool = False) -> SimulationGap | None:
+    """Gap in position over the whole log; None where the simulation cannot run or diverges."""
+    if machine.controller is not None and log.reference is None and machine.course is None:
+        machine = replace(machine, controller=None)
+    # Nothing is differentiated here: friction sticks exactly, break-away friction too.
+    try:
+        numerics = exact_numerics(machine, log)
+    except TooStiffError:
+        return None
+    replay = make_replay(machine, log, numerics)
+    replay = from_rest(replay) if at_rest else with_fitted_start(replay, machine.plant, log)
+    gap = simulation_gap(machine, replay, log)
+    seen = list(log.measured)
+    return gap if np.all(np.isfinite(gap.rms[seen])) and np.all(gap.relative[seen] < 1e3) else None

@@ -1,0 +1,337 @@
+"""A case's controller one tick at a time, for a machine or a simulator that is not jaxid's.
+
+With `identify` it finds the unknowns in the first instants, algebraically, and goes on with what it found.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.case.case import Case, load_case
+from jaxid.controllers import Controller, Tick, base
+from jaxid.errors import InputError
+from jaxid.estimators.algebraic.online import Memory, Online, Told
+from jaxid.estimators.recursive.recursion import Told as Estimate
+from jaxid.logs.log import Log
+from jaxid.machine import Machine, build_machine
+from jaxid.scene import Scene
+
+# A joint is taken to rest below this part of its reference's largest speed, and below so many
+# standard deviations of a difference of two readings.
+_REST = 5e-3
+_NOISE = 5.0
+# What may be measured beside positions.
+_OTHERS = ("velocity", "acceleration", "measured")
+
+
+class Live:
+    """The loop of a case without its plant: readings in, commands out.
+
+    Args:
+        case: The case, or its file; it needs [controller], [reference] and [simulation].
+        identify: Identify the unknowns on-line and, once all may be trusted, put what was found into
+            the model of a controller that has one.
+        tolerance: Of that trust (see `jaxid.estimators.algebraic.online.Told`).
+
+    Attributes:
+        told: What the rows so far say; None without `identify`, and before the second tick.
+        adapts: Whether the controller identifies by itself.
+        switched: Tick from which on the controller knows what was found; None: not yet.
+
+    Raises:
+        InputError: If the case has no controller or reference, or asks for what cannot be identified
+            on-line.
+    """
+
+    def __init__(self, case: Case | str | Path, *, identify: bool = False, tolerance: float = 0.05):
+        case = case if isinstance(case, Case) else load_case(case)
+        scene = Scene.of(case)
+        if scene.machine.controller is None:
+            raise InputError("there is no loop", where=str(case.path), mend="add a [controller]")
+        self.machine = build_machine(case, period=scene.drive.period)
+        self.reference: Float[np.ndarray, "ticks m"] = scene.signal
+        self.period: float = scene.drive.period
+        self.told: Told | None = None
+        self.switched: int | None = None
+        self._controller = scene.machine.controller
+        path = self._controller.path(jnp.asarray(self.reference))
+        self._path = jax.tree.map(np.asarray, path)
+        self._driven = self.machine.plant.driven(case.plant.joints)
+        self._tick = 0
+        self._law = _Law(self._controller, scene.signal.shape[1], path, self._driven)
+        self._memory: np.ndarray | None = None
+        sensor = self.machine.sensor
+        self._holds = sensor.hold, 1 if sensor.inertial is None else sensor.inertial.hold
+        self.adapts = "estimator" in self._controller.of_machine
+        self._last: np.ndarray | None = None
+        self._as_given = np.full(self.machine.gain.size, np.nan)
+        self._online, self._rows = None, None
+        if identify:
+            if "model" not in self._controller.of_machine or self.adapts:
+                kind = (case.controller or {})["kind"]
+                what = "identifies by itself" if self.adapts else "has no model to put what is found into"
+                raise InputError(
+                    f"a controller of kind {kind!r} {what}",
+                    where=str(case.path),
+                    mend="leave identify out" if self.adapts else "take kind = 'flatness'",
+                )
+            self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
+
+    def command(
+        self, position: Float[np.ndarray, " n"], velocity: Float[np.ndarray, " n"] | None = None,
+        acceleration: Float[np.ndarray, " n"] | None = None, measured: Float[np.ndarray, " m"] | None = None,
+    ) -> Float[np.ndarray, " m"]:
+        """The command to hold until the next tick.
+
+        Args:
+            position: Readings of all joints [m or rad].
+            velocity, acceleration: Likewise, of a gyroscope and an accelerometer; absent: differenced.
+                The same are to be given at every tick, held where they are not new: at ticks that are no
+                multiple of what [[inertial_sensors]] rate says.
+            measured: Command that the drives report since the last tick; absent: as it was given.
+
+        Raises:
+            InputError: If the reference has ended, or there is not one reading a joint, or command a drive.
+        """
+        if self._tick >= len(self.reference):
+            raise InputError(
+                f"the reference ends after {len(self.reference)} ticks",
+                mend="let [simulation] duration be longer",
+            )
+        position = np.asarray(position, dtype=np.float64)
+        joints = self.machine.plant.joints
+        if position.shape != (joints,):
+            what = f"position has shape {position.shape}"
+            raise InputError(what, where="Live.command", mend=f"give one reading of each of {joints} joints")
+        if measured is None and self.adapts:
+            measured = self._as_given
+        others = [None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured)]
+        # All go into one vector, in which one of another length would push the next aside.
+        for name, x, like in zip(_OTHERS, others, (position, position, self._as_given), strict=True):
+            if x is not None and x.shape != like.shape:
+                what = f"{name} has shape {x.shape}"
+                raise InputError(what, where="Live.command", mend=f"give {like.size} numbers")
+        fresh = tuple(self._tick % hold == 0 for hold in self._holds)
+        if self._tick == 0:
+            path = jax.tree.map(lambda x: x[0], self._path)
+            tick = Tick(position, path, self._driven, np.asarray(fresh[0]), *others, np.asarray(fresh[1]))
+            start, saved = self._controller.start(tick, np.zeros_like(position), self._path), self.memory
+            # Readings of an earlier run would be differenced with those of this one.
+            self.memory = start if saved is None else self._controller.resumed(start, saved)
+        if self._online is not None and self.switched is None:
+            self._identify(position)
+        u, self._memory, closed = self._law(self._tick, position, fresh, others, self._memory)
+        if self.adapts and self.switched is None and closed:
+            self.switched = self._tick
+        self._tick, self._last = self._tick + 1, u
+        return self._last
+
+    @property
+    def memory(self) -> object:
+        """What the controller remembers, a tree of arrays.
+
+        Of one that was saved, and put back before the first tick, what was identified is kept.
+        """
+        return None if self._memory is None else self._law.memory.unpacked(self._memory)
+
+    @memory.setter
+    def memory(self, memory: object) -> None:
+        self._memory = self._law.remembers(memory)
+
+    @property
+    def estimate(self) -> Estimate:
+        """What a controller that identifies says of the unknowns, in the order of `machine.parameters`.
+
+        Raises:
+            InputError: If it does not identify, or nothing has been read yet.
+        """
+        if not self.adapts or self.memory is None:
+            what = "no reading yet" if self.adapts else "the controller does not identify"
+            raise InputError(what, where="Live", mend="take kind = 'adaptive', and give it readings")
+        return self._controller.estimate(self.memory)
+
+    def _identify(self, position: np.ndarray) -> None:
+        if self._rows is None:
+            self._rows = self._online.start(jnp.asarray(position))
+            return
+        self._rows, told = _learned(self._online, self._rows, position, self._last)
+        self.told = jax.tree.map(np.asarray, told)
+        if self.told.trusted.all():
+            model = self.machine.with_estimate(self.told.theta).plant
+            self._controller = eqx.tree_at(lambda c: c.model, self._controller, model)
+            self._law.take(self._controller)
+            self.switched = self._tick
+
+
+def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> Told:
+    """What the on-line estimator tells at every sample of a log but the first, (time, p) each.
+
+    Args:
+        case: The case, or its file.
+        log: The log; its command is held between samples.
+        tolerance: Of trust (see `jaxid.estimators.algebraic.online.Told`).
+
+    Raises:
+        InputError: If the case asks for what cannot be identified on-line.
+    """
+    case = case if isinstance(case, Case) else load_case(case)
+    log.need_every_encoder("on-line identification")
+    machine = build_machine(case, period=log.period)
+    fast = np.abs(np.diff(log.position, axis=0)).max(axis=0) / log.period
+    rest = np.maximum(_REST * fast, _noise(machine, log.position.shape[1]) / log.period)
+    online = Online.of(machine, log.period, rest, fast, tolerance)
+    return jax.tree.map(np.asarray, _followed(online, log.position, log.force))
+
+
+@eqx.filter_jit
+def _followed(online: Online, position: Array, command: Array) -> Told:
+    def step(memory: Memory, now: tuple) -> tuple[Memory, Told]:
+        return _learn(online, memory, *now)
+
+    return jax.lax.scan(step, online.start(position[0]), (position[1:], command[:-1]))[1]
+
+
+class _Law:
+    """A controller's command, compiled as a function of one vector: its own values, the tick, its memory.
+
+    To build trees at every tick, and to hand over an array for each of their leaves, takes five times as long
+    as the law itself.
+
+    Args:
+        controller: The law.
+        drives: How many commands it gives.
+        path: Its path, one row a tick.
+        driven: Joints that are driven.
+    """
+
+    def __init__(self, controller: Controller, drives: int, path: base.Path, driven: tuple[int, ...]):
+        self.take(controller)
+        self._drives, self._driven = drives, driven
+        leaves, self._path = jax.tree.flatten(path)
+        self._rows = [np.asarray(x, float).reshape(len(x), -1) for x in leaves]
+        self._shapes = tuple(x.shape[1:] for x in leaves)
+        self._compiled: dict[tuple[bool, ...], Callable] = {}
+        self._once = jnp.asarray(1)
+
+    def take(self, controller: Controller) -> None:
+        """Go on with a controller of the same structure."""
+        arrays, self._static = eqx.partition(controller, eqx.is_array)
+        self._own = _Packed.of(arrays)
+        self._leaves = self._own.packed(arrays)
+
+    def remembers(self, memory: object) -> np.ndarray:
+        """A memory as the law takes it."""
+        self.memory = _Packed.of(memory)
+        return self.memory.packed(memory)
+
+    def __call__(
+        self, k: int, position: np.ndarray, fresh: tuple[bool, bool], others: Sequence[np.ndarray | None],
+        memory: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, bool]:
+        """The command, the new memory, and whether what the law found takes part in the command.
+
+        Args:
+            k: The tick.
+            position: Readings.
+            fresh: Whether they are new, and those of inertial sensors.
+            others: Velocity, acceleration and command, as measured.
+            memory: Of the tick before.
+        """
+        given = tuple(x is not None for x in others)
+        if given not in self._compiled:
+            self._compiled[given] = jax.jit(functools.partial(self._command, len(position), given))
+        rows = (x[k] for x in self._rows)
+        now = (position, *rows, fresh, *(x for x in others if x is not None), np.zeros(1 + self._drives))
+        before = np.concatenate([self._leaves, memory, *now])
+        after = np.asarray(self._compiled[given](before, self._once))
+        first = len(self._leaves)
+        end = first + self.memory.size
+        return after[-self._drives :], after[first:end], bool(after[-1 - self._drives])
+
+    def _command(self, joints: int, given: tuple[bool, ...], before: Array, once: Array) -> Array:
+        sizes = [self._own.size, self.memory.size, joints, *(x.shape[1] for x in self._rows), 2]
+        sizes += [size for size, there in zip((joints, joints, self._drives), given, strict=True) if there]
+        ends = [int(x) for x in np.cumsum(sizes)]
+
+        def body(_: Array, before: Array) -> Array:
+            own, memory, position, *now, _ = jnp.split(before, ends)
+            path = [now.pop(0).reshape(shape) for shape in self._shapes]
+            fresh = now.pop(0) != 0
+            others = [now.pop(0) if there else None for there in given]
+            path = jax.tree.unflatten(self._path, path)
+            tick = Tick(position, path, self._driven, fresh[0], *others, fresh[1])
+            controller = eqx.combine(self._own.unpacked(own), self._static)
+            u, memory = controller.command(tick, self.memory.unpacked(memory), jnp.zeros(1))
+            told = controller.told(memory)
+            closed = jnp.zeros(1) if told is None else told.closed.astype(float)[None]
+            memory = self.memory.packed(memory, jnp)
+            return jnp.concatenate([own, memory, before[ends[1] : ends[-1]], closed, u])
+
+        # A loop of one turn, whose number the compiler does not know, is one kernel (see `jaxid._platform`).
+        # All in one vector, or what the turn does not change would be taken out of it: else there are a
+        # hundred kernels, started one by one.
+        return jax.lax.fori_loop(0, once, body, before)
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A tree of arrays as one vector of float64: truths and whole numbers below 2^53 stay exact."""
+
+    structure: object
+    shapes: tuple
+
+    @classmethod
+    def of(cls, tree: object) -> _Packed:
+        leaves, structure = jax.tree.flatten(tree)
+        return cls(structure, tuple((np.shape(x), np.asarray(x).dtype.str) for x in leaves))
+
+    @functools.cached_property
+    def size(self) -> int:
+        return sum(int(np.prod(shape)) for shape, _ in self.shapes)
+
+    def packed(self, tree: object, xp: Any = np) -> Any:
+        parts = [xp.ravel(x).astype(np.float64) for x in jax.tree.leaves(tree)]
+        return xp.concatenate(parts) if parts else xp.zeros(0)
+
+    def unpacked(self, vector: Any) -> object:
+        leaves, end = [], 0
+        for shape, dtype in self.shapes:
+            first, end = end, end + int(np.prod(shape))
+            leaves.append(vector[first:end].reshape(shape).astype(dtype))
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def _learn(online: Online, memory: Memory, position: Array, command: Array) -> tuple[Memory, Told]:
+    memory, _ = online.update(memory, position, command)
+    return memory, online.told(memory)
+
+
+_learned = eqx.filter_jit(_learn)
+
+
+def _online(
+    machine: Machine, reference: np.ndarray, driven: tuple[int, ...], period: float, tolerance: float
+) -> Online:
+    speed = np.abs(np.diff(reference, axis=0)).max(axis=0) / period
+    joints = machine.plant.joints
+    fast = np.full(joints, speed.max())
+    fast[list(driven)] = np.where(speed > 0, speed, speed.max())
+    rest = np.maximum(_REST * fast, _noise(machine, joints) / period)
+    return Online.of(machine, period, rest, fast, tolerance)
+
+
+def _noise(machine: Machine, joints: int) -> np.ndarray:
+    """Difference of two readings that noise alone hardly exceeds."""
+    stated = machine.sensor.position_std
+    std = np.zeros(joints) if stated is None else np.broadcast_to(np.asarray(stated), joints)
+    return _NOISE * np.sqrt(2) * std

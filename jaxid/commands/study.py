@@ -1,0 +1,221 @@
+"""`study`: run the chunks of a plan on all cores, keep each as it ends, and gather the table."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from jaxid.case.case import Case, load_case
+from jaxid.errors import InputError
+from jaxid.estimators.output_error import choose_numerics, position_jacobian
+from jaxid.files import check_folder, mark_folder, write_json, write_whole
+from jaxid.logs.log import Log
+from jaxid.machine import position_noise
+from jaxid.numerics.lanes import alone
+from jaxid.simulation.step_size import TooStiffError
+from jaxid.studies.levels import Level
+from jaxid.studies.plan import Plan, at_once, digest_of, same
+from jaxid.studies.remote import Bundle, Remote
+from jaxid.studies.result import FILES, Study, gathered
+from jaxid.studies.runs import Arrays, Runner
+
+_MANIFEST = "study.json"
+_CHUNKS = "chunks"
+
+# Called with runs done, and runs in all.
+Told = Callable[[int, int], None]
+
+
+def study(
+    case: Case | str | Path,
+    *,
+    runs: int | None = None,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    resume: bool = False,
+    force: bool = False,
+    scheduler: str | None = None,
+    progress: Told = lambda done, runs: None,
+) -> Study:
+    """Simulate and identify a case over and over.
+
+    Args:
+        case: The case, or its file; [simulation] and [study] say what to do, `true` where a true value
+            differs from the guess.
+        runs: At each level; in place of the case's.
+        seed: Of everything drawn.
+        folder: Where each chunk is kept as soon as it ends, and the results at the end; absent: in
+            memory only.
+        resume: Go on where an interrupted study in that folder stopped: to the same bits.
+        force: Write into a folder that jaxid did not make.
+        scheduler: Address of a Dask scheduler whose workers run the chunks; absent: this machine, all
+            cores.
+        progress: Called with the number of runs done, and of all.
+
+    Raises:
+        InputError: If the case does not say what to simulate, or the folder holds another study.
+    """
+    case = case if isinstance(case, Case) else load_case(case)
+    where = None if folder is None else Path(folder)
+    if resume and where is None:
+        raise InputError("there is nothing to resume from", mend="give the folder of the study: -o DIR")
+    if where is not None and not resume:
+        check_folder(where, FILES, force=force)
+        if (where / _MANIFEST).exists():
+            raise InputError(
+                "holds a study already", where=str(where),
+                mend="go on with it with --resume, or choose another -o",
+            )
+    begun = _begun(where) if resume else {}
+    with contextlib.ExitStack() as stack:
+        remote = None if scheduler is None else stack.enter_context(Remote(scheduler))
+        plan = Plan.of(case, runs=runs, seed=seed, workers=remote and remote.threads)
+        # How many runs are solved together changes the last bits: what was begun with stays.
+        plan = replace(plan, chunk=int(begun.get("chunk", plan.chunk)))
+        differs = same(plan.manifest, begun) if resume else ""
+        if differs:
+            raise InputError(
+                f"the study there is another one: {differs} differ", where=str(where),
+                mend="give what it was begun with, or choose another -o",
+            )
+        # All that can be refused is refused before anything is written.
+        runner = Runner(plan)
+        for level in range(len(plan.levels)):
+            runner.ways(level)
+        bundle = None if remote is None else Bundle.of(plan)
+        bound = np.stack([_bound(plan, level) for level in plan.levels])
+        identity = digest_of(plan.manifest)
+        kept = _kept(where, plan, identity) if resume else {}
+        if where is not None and not resume:
+            _begin(where, plan)
+        missing = [k for k in range(len(plan.chunks)) if k not in kept]
+        total, done = plan.runs * len(plan.levels), sum(len(plan.chunks[k][1]) for k in kept)
+        progress(done, total)
+        for number, arrays in remote.run(bundle, missing) if remote else _solved(runner, missing):
+            kept[number] = arrays
+            if where is not None:
+                write_whole(_path(where, number), _packed(arrays, identity))
+            done += len(plan.chunks[number][1])
+            progress(done, total)
+    result = gathered(plan, [kept[k] for k in range(len(plan.chunks))], bound)
+    if where is not None:
+        result.save(where, force=force)
+    return result
+
+
+def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
+    """Chunks as they end, as many at once as the device takes: compiled code leaves Python's lock alone.
+
+    Linear algebra keeps to one thread meanwhile: its own would wait for each other in a loop.
+    """
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(at_once()) as pool:
+        left: dict[Future, int] = {pool.submit(runner.chunk, number): number for number in numbers}
+        try:
+            while left:
+                finished, _ = wait(left, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    yield left.pop(future), future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _begin(folder: Path, plan: Plan) -> None:
+    """A folder that is a study's: what it is comes last, so that it is there whole."""
+    mark_folder(folder)
+    (folder / _CHUNKS).mkdir(exist_ok=True)
+    for old in (folder / _CHUNKS).iterdir():
+        old.unlink()
+    write_json(folder / _MANIFEST, plan.manifest)
+
+
+def _begun(folder: Path) -> dict:
+    """What a folder's study was begun with."""
+    path = folder / _MANIFEST
+    if not path.exists():
+        raise InputError(
+            "holds no study", where=str(folder), mend="leave out --resume, or give the study's folder"
+        )
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(
+            f"cannot be read: {error}", where=str(path), mend="begin anew in another folder"
+        ) from error
+
+
+def _kept(folder: Path, plan: Plan, identity: str) -> dict[int, Arrays]:
+    """The chunks that are there; what an interruption left of another is removed."""
+    for part in (folder / _CHUNKS).glob(".*.npz.*"):
+        part.unlink()
+    there = {k: _path(folder, k) for k in range(len(plan.chunks))}
+    return {k: _unpacked(p, identity) for k, p in there.items() if p.exists()}
+
+
+def _path(folder: Path, number: int) -> Path:
+    return folder / _CHUNKS / f"{number:06d}.npz"
+
+
+def _packed(arrays: Arrays, identity: str) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, study=np.asarray(identity), **arrays)
+    return buffer.getvalue()
+
+
+def _unpacked(path: Path, identity: str) -> Arrays:
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in arrays.files}
+        own = str(found.pop("study"))
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"cannot be read: {error}", where=str(path), mend="remove this file, and resume again"
+        ) from error
+    if own != identity:
+        raise InputError(
+            "belongs to another study", where=str(path), mend="remove this file, and resume again"
+        )
+    return found
+
+
+def _bound(plan: Plan, level: Level) -> np.ndarray:
+    """Cramer-Rao bound on the deviation of each parameter at a level.
+
+    Of an unbiased estimate from the readings of one log, their noise white, the start and the command
+    known exactly: in a loop too the readings so far give the command, so that what counts is the
+    derivative of the position under a given command. NaN where the case states no noise of the
+    readings, where nothing is fitted to logs, or where the log cannot tell. Where true values are drawn it
+    is that of their middle.
+    """
+    none, scene, machine = np.full(len(plan.names), np.nan), level.scene, level.scene.machine
+    if machine.sensor.position_std is None or not plan.fits:
+        return none
+    silent = replace(machine, sensor=replace(machine.sensor, position_noise=None, force_noise=None))
+    virtual = alone(scene.virtual(silent, np.random.default_rng(0)))
+    # The command of every tick, of which the log may have but some.
+    run = virtual.trajectory
+    ticks = scene.drive.period * np.arange(len(run.command))
+    log = Log(ticks, np.asarray(run.reading), np.asarray(run.command), hold=virtual.log.hold)
+    driven = replace(machine, controller=None)
+    try:
+        numerics = choose_numerics(driven, log, segments=False)
+        jacobian = position_jacobian(driven, log, numerics)[:: scene.every]
+    except TooStiffError:
+        return none
+    noise = position_noise(machine, log)
+    rows = (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, jacobian.shape[-1])
+    scale = np.linalg.norm(rows, axis=0)
+    if not np.all(np.isfinite(scale)) or np.any(scale == 0):
+        return none
+    values, vectors = np.linalg.eigh((rows / scale).T @ (rows / scale))
+    if values[0] <= 1e-12 * values[-1]:
+        return none
+    return (np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)[plan.own]

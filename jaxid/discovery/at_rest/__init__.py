@@ -1,0 +1,1 @@
+"""Effects that show at rest: break-away forces, and departures from rest."""

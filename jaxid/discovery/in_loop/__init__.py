@@ -1,0 +1,1 @@
+"""The search in the simulated control loop: trials of candidates by linearisation, then refits."""

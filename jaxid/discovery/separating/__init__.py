@@ -1,0 +1,1 @@
+"""Experiments that separate effects which a log cannot tell apart."""

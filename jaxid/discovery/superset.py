@@ -1,0 +1,143 @@
+"""Which effects a machine might be missing, where, and the plant that has them all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxid.discovery.candidates import Candidate, Union
+from jaxid.discovery.user_effects import check_foreign, is_foreign
+from jaxid.effects import EFFECTS
+from jaxid.estimators.inverse_dynamics import ForceData, sharpened, whole_motion
+from jaxid.logs.prepare import Prepared
+from jaxid.machine import Machine
+from jaxid.model.plant import Effect, Plant, Scales, carries_force, parameters_of, port_motion
+from jaxid.model.unknowns import Free, Parameters, colours, free_effect, label
+
+
+def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
+    """How large the quantities of a prepared log are, by port of a plant."""
+    y, yd, ydd = (np.asarray(a) for a in _port_motion(plant, ForceData.of(data)))
+    n, drives = data.q.shape[1], data.force.shape[1]
+    force = data.force - np.mean(data.force, axis=0)
+
+    def rms(x: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(x**2)))
+
+    found = []
+    for port in range(y.shape[1]):
+        rows = data.moving[:, port] if port < n else data.moving.any(axis=1)
+        v, a = data.at_kept(yd)[rows, port], data.at_kept(ydd)[rows, port]
+        drive = plant.drive_of(port, drives) if len(v) else None
+        own = slice(None) if drive is None else slice(drive, drive + 1)
+        found.append(Scales(
+            position=float(np.ptp(y[:, port]) / 2),
+            velocity=rms(v) if len(v) else 0.0,
+            acceleration=rms(a) if len(v) else 0.0,
+            force=rms(force[:, own]),
+            peak_velocity=float(np.abs(v).max(initial=0.0)),
+            peak_force=float(np.abs(data.force[:, own]).max()),
+            period=data.period,
+            duration=data.period * len(data.q),
+        ))
+    return tuple(found)
+
+
+@eqx.filter_jit
+def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
+    motion = whole_motion(plant, data, data.force)
+    return jax.vmap(lambda *now: port_motion(plant, *now))(*motion)
+
+
+def build_union(
+    machine: Machine, data: Prepared, effects: Sequence[type[Effect]] | None = None
+) -> Union:
+    """Add every effect that the plant does not have yet, at every joint and spring that suits it.
+
+    Args:
+        machine: The baseline.
+        data: The log to be searched, for scales.
+        effects: Those that it might be missing; default all but those on request.
+
+    Raises:
+        InputError: If an effect that is not jaxid's own cannot be searched for.
+    """
+    if effects is None:
+        effects = [cls for cls in EFFECTS.values() if not cls.on_request]
+    scales = scales_of(machine.plant, data)
+    plant, parameters = machine.plant, machine.parameters
+    base = np.arange(len(parameters.free))
+    candidates = []
+    # Kind by kind, so that the effects of one kind are traced as one.
+    for cls in effects:
+        ports = [i for i, s in enumerate(scales) if s.velocity > 0.0 and _missing(machine, cls, i, data)]
+        if ports and is_foreign(cls):
+            check_foreign(cls, machine, data, scales[ports[0]], ports[0])
+        for port in ports:
+            plant, free = free_effect(plant, cls(**cls.neutral(scales[port]), port=port), machine.units)
+            free = _limited(free, cls.limits(scales[port]))
+            first = len(parameters.free)
+            parameters = parameters.extended(free)
+            index = np.arange(first, first + len(free))
+            where = label(plant, cls.kind, port)
+            candidates.append(_candidate(cls, where, port, index, scales[port]))
+    union = machine.with_plant(sharpened(plant, data), parameters)
+    enters = _enters(plant, parameters, data.q.shape[1], data.force.shape[1])
+    return Union(union, base, tuple(candidates), enters, colours(enters))
+
+
+def _enters(
+    plant: Plant, parameters: Parameters, joints: int, drives: int
+) -> Bool[np.ndarray, "n p"]:
+    """Which unknowns stand in the balance of which joints, as far as the plant says."""
+    enters = np.ones((joints, len(parameters.free)), bool)
+    undriven = [i for i in range(joints) if plant.drive_of(i, drives) is None]
+    for k, f in enumerate(parameters.free):
+        if f.path[0] != "effects":
+            continue
+        effect = plant.effects[f.path[1]]
+        if is_foreign(type(effect)):  # it may act on the drive without saying so
+            continue
+        # The scale of forces where no drive is follows all drives.
+        rows = [*plant.reached(effect.port, joints), *(undriven if effect.in_drive else [])]
+        enters[:, k] = np.isin(np.arange(joints), rows)
+    return enters
+
+
+def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> bool:
+    """Whether a port may lack an effect: one that it does not have yet, nor by another name."""
+    plant = machine.plant
+    if not plant.offers(cls, port, data.force.shape[1]):
+        return False
+    twin = plant.twin(cls, port)
+    fitted = twin is not None and any(
+        f.path == (twin[0],) and f.index == twin[1] for f in machine.parameters.free
+    )
+    return not fitted and all(e.kind != cls.kind or e.port != port for e in plant.effects)
+
+
+def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[Free]:
+    """Unknowns within the bounds that a search keeps."""
+    out = []
+    for f in free:
+        lower, upper = limits.get(f.name.rpartition(".")[2], (-np.inf, np.inf))
+        out.append(replace(f, lower=lower, upper=upper))
+    return out
+
+
+def _candidate(
+    cls: type[Effect], where: str, port: int, index: np.ndarray, scales: Scales
+) -> Candidate:
+    neutral, infos = cls.neutral(scales), parameters_of(cls)
+    names = [n for n in infos if n in neutral]
+    return Candidate(
+        cls.kind, where, port, index,
+        np.asarray([neutral[n] for n in names], float),
+        np.asarray([[s[n] for n in names] for s in cls.starts(scales)], float),
+        np.asarray([cls.adds_force and carries_force(infos[n]) for n in names]),
+    )

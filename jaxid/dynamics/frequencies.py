@@ -1,0 +1,110 @@
+"""Natural frequencies of a plant about rest, with their slopes in the unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import scatter
+
+# Relative to the square of the highest frequency, below this one is that of a rigid motion.
+_RIGID = 1e-9
+# Of its largest term, what is left of a slope whose terms cancel.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Natural frequencies, lowest first; motions without stiffness left out.
+
+    Args:
+        hz: [Hz], (modes,).
+        slopes: In the unknowns, (modes, p).
+    """
+
+    hz: Float[np.ndarray, " modes"]
+    slopes: Float[np.ndarray, "modes p"]
+
+    def std(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " modes"]:
+        """Standard deviations [Hz]; NaN where an unknown in one has none."""
+        known = np.isfinite(np.diag(covariance))
+        inner = np.where(np.outer(known, known), covariance, 0.0)
+        std = np.sqrt(np.maximum(np.einsum("mi,ij,mj->m", self.slopes, inner, self.slopes), 0.0))
+        return np.where(np.any((self.slopes != 0) & ~known, axis=1), np.nan, std)
+
+
+def natural_frequencies(
+    plant: Plant, places: tuple, theta: Float[np.ndarray, " p"], held: tuple[int, ...] = ()
+) -> Modes:
+    """How fast a plant swings about rest without friction: the size of its eigenvalues.
+
+    Dry friction and what damps the joints are left out: with it the size of a weakly damped mode moves
+    in the second order only, but a strongly damped one is lost, and guesses of damping may be far off.
+    Damping among the effects' own states stays; beside a single spring it leaves the size as it is.
+
+    Args:
+        plant: The plant.
+        places: Where its unknowns are (`Parameters.places`).
+        theta: Their values.
+        held: Joints that are held still.
+
+    Source:
+        First-order perturbation for the slopes: y' dA x / y' x with left and right eigenvectors.
+    """
+    a, slopes = (np.asarray(x) for x in _matrix(plant, places, np.asarray(theta), held))
+    if not (a.size and np.all(np.isfinite(a))):
+        return Modes(np.zeros(0), np.zeros((0, len(theta))))
+    values, left, right = scipy.linalg.eig(a, left=True)
+    size = np.abs(values)
+    swings = values.imag > np.abs(values.real)
+    swings &= size**2 > _RIGID * np.max(size[swings] ** 2, initial=0.0)
+    at = np.flatnonzero(swings)[np.argsort(size[swings])]
+    y, x, direction = left[:, at].conj(), right[:, at], values[at].conj() / size[at]
+    per = 2 * np.pi * np.sum(y * x, axis=0)
+    slope = np.real(np.einsum("im,ijp,jm->mp", y, slopes, x) * (direction / per)[:, None])
+    largest = np.einsum("im,ijp,jm->mp", *(np.abs(k) for k in (y, slopes, x))) / np.abs(per)[:, None]
+    return Modes(size[at] / (2 * np.pi), np.where(np.abs(slope) > _ROUNDING * largest, slope, 0.0))
+
+
+@eqx.filter_jit
+def _matrix(plant: Plant, places: tuple, theta: Array, held: tuple[int, ...]) -> tuple[Array, Array]:
+    """The state matrix, (s, s), and its slopes in the unknowns, (s, s, p)."""
+
+    def matrix(theta: Array) -> tuple[Array, Array]:
+        a = _state_matrix(scatter(places, plant, theta), held)
+        return a, a
+
+    slopes, a = jax.jacfwd(matrix, has_aux=True)(theta)
+    return a, slopes
+
+
+def _state_matrix(plant: Plant, held: tuple[int, ...]) -> Float[Array, "s s"]:
+    """Of positions and velocities of the free joints, and the effects' own states, at rest."""
+    free = np.asarray([i for i in range(plant.joints) if i not in held], dtype=int)
+    n, u = len(free), jnp.zeros(len(plant.driven(plant.joints)))
+    own, back = ravel_pytree(plant.initial_states(u))
+    no_friction = jnp.zeros_like(plant.ports(jnp.zeros(plant.joints)))
+
+    def balance(q: Array, v: Array, a: Array, own: Array) -> tuple[Array, Array]:
+        whole = (jnp.zeros(plant.joints).at[free].set(x) for x in (q, v, a))
+        b = plant.balance(*whole, u, jnp.zeros(()), back(own), no_friction)
+        return b.residual[free], ravel_pytree(b.rates)[0]
+
+    zero = jnp.zeros(n)
+    forces, rates = jax.jacfwd(balance, argnums=(0, 1, 2, 3))(zero, zero, zero, own)
+    by_q, _, mass, by_own = forces
+    # Without the column of the velocities, which is the damping.
+    a_q, a_own = (-jnp.linalg.solve(mass, x) for x in (by_q, by_own))
+    return jnp.block([
+        [jnp.zeros((n, n)), jnp.eye(n), jnp.zeros((n, own.size))],
+        [a_q, jnp.zeros((n, n)), a_own],
+        [rates[0] + rates[2] @ a_q, rates[1], rates[3] + rates[2] @ a_own],
+    ])

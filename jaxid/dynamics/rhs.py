@@ -1,0 +1,348 @@
+"""What is read from a plant's one balance at an instant, and over a step: accelerations, and motion.
+
+The step in which dry friction sticks exactly is in `jaxid.dynamics.dry_friction`; residuals along a measured
+motion, whose Jacobians are regressors, are in `jaxid.dynamics.residuals`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import factorial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxid.errors import InputError
+from jaxid.model.plant import Balance, Plant
+from jaxid.numerics.affine import Affine, affine
+from jaxid.numerics.smooth import ramp, sign
+
+# Traced once for all places of a step that read it: tracing is most of what a first answer waits for.
+balance_of = eqx.filter_jit(lambda plant, *args: plant.balance(*args))
+
+# Coordinates, velocities, and own states in one array.
+Split = tuple[Array, Array, Array]
+
+
+class State(eqx.Module):
+    """Motion and memory: coordinates, velocities, the effects' own states (None where none)."""
+
+    q: Float[Array, " n"]
+    qd: Float[Array, " n"]
+    own: tuple
+
+
+def small_solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solve a x = b by unrolled elimination, for the small mass matrices inside loops.
+
+    A LAPACK call inside a scan would defeat the loop flag (see `jaxid._platform`), 60 times slower.
+    No pivoting: a mass matrix is positive definite.
+    """
+    n = b.size
+    rows = [[a[i, j] for j in range(n)] + [b[i]] for i in range(n)]
+    # Reciprocals of the pivots: those of a constant mass matrix are taken out of the loop.
+    scale: list[Array] = []
+    for k in range(n):
+        scale.append(1.0 / rows[k][k])
+        for i in range(k + 1, n):
+            factor = rows[i][k] * scale[k]
+            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k], strict=True)]
+    x: list[Array] = [jnp.zeros(())] * n
+    for k in reversed(range(n)):
+        known = [rows[k][j] * x[j] for j in range(k + 1, n)]
+        x[k] = sum((-y for y in known), rows[k][n]) * scale[k]
+    return jnp.stack(x)
+
+
+def acceleration(
+    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None
+) -> Float[Array, " n"]:
+    """Solve the balance, affine in the acceleration, for it.
+
+    Args:
+        plant: The plant.
+        x: State.
+        u: Declared force of each drive, delay applied [N or N m].
+        t: Time [s].
+        reaction: Dry-friction force by port from a set-valued step; absent: smoothed.
+    """
+
+    def residual(qdd: Array) -> tuple[Array, Balance]:
+        balance = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction)
+        return balance.residual, balance
+
+    mass, rest = mass_of(plant, residual, x.q)
+    if reaction is not None or not rest.rises:
+        if plant.coupled:
+            return _implicit(lambda qdd: residual(qdd)[0], solved(mass, -rest.residual))
+        return solved(mass, -rest.residual)
+    # At rest in acceleration the balance has nothing of what acts while speed grows: that resists what
+    # is left of the force, as far as it goes.
+    each = need_apart(plant, mass, rest.rises)
+    way = sign(x.qd, plant.port_width(x.q)[: x.q.size])
+    forth, back = (spread(picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
+    left = -rest.residual
+    forth, back = 0.5 * (1 + way) * forth, 0.5 * (1 - way) * back
+    more = ramp(left, forth, plant.sharpness * forth) - ramp(-left, back, plant.sharpness * back)
+    return (left - more) / each
+
+
+def _implicit(residual: Callable[[Array], Array], qdd: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Accelerations at which a residual that is affine in them is zero, differentiated as such.
+
+    A tangent then takes one balance, and not those of all columns of the mass: of seven joints one for
+    eight, and the same through the elimination.
+    """
+    none = jnp.zeros_like(qdd)
+    return jax.lax.custom_root(
+        residual, qdd, lambda _, known: known, lambda slope, y: solved(jax.jacfwd(slope)(none), y)
+    )
+
+
+def need_apart(plant: Plant, mass: Array, ports: tuple[int, ...]) -> Array:
+    """Mass of each joint, where none pushes another and all of some ports are joints.
+
+    Raises:
+        InputError: Elsewhere: friction that depends on the acceleration has no answer there.
+    """
+    apart = mass.ndim == 1 or mass.shape == (1, 1)
+    if apart and max(ports) < mass.shape[0]:
+        return mass if mass.ndim == 1 else mass[0]
+    raise InputError(
+        f"velocity_hysteresis cannot be simulated here: on kind = {plant.kind!r} "
+        + ("it, or other dry friction beside it, acts in a spring" if apart else "joints push each other"),
+        mend="put it on a joint of a machine whose joints do not push each other, "
+        "and leave dry friction out of the springs",
+    )
+
+
+def mass_of(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple[Array, Any]:
+    """Derivative of a residual in the accelerations, (n, n), or (n,) where it is diagonal; and its aux."""
+    zero = jnp.zeros_like(q)
+    if plant.diagonal:
+        return jax.jvp(residual, (zero,), (jnp.ones_like(q),), has_aux=True)[1:]
+    return jax.jacfwd(residual, has_aux=True)(zero)
+
+
+def solved(mass: Array, force: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Accelerations that forces give a mass, which is a matrix or its diagonal."""
+    return force / mass if mass.ndim == 1 else small_solve(mass, force)
+
+
+def derivative(
+    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None
+) -> State:
+    """Time derivative of the state: the right-hand side."""
+    qdd = acceleration(plant, x, u, t, reaction)
+    rates = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction).rates
+    return State(x.qd, qdd, rates)
+
+
+# Likewise, for all stages of a step.
+_derivative = eqx.filter_jit(derivative)
+
+
+def vector_field(t: Array, x: State, args: tuple[Plant, Callable[[Array], Array]]) -> State:
+    """Right-hand side in diffrax's form: args are the plant and the force as function of time."""
+    plant, force = args
+    drives = jax.eval_shape(force, t).size
+    late = [force(t - d)[j] for j, d in enumerate(plant.command_delays(drives))]
+    return derivative(plant, x, jnp.stack(late), t)
+
+
+def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
+    """Decay rate of each own state, as a tree like the state; zero for the motion.
+
+    The rate of an own state is affine in it, so that its slope is the decay; a lag far shorter
+    than the step, or a presliding spring at speed, is then stepped exactly instead of blowing up.
+    Vectors (oscillators) are no single decays, and are left to the explicit part.
+    """
+
+    def rates(own: tuple) -> tuple:
+        return balance_of(plant, x.q, x.qd, jnp.zeros_like(x.q), u, t, own).rates
+
+    slopes = jax.jvp(rates, (x.own,), (jax.tree.map(jnp.ones_like, x.own),))[1]
+    slopes = jax.tree.map(lambda s: s if s.ndim == 0 else jnp.zeros_like(s), slopes)
+    zero = jnp.zeros_like(x.q)
+    return State(zero, zero, slopes)
+
+
+def phi(x: Array) -> list[Array]:
+    """e^x, (e^x - 1)/x and the next three of that family; series near zero, where they cancel."""
+    small = jnp.abs(x) < 0.3
+    safe = jnp.where(small, 1.0, x)
+    closed = [jnp.expm1(safe) / safe]
+    for k in range(1, 4):
+        closed.append((closed[-1] - 1 / factorial(k)) / safe)
+    series = [jnp.zeros_like(x)] * 4
+    for k in reversed(range(12)):  # twelve terms leave 1e-16 at 0.3
+        series = [s * x + 1 / factorial(k + i) for i, s in enumerate(series, start=1)]
+    return [jnp.exp(x), *(jnp.where(small, s, c) for s, c in zip(series, closed, strict=True))]
+
+
+def step(
+    plant: Plant,
+    x: State,
+    u: Callable[[Array], Array],
+    t: Array,
+    h: Array,
+    reaction: Array | None = None,
+) -> State:
+    """One fourth-order step: Runge-Kutta for the motion, its exponential form for own states.
+
+    Args:
+        plant: The plant.
+        x: State at t.
+        u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
+        t: Time [s].
+        h: Step [s].
+        reaction: Dry-friction force by port, constant over the step; absent: smoothed.
+
+    Source:
+        Cox and Matthews (2002), J. Comput. Phys. 176, ETDRK4. The linear part is the decay of own
+        states and their push on the velocities (without which a lag far shorter than the step
+        acts a sixth of a step late); where there are none it is the classical method.
+    """
+    if not jax.tree.leaves(x.own):
+        return _classical_step(plant, x, u, t, h, reaction)
+    start, middle, end = u(jnp.asarray(0.0)), u(jnp.asarray(0.5)), u(jnp.asarray(1.0))
+    z, back = ravel_pytree(x.own)
+    decay = ravel_pytree(_own_decay(plant, x, start, t).own)[0]
+    push = _own_push(plant, x, start, t, reaction)
+
+    def linear(y: Split, motion: float | Array, own: Array, above: Array) -> Split:
+        """A function of the linear part, times y; `above` is its entry between own and speed."""
+        q, v, z = y
+        return motion * q, motion * v + jnp.sum(push * (above * z), axis=1), own * z
+
+    def rest(y: Split, u: Array, t: Array) -> Split:
+        q, v, z = y
+        rate = _derivative(plant, State(q, v, back(z)), u, t, reaction)
+        return v, rate.qd - jnp.sum(push * z, axis=1), ravel_pytree(rate.own)[0] - decay * z
+
+    half = 0.5 * h
+    e, p1, p2, *_ = phi(decay * half)
+    over, add = (1.0, e, half * p1), (half, half * p1, half**2 * p2)
+    e, p1, p2, p3, p4 = phi(decay * h)
+    y0 = (x.q, x.qd, z)
+    n0 = rest(y0, start, t)
+    a = _sum(linear(y0, *over), linear(n0, *add))
+    na = rest(a, middle, t + half)
+    b = _sum(linear(y0, *over), linear(na, *add))
+    nb = rest(b, middle, t + half)
+    c = _sum(linear(a, *over), linear(jax.tree.map(lambda n, m: 2 * n - m, nb, n0), *add))
+    nc = rest(c, end, t + h)
+    q, v, z = _sum(
+        linear(y0, 1.0, e, h * p1),
+        linear(n0, h / 6, h * (p1 - 3 * p2 + 4 * p3), h**2 * (p2 - 3 * p3 + 4 * p4)),
+        linear(_sum(na, nb), h / 3, h * (2 * p2 - 4 * p3), h**2 * (2 * p3 - 4 * p4)),
+        linear(nc, h / 6, h * (4 * p3 - p2), h**2 * (4 * p4 - p3)),
+    )
+    return State(q, v, back(z))
+
+
+def _sum(*terms: Split) -> Split:
+    return jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *terms)
+
+
+def _own_push(
+    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None
+) -> Float[Array, "n own"]:
+    """Derivative of the accelerations with respect to the own states."""
+    flat, back = ravel_pytree(x.own)
+
+    def acc(own: Array) -> Array:
+        return acceleration(plant, State(x.q, x.qd, back(own)), u, t, reaction)
+
+    return jax.jacfwd(acc)(flat)
+
+
+def _classical_step(
+    plant: Plant,
+    x: State,
+    u: Callable[[Array], Array],
+    t: Array,
+    h: Array,
+    reaction: Array | None,
+) -> State:
+    def slope(q: Array, v: Array, part: Array, u: Array) -> Array:
+        return acceleration(plant, State(q, v, x.own), u, t + part * h, reaction)
+
+    parts = jnp.asarray([0.0, 0.5, 0.5, 1.0])
+    forces = [u(part) for part in parts]
+    if plant.coupled:
+        return _rolled(slope, x, h, parts, jnp.stack(forces))
+    q, v, half = x.q, x.qd, 0.5 * h
+    a1 = slope(q, v, parts[0], forces[0])
+    v2 = v + half * a1
+    a2 = slope(q + half * v, v2, parts[1], forces[1])
+    v3 = v + half * a2
+    a3 = slope(q + half * v2, v3, parts[2], forces[2])
+    v4 = v + h * a3
+    a4 = slope(q + h * v3, v4, parts[3], forces[3])
+    q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
+    v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+    return State(q, v, x.own)
+
+
+def _rolled(slope: Callable[..., Array], x: State, h: Array, parts: Array, forces: Array) -> State:
+    """The four stages as a loop: four copies of an arm compile four times as long."""
+
+    def stage(carry: tuple, now: tuple) -> tuple[tuple, None]:
+        v, a, q_sum, v_sum = carry
+        part, weight, u = now
+        q, v = x.q + part * h * v, x.qd + part * h * a
+        a = slope(q, v, part, u)
+        return (v, a, q_sum + weight * v, v_sum + weight * a), None
+
+    zero = jnp.zeros_like(x.q)
+    weights = jnp.asarray([1.0, 2.0, 2.0, 1.0])
+    (_, _, q, v), _ = jax.lax.scan(stage, (x.qd, zero, zero, zero), (parts, weights, forces))
+    return State(x.q + h / 6 * q, x.qd + h / 6 * v, x.own)
+
+
+def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array) -> Affine | None:
+    """`step` under a given reaction as one matrix, where the plant's forces are affine.
+
+    Args:
+        plant: The plant.
+        x: Any state, for its shape.
+        u: Declared force at the ends of the step, as `course` takes it; for its shape.
+        t: Any time: a force that depends on it is not affine.
+        h: Step [s].
+
+    Returns:
+        For `set_valued_step`, a function of state, that force and reaction; or None.
+    """
+
+    def flow(x: State, u: tuple[Array, ...], reaction: Array, t: Array) -> State:
+        return step(plant, x, course(u), t, h, reaction)
+
+    return affine(flow, (x, u, jnp.zeros_like(plant.ports(x.q))), (t,))
+
+
+def course(values: tuple[Array, ...]) -> Callable[[Array], Array]:
+    """Held at one value, a line through two, a parabola through three; of the fraction in [0, 1]."""
+    if len(values) == 3:
+        start, middle, end = values
+        bend = 2.0 * (start - 2.0 * middle + end)
+        return lambda s: start + s * (end - start + (s - 1.0) * bend)
+    start, end = values[0], values[-1]
+    return lambda s: start if len(values) == 1 else start + s * (end - start)
+
+
+def picked(x: Array, ports: tuple[int, ...]) -> Array:
+    """Values of some ports."""
+    return x if len(ports) == x.size else jnp.stack([x[i] for i in ports])
+
+
+def spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
+    """Values of some ports among all; zero elsewhere."""
+    if len(ports) == size:
+        return x
+    zero = jnp.zeros((), x.dtype)
+    return jnp.stack([x[ports.index(i)] if i in ports else zero for i in range(size)])

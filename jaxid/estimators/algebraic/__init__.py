@@ -1,0 +1,1 @@
+"""Algebraic estimators: iterated integrals over windows of a log."""

@@ -1,0 +1,1 @@
+"""Parts that several estimators share: least-squares solver, bounds, consistency, reruns."""

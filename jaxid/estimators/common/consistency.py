@@ -1,0 +1,96 @@
+"""Links whose ten parameters some body can have, as an option of every fit that minimises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.arms.pseudo_inertia import TEN, log_cholesky, pseudo_inertia
+from jaxid.errors import InputError
+from jaxid.estimators.estimate import Estimate
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import Body, Free
+from jaxid.numerics.lanes import Steps
+from jaxid.session import Session
+
+# Masses, and how far a body extends, stay within this factor of the guess: where the best of all bodies has
+# no extent in some direction, its logarithm would run away.
+_RANGE = 1e3
+
+
+def need_bodies(session: Session) -> Session:
+    """The same session, the unknown links of its arm kept to what bodies can be.
+
+    Of other machines inertias are positive anyway.
+
+    Raises:
+        InputError: If a link is known in part, bounded by min or max, or its guess is no body.
+    """
+    machine, where = session.machine, str(session.case.path)
+    if not machine.plant.linked:
+        return session
+    unknown, bodies = machine.parameters.free, []
+    for link in range(machine.plant.joints):
+        own = {f.path[0]: k for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
+        if own:
+            bodies.append(_body(link, own, unknown, f"{where}, link {link + 1}"))
+    return session.with_machine(
+        machine.with_plant(machine.plant, replace(machine.parameters, bodies=tuple(bodies)))
+    )
+
+
+def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -> Body:
+    known = [name for name in TEN if name not in own]
+    if known:
+        mend = "let all ten be unknown and start at those of a body; base parameters alone are of none"
+        raise InputError(f"{known[0]}[{link + 1}] is known and others are not, and physically_consistent "
+                         "asks for whole bodies", where=where, mend=mend)
+    places = tuple(own[name] for name in TEN)
+    bounded = [unknown[k].name for k in places if np.isfinite([unknown[k].lower, unknown[k].upper]).any()]
+    if bounded:
+        what = f"{bounded[0]} has min or max, which physically_consistent does not keep"
+        raise InputError(what, where=where, mend="leave them out")
+    ten = jnp.asarray([unknown[k].guess for k in places])
+    least = float(np.linalg.eigvalsh(np.asarray(pseudo_inertia(ten)))[0])
+    x = np.asarray(log_cholesky(ten))
+    if not (least > 0 and np.all(np.isfinite(x))):
+        what = f"its guess is no body: the least eigenvalue of its pseudo-inertia is {least:.3g}"
+        mend = "start from mass, first_moment and inertia of a body: a rod, a ball"
+        raise InputError(what, where=where, mend=mend)
+    lower, upper = np.full(10, -np.inf), np.full(10, np.inf)
+    # Half the logarithm of the mass, and those of the spread.
+    for coordinates, factor in (([0], 0.5), ([4, 5, 6], 1.0)):
+        lower[coordinates] = x[coordinates] - factor * np.log(_RANGE)
+        upper[coordinates] = x[coordinates] + factor * np.log(_RANGE)
+    return Body(places, tuple(lower.tolist()), tuple(upper.tolist()))
+
+
+def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
+    """A fit whose estimate says what its links are, where the log tells sums of their parameters too."""
+    estimate = yield from steps
+    if not estimate.machine.plant.linked:
+        return estimate
+    note = "links are what bodies can be; standard deviations are those of the log alone"
+    return replace(
+        estimate, notes=(*estimate.notes, note),
+        details={**estimate.details, "links": links_of(estimate.machine.plant)},
+    )
+
+
+def links_of(plant: Plant) -> list[dict[str, object]]:
+    """Each link's parameters, and the least eigenvalue of its pseudo-inertia over the largest."""
+    ten = bodies_of(plant)
+    values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten))))
+    return [
+        {"mass": b[0], "first_moment": b[1:4], "inertia": b[4:], "eigenvalue_ratio": float(v[0] / v[-1])}
+        for b, v in zip(ten.tolist(), values, strict=True)
+    ]
+
+
+def bodies_of(plant: Plant) -> Float[np.ndarray, "n 10"]:
+    """The ten parameters of every link."""
+    return np.stack([np.asarray(getattr(plant, name)) for name in TEN], axis=-1)

@@ -1,0 +1,337 @@
+"""Levenberg-Marquardt within bounds, compiled whole; and the scales it works on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky
+from jaxid.estimators.common.interior import inner_start
+from jaxid.model.unknowns import Parameters
+
+# At the start, relative to the diagonal of the normal matrix.
+DAMPING = 1e-4
+# A fit has converged where the cost can fall by no more than this part of itself: with 10^4
+# samples that is 10^-4 of a standard deviation.
+_TOLERANCE = 1e-12
+# It has also converged where a step that should lower the cost by no more than this, with 10^4 samples
+# a hundredth of a standard deviation, does not: sticking and rounding make the last digits of a cost rough.
+# Only a step that is damped by less than this says so: a short one promises little anywhere.
+_FLAT = 1e-8
+_WHOLE = 1e-2
+# Bodies take more evaluations, and have converged earlier: of what no force tells their coordinates go a long
+# way along curves.
+_BODY_STEPS = 500
+_BODY_TOLERANCE = 1e-9
+# And where it is above what it is known not to fall below by no more than this over the residual's entries: a
+# hundredth of a standard deviation too.
+_SURE = 1e-4
+# And where no step within this damping lowers the cost, although one should by less than a tenth.
+_ROUGH = 1e-6
+_STUCK = 1e3
+# An unknown whose own size moves the residual by less than this part of the first one is without effect: what
+# its column holds is rounding, and dividing by it sends the unknown to 1e15.
+_NOTHING = 1e-12
+
+
+class Transform(eqx.Module):
+    """Physical values to the scale of the solver and back: one object, one inverse.
+
+    What must be positive is fitted as its logarithm (in the force domain only what the balance is not in
+    proportion to); the ten parameters of a body as its `log_cholesky`; the rest as it is. Scaling to order
+    one is the solver's own (it scales by the columns of the Jacobian).
+
+    Args:
+        log: Which are fitted as their logarithms, (p,).
+        lower, upper: Bounds on the coordinates of the bodies, (bodies, 10).
+        bodies: Places of their parameters.
+        affine: Whether the residual is known to be affine in the physical values.
+    """
+
+    log: Bool[Array, " p"]
+    lower: Float[Array, "bodies 10"] = eqx.field(default_factory=lambda: np.zeros((0, 10)))
+    upper: Float[Array, "bodies 10"] = eqx.field(default_factory=lambda: np.zeros((0, 10)))
+    bodies: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
+    affine: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> Transform:
+        """The transform of a set of unknowns."""
+        log = np.asarray([f.sign == "positive" for f in parameters.free], dtype=bool)
+        bodies = parameters.bodies
+        bounds = (np.array([getattr(b, s) for b in bodies]).reshape(-1, 10) for s in ("lower", "upper"))
+        return cls(log, *bounds, tuple(b.places for b in bodies))
+
+    def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Physical to solver."""
+        return self._with_bodies(
+            jnp.where(self.log, jnp.log(jnp.where(self.log, theta, 1.0)), theta), log_cholesky, theta
+        )
+
+    def outward(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Solver to physical."""
+        return self._with_bodies(
+            jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x), of_log_cholesky, x
+        )
+
+    def bounds(self, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> tuple[Array, Array]:
+        """Bounds on the physical values as those of the solver; bodies keep to their own."""
+        plain = Transform(self.log)
+        out = []
+        for bound, own in ((lower, self.lower), (upper, self.upper)):
+            bound = plain.inward(bound)
+            for places, values in zip(self.bodies, own, strict=True):
+                bound = bound.at[np.array(places)].set(values)
+            out.append(bound)
+        return out[0], out[1]
+
+    def physical(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
+        """A Jacobian in the solver's values as one in the physical ones, at some of these."""
+        out = jacobian / self.slope(theta)
+        for places in map(np.array, self.bodies):
+            out = out.at[:, places].set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
+        return out
+
+    def _with_bodies(self, out: Array, f: Callable[[Array], Array], values: Array) -> Array:
+        for places in map(np.array, self.bodies):
+            out = out.at[places].set(f(values[places]))
+        return out
+
+    def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
+        """D physical / d solver, for Jacobians; of what is part of no body."""
+        return jnp.where(self.log, theta, 1.0)
+
+
+class Minimum(eqx.Module):
+    """What the solver returns.
+
+    Args:
+        theta: Physical values.
+        cost: Half the sum of squares.
+        steps: Evaluations of residual and Jacobian.
+        converged: Whether the cost could fall no further.
+        residual: At theta, flat; empty where not kept.
+        jacobian: Of the residual in the physical values; empty where not kept.
+    """
+
+    theta: Float[Array, " p"]
+    cost: Float[Array, ""]
+    steps: Array
+    converged: Array
+    residual: Array
+    jacobian: Array
+
+
+class Progress(eqx.Module):
+    """Where a descent stands, on the solver's scale: cut short anywhere, it goes on to the same bits.
+
+    Args:
+        trial: Point to evaluate next, and by how much the cost should fall there (`predicted`).
+        x, cost, gradient, normal: Best point, and the quadratic picture of the cost there.
+        kept: Residual and Jacobian there; empty where not kept.
+        damping, growth: Of the steps.
+        own: Sizes of the unknowns at the start. `nothing`: of the residual, what counts as nothing.
+        steps: Evaluations so far.
+        done: Whether the cost can fall no further, or is not finite.
+    """
+
+    trial: Array
+    predicted: Array
+    x: Array
+    cost: Array
+    gradient: Array
+    normal: Array
+    kept: tuple[Array, Array]
+    damping: Array
+    growth: Array
+    own: Array
+    nothing: Array
+    steps: Array
+    done: Array
+
+    @classmethod
+    def at(cls, x: Array, own: Array, size: int, damping: float = DAMPING) -> Progress:
+        """At a start; `size`: of the residual that is kept, zero for none.
+
+        Of numpy's arrays where x is one: to make jax's outside of compiled code takes longer.
+        """
+        p, xp = x.size, np if isinstance(x, np.ndarray) else jnp
+        return cls(
+            x, xp.asarray(0.0), x, xp.asarray(np.inf), xp.zeros(p), xp.zeros((p, p)),
+            (xp.zeros(size), xp.zeros((size, p))), xp.asarray(damping), xp.asarray(2.0), own,
+            xp.asarray(0.0), xp.asarray(0), xp.asarray(False),
+        )
+
+    def minimum(self, transform: Transform) -> Minimum:
+        """As a result."""
+        theta = transform.outward(self.x)
+        return Minimum(
+            theta, self.cost, self.steps, self.done & jnp.isfinite(self.cost), self.kept[0],
+            transform.physical(self.kept[1], theta),
+        )
+
+
+def levenberg_marquardt(
+    residual: Callable[[Float[Array, " p"]], Float[Array, "..."]],
+    theta: Float[Array, " p"],
+    transform: Transform,
+    lower: Float[Array, " p"],
+    upper: Float[Array, " p"],
+    active: Bool[Array, " p"] | None = None,
+    max_steps: int | None = None,
+    keep: bool = True,
+    damping: float = DAMPING,
+    tolerance: float = _TOLERANCE,
+) -> Minimum:
+    """Minimise half the sum of squares of `residual` within bounds.
+
+    Forward-mode Jacobian, Marquardt's scaling, Nielsen's damping; steps are projected on the
+    bounds and unknowns that press against one rest. Compiles whole, with a single copy of the
+    residual's Jacobian in it (a second copy doubles the compile time): vmap it over starts or data.
+
+    Args:
+        residual: Residual as a function of the physical unknowns; entries that are not to count
+            are zero.
+        theta: Start.
+        transform: Scale of the solver.
+        lower, upper: Bounds on the physical values.
+        active: Which unknowns may move; absent: all.
+        max_steps: Most evaluations; absent: 60, or with bodies 500.
+        keep: Return residual and Jacobian; without, batches need less memory.
+        damping: At the start, relative to the diagonal. What is linear asks for none.
+        tolerance: It has converged where the cost can fall by no more than this part of itself.
+
+    Returns:
+        The minimum; `converged` is false where the steps ran out or the residual is not finite.
+
+    Source:
+        Marquardt (1963); damping after Nielsen (1999), IMM-REP-1999-05.
+    """
+    if theta.size == 0:  # nothing is unknown: only the residual is asked for
+        e = residual(theta).ravel()
+        cost, kept = 0.5 * e @ e, e if keep else e[:0]
+        return Minimum(
+            theta, cost, jnp.asarray(1), jnp.isfinite(cost), kept, jnp.zeros((kept.size, 0)),
+        )
+    # Traced once, for its shape and for its Jacobian.
+    residual, floor = jax.jit(residual), -jnp.inf
+    if transform.affine:
+        columns = jax.jacfwd(residual)(theta).reshape(-1, theta.size)
+        rest = residual(theta).ravel() - columns @ theta
+        residual = lambda theta: columns @ theta + rest
+        theta, floor = inner_start(columns, rest, theta, transform.bodies, eliminated)
+    if transform.bodies:
+        tolerance = max(tolerance, _BODY_TOLERANCE)
+    max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
+    bounds = transform.bounds(jnp.asarray(lower), jnp.asarray(upper))
+    x0 = jnp.clip(transform.inward(theta), *bounds)
+    own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
+    size = jax.eval_shape(residual, theta).size if keep else 0
+    start = Progress.at(x0, own, size, damping)
+    on_scale = lambda x: residual(transform.outward(x))
+    return descend(on_scale, start, bounds, max_steps, active, tolerance, floor).minimum(transform)
+
+
+def descend(
+    residual: Callable[[Float[Array, " p"]], Float[Array, "..."]],
+    progress: Progress,
+    bounds: tuple[Float[Array, " p"], Float[Array, " p"]],
+    max_steps: Array | int,
+    active: Bool[Array, " p"] | None = None,
+    tolerance: float = _TOLERANCE,
+    floor: Array | float = -np.inf,
+) -> Progress:
+    """Go on with a descent; see `levenberg_marquardt`, but on the solver's scale.
+
+    Args:
+        residual: Of the solver's unknowns.
+        progress: Where it stands.
+        bounds: On the solver's unknowns.
+        max_steps: Evaluations at which to stop, those so far among them.
+        active, tolerance: As there.
+        floor: What the cost is known not to fall below: near enough to it, it has converged too.
+    """
+    moves = jnp.ones(progress.x.size, bool) if active is None else active
+
+    def flat(x: Array) -> tuple[Array, Array]:
+        e = residual(x).ravel()
+        return e, e
+
+    def advance(p: Progress) -> Progress:
+        jacobian, e = jax.jacfwd(flat, has_aux=True)(p.trial)
+        return _advanced(p, e, jacobian, bounds, moves, tolerance, floor)
+
+    return jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, progress)
+
+
+def _advanced(
+    p: Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
+    tolerance: float, floor: Array | float,
+) -> Progress:
+    """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
+    (lower, upper), keep = bounds, p.kept[0].size > 0
+    cost = 0.5 * e @ e
+    first = p.steps == 0
+    better = first | (cost < p.cost)
+    ratio = (p.cost - cost) / jnp.maximum(p.predicted, 1e-300)
+    shrink = jnp.where(first, 1.0, jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
+    damping = jnp.clip(p.damping * jnp.where(better, shrink, p.growth), 1e-15, 1e20)
+    x, cost, gradient, normal, kept = jax.tree.map(
+        lambda new, old: jnp.where(better, new, old),
+        (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept),
+        (p.x, p.cost, p.gradient, p.normal, p.kept),
+    )
+    nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
+    # Asked at every step: a velocity of which a level of zero leaves no trace has one as soon as that moves.
+    moves = moves & (p.own * jnp.sqrt(jnp.diag(normal)) > nothing)
+    pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+    aim = x + _step(gradient, normal, damping, moves & ~pressed)
+    trial = jnp.clip(aim, lower, upper)
+    # Of the step that is taken: a bound cuts it short.
+    change = trial - x
+    predicted = -change @ gradient - 0.5 * change @ normal @ change
+    # A step cut short by a bound says little of what is left: its unknown rests from now on.
+    small = (predicted <= tolerance * cost) & jnp.all(trial == aim)
+    # A step that a bound bent may promise less than nothing.
+    flat = (p.damping < _WHOLE) & (p.predicted > 0) & (p.predicted <= _FLAT * p.cost)
+    rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))
+    stuck = rough | (~better & (damping > 1e12))
+    growth = jnp.where(better, 2.0, 2 * p.growth)
+    return Progress(
+        trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.own, nothing, p.steps + 1,
+        small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
+    )
+
+
+def _step(
+    gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"]
+) -> Array:
+    """Damped step of the free unknowns."""
+    scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 0.0))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    normal = jnp.where(jnp.outer(free, free), normal / jnp.outer(scale, scale), 0.0)
+    # A trace of damping keeps directions that the data cannot tell where they are.
+    matrix = normal + jnp.diag(jnp.where(free, damping + 1e-13, 1.0))
+    gradient = jnp.where(free, gradient / scale, 0.0)
+    return -eliminated(matrix, gradient[:, None])[:, 0] / scale
+
+
+def eliminated(matrix: Float[Array, "p p"], b: Float[Array, "p k"]) -> Float[Array, "p k"]:
+    """Solve by Gauss and Jordan's elimination, without pivoting: the symmetric part is positive definite.
+
+    Not LAPACK's: a batch of its factorisations waits for threads of the pool on which it runs, and two
+    batches at once, as studies have them, then wait for each other for ever (jaxlib 0.10.2).
+    """
+
+    def eliminate(k: Array, rows: Array) -> Array:
+        pivot = rows[k] / rows[k, k]
+        rows = rows - rows[:, k, None] * pivot
+        return rows.at[k].set(pivot)
+
+    rows = jnp.concatenate([matrix, b], axis=1)
+    return jax.lax.fori_loop(0, len(b), eliminate, rows)[:, len(b) :]

@@ -1,0 +1,181 @@
+"""A log run once more by simulation, and filtered as it was: a motion without the sensors' noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared, prepare
+from jaxid.machine import Machine
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import Parameters, scatter
+from jaxid.numerics.lanes import Solve, Steps
+from jaxid.simulation.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
+
+# A simulated position this many times larger than the measured one has run away.
+_RUNAWAY = 1e3
+# Directions in which columns differ by less than this part tell nothing.
+_ROUNDING = 1e-6
+# Of a standard deviation, were the residual white: a fit that moves by less has converged.
+_SMALL = 1e-2
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """A log, ready to be simulated with any values of the unknowns.
+
+    Args:
+        machine: The machine; in its loop where it has a controller, else driven by the measured force.
+        log: The log.
+        data: The same, prepared: its recipe filters the simulated motion too.
+        replay: Inputs of the simulation.
+    """
+
+    machine: Machine
+    log: Log
+    data: Prepared
+    replay: Replay
+
+    @classmethod
+    def of(cls, machine: Machine, log: Log, data: Prepared, numerics: Numerics | None = None) -> Rerun:
+        """Prepare a log.
+
+        Args:
+            machine: The machine, at values that the steps of integration should suit.
+            log: The log.
+            data: The same, prepared.
+            numerics: How to integrate; nothing is differentiated, so that dry friction always
+                sticks exactly. Absent: as machine and log ask.
+
+        Raises:
+            InputError: If the loop is to be closed and the log has no reference.
+        """
+        numerics = numerics or exact_numerics(machine, log)
+        numerics = replace(numerics, set_valued=True, segment=None, solver=None)
+        # A rounded reading would put a noise of its own into the simulated loop.
+        exact = replace(machine, sensor=replace(machine.sensor, position_resolution=None))
+        replay = with_fitted_start(make_replay(exact, log, numerics), machine.plant, log)
+        return cls(machine, log, data, replay)
+
+    @property
+    def looped(self) -> bool:
+        """Whether the loop is closed."""
+        return self.replay.controller is not None
+
+    def steps(self, theta: np.ndarray, *, own_command: bool) -> Steps[Prepared | None]:
+        """Simulate, and prepare what comes out as the log was.
+
+        Args:
+            theta: The unknowns.
+            own_command: Whether the force is that of the simulated loop; else the measured one.
+
+        Returns:
+            The simulated motion with its force; None where the simulation diverges.
+        """
+        places = self.machine.parameters.places
+        position, command = yield Solve(_simulated, (self.replay, places, self.machine.plant, theta))
+        position = np.asarray(position)
+        largest = _RUNAWAY * np.max(np.abs(self.log.filled))
+        if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > largest:
+            return None
+        own = own_command and self.looped
+        force = np.asarray(command) if own else self.log.force
+        # What has no encoder has none here: its motion is found as that of the log is.
+        position = np.where(self.log.measured, position, np.nan)
+        run = replace(self.log, position=position, force=force)
+        # The log's own force has passed its median before.
+        run = self.data.recipe.cleaned(run) if own else run
+        return replace(
+            prepare(run, self.machine.gain, self.data.recipe), hold=self.data.hold, steps=self.data.steps
+        )
+
+
+@eqx.filter_jit
+def _simulated(replay: Replay, places: tuple, plant: Plant, theta: Array) -> tuple[Array, Array]:
+    """Position, (time, n), and command, (time, m), at the samples of the log."""
+    run = replay(scatter(places, plant, theta))
+    return run.position, run.command
+
+
+def best_step(
+    parameters: Parameters, columns: Float[np.ndarray, "rows p"], e: Float[np.ndarray, " rows"],
+    theta: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Gauss-Newton's step: within bounds, or, where links are kept to bodies, to the best of all bodies.
+
+    Between two bodies there are only bodies: any part of the step keeps to them too.
+
+    Args:
+        parameters: The unknowns; what the columns do not tell of bodies stays near their guess.
+        columns: Jacobian of the residual.
+        e: Residual.
+        theta: The unknowns.
+    """
+    if not parameters.bodies:
+        return bounded_step(columns, e, theta, parameters.bounds)
+    # As many rows as unknowns hold all that a sum of squares does.
+    triangle = np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r")
+    minimum = _best_bodies(triangle, Transform.of(parameters), parameters.guess, parameters.bounds)
+    return np.asarray(minimum.theta) - theta
+
+
+@eqx.filter_jit
+def _best_bodies(
+    triangle: Array, transform: Transform, guess: Array, bounds: tuple[Array, Array]
+) -> Minimum:
+    linear = replace(transform, log=np.zeros(guess.size, bool), affine=True)
+    residual = lambda theta: triangle[:, :-1] @ theta + triangle[:, -1]
+    return levenberg_marquardt(residual, guess, linear, *bounds)
+
+
+def bounded_step(
+    columns: Float[np.ndarray, "rows p"], e: Float[np.ndarray, " rows"], theta: Float[np.ndarray, " p"],
+    bounds: tuple[np.ndarray, np.ndarray],
+) -> Float[np.ndarray, " p"]:
+    """Gauss-Newton's step within bounds: an unknown that would pass one goes there, and the rest adapts.
+
+    Directions that the columns do not tell stay where they are.
+
+    Args:
+        columns: Jacobian of the residual.
+        e: Residual.
+        theta: The unknowns.
+        bounds: Lower and upper.
+    """
+    lower, upper = bounds
+    norm = np.linalg.norm(columns, axis=0)
+    norm = np.where(norm > 0, norm, 1.0)
+    step, free = np.zeros(len(theta)), np.ones(len(theta), bool)
+    while free.any():
+        left = e + columns[:, ~free] @ step[~free]
+        step[free] = np.linalg.lstsq((columns / norm)[:, free], -left, rcond=_ROUNDING)[0] / norm[free]
+        out = free & ((theta + step < lower) | (theta + step > upper))
+        if not out.any():
+            break
+        step[out] = np.clip(theta + step, lower, upper)[out] - theta[out]
+        free &= ~out
+    return step
+
+
+def settled(change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], size: float) -> bool:
+    """Whether a step changes the residual by less than a hundredth of a standard deviation would.
+
+    Args:
+        change: Of the residual.
+        e: Residual.
+        size: 2-norm of the force; below 10^-10 of it all is rounding.
+    """
+    small = _SMALL * np.linalg.norm(e) / np.sqrt(max(e.size, 1))
+    return bool(np.linalg.norm(change) <= max(small, 1e-10 * size))
+
+
+def span(columns: Float[np.ndarray, "rows p"]) -> Float[np.ndarray, "rows r"]:
+    """Orthonormal basis of what columns span."""
+    norm = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns / np.where(norm > 0, norm, 1.0), full_matrices=False)
+    return u[:, s > _ROUNDING * s[0]]

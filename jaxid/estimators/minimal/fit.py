@@ -1,0 +1,236 @@
+"""Least squares on the minimal model that a log allows, and from its coefficients to the parameters.
+
+The coefficients chi are fitted by ordinary least squares, as published; then the parameters to the
+coefficients, which is a weighted least-squares problem of a handful of numbers.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+
+from jaxid.dynamics.frequencies import natural_frequencies
+from jaxid.errors import InputError
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.minimal.basis import basis_of
+from jaxid.estimators.minimal.columns import Regression, regression_of
+from jaxid.estimators.minimal.filtering import Spectrum, choose_filtering, spectrum_of
+from jaxid.estimators.minimal.matrices import LinearBalance, delays_command, linear_balance, require_linear
+from jaxid.estimators.minimal.models import Form, form_of, rigid_rows_hold, structure_of
+from jaxid.estimators.minimal.read_back import Model, constraint_steps, read_back
+from jaxid.estimators.minimal.report import minimal_json, minimal_notes
+from jaxid.estimators.minimal.statistics import Constraint, Fit, least_squares
+from jaxid.logs.prepare import Recipe
+from jaxid.machine import Machine
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import Parameters, scatter
+from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.precision import assess
+
+if TYPE_CHECKING:
+    from jaxid.session import Session
+
+# The band follows the natural frequency that is found, until that moves by less than this.
+_SETTLED = 0.1
+_PASSES = 4
+# Samples that a coefficient needs at least.
+_A_COEFFICIENT = 5
+
+
+@eqx.filter_jit
+def _linear_balance(plant: Plant, places: tuple, theta: Array) -> LinearBalance:
+    return linear_balance(scatter(places, plant, theta))
+
+
+def minimal_model_steps(
+    session: Session, printed: bool = False, weight: float | None = None
+) -> Steps[Estimate]:
+    """Fit the minimal model of what was measured.
+
+    Args:
+        session: Case and log: with motor and load position, load acceleration and motor position, or
+            motor position alone.
+        printed: Take the model with an acceleration as the paper prints it.
+        weight: On its rows that were differentiated twice, beside one on that of the forces [s^2].
+            Absent: 1 as printed, else what brings them to the size of a force at the resonance.
+
+    Returns:
+        The estimate; `details["minimal"]` holds coefficients, statistics and the constraint's test.
+
+    Raises:
+        InputError: If the plant is not linear away from rest, the log does not suit, or too few samples
+            are left.
+
+    Source:
+        Janot, Gautier, Jubien and Vandanjon, "Experimental joint stiffness identification depending on
+        measurements availability".
+    """
+    machine, log, stated = session.machine, session.fit.log, session.case.preprocess
+    where = str(session.case.path)
+    form = _form(session, printed)
+    model = _model(machine.plant, machine.parameters, form, session, where)
+    parameters, coefficients = machine.parameters, model.guess
+    theta = parameters.guess
+    now = natural_frequencies(machine.plant, parameters.places, theta).hz
+    for k in range(_PASSES):
+        natural = now
+        spectrum = spectrum_of(
+            log, machine, model.structure, coefficients, model.known, natural, stated.get("median")
+        )
+        recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
+        balance = _linear_balance(machine.plant, parameters.places, theta)
+        data = regression_of(log, machine, model.structure, model.basis, model.known, recipe, balance)
+        _require_samples(data, model, log.source)
+        weights = _weights(form, model.structure.rows, natural, weight)
+        fit = least_squares(model.basis.names, data, weights)
+        options = (Transform.of(parameters), parameters.bounds)
+        found, chi, slopes = yield Solve(read_back, (
+            machine.plant, parameters.places, model.structure, model.maps, fit.chi, fit.root,
+            np.asarray(np.linalg.norm(fit.residual)), parameters.guess, *options,
+        ))
+        chi, slopes, theta = (np.asarray(a) for a in (chi, slopes, found.theta))
+        coefficients = model.basis.constant + model.basis.spread @ chi
+        now = natural_frequencies(machine.plant, parameters.places, theta).hz
+        moved = np.abs(now / natural - 1) if natural.size else np.zeros(1)
+        # Where a hidden joint turns round is not known at the guesses.
+        if k >= bool(form.hidden) and (moved.max() < _SETTLED or "cutoff_hz" in stated):
+            break
+    constraint = yield from constraint_steps(machine.plant, parameters, model, fit, theta, slopes)
+    return _estimate(session, model, data, fit, weights, (found, chi, slopes), constraint, recipe, notes)
+
+
+def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Recipe, tuple[str, ...]]:
+    """Force and noise over frequency at a session's guesses, the recipe that follows, and why.
+
+    Around an estimate (`session.with_machine(estimate.machine)`) it is the one that was used.
+
+    Raises:
+        InputError: As `minimal_model_steps`.
+    """
+    machine, log = session.machine, session.fit.log
+    form = _form(session, printed)
+    model = _model(machine.plant, machine.parameters, form, session, str(session.case.path))
+    natural = natural_frequencies(machine.plant, machine.parameters.places, machine.parameters.guess).hz
+    stated = session.case.preprocess
+    spectrum = spectrum_of(
+        log, machine, model.structure, model.guess, model.known, natural, stated.get("median")
+    )
+    return spectrum, *choose_filtering(log, stated, model.structure, spectrum)
+
+
+def _form(session: Session, printed: bool) -> Form:
+    """The model that the log allows; the plant suits it."""
+    plant, log, where = session.machine.plant, session.fit.log, str(session.case.path)
+    require_linear(plant, where)
+    if session.case.preprocess.get("derivatives") == "parabolic":
+        raise InputError(
+            "[preprocess] derivatives = 'parabolic' filters each derivative differently, and a minimal model "
+            "needs one filter for all of its columns", where=where,
+            mend="leave it out, or use inverse_dynamics",
+        )
+    unknown = {f.path[1] for f in session.machine.parameters.free if f.path[0] == "effects"}
+    if any(delays_command(e) and k in unknown for k, e in enumerate(plant.effects)):
+        raise InputError(
+            "the delay of the command is unknown, which no minimal model holds", where=where,
+            mend="give it as known, or use output_error",
+        )
+    accelerated = log.load_acceleration is not None
+    form = form_of(plant.joints, log.measured, accelerated, printed)
+    if printed and not form.accelerated:
+        raise InputError(
+            "minimal_model_printed is the model with the load's acceleration and the motor's position",
+            where=where,
+            mend="name load_acceleration in [log] and leave out load_position, or use minimal_model",
+        )
+    if form.accelerated and log.load_acceleration.shape[1] != len(form.hidden):
+        raise InputError(
+            f"load_acceleration has {log.load_acceleration.shape[1]} columns where {len(form.hidden)} belong",
+            where=log.source, mend="name the column of the load's accelerometer",
+        )
+    if form.accelerated and not rigid_rows_hold(plant):
+        raise InputError(
+            "the model with an acceleration needs a machine that no spring ties to the ground", where=where,
+            mend="leave out load_acceleration, or the spring",
+        )
+    return form
+
+
+def _model(plant: Plant, parameters: Parameters, form: Form, session: Session, where: str) -> Model:
+    try:
+        structure, samples = structure_of(plant, parameters, form)
+    except ValueError as error:
+        raise InputError(
+            f"{error}, and with it the scale of all other unknowns", where=where,
+            mend="give actuator_gain as known, or use output_error",
+        ) from error
+    # A row from which a joint was eliminated has no scale without a force.
+    if form.hidden and not form.accelerated and None in structure.leading:
+        raise InputError(
+            "without the motion of some joints there is a row without a force", where=where,
+            mend="use inverse_dynamics or output_error",
+        )
+    basis = basis_of(structure, samples, parameters, session.machine.units)
+    known, guess = (samples.of(w, structure.leading)[0][-1] for w in (structure.known, structure.unknown))
+    return Model(structure, basis, known, guess)
+
+
+def _require_samples(data: Regression, model: Model, source: str) -> None:
+    left = int(data.counts.sum())
+    if left < _A_COEFFICIENT * len(model.basis.names):
+        raise InputError(
+            f"only {left} samples lie farther from rest than the filters reach", where=source,
+            mend="take a log with longer moves, lower rest_velocity, or raise cutoff_hz",
+        )
+
+
+def _weights(form: Form, rows: int, natural: np.ndarray, weight: float | None) -> np.ndarray:
+    """On each row; that of the forces is the last where others are differentiated twice."""
+    if not form.accelerated:
+        return np.ones(rows)
+    if weight is None:
+        weight = 1.0 if form.printed else float((2 * np.pi * natural.max()) ** -2)
+    return np.append(np.full(rows - 1, weight), 1.0)
+
+
+def _estimate(
+    session: Session, model: Model, data: Regression, fit: Fit, weight: np.ndarray,
+    found: tuple[Minimum, np.ndarray, np.ndarray], constraint: Constraint | None, recipe: Recipe,
+    notes: tuple[str, ...],
+) -> Estimate:
+    machine, parameters = session.machine, session.machine.parameters
+    solved, chi, slopes = found
+    theta = np.asarray(solved.theta)
+    w = np.where(data.counts[..., None], data.w * weight[:, None], 0.0)
+    residual = fit.residual + w @ (fit.chi - chi)
+    precision = assess(
+        parameters.names, w @ slopes, residual, data.counts, fit.size, np.where(theta != 0, theta, 1.0)
+    )
+    converged = bool(solved.converged) and bool(np.all(np.isfinite(theta)))
+    at = machine.with_estimate(theta)
+    modes = _modes(at, precision.covariance)
+    names = [n for n, t, low in zip(parameters.names, theta, parameters.bounds[0], strict=True) if t <= low]
+    pressed = (f"at its bound: {', '.join(names)}",) if names else ()
+    form = model.structure.form
+    return Estimate(
+        method="minimal_model_printed" if form.printed else "minimal_model", machine=at, theta=theta,
+        precision=precision, converged=converged,
+        message="solved" if converged else f"no convergence within {int(solved.steps)} steps",
+        residual=np.where(data.counts, residual, np.nan), samples=int(data.counts.any(axis=1).sum()),
+        steps=int(solved.steps),
+        notes=(*notes, *minimal_notes(form, fit, model.basis, constraint), *pressed),
+        details={"minimal": minimal_json(form, fit, model.basis, constraint, modes, recipe)},
+    )
+
+
+def _modes(machine: Machine, covariance: np.ndarray) -> dict[str, list[tuple[float, float]]]:
+    """Natural frequencies at an estimate and their standard deviations [Hz]."""
+    plant, parameters = machine.plant, machine.parameters
+    out = {}
+    for name, held in (("free", ()), ("motor_locked", plant.driven(plant.joints))):
+        found = natural_frequencies(plant, parameters.places, parameters.guess, held)
+        out[name] = list(zip(found.hz.tolist(), found.std(covariance).tolist(), strict=True))
+    return out

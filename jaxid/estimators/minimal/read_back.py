@@ -1,0 +1,134 @@
+"""From the coefficients of a minimal model to parameters, and whether they agree with any.
+
+A weighted least-squares problem of a handful of numbers, whose slopes are exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.effects import EFFECTS
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.minimal.basis import Basis, chi_of
+from jaxid.estimators.minimal.models import Structure
+from jaxid.estimators.minimal.statistics import Constraint, Fit, chance
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import Parameters, scatter
+from jaxid.numerics.lanes import Solve, Steps
+
+# Relative to the largest, below this a singular value of the scaled slopes is rounding.
+_RANK = 1e-6
+
+
+@dataclass(frozen=True)
+class Model:
+    """A minimal model of a machine.
+
+    Args:
+        structure: Which coefficients there are.
+        basis: What they are made of.
+        known: Values of those that no unknown is in.
+        guess: Of the others at the guesses.
+    """
+
+    structure: Structure
+    basis: Basis
+    known: Float[np.ndarray, " known"]
+    guess: Float[np.ndarray, " terms"]
+
+    @property
+    def maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """For `chi_of`."""
+        return self.basis.gather, self.basis.constant
+
+
+@eqx.filter_jit
+def read_back(
+    plant: Plant, places: tuple, structure: Structure, maps: tuple[Array, Array], target: Array,
+    root: Array, rest: Array, theta: Array, transform: Transform, bounds: tuple[Array, Array],
+) -> tuple[Minimum, Array, Array]:
+    """Parameters whose chi is nearest to a target, that chi, and its slopes.
+
+    `rest` is the norm of what no coefficients explain: by it the solver knows when it is done.
+    """
+
+    def chi(theta: Array) -> Array:
+        return chi_of(scatter(places, plant, theta), structure, *maps)
+
+    def residual(theta: Array) -> Array:
+        return jnp.append(root @ (chi(theta) - target), rest)
+
+    fit = levenberg_marquardt(residual, theta, transform, *bounds)
+    return fit, chi(fit.theta), jax.jacfwd(chi)(fit.theta)
+
+
+def constraint_steps(
+    plant: Plant, parameters: Parameters, model: Model, fit: Fit, theta: np.ndarray, slopes: np.ndarray
+) -> Steps[Constraint | None]:
+    """Test whether the coefficients can be those of a plant, where there are more than a plant has.
+
+    Where there are not, friction of hidden joints is moved to the measured ones first, as published.
+    """
+    covariance = fit.precision.covariance
+    if not np.all(np.isfinite(covariance)):
+        return None
+    pinned: tuple[int, ...] = ()
+    freedom = len(fit.chi) - _rank(slopes, covariance, theta)
+    form = model.structure.form
+    if freedom == 0:
+        # With an acceleration the coefficients are the parameters themselves.
+        pinned = () if form.accelerated else _regroupable(plant, parameters, form.hidden)
+        if not pinned:
+            return None
+    rest = tuple(k for k in range(len(theta)) if k not in pinned)
+    bare = parameters.insert(plant, np.where(np.isin(np.arange(len(theta)), pinned), 0.0, theta))
+    part = Parameters(tuple(parameters.free[k] for k in rest))
+    wide = np.full(len(rest), np.inf)
+    # chi may lie beyond a bound by chance, which is not what is tested.
+    transform = Transform.of(part)
+    floor = np.where(transform.log, part.bounds[0], -wide)
+    root = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    found, _, slopes = yield Solve(read_back, (
+        bare, part.places, model.structure, model.maps, fit.chi, root, np.asarray(1.0),
+        theta[list(rest)], transform, (floor, wide),
+    ))
+    freedom = len(fit.chi) - _rank(np.asarray(slopes), covariance, np.asarray(found.theta))
+    if freedom == 0:
+        return None
+    square = max(2 * float(found.cost) - 1.0, 0.0)
+    names = tuple(parameters.names[k] for k in pinned)
+    return Constraint(square, freedom, chance(square, freedom), names)
+
+
+def _rank(slopes: np.ndarray, covariance: np.ndarray, theta: np.ndarray) -> int:
+    """Of the slopes of chi, each over its standard deviation, columns of one length."""
+    scaled = slopes / np.sqrt(np.diag(covariance))[:, None]
+    norm = np.linalg.norm(scaled, axis=0)
+    return int(np.linalg.matrix_rank(scaled[:, norm > 0] / norm[norm > 0], tol=_RANK))
+
+
+def _regroupable(plant: Plant, parameters: Parameters, hidden: tuple[int, ...]) -> tuple[int, ...]:
+    """Unknown friction of hidden joints that a measured joint has too."""
+    kinds = [_friction(plant, f.path, f.index) for f in parameters.free]
+    seen = {kind for kind, joint in (k for k in kinds if k is not None) if joint not in hidden}
+    return tuple(
+        k for k, at in enumerate(kinds) if at is not None and at[1] in hidden and at[0] in seen
+    )
+
+
+def _friction(plant: Plant, path: tuple, index: int | None) -> tuple[str, int] | None:
+    """Kind and joint of friction whose strength an unknown is."""
+    if path[0] == "effects":
+        effect = plant.effects[path[1]]
+        regroups = effect.kind in ("viscous_friction", "coulomb_friction") and effect.port < plant.joints
+        return (effect.kind, effect.port) if regroups else None
+    for joint in range(plant.joints):
+        if plant.twin(EFFECTS["viscous_friction"], joint) == (path[0], index):
+            return "viscous_friction", joint
+    return None

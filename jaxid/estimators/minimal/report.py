@@ -1,0 +1,96 @@
+"""What is said of a minimal model: for result.json, and in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxid.estimators.minimal.basis import Basis
+from jaxid.estimators.minimal.models import Form
+from jaxid.estimators.minimal.statistics import DROPPED, Constraint, Fit
+from jaxid.logs.prepare import Recipe
+
+
+def minimal_json(
+    form: Form, fit: Fit, basis: Basis, constraint: Constraint | None,
+    modes: dict[str, list[tuple[float, float]]], recipe: Recipe,
+) -> dict[str, Any]:
+    """The `minimal` object of result.json."""
+    rows = zip(
+        basis.names, basis.units, fit.chi, fit.precision.std, fit.white, fit.without, strict=True
+    )
+    return {
+        "model": form.name,
+        "equation": form.equation,
+        "coefficients": {
+            name: {
+                "value": float(c), "unit": unit, "std": float(s), "relative_std": float(s / abs(c)),
+                "std_white": float(w), "relative_std_white": float(w / abs(c)),
+                "residual_without": float(g),
+            }
+            for name, unit, c, s, w, g in rows
+        },
+        "condition": fit.condition,
+        "condition_scaled": fit.condition_scaled,
+        "residual_norm": fit.relative,
+        "droppable": droppable(fit, basis),
+        "constraint": None if constraint is None else {
+            "chi_square": constraint.chi_square, "degrees_of_freedom": constraint.freedom,
+            "p_value": constraint.p_value, "regrouped": list(constraint.regrouped),
+        },
+        "natural_frequency_hz": {
+            name: [{"value": v, "std": s} for v, s in found] for name, found in modes.items()
+        },
+        "preprocess": {
+            "cutoff_hz": recipe.cutoff_hz, "order": recipe.order, "decimation": recipe.decimation,
+            "trim": recipe.trim, "derivatives": recipe.derivatives,
+        },
+    }
+
+
+def droppable(fit: Fit, basis: Basis) -> list[str]:
+    """Coefficients without any one of which the residual's norm changes by less than 1 %."""
+    return [n for n, g in zip(basis.names, fit.without, strict=True) if g - 1 < DROPPED]
+
+
+def minimal_notes(form: Form, fit: Fit, basis: Basis, constraint: Constraint | None) -> tuple[str, ...]:
+    """What a user should know of the model."""
+    out = [f"minimal model {form.equation}: {form.name.replace('_', ' ')}"]
+    if form.hidden:
+        out.append("dry friction of joints without an encoder acts in the direction of the motor")
+    blind = [n for n, ok in zip(basis.names, fit.precision.identifiable, strict=True) if not ok]
+    if blind:
+        out.append(f"coefficients that this log cannot tell: {', '.join(blind)}")
+    if constraint is not None:
+        names = ", ".join(constraint.regrouped)
+        moved = f", {names} regrouped with the motor's" if names else ""
+        said = "are not" if constraint.p_value < 0.01 else "may be"
+        out.append(
+            f"{len(fit.chi)} coefficients {said} those of a plant with {len(fit.chi) - constraint.freedom} "
+            f"parameters{moved}: chi-square {constraint.chi_square:.3g}, p = {constraint.p_value:.2g}"
+        )
+    return tuple(out)
+
+
+def minimal_rows(content: dict[str, Any]) -> tuple[list[list[str]], list[str]]:
+    """Rows of the printed table, and lines below it."""
+    number = lambda x: "-" if x is None or not np.isfinite(x) else f"{x:.4g}"
+    percent = lambda x: "-" if x is None or not np.isfinite(x) else f"{100 * x:.3g} %"
+    rows = [["coefficient", "value", "std", "relative", "white", "unit", "without it"]]
+    for name, c in content["coefficients"].items():
+        rows.append([
+            name, number(c["value"]), number(c["std"]), percent(c["relative_std"]),
+            percent(c["relative_std_white"]), c["unit"], f"residual +{percent(c['residual_without'] - 1)}",
+        ])
+    free = content["natural_frequency_hz"]
+    lines = [
+        f"natural frequency, {name.replace('_', ' ')}: "
+        + ", ".join(f"{number(m['value'])} +- {number(m['std'])} Hz" for m in modes)
+        for name, modes in free.items() if modes
+    ]
+    lines.append(
+        f"condition {number(content['condition'])} (columns of one length: "
+        f"{number(content['condition_scaled'])}), relative residual {percent(content['residual_norm'])}"
+    )
+    return rows, lines

@@ -1,0 +1,156 @@
+"""The method `recursive` one measured sample at a time, in the loop of a machine.
+
+Velocity and acceleration come from the sensors (a gyroscope, an accelerometer) or from filters of the user's;
+nothing is filtered here.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxid.errors import InputError
+from jaxid.estimators.algebraic.online import check_instant, slopes
+from jaxid.estimators.recursive.estimate import gains_of, start_of
+from jaxid.estimators.recursive.recursion import Memory, Recursion, Told, column_squares
+from jaxid.estimators.recursive.rows import check_proportion, elsewhere
+from jaxid.machine import Machine
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import scatter
+
+
+class RealTime(eqx.Module):
+    """Recursive estimator of a machine's unknowns; `update` may also stand in a scan.
+
+        live = RealTime.of(machine, 1e-3, noise=2.0, spread=[20.0, 200.0, 20.0], gate_velocity=1e-3)
+        memory = live.memory()
+        memory = live.update(memory, q, qd, qdd, command)    # every millisecond
+        live.told(memory).theta
+
+    A memory is a tree of arrays: saved as it is and given to `update` again, all goes on bit for bit.
+
+    Args:
+        plant: The plant, its sign as sharp as the gate allows.
+        places: Of the unknowns.
+        guess: Any values of them: the balance is in proportion, they only fix the origin.
+        gain: Known force per unit of command, by drive.
+        gate_velocity, gate_acceleration: Of which a joint must exceed one for its row to count, (n,)
+            [m/s, m/s^2 or in rad].
+        recursion: What takes the rows.
+    """
+
+    plant: Plant
+    places: tuple = eqx.field(static=True)
+    guess: Float[Array, " p"]
+    gain: Float[Array, " m"]
+    gate_velocity: Float[Array, " n"]
+    gate_acceleration: Float[Array, " n"]
+    recursion: Recursion
+
+    @classmethod
+    def of(
+        cls, machine: Machine, period: float, *, noise: float, spread: np.ndarray,
+        gate_velocity: float | np.ndarray, gate_acceleration: float | np.ndarray = np.inf,
+        half_life: float = np.inf, summed: bool = False, instrument: bool = False,
+        start: np.ndarray | None = None,
+    ) -> RealTime:
+        """The estimator of a machine.
+
+        Args:
+            machine: The machine.
+            period: Sampling time [s].
+            noise: Standard deviation of the force's noise and of what the model lacks [N or N m].
+            spread: Standard deviation of the start, (p,) [units of the unknowns].
+            gate_velocity, gate_acceleration: See `RealTime`; one for all joints, or one each.
+            half_life: Of a sample's weight [s of motion].
+            summed: Whether the rows of a sample are summed to one.
+            instrument: Whether the measured force is so noisy that its gain needs an instrument.
+            start: Absent: gains from one, forces from zero, the plant's own from its guesses.
+
+        Raises:
+            InputError: If a number is out of range, an effect remembers, delays or changes with time, or
+                an unknown does not enter in proportion.
+        """
+        n, names, places = machine.plant.joints, machine.parameters.names, machine.parameters.places
+        sizes = {"period": period, "noise": noise, "spread": spread, "half_life": half_life}
+        for name, value in {**sizes, "gate_velocity": gate_velocity}.items():
+            if not np.all(np.asarray(value, float) > 0):
+                raise InputError(f"{name} = {value} is not positive", where="RealTime", mend="it must be > 0")
+        # A negative gate would let samples at rest through.
+        if not np.all(np.asarray(gate_acceleration, float) >= 0):
+            what = f"gate_acceleration = {gate_acceleration} is negative"
+            raise InputError(what, where="RealTime", mend="it must be >= 0")
+        for name, value in {"spread": spread, "start": spread if start is None else start}.items():
+            if np.shape(value) != (len(names),):
+                mend = f"give one of each of {', '.join(names)}"
+                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", mend=mend)
+        for name, value in {"gate_velocity": gate_velocity, "gate_acceleration": gate_acceleration}.items():
+            if np.shape(value) not in ((), (1,), (n,)):
+                mend = f"give one for all joints, or {n}"
+                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", mend=mend)
+        check_instant(machine, "RealTime")
+        velocity, acceleration = (
+            np.broadcast_to(np.asarray(x, float), (n,)) for x in (gate_velocity, gate_acceleration)
+        )
+        sharp = (np.asarray(1 / 3), np.asarray(np.min(velocity)))
+        plant = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), machine.plant, sharp)
+        random, guess = np.random.default_rng(0), machine.parameters.guess
+        motion, u = plant.any_motion(random), random.uniform(0.5, 1.5, machine.gain.size)
+        here, there = (np.asarray(slopes(plant, places, x, motion, u)) for x in (guess, elsewhere(guess)))
+        check_proportion(names, here, there)
+        recursion = Recursion(
+            start_of(machine) if start is None else np.asarray(start, float),
+            np.square(noise / np.asarray(spread, float)), np.asarray(2.0 ** (-period / half_life)),
+            summed, gains_of(machine), instrument,
+        )
+        return cls(plant, places, guess, machine.gain, velocity, acceleration, recursion)
+
+    def memory(self) -> Memory:
+        """Before the first sample."""
+        return self.recursion.memory()
+
+    def rows(
+        self, q: Float[Array, " n"], qd: Float[Array, " n"], qdd: Float[Array, " n"],
+        command: Float[Array, " m"],
+    ) -> tuple[Float[Array, "n p"], Float[Array, " n"], Bool[Array, " n"]]:
+        """Rows, right-hand side and which rows count of one sample."""
+        u, guess = self.gain * command, jnp.asarray(self.guess)
+
+        def residual(theta: Array) -> tuple[Array, Array]:
+            plant = scatter(self.places, self.plant, theta)
+            e = plant.balance(q, qd, qdd, u, jnp.zeros(()), plant.initial_states(u)).residual
+            return e, e
+
+        rows, e = jax.jacfwd(residual, has_aux=True)(guess)
+        counts = (jnp.abs(qd) > self.gate_velocity) | (jnp.abs(qdd) > self.gate_acceleration)
+        return rows, rows @ guess - e, counts
+
+    def sizes(
+        self, rows: Float[Array, "time n p"], counts: Bool[Array, "time n"], force: Float[Array, "time n"]
+    ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+        """Mean square of each column, and root mean square of the force, of samples that count."""
+        natural = jnp.where(self.guess == 0, 1.0, jnp.asarray(self.guess))
+        square, force = column_squares(rows, counts, force, natural)
+        return square, jnp.sqrt(force)
+
+    @eqx.filter_jit
+    def update(
+        self, memory: Memory, q: Float[Array, " n"], qd: Float[Array, " n"], qdd: Float[Array, " n"],
+        command: Float[Array, " m"],
+    ) -> Memory:
+        """Take one sample more.
+
+        Args:
+            memory: So far.
+            q, qd, qdd: Measured motion of all joints.
+            command: Measured, in its units, by drive.
+        """
+        return self.recursion.update(memory, *self.rows(q, qd, qdd, command))[0]
+
+    @eqx.filter_jit
+    def told(self, memory: Memory) -> Told:
+        """What the samples so far say."""
+        return self.recursion.told(memory)

@@ -1,0 +1,1 @@
+"""Output error under a prior, in the directions that a short log can identify."""

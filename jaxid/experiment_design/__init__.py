@@ -1,0 +1,1 @@
+"""Experiments that identify the unknowns best, within the limits of a machine."""

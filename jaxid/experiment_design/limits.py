@@ -1,0 +1,113 @@
+"""What an experiment may do to a machine: stroke, speed and force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
+from jaxid.machine import Machine
+
+if TYPE_CHECKING:
+    from jaxid.experiment_design.shapes import Shapes
+
+# Amplitudes tried until the machine keeps within its limits.
+_AMPLITUDES = (1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.15, 0.07)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds on the motion and on the command, by joint.
+
+    Args:
+        low, high: Ends of the stroke [m or rad].
+        speed: Largest speed [m/s or rad/s].
+        force: Largest magnitude of the command, in its own units.
+        stated: Which of "stroke", "speed" and "force" the case gives; the rest is what the log used.
+    """
+
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+    speed: Float[np.ndarray, " n"]
+    force: Float[np.ndarray, " m"]
+    stated: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, stated: Mapping[str, Any], machine: Machine, log: Log, data: Prepared) -> Limits:
+        """The limits that a case states, the rest as far as the log went.
+
+        Where no force is stated it is the controller's own limit, if it has one: that is what the
+        drive is known to stand.
+
+        Args:
+            stated: The case's [limits].
+            machine: The machine.
+            log, data: Its log, raw and prepared.
+        """
+        n, m = log.position.shape[1], log.force.shape[1]
+        stroke = stated.get("stroke")
+        if stroke is None:
+            low, high = data.q.min(axis=0), data.q.max(axis=0)
+        else:
+            low, high = np.broadcast_to(np.asarray(stroke, float), (n, 2)).T
+        speed = np.abs(data.qd).max(axis=0) if "speed" not in stated else stated["speed"]
+        own = None if machine.controller is None else machine.controller.limit
+        used = np.abs(log.force).max(axis=0) if own is None else np.asarray(own)
+        force = stated.get("force", used)
+        return cls(
+            np.array(low, float), np.array(high, float), np.broadcast_to(speed, n).astype(float),
+            np.broadcast_to(force, m).astype(float), tuple(stated),
+        )
+
+    def broken(self, peaks: Peaks) -> bool:
+        """Whether a run goes beyond them."""
+        return bool(
+            np.any(peaks.low < self.low) or np.any(peaks.high > self.high)
+            or np.any(peaks.speed > self.speed) or np.any(peaks.force > self.force)
+            or not np.all(np.isfinite(peaks.speed))
+        )
+
+
+def kept_within(
+    limits: Limits, shapes: Shapes, p: Float[np.ndarray, " p"], peaks_of: Callable[[np.ndarray], Peaks]
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "time m"], Peaks] | None:
+    """The signal of some numbers at the largest amplitude at which a machine keeps to its limits.
+
+    Args:
+        limits: The limits.
+        shapes, p: The family of signals, and the numbers.
+        peaks_of: How far the machine goes under a signal.
+
+    Returns:
+        Its numbers, the signal and how far it goes; None where it goes beyond whatever the amplitude.
+    """
+    for factor in _AMPLITUDES:
+        smaller = shapes.smaller(p, factor)
+        signal = shapes.signal(smaller)
+        peaks = peaks_of(signal)
+        if not limits.broken(peaks):
+            return smaller, signal, peaks
+    return None
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """How far a run went; the fields are those of `Limits`."""
+
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+    speed: Float[np.ndarray, " n"]
+    force: Float[np.ndarray, " m"]
+
+    @classmethod
+    def of(cls, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> Peaks:
+        """Of runs whose time is the axis before the last."""
+        def most(x: np.ndarray) -> np.ndarray:
+            return np.max(x.reshape(-1, x.shape[-1]), axis=0)
+
+        return cls(-most(-position), most(position), most(np.abs(velocity)), most(np.abs(command)))

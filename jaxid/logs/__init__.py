@@ -1,0 +1,1 @@
+"""Logs: reading, time base, soundness checks, filtering."""

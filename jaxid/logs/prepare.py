@@ -1,0 +1,409 @@
+"""From a log to the motion and force that inverse dynamics compares, and the choice of how.
+
+A stated recipe is applied to the letter. Where none is stated, cut-off, decimation and rest
+velocity follow from the log's own noise, and are reported. A running median of the force is stated
+or there is none: it goes before all else, see `Recipe.cleaned`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.signal
+from jaxtyping import Bool, Float
+
+from jaxid.errors import InputError
+from jaxid.logs.log import Log
+from jaxid.numerics import filters as signals
+
+# The surroundings of reversals that are left out are less of the motion than this.
+_MOSTLY = 0.5
+# Decimation keeps 1 / 0.4 samples a period of the band's edge, and of a short log so many in all.
+A_PERIOD = 0.4
+_ENOUGH = 100
+# Periods of the band's edge that are left out at each end.
+_ENDS = 3
+# The parallel filter's edge over the frequency at which a parabola has half of a velocity left, at
+# most: there nine tenths are left.
+_FLAT = 1 / 3
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a log is filtered.
+
+    Args:
+        cutoff_hz: Of the zero-phase low-pass on the position; with "parabolic" derivatives, which
+            leave the position as it is, where half of the velocity is left.
+        order: Of the Butterworth filter, which is run twice.
+        decimation: One sample in so many is kept, after the parallel filter.
+        trim: Samples left out at each end, after decimation.
+        rest_velocity: Below it a sample counts as at rest [m/s or rad/s], by joint.
+        align_hold: Whether the command is seen as it acts, half a sample late where it is held,
+            instead of at the instants at which it was logged.
+        derivatives: "central" (differences), "spectral" (exact in the band) or "parabolic" (of the
+            parabola through the neighbours, with no low-pass before it).
+        keeps_reversals: Whether a fit uses samples that only pass through zero.
+        edge: Of the parallel filter over half the sampling rate (see `signals.Decimator`); None:
+            its decimation's.
+        reach: Samples on each side of a parabola.
+        median: Samples of the running median of the force; None: as it was logged.
+    """
+
+    cutoff_hz: float
+    order: int
+    decimation: int
+    trim: int
+    rest_velocity: tuple[float, ...]
+    align_hold: bool
+    derivatives: str
+    keeps_reversals: bool = False
+    edge: float | None = None
+    reach: int = 2
+    median: int | None = None
+
+    def cleaned(self, log: Log) -> Log:
+        """A log as everything else sees it: its force behind the running median.
+
+        Raises:
+            InputError: If the log is shorter than the median or the parabola.
+        """
+        _require_length(log, self.median, self.reach if self.derivatives == "parabolic" else None)
+        if self.median is None:
+            return log
+        return replace(log, force=signals.running_median(log.force, self.median))
+
+    def band_hz(self, rate_hz: float) -> float:
+        """Edge of the band in which forces are compared."""
+        return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
+
+    def motion_hz(self, rate_hz: float) -> float:
+        """Cut-off that the position has, or would have if it were filtered."""
+        if self.derivatives != "parabolic" or self.edge is None:
+            return self.cutoff_hz
+        return min(self.edge, 0.45) * rate_hz
+
+    def response(self, frequency: np.ndarray, rate_hz: float, order: int = 0) -> np.ndarray:
+        """Gain of a derivative over the exact one at each frequency [Hz], without the parallel filter.
+
+        Args:
+            frequency: [Hz].
+            rate_hz: Sampling rate of the log.
+            order: Of the derivative, 0 to 2; only a parabola treats them differently.
+        """
+        if self.derivatives == "parabolic":
+            if order == 0:
+                return np.ones_like(frequency)
+            return signals.parabolic_response(frequency / rate_hz, self.reach, order)
+        if self.derivatives == "spectral":
+            return signals.roll_off(frequency, self.cutoff_hz)
+        sos = scipy.signal.butter(self.order, self.cutoff_hz, fs=rate_hz, output="sos")
+        return np.abs(scipy.signal.freqz_sos(sos, worN=frequency, fs=rate_hz)[1]) ** 2
+
+    def hold(self, log: Log, period: float | None = None) -> float:
+        """For how long each command of a log is held from its sample on [s]; zero where that is not to count.
+
+        Args:
+            log: The log.
+            period: Of the controller [s]; absent: the log's sampling time.
+        """
+        held = self.align_hold and log.hold == "zero_order"
+        return (period or log.period) if held else 0.0
+
+    @property
+    def independent(self) -> float:
+        """Part of the kept samples whose noise is independent: half where the band is just filled."""
+        if self.edge is None:
+            return 0.5
+        return min(0.5, 0.5 * self.decimation * self.edge / (2 * A_PERIOD))
+
+    @property
+    def decimator(self) -> signals.Decimator:
+        """The parallel filter.
+
+        A stated recipe's is its decimation's. Else the band ends where the position's filter is
+        still flat: beyond that, the force would have no motion to be compared with.
+        """
+        return signals.Decimator(self.decimation, self.trim, self.edge)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A log made ready for inverse dynamics.
+
+    Args:
+        q, qd, qdd: Filtered motion at the log's rate, (time, n).
+        force: Declared force, (time, m) [N or N m].
+        period: Sampling time of the log [s].
+        hold: For how long each force is held from its sample on [s]; zero where that is not to
+            count (see `Recipe.align_hold`).
+        recipe: How it was filtered.
+        moving: Which kept samples are not at rest, (kept, n).
+        fitted: Which kept samples a fit uses, (kept, n): those that move; under a stated recipe
+            also those that only pass through zero, as the published recipes leave nothing out.
+        kept: Their indices in these arrays.
+        start: Time of the first sample, from the start of the log [s].
+        measured: Which joints have an encoder; the motion of the others is that of `Log.filled`.
+        steps: Integration steps a sample by which theirs is found (see `jaxid.dynamics.hidden_joints`).
+    """
+
+    q: Float[np.ndarray, "time n"]
+    qd: Float[np.ndarray, "time n"]
+    qdd: Float[np.ndarray, "time n"]
+    force: Float[np.ndarray, "time m"]
+    period: float
+    hold: float
+    recipe: Recipe
+    moving: Bool[np.ndarray, "kept n"]
+    fitted: Bool[np.ndarray, "kept n"]
+    kept: np.ndarray
+    start: float = 0.0
+    measured: tuple[bool, ...] = (True,)
+    steps: int = 1
+
+    @property
+    def times(self) -> Float[np.ndarray, " kept"]:
+        """Time of the kept samples from the start of the log [s]."""
+        return self.start + self.period * self.kept
+
+    def parts(self, most: int, pieces: int) -> list[Prepared]:
+        """The log itself, or, where it keeps more than `most` samples, pieces spread over it.
+
+        All pieces have one length, so that compiled code serves them all, and begin on a kept
+        sample. A joint that moves between them only has a further piece where it does.
+
+        Args:
+            most: Samples to keep, all pieces together.
+            pieces: Into how many.
+        """
+        if len(self.kept) <= most:
+            return [self]
+        step, trim = self.recipe.decimation, self.recipe.trim
+        rows = most // pieces
+        length = (rows + 2 * trim) * step
+        last = (len(self.q) - length) // step
+        starts = [int(k) for k in np.linspace(0, last, pieces)]
+        for moving in self.moving.T:
+            # The first sample of a piece does not continue another.
+            seen = any(moving[k + 1 : k + rows].any() for k in starts)
+            if moving.any() and not seen:
+                own = np.flatnonzero(moving)
+                starts.append(int(np.clip(own[len(own) // 2] - rows // 2, 0, last)))
+        return [self._piece(k * step, length) for k in starts]
+
+    def _piece(self, first: int, length: int) -> Prepared:
+        part = slice(first, first + length)
+        kept = self.recipe.decimator.kept(length)
+        at = first // self.recipe.decimation
+        rows = slice(at, at + len(kept))
+        return replace(
+            self, q=self.q[part], qd=self.qd[part], qdd=self.qdd[part], force=self.force[part],
+            moving=self.moving[rows], fitted=self.fitted[rows], kept=kept,
+            start=self.start + first * self.period,
+        )
+
+    def at_kept(self, x: np.ndarray) -> np.ndarray:
+        """Values of a signal of the log at the kept samples."""
+        return x[self.kept]
+
+
+def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
+    """Complete a stated recipe from the log, or choose all of it.
+
+    The parallel filter ends where the position first stands less than four times above its noise floor
+    in power (a gap between the lines of a multisine is enough), at most at 0.3 of the sampling rate; the
+    position's own filter, at twice that, is flat where the parallel filter still passes anything. The
+    rest velocity is five standard deviations of the velocity's noise in that band, at least half a
+    percent of the RMS velocity.
+
+    Parabolic derivatives leave the position unfiltered, and the parallel filter ends where they are still
+    flat, or earlier; with a stated decimation it is that decimation's, to the letter.
+
+    Args:
+        log: The log.
+        stated: The case's `[preprocess]`; its entries win.
+
+    Raises:
+        InputError: If it states a cut-off that the log's sampling rate cannot have, or a median or a
+            parabola that is longer than the log.
+    """
+    stated = dict(stated or {})
+    rate = log.rate_hz
+    if stated.get("cutoff_hz", 0.0) >= 0.5 * rate:
+        raise InputError(
+            f"[preprocess] cutoff_hz = {stated['cutoff_hz']:g} is not below half the sampling rate of "
+            f"{rate:.6g} Hz", where=log.source, mend="lower it, or leave it out: it is then chosen",
+        )
+    parabolic, reach = stated.get("derivatives") == "parabolic", int(stated.get("reach", 2))
+    _require_length(log, stated.get("median"), reach if parabolic else None)
+    literal = "cutoff_hz" in stated or (parabolic and "decimation" in stated)
+    how = stated.get("derivatives", "central" if literal else "spectral")
+    edge = None if literal else _noise_cutoff(log)
+    if parabolic:
+        cutoff = signals.parabolic_cutoff(reach) * rate
+        edge = None if literal else min(edge, _FLAT * cutoff)
+    else:
+        cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
+    band = cutoff if literal else edge
+    decimation = int(stated.get("decimation", _decimation(log, band)))
+    q, qd, _ = differentiate(log.filled, log.period, cutoff, 4, how, reach=reach)
+    noise = signals.high_band_std(log.filled)
+    # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
+    velocity_noise = noise * 2 * np.pi * np.sqrt(2 * cutoff**3 / (3 * rate))
+    if parabolic:
+        # Slope of a line through 2 k + 1 samples.
+        velocity_noise = noise * rate * np.sqrt(3 / (reach * (reach + 1) * (2 * reach + 1)))
+    rest = np.maximum(5 * velocity_noise, 5e-3 * np.sqrt(np.mean(qd**2, axis=0)))
+    if "rest_velocity" in stated:
+        rest = np.full(q.shape[1], stated["rest_velocity"], float)
+    return Recipe(
+        cutoff_hz=cutoff,
+        order=int(stated.get("order", 4)),
+        decimation=decimation,
+        trim=int(stated.get("trim", trimmed(log, band, decimation, literal=literal))),
+        rest_velocity=tuple(float(r) for r in rest),
+        align_hold=bool(stated.get("align_hold", not literal)),
+        derivatives=how,
+        keeps_reversals=literal,
+        edge=None if literal else 2 * edge / rate,
+        reach=reach,
+        median=stated.get("median"),
+    )
+
+
+def _require_length(log: Log, median: int | None, reach: int | None) -> None:
+    """Refuse a window that is as long as the log."""
+    for key, value, width in (("median", median, median), ("reach", reach, 2 * (reach or 0) + 1)):
+        if value is not None and width >= log.samples:
+            raise InputError(
+                f"[preprocess] {key} = {value} takes {width} samples, and the log has {log.samples}",
+                where=log.source, mend="lower it, or take a longer log",
+            )
+
+
+def _decimation(log: Log, band_hz: float) -> int:
+    """One sample in how many to keep: as many as the band needs, and of a short log more.
+
+    What else is left out (ends, stops, reversals) is left out in whole samples; of twenty-five
+    kept ones too few would remain. Their noise is correlated, which whitening takes care of.
+    """
+    return max(1, min(spaced(log.rate_hz, band_hz), log.samples // _ENOUGH))
+
+
+def spaced(rate_hz: float, band_hz: float) -> int:
+    """One sample in how many a band needs."""
+    return max(1, int(A_PERIOD * rate_hz / band_hz))
+
+
+def trimmed(log: Log, band_hz: float, decimation: int, *, literal: bool, periods: int = _ENDS) -> int:
+    """Kept samples to leave out at each end: as far as the ends of filters reach.
+
+    Args:
+        log: The log.
+        band_hz: Edge of the band.
+        decimation: One sample in so many is kept.
+        literal: Whether the recipe is stated; else of a short log not more than an eighth.
+        periods: Of the band's edge, over which filters forget the ends.
+    """
+    reach = int(np.ceil(periods * log.rate_hz / (band_hz * decimation)))
+    return reach if literal else min(reach, log.samples // decimation // 8)
+
+
+def _noise_cutoff(log: Log) -> float:
+    """Frequency up to which every joint's position stands above its noise without a gap [Hz]."""
+    rate = log.rate_hz
+    # Two seconds a segment: friction's corners recur over seconds, noise everywhere.
+    position = log.position[:, list(log.measured)]
+    length = int(min(len(position), max(256, 2 * rate)))
+    f, p = scipy.signal.welch(
+        position, rate, window="hann", nperseg=length, detrend="linear", axis=0
+    )
+    floor = 2 * signals.high_band_std(position) ** 2 / rate
+    above = np.all(p > 4 * floor, axis=1) & (f < 0.3 * rate)
+    first_lost = np.argmax(~above[1:]) + 1 if np.any(~above[1:]) else len(f) - 1
+    lowest = 8.0 / (log.samples * log.period)
+    # Two digits, rounded down: it is not known better, and alike logs share compiled code.
+    digit = 10.0 ** (np.floor(np.log10(f[first_lost])) - 1)
+    return float(np.clip(np.floor(f[first_lost] / digit) * digit, lowest, 0.3 * rate))
+
+
+def differentiate(
+    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str, orders: int = 2,
+    reach: int = 2,
+) -> tuple[np.ndarray, ...]:
+    """Signal and its derivatives up to an order; filtered unless `how` is "parabolic", see `Recipe`."""
+    if how == "parabolic":
+        if orders > 2:
+            raise ValueError(f"a parabola has no derivative of order {orders}.")
+        return (x, *signals.parabolic_derivatives(x, period, reach))[: orders + 1]
+    if how == "spectral":
+        return signals.spectral_derivatives(x, period, cutoff_hz, orders)
+    out = [signals.butterworth_zero_phase(x, cutoff_hz, order, 1 / period)]
+    for _ in range(orders):
+        out.append(signals.central_difference(out[-1], period))
+    return tuple(out)
+
+
+def prepare(
+    log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | None = None
+) -> Prepared:
+    """Filter a log and mark the samples that count.
+
+    Args:
+        log: The log, as `Recipe.cleaned` gives it.
+        gain: Declared force per unit of command, (m,).
+        recipe: How to filter it.
+        hold_period: For how long a held command is held [s]; absent: the log's sampling time.
+    """
+    q, qd, qdd = differentiate(
+        log.filled, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives, reach=recipe.reach
+    )
+    kept = recipe.decimator.kept(len(q))
+    at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
+    reach = recipe.decimator.reach
+    if not recipe.keeps_reversals:
+        reach = affordable(at_rest, turning(qd), max(reach, recipe.decimation - 1))
+        # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
+        at_rest = at_rest | (turning(qd) & (reach > 0))
+    moving = ~smeared(at_rest, reach)[kept] & log.measured
+    fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
+    return Prepared(
+        q, qd, qdd, log.force * gain, log.period,
+        recipe.hold(log, hold_period), recipe, moving,
+        fitted if recipe.keeps_reversals else moving, kept, measured=log.measured,
+    )
+
+
+def affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
+    """How many samples about stops and reversals to leave out, so that most of the motion remains."""
+    for part in (1.0, 0.75, 0.5, 0.25):
+        near = int(np.ceil(part * reach))
+        lost = smeared(at_rest | turning, near) & ~at_rest
+        if np.all(lost.sum(axis=0) < _MOSTLY * np.maximum((~at_rest).sum(axis=0), 1)):
+            return near
+    return 0
+
+
+def turning(v: np.ndarray) -> np.ndarray:
+    """Samples between which a velocity changes its sign: a fast reversal has none at rest."""
+    turns = np.diff(np.sign(v), axis=0) != 0
+    edge = np.zeros((1, v.shape[1]), bool)
+    return np.concatenate([turns, edge]) | np.concatenate([edge, turns])
+
+
+def smeared(flags: np.ndarray, reach: int) -> np.ndarray:
+    """Flags and their neighbours: the parallel filter smears a stop, which goes with them."""
+    width = 2 * reach + 1
+    count = np.cumsum(np.pad(flags, ((reach + 1, reach), (0, 0))), axis=0)
+    return count[width:] > count[:-width]
+
+
+def lasting(flags: np.ndarray, length: int) -> np.ndarray:
+    """Only those flags, (time, n), that stand for longer than `length` samples on end."""
+    out = np.zeros_like(flags)
+    for i, f in enumerate(flags.T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], f, [False]]).astype(int)))
+        for start, end in edges.reshape(-1, 2):
+            out[start:end, i] = end - start > length
+    return out

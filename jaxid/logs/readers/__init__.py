@@ -1,0 +1,53 @@
+"""Named columns of numbers from the file formats that logs come in."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError
+from jaxid.logs.readers.array_files import read_mat, read_npz, read_parquet
+from jaxid.logs.readers.csv_file import read_csv
+from jaxid.logs.readers.rows import Rows
+
+# Each reader: (path, names, rows) -> ({name: (samples, width)}, rows that were read).
+READERS = {".csv": read_csv, ".npz": read_npz, ".mat": read_mat, ".parquet": read_parquet}
+
+
+def read_columns(
+    path: str | Path, names: list[str], rows: Rows | None = None
+) -> tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]:
+    """Read the named columns of a file, unchanged and without a look at their meaning.
+
+    A matrix in `.npz` or `.mat` has its samples along the longer side. A name
+    like `pos[2]` is its second column.
+
+    Args:
+        path: The file; its suffix says the format.
+        names: The columns wanted.
+        rows: 0-based, half open; all where absent. Rows outside are not looked at.
+
+    Returns:
+        The columns by name, each of shape (samples, width), and the rows in the file.
+
+    Raises:
+        InputError: If the file, a column, a cell or the rows are not there or not numbers.
+    """
+    path = Path(path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        mend = f"use one of {', '.join(READERS)}"
+        raise InputError(f"unknown suffix '{path.suffix}'", where=str(path), mend=mend)
+    if not path.exists():
+        beside = [p.name for p in path.parent.glob("*" + path.suffix)]
+        mend = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
+        raise InputError("no such file", where=str(path), mend=mend)
+    if not path.is_file():
+        raise InputError("is not a file", where=str(path), mend="name the log itself")
+    if path.stat().st_size == 0:
+        raise InputError("is empty", where=str(path), mend="export the log again")
+    try:
+        return reader(path, list(dict.fromkeys(names)), rows)
+    except OSError as error:
+        mend = "check that it may be read"
+        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error

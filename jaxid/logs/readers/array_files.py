@@ -1,0 +1,122 @@
+"""Columns of files that hold arrays: NumPy, MATLAB and Parquet."""
+
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError, suggest
+from jaxid.logs.readers.rows import Rows, resolve_rows
+
+Columns = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]
+_INDEXED = re.compile(r"(.+)\[(\d+)\]$")
+
+
+def read_npz(path: Path, names: list[str], rows: Rows | None) -> Columns:
+    """Read columns of a NumPy archive; see `read_columns`. Pickled objects are refused."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not hasattr(archive, "files"):
+                raise InputError("holds no named arrays", where=str(path), mend="use numpy.savez")
+            wanted = {_base(name, archive.files) for name in names} & set(archive.files)
+            known = {key: archive[key] if key in wanted else None for key in archive.files}
+    except (ValueError, zipfile.BadZipFile, EOFError) as error:
+        if isinstance(error, InputError):
+            raise
+        mend = "save plain arrays of numbers with numpy.savez"
+        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error
+    return _pick(path, known, names, rows)
+
+
+def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
+    """Read columns of a MATLAB file up to version 7.2; see `read_columns`."""
+    # Loaded here, not above: a CSV should not wait for it.
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path)
+    except NotImplementedError as error:
+        mend = "in MATLAB: save('log.mat', '-v7', ...), or export CSV"
+        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), mend=mend) from error
+    except (MatReadError, ValueError, TypeError, KeyError, IndexError) as error:
+        mend = "is it a MATLAB file? save it again with -v7"
+        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error
+    known = {key: value for key, value in content.items() if not key.startswith("__")}
+    return _pick(path, known, names, rows)
+
+
+def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
+    """Read columns of a Parquet file; see `read_columns`. Needs pyarrow."""
+    try:
+        import pyarrow
+        import pyarrow.parquet as parquet
+    except ImportError as error:
+        mend = "pip install pyarrow, or export CSV"
+        raise InputError("Parquet needs pyarrow", where=str(path), mend=mend) from error
+    try:
+        known: dict[str, Any] = dict.fromkeys(parquet.read_schema(path).names)
+        wanted = [name for name in names if name in known]
+        table = parquet.read_table(path, columns=wanted)
+        known.update({name: table[name].to_numpy() for name in wanted})
+    except pyarrow.ArrowException as error:
+        mend = "is it a Parquet file? export it again"
+        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error
+    return _pick(path, known, names, rows)
+
+
+def _base(name: str, known: Mapping[str, Any] | list[str]) -> str:
+    """The variable that a name like `pos[2]` belongs to; a literal `pos[2]` comes first."""
+    match = _INDEXED.match(name)
+    return match[1] if match and name not in known else name
+
+
+def _pick(path: Path, known: Mapping[str, Any], names: list[str], rows: Rows | None) -> Columns:
+    """Take the named columns out of arrays and cut the rows.
+
+    Args:
+        path: The file, for messages.
+        known: All variables; those not asked for may be None.
+        names: What is wanted.
+        rows: 0-based, half open; None is all.
+    """
+    columns = {name: _column(path, known, name) for name in names}
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"'{name}' {count}" for name, count in lengths.items())
+        mend = "columns of one log have one length"
+        raise InputError(f"unequal lengths: {told}", where=str(path), mend=mend)
+    count = next(iter(lengths.values()), 0)
+    if names and not count:
+        raise InputError("is empty", where=str(path), mend="export the log again")
+    first, end = resolve_rows(rows, count, path)
+    return {name: values[first:end] for name, values in columns.items()}, (first, end)
+
+
+def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray, "samples _"]:
+    base = _base(name, known)
+    if base not in known:
+        mend = suggest(base, known)
+        raise InputError(f"has no variable '{name}'", where=str(path), mend=mend)
+    values = np.asarray(known[base])
+    where = f"{path}, variable '{base}'"
+    if values.dtype.kind not in "fiub":
+        mend = "save it as a plain array of real numbers"
+        raise InputError(f"is not numeric ({values.dtype})", where=where, mend=mend)
+    if values.ndim > 2:
+        raise InputError(f"has {values.ndim} dimensions", where=where, mend="save a matrix")
+    values = np.atleast_1d(values).astype(np.float64)
+    values = values[:, None] if values.ndim == 1 else values
+    # A log has more samples than joints, so the longer side is time.
+    values = values.T if values.shape[0] < values.shape[1] else values
+    if base == name:
+        return values
+    index = int(name[len(base) + 1 : -1])
+    if not 1 <= index <= values.shape[1]:
+        mend = f"it has columns 1 to {values.shape[1]}"
+        raise InputError(f"has no column {index}", where=where, mend=mend)
+    return values[:, index - 1 : index]

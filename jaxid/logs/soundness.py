@@ -1,0 +1,164 @@
+"""Does a log make physical sense, before anything is fitted to it?
+
+`read_log` has refused what cannot be read; here stand the faults that are perfectly
+readable numbers: a machine at rest, a command at its limit, the wrong unit.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.logs.finding import Finding
+from jaxid.logs.log import Log
+from jaxid.logs.units_check import ByJoint, magnitude_findings, plausible_inertia, ratio_findings
+
+__all__ = ["Finding", "check_log", "plausible_inertia", "raise_on_error"]
+
+# Chosen: with fewer levels than this over the whole stroke, an acceleration is made of steps.
+_COARSE_LEVELS = 500
+# A position of fewer values is no movement.
+FEWEST_LEVELS = 5
+# Of all rows; a command that is longer at its limit than not says little about the force.
+_SATURATED = 0.5
+_OFTEN_SATURATED = 0.05
+
+
+def check_log(
+    log: Log,
+    *,
+    command_limit: ByJoint | None = None,
+    motion: str = "linear",
+    units: dict[str, str] | None = None,
+    path: str | Path | None = None,
+    driven: Sequence[int] | np.ndarray | None = None,
+    fewest_levels: int = FEWEST_LEVELS,
+    resolution_stated: bool = False,
+) -> list[Finding]:
+    """Look for the faults of a readable log.
+
+    Args:
+        log: The log.
+        command_limit: Known saturation of the logged command, in its unit; a list by channel.
+        motion: "linear" (m) or "rotary" (rad).
+        units: Labels of the case where the quantities are not mechanical; a foreign
+            position unit leaves out the checks that need metres or radians.
+        path: Name of the log in messages; its source where absent.
+        driven: Joints with a drive, 0-based, in the order of the drives; None: the first ones.
+        fewest_levels: A position of fewer values is no movement.
+        resolution_stated: Whether the case says in what steps the position comes.
+
+    Returns:
+        What was found; empty for a sound log.
+    """
+    where = str(path or log.source)
+    findings = [*_movement(log, where, fewest_levels, resolution_stated), *_force(log, command_limit, where)]
+    still = any(finding.severity == "error" for finding in findings)
+    if not still:
+        findings += ratio_findings(log, motion, where, driven)
+        label = (units or {}).get("position", "m")
+        if label in ("m", "rad"):
+            findings += magnitude_findings(log, motion, where)
+    return findings
+
+
+def raise_on_error(findings: Iterable[Finding]) -> None:
+    """Refuse a log in which an error was found.
+
+    Args:
+        findings: What `check_log` returned.
+
+    Raises:
+        InputError: For the first error; the number of further ones is told.
+    """
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if errors:
+        first, others = errors[0], len(errors) - 1
+        mend = first.mend + (f" (and {others} more error(s))" if others else "")
+        raise InputError(first.what, where=first.where, mend=mend)
+
+
+def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
+    """Joints that stand still, and positions that come in coarse steps."""
+    seen = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
+    reasons = [_stillness(q, fewest) for _, q in seen]
+    if all(reasons):
+        mend = "check that position names the right column and that the machine moved"
+        return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, position", mend)]
+    findings = []
+    for (joint, q), reason in zip(seen, reasons, strict=True):
+        where = f"{path}, position of joint {joint}"
+        levels, step = _levels(q)
+        if reason:
+            mend = "its parameters cannot be told from this log; check the column"
+            findings.append(Finding("warning", f"the joint does not move: {reason}", where, mend))
+        elif step and levels < _COARSE_LEVELS:
+            what = f"the position is quantised in steps of {step:.3g}: {levels} levels in all"
+            mend = "log a longer stroke or more digits"
+            mend += "" if stated else ", and give sensor.position_resolution"
+            findings.append(Finding("warning", what, where, mend))
+    return findings
+
+
+def _stillness(q: np.ndarray, fewest: int) -> str:
+    """Why this position is no movement; empty where it is one."""
+    if np.ptp(q) == 0:
+        return f"the position is {q[0]:.6g} throughout"
+    levels, step = _levels(q)
+    if levels < fewest:
+        return f"the position takes only {levels} values, {step:.3g} apart"
+    centred = q - q.mean()
+    lags = range(1, min(20, q.size // 4) + 1)
+    similar = [abs(centred[lag:] @ centred[:-lag]) / (centred @ centred) for lag in lags]
+    # Any motion that the sampling resolves looks like itself a sample later; noise does not.
+    if max(similar) < max(0.1, 4.0 / np.sqrt(q.size)):
+        return f"the position is noise of {q.std():.3g} (standard deviation)"
+    return ""
+
+
+def _levels(q: np.ndarray) -> tuple[int, float]:
+    """Number of distinct positions, and their spacing; spacing 0 where they lie on no grid."""
+    levels = np.unique(q)
+    gaps = np.diff(levels)
+    # Equal levels may differ in their last bits after a conversion of units.
+    gaps = gaps[gaps > 1e-9 * np.ptp(q)] if gaps.size else gaps
+    if not gaps.size:
+        return 1, 0.0
+    multiples = gaps / gaps.min()
+    on_grid = np.mean(np.abs(multiples - np.round(multiples)) < 0.05) > 0.99
+    return gaps.size + 1, float(gaps.min()) if on_grid else 0.0
+
+
+def _force(log: Log, limit: ByJoint | None, path: str) -> list[Finding]:
+    """Commands that are constant, or sit at their limit."""
+    channels = log.force.T
+    constant = np.ptp(log.force, axis=0) == 0
+    if constant.all():
+        level = "zero" if not log.force.any() else f"constant ({channels[0][0]:.6g})"
+        mend = "check that force names the right column; nothing can be learned without a change"
+        return [Finding("error", f"the force is {level} throughout", f"{path}, force", mend)]
+    limits = [None] * len(channels) if limit is None else np.broadcast_to(limit, len(channels))
+    findings = []
+    for k, (u, bound) in enumerate(zip(channels, limits, strict=True), start=1):
+        where = f"{path}, force {k}"
+        if constant[k - 1]:
+            mend = "check the column; this joint is driven by the others alone"
+            findings.append(Finding("warning", f"constant at {u[0]:.6g}", where, mend))
+        else:
+            findings += _saturation(u, bound, where)
+    return findings
+
+
+def _saturation(u: np.ndarray, bound: float | None, where: str) -> list[Finding]:
+    extreme = np.abs(u).max() if bound is None else bound
+    at_limit = np.abs(u) >= (1.0 - 1e-6) * extreme
+    share = float(at_limit.mean())
+    if share <= (_OFTEN_SATURATED if bound is not None else _SATURATED):
+        return []
+    what = f"the command is saturated: |u| = {extreme:.6g} in {100 * share:.0f} % of the rows"
+    mend = "log a gentler motion, or take other rows"
+    # A random binary excitation has two levels of both signs and is a sound experiment.
+    binary = bound is None and share > 0.98 and np.ptp(np.sign(u[at_limit])) == 2
+    severity = "error" if share > _SATURATED and not binary else "warning"
+    return [Finding(severity, what, where, mend)]

@@ -1,0 +1,245 @@
+"""Quantities that disagree by the factor of a usual slip of units.
+
+Everything is compared after the same running means on both sides, which leave a
+law between the two quantities as it was while they take noise away.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxid.logs.finding import Finding
+from jaxid.logs.log import Log
+from jaxid.logs.rough_inertia import correlation, implied_inertia, smooth, windows
+
+# One number for all joints or channels, or one each.
+ByJoint = float | int | Sequence[float | int] | np.ndarray
+_DEGREES = 180.0 / math.pi
+_RPM = 30.0 / math.pi
+# Chosen: two columns that correlate less are not the same quantity in two units.
+_ALIKE = 0.9
+
+
+@dataclass(frozen=True)
+class _Slip:
+    """A usual factor and what it says; `motion` where it belongs to one kind of axis."""
+
+    factor: float
+    text: str
+    motion: str = ""
+    severity: str = "error"
+
+    def matches(self, ratio: float, motion: str, spread: float) -> bool:
+        near = abs(math.log(ratio / self.factor)) < math.log(spread)
+        return near and self.motion in ("", motion)
+
+
+# Velocity column over the derivative of the position column.
+_VELOCITY = (
+    _Slip(1e3, "velocity looks like mm/s, or time like milliseconds", "linear"),
+    _Slip(1e3, "time looks like milliseconds, or velocity like mrad/s", "rotary"),
+    _Slip(1e6, "time looks like microseconds"),
+    _Slip(1e-3, "position looks like millimetres", "linear"),
+    _Slip(1e-3, "position looks like milliradians", "rotary"),
+    _Slip(1e-6, "position looks like micrometres", "linear"),
+    _Slip(_DEGREES, "velocity looks like degrees/s while position is in radians", "rotary"),
+    _Slip(1.0 / _DEGREES, "position looks like degrees", "rotary"),
+    _Slip(_RPM, "velocity looks like revolutions per minute", "rotary"),
+    _Slip(1.0 / (2.0 * math.pi), "velocity looks like revolutions per second", "rotary"),
+    _Slip(60.0, "velocity looks like a quantity per minute"),
+)
+# Reference over position.
+_REFERENCE = (
+    _Slip(1e3, "the reference looks like millimetres", "linear"),
+    _Slip(1e-3, "position looks like millimetres", "linear"),
+    _Slip(1e6, "the reference looks like micrometres", "linear"),
+    _Slip(1e-6, "position looks like micrometres", "linear"),
+    _Slip(_DEGREES, "the reference looks like degrees", "rotary"),
+    _Slip(1.0 / _DEGREES, "position looks like degrees", "rotary"),
+)
+# Inertia implied by the log over the guess of the case. A guess is often ten times
+# off, so a factor that only a poor guess could make as well is no more than a warning.
+_INERTIA = (
+    _Slip(1e-3, "position looks like millimetres, or force like kilonewtons", "linear"),
+    _Slip(1e-6, "position looks like micrometres", "linear"),
+    _Slip(1.0 / _DEGREES, "position looks like degrees", "rotary", "warning"),
+    _Slip(1e-3, "position looks like milliradians, or torque like kN m", "rotary"),
+    _Slip(1e3, "force looks like thousandths of its unit (mN, mV)", "", "warning"),
+    _Slip(1e6, "time looks like milliseconds"),
+    _Slip(1e12, "time looks like microseconds"),
+)
+
+
+def ratio_findings(
+    log: Log, motion: str, path: str, driven: Sequence[int] | np.ndarray | None = None
+) -> list[Finding]:
+    """Compare the columns for velocity and reference with the position.
+
+    Args:
+        log: The log.
+        motion: "linear" or "rotary".
+        path: Name of the log in messages.
+        driven: Joints with a drive, 0-based, in the order of the references; None: the first ones.
+    """
+    findings = []
+    references = 0 if log.reference is None else log.reference.shape[1]
+    followed = range(references) if driven is None else driven
+    reference_of = dict(zip(followed, range(references), strict=False))
+    for joint in range(log.position.shape[1]):
+        q = log.position[:, joint]
+        if np.ptp(q) == 0 or not log.measured[joint]:
+            continue
+        if log.velocity is not None:
+            where = f"{path}, velocity of joint {joint + 1}"
+            findings += _compare_velocity(log.velocity[:, joint], q, log.period, motion, where)
+        if joint in reference_of:
+            where = f"{path}, reference of joint {joint + 1}"
+            findings += _compare_reference(log.reference[:, reference_of[joint]], q, motion, where)
+    return findings
+
+
+def _compare_velocity(
+    velocity: np.ndarray, q: np.ndarray, period: float, motion: str, where: str
+) -> list[Finding]:
+    slope = (q[2:] - q[:-2]) / (2.0 * period)
+    pairs = [(smooth(velocity[1:-1], w), smooth(slope, w)) for w in windows(q.size)]
+    measured, derived = max(pairs, key=lambda pair: abs(correlation(*pair)))
+    alike = correlation(measured, derived)
+    if abs(alike) < _ALIKE:
+        what = f"velocity is not the derivative of position (correlation {alike:.2f})"
+        mend = "check that velocity names the right column, or leave it out"
+        return [Finding("warning", what, where, mend)]
+    if alike < 0:
+        what = "velocity has the opposite sign of the derivative of position"
+        return [Finding("error", what, where, "turn the sign of one of them, or leave it out")]
+    ratio = float(measured.std() / derived.std())
+    return _judge(ratio, _VELOCITY, motion, "velocity is {:.4g} times the derivative", where)
+
+
+def _compare_reference(r: np.ndarray, q: np.ndarray, motion: str, where: str) -> list[Finding]:
+    if np.ptp(r) == 0 or abs(correlation(r, q)) < _ALIKE:
+        # A loop may be loose, or the reference constant: no ground for a verdict.
+        return []
+    ratio = float(r.std() / q.std())
+    return _judge(ratio, _REFERENCE, motion, "the reference is {:.4g} times the position", where)
+
+
+def _judge(
+    ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: str
+) -> list[Finding]:
+    """An error where a usual slip explains the factor, a warning where none does."""
+    if 0.67 < ratio < 1.5:
+        return []
+    told = text.format(ratio)
+    for slip in slips:
+        if slip.matches(ratio, motion, 1.2):
+            mend = "bring all columns to SI units"
+            return [Finding("error", f"{told}: {slip.text}", where, mend)]
+    mend = "check the units of both columns"
+    return [Finding("warning", f"{told}, which should be 1", where, mend)]
+
+
+def magnitude_findings(log: Log, motion: str, path: str) -> list[Finding]:
+    """Strokes, speeds and sampling periods that no machine has.
+
+    Args:
+        log: The log, in mechanical units.
+        motion: "linear" (m) or "rotary" (rad).
+        path: Name of the log in messages.
+    """
+    findings = []
+    if log.period >= 0.5:
+        severity = "error" if log.period > 10.0 else "warning"
+        what = f"the sampling period is {log.period:.4g} s: time looks like milliseconds or rows"
+        findings.append(Finding(severity, what, f"{path}, time", "give time in seconds"))
+    for joint, q in enumerate(log.position.T, start=1):
+        if not log.measured[joint - 1]:
+            continue
+        where = f"{path}, position of joint {joint}"
+        span = float(np.ptp(q))
+        if span >= 100 and np.all(q == np.round(q)):
+            what = f"position holds whole numbers only, {span:.0f} in all: encoder counts?"
+            mend = "convert position to " + ("m" if motion == "linear" else "rad")
+            findings.append(Finding("error", what, where, mend))
+        elif finding := _magnitude(q, log.period, motion, where):
+            findings.append(finding)
+    return findings
+
+
+def _magnitude(q: np.ndarray, period: float, motion: str, where: str) -> Finding | None:
+    span = float(np.ptp(q))
+    # Over at least ten samples, so that a coarse encoder makes no speed of its own.
+    lag = max(10, q.size // 1000)
+    speed = float(np.abs(q[lag:] - q[:-lag]).max() / (lag * period))
+    if motion == "linear":
+        # Chosen: no axis travels 50 m or runs at 100 m/s; metres written as mm do at once.
+        seen, limit, absurd = (span, 50.0, 1e4) if span > 50.0 else (speed, 100.0, 1e5)
+        told = f"a stroke of {span:.4g} m" if span > 50.0 else f"a speed of {speed:.4g} m/s"
+        unit, mend = "millimetres" if span < 1e4 else "micrometres", "convert position to m"
+    else:
+        # Chosen: 1e4 rad/s is 95 000 rpm.
+        seen, limit, absurd = speed, 1e4, 1e6
+        told, unit, mend = f"a speed of {speed:.4g} rad/s", "degrees", "convert position to rad"
+    if seen <= limit:
+        return None
+    severity = "error" if seen > absurd else "warning"
+    return Finding(severity, f"{told}: position looks like {unit}", where, mend)
+
+
+def plausible_inertia(
+    log: Log,
+    guess: ByJoint,
+    gain: ByJoint = 1.0,
+    *,
+    motion: str = "linear",
+    driven: Sequence[int] | np.ndarray | None = None,
+) -> Finding | None:
+    """Compare the inertia that the log implies with the guess, by its order of magnitude.
+
+    Only where the two differ by the factor of a usual slip of units is anything said; a
+    guess may be poor.
+
+    Args:
+        log: The log.
+        guess: Inertia by joint [kg or kg m^2].
+        gain: Force per unit of the logged command, by drive.
+        motion: "linear" or "rotary".
+        driven: Joint of each drive, 0-based; absent: all, in their order.
+
+    Returns:
+        The first joint's finding, or None where nothing speaks against the units.
+        None too where it is not told which joints have a force of their own.
+    """
+    joints = log.position.shape[1]
+    driven = np.arange(joints) if driven is None else driven
+    if log.force.shape[1] != len(driven):
+        return None
+    guesses = np.broadcast_to(np.asarray(guess, dtype=np.float64), joints)
+    forces = log.force * np.asarray(gain, dtype=np.float64)
+    for force, joint in zip(forces.T, driven, strict=True):
+        others = np.delete(log.position, [joint, *np.flatnonzero(~np.array(log.measured))], axis=1)
+        rough = implied_inertia(force, log.position[:, joint], log.period, others)
+        where = f"{log.source}, joint {joint + 1}"
+        span = float(np.ptp(log.position[:, joint]))
+        finding = _judge_inertia(rough, float(guesses[joint]), span, motion, where)
+        if finding is not None:
+            return finding
+    return None
+
+
+def _judge_inertia(
+    rough: float | None, guess: float, span: float, motion: str, where: str
+) -> Finding | None:
+    if rough is None or guess <= 0:
+        return None
+    for slip in _INERTIA:
+        spread = 2.0 if slip.severity == "warning" else 5.0
+        if slip.matches(rough / guess, motion, spread):
+            what = f"the log implies an inertia of about {rough:.2g}, the guess is {guess:.3g}"
+            mend = "bring the log to SI units, check actuator.gain, or mend the guess"
+            # A guess may be 57 times off; an angle of more than 20 makes it degrees.
+            sure = slip.severity == "error" or (slip.motion == "rotary" and span > 20.0)
+            return Finding("error" if sure else "warning", f"{what}: {slip.text}", where, mend)
+    return None

@@ -1,0 +1,77 @@
+"""Effects of one kind on several joints, traced and compiled as one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+if TYPE_CHECKING:
+    from jaxid.model.plant import Action, Effect, Signals
+
+
+def alike(effects: Sequence[Effect], drives: Sequence[int | None]) -> list[list[int]]:
+    """Indices of effects in runs of one kind, no two of a run on one port or one drive.
+
+    Args:
+        effects: In the order of the drive, which the runs keep.
+        drives: Drive of each; None where it has none.
+    """
+    runs: list[list[int]] = []
+    for k, e in enumerate(effects):
+        last = runs[-1] if runs else []
+        apart = all(e.port != effects[i].port for i in last)
+        alone = drives[k] is None or all(drives[k] != drives[i] for i in last)
+        if last and apart and alone and _same(effects[last[0]], e):
+            last.append(k)
+        else:
+            runs.append([k])
+    return runs
+
+
+def _same(one: Effect, two: Effect) -> bool:
+    """Whether two effects differ in nothing but port and values."""
+    if type(one) is not type(two):
+        return False
+    for f in fields(one):
+        a, b = getattr(one, f.name), getattr(two, f.name)
+        if f.metadata.get("static"):
+            if f.name != "port" and a != b:
+                return False
+        elif jax.tree.structure(a) != jax.tree.structure(b):
+            return False
+    return True
+
+
+def acted(effects: list[Effect], signals: list[Signals], states: list) -> list[Action]:
+    """What the effects of a run do; several are traced as one.
+
+    Args:
+        effects: Of one kind.
+        signals: What each may look at.
+        states: Own state of each; None where the kind has none.
+    """
+    if len(effects) == 1:
+        return [effects[0].act(signals[0], states[0])]
+    treedef = jax.tree.structure(effects[0])
+    left_out: list[Any] = []
+
+    def act(leaves: list[Array], x: Signals, state: Array | None) -> Action:
+        action = jax.tree.unflatten(treedef, leaves).act(x, state)
+        # What is left out stays a plain number, by which a balance knows that nothing is there.
+        arrays, numbers = eqx.partition(action, eqx.is_array)
+        left_out.append(numbers)
+        return arrays
+
+    leaves = [jnp.stack(column) for column in zip(*map(jax.tree.leaves, effects), strict=True)]
+    together = [jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (signals, states)]
+    found = jax.vmap(act)(leaves, *together)
+    return [
+        eqx.combine(jax.tree.map(lambda a, k=k: a[k], found), left_out[-1])
+        for k in range(len(effects))
+    ]

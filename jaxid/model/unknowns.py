@@ -1,0 +1,219 @@
+"""Which leaves of a plant are unknown, and how a vector of them goes in and comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxid.model.plant import Effect, Plant, parameters_of
+from jaxid.model.units import Units
+
+# Lower bound of what must be positive, relative to its guess: keeps a solver off zero, far below
+# anything that a log can tell.
+_POSITIVE_FLOOR = 1e-9
+# First step of the path of what is unknown of a reference, and of no plant.
+REFERENCE = "reference"
+
+
+@dataclass(frozen=True)
+class Free:
+    """One unknown number.
+
+    Args:
+        name: As in results: `inertia`, `viscous_friction.coefficient`.
+        path: Attributes and indices from the plant to the leaf.
+        unit: Label.
+        sign: "free", "nonnegative" or "positive".
+        guess: Where a fit starts.
+        lower, upper: Bounds.
+        index: Entry of the leaf, where the leaf is a list; row and entry, of a list of lists.
+        true: Value for simulation and studies, where it differs from the guess.
+    """
+
+    name: str
+    path: tuple[str | int, ...]
+    unit: str
+    sign: str
+    guess: float
+    lower: float = -np.inf
+    upper: float = np.inf
+    index: int | tuple[int, int] | None = None
+    true: float | None = None
+
+    def get(self, plant: Plant) -> Array:
+        """The leaf that holds this unknown."""
+        return leaf(plant, self.path)
+
+
+@dataclass(frozen=True)
+class Body:
+    """Unknowns that are the ten parameters of a body, and are fitted as such.
+
+    Args:
+        places: Of each among the unknowns, in the order of `jaxid.arms.pseudo_inertia.TEN`.
+        lower, upper: Bounds on the coordinates of `jaxid.arms.pseudo_inertia.log_cholesky`.
+    """
+
+    places: tuple[int, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The unknowns of a plant, in a fixed order: one scatter, one gather.
+
+    Args:
+        free: The unknowns.
+        bodies: Those of them that must be what bodies can have.
+    """
+
+    free: tuple[Free, ...]
+    bodies: tuple[Body, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each unknown."""
+        return [f.name for f in self.free]
+
+    @property
+    def guess(self) -> Float[np.ndarray, " p"]:
+        """Where a fit starts."""
+        return np.asarray([f.guess for f in self.free], dtype=np.float64)
+
+    @property
+    def bounds(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+        """Lower and upper bounds: the user's, and what the signs demand."""
+        lower = [max(f.lower, _sign_floor(f)) for f in self.free]
+        upper = [f.upper for f in self.free]
+        return np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+
+    def insert(self, plant: Plant, theta: Float[Array, " p"]) -> Plant:
+        """The plant with the unknowns set."""
+        return scatter(self.places, plant, theta)
+
+    @property
+    def places(self) -> tuple[tuple[tuple[str | int, ...], int | tuple[int, int] | None], ...]:
+        """Path and index of each unknown: hashable, so that compiled code can depend on it."""
+        return tuple((f.path, f.index) for f in self.free)
+
+    def extract(self, plant: Plant) -> Float[Array, " p"]:
+        """The unknowns' values in a plant."""
+        values = [f.get(plant) if f.index is None else f.get(plant)[f.index] for f in self.free]
+        return jnp.asarray(values, dtype=jnp.float64)
+
+    def with_guess(self, theta: Sequence[float]) -> Parameters:
+        """The same unknowns, starting elsewhere."""
+        free = tuple(replace(f, guess=float(v)) for f, v in zip(self.free, theta, strict=True))
+        return Parameters(free, self.bodies)
+
+    def extended(self, more: Sequence[Free]) -> Parameters:
+        """These unknowns and more."""
+        return Parameters((*self.free, *more), self.bodies)
+
+
+def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
+    """The leaf at the end of a path of attributes and indices."""
+    node = plant
+    for step in path:
+        node = node[step] if isinstance(step, int) else getattr(node, step)
+    return node
+
+
+def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
+    """The plant with theta[k] at places[k], each a path and, where the leaf is a list, an index.
+
+    What is unknown of a reference stands in no plant, and is passed over.
+    """
+    leaves, structure = jax.tree.flatten(plant)
+    numbers = jax.tree.unflatten(structure, range(len(leaves)))
+    for k, (path, index) in enumerate(places):
+        if path[0] == REFERENCE:
+            continue
+        at, value = leaf(numbers, path), theta[k]
+        if isinstance(theta, np.ndarray):
+            # Each array that JAX makes outside compiled code takes longer than all else here.
+            leaves[at] = np.asarray(value) if index is None else _with_entry(leaves[at], index, value)
+        else:
+            leaves[at] = value if index is None else jnp.asarray(leaves[at]).at[index].set(value)
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _with_entry(values: Array, index: int | tuple[int, int], value: float) -> np.ndarray:
+    out = np.array(values)
+    out[index] = value
+    return out
+
+
+def _sign_floor(f: Free) -> float:
+    if f.sign == "free":
+        return -np.inf
+    return 0.0 if f.sign == "nonnegative" else _POSITIVE_FLOOR * abs(f.guess)
+
+
+def colours(enters: Bool[np.ndarray, "n p"]) -> tuple[int, ...]:
+    """A number for each unknown, such that no two of one number stand in one balance.
+
+    Each takes the first that is free in all balances in which it stands.
+    """
+    taken: list[np.ndarray] = []
+    out = []
+    for rows in enters.T:
+        k = next((k for k, t in enumerate(taken) if not np.any(t & rows)), len(taken))
+        if k == len(taken):
+            taken.append(np.zeros_like(rows))
+        taken[k] = taken[k] | rows
+        out.append(k)
+    return tuple(out)
+
+
+def seeds(colours: tuple[int, ...]) -> Float[np.ndarray, "p c"]:
+    """Directions in which a derivative is taken, one a colour."""
+    out = np.zeros((len(colours), max(colours, default=-1) + 1))
+    out[np.arange(len(colours)), list(colours)] = 1.0
+    return out
+
+
+def free_effect(
+    plant: Plant, effect: Effect, units: Units, name: str | None = None
+) -> tuple[Plant, list[Free]]:
+    """Add an effect to a plant with all its parameters unknown, starting from their values."""
+    name = name or effect_name(plant, effect)
+    added = plant.with_effect(effect)
+    position = len(plant.effects)
+    free = [
+        Free(
+            name=f"{name}.{field}",
+            path=("effects", position, field),
+            unit=units.label(info.dimension, plant.motion(effect.port)),
+            sign=info.sign,
+            guess=float(getattr(effect, field)),
+        )
+        for field, info in parameters_of(type(effect)).items()
+        if getattr(effect, field) is not None
+    ]
+    return added, free
+
+
+def effect_name(plant: Plant, effect: Effect) -> str:
+    """Key of an effect in results: kind and place, numbered where the plant already has one there."""
+    same = sum(e.kind == effect.kind and e.port == effect.port for e in plant.effects)
+    return label(plant, effect.kind, effect.port) + ("" if same == 0 else f"#{same + 1}")
+
+
+def label(plant: Plant, kind: str, port: int) -> str:
+    """A kind with its place, which on a machine of one joint says nothing: `cogging[2]`, `[spring 3]`."""
+    if not several_places(plant):
+        return kind
+    what, k = plant.place(port)
+    return f"{kind}[{k}]" if what == "joint" else f"{kind}[{what} {k}]"
+
+
+def several_places(plant: Plant) -> bool:
+    """Whether effects need a place to be told apart."""
+    return plant.parts(plant.joints) + plant.springs(plant.joints) > 1

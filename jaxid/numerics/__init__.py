@@ -1,0 +1,1 @@
+"""Numerical tools that know no machine: smooth functions, filters, precision, batched calls."""

@@ -1,0 +1,56 @@
+"""A reference of which some numbers are unknown: what a loop followed when nobody logged it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxid.model.unknowns import REFERENCE
+from jaxid.references import REFERENCES
+
+
+class Course(eqx.Module):
+    """A family of references at its numbers, some of them unknown.
+
+    Args:
+        numbers: Values of the unknowns.
+        time: Instants from the start of the log [s].
+        names: Of the unknowns.
+        kind: Of the family.
+        known: Its other values.
+    """
+
+    numbers: Float[Array, " k"]
+    time: Float[Array, " ticks"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    known: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, table: Mapping[str, Any], unknown: Mapping[str, float]) -> Course:
+        """Of a table of a case, and values for what it leaves unknown."""
+        family = REFERENCES[table["kind"]]
+        (values,) = family.read({**table, **unknown}, f"[{REFERENCE}]")
+        lists = {k: tuple(v.tolist()) for k, v in values.items() if family.keys[k].shape == "list"}
+        numbers = jnp.asarray(list(unknown.values()), dtype=jnp.float64)
+        rest = tuple((k, v) for k, v in (values | lists).items() if k not in unknown)
+        return cls(numbers, jnp.zeros(1), tuple(unknown), family.kind, rest)
+
+    def at(self, time: Float[Array, " ticks"]) -> Course:
+        """The same reference at other instants."""
+        return replace(self, time=jnp.asarray(time))
+
+    def with_unknowns(self, places: tuple, theta: Float[Array, " p"]) -> Course:
+        """The same reference with theta[k] where places[k] is one of its unknowns."""
+        own = [k for k, (path, _) in enumerate(places) if path[0] == REFERENCE]
+        return replace(self, numbers=jnp.stack([jnp.asarray(theta[k]) for k in own])) if own else self
+
+    def __call__(self) -> Float[Array, "ticks 1"]:
+        """The position of the one drive at its instants [m or rad]."""
+        values = dict(self.known) | dict(zip(self.names, self.numbers, strict=True))
+        return REFERENCES[self.kind].follow(values, self.time)[:, None]

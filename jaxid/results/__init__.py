@@ -1,0 +1,1 @@
+"""Results as JSON, as text, and as report pages."""

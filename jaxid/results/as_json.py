@@ -1,0 +1,319 @@
+"""The JSON results and the tables that commands print."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxid.files import ready_folder, write_json, write_whole
+from jaxid.model.unknowns import leaf, several_places
+from jaxid.results.proposals import proposal_json, signal_csv
+
+if TYPE_CHECKING:
+    from jaxid.commands.identify import Gap, Identification
+    from jaxid.discovery.candidates import Candidate
+    from jaxid.discovery.result import Discovery, Found
+    from jaxid.discovery.screen import Score
+    from jaxid.estimators.common.derived import Derived
+    from jaxid.estimators.estimate import Estimate
+    from jaxid.model.plant import Plant
+    from jaxid.session import Session
+
+
+def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """Value, standard deviation, unit and identifiability by name; plant lists as lists."""
+    out: dict[str, Any] = {}
+    plant = estimate.machine.plant
+    rows = zip(
+        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        strict=True,
+    )
+    for f, value, std, told in rows:
+        if names is not None and f.name not in names:
+            continue
+        entry = {
+            "value": float(value) if told else None, "std": float(std) if told else None,
+            "unit": f.unit, "identifiable": bool(told),
+        }
+        if f.index is None:
+            out[f.name] = entry
+            continue
+        listed = out.setdefault(f.name.partition("[")[0], _known(leaf(plant, f.path), f.unit))
+        for key in ("value", "std", "identifiable"):
+            *row, at = np.atleast_1d(f.index)
+            (listed[key][row[0]] if row else listed[key])[at] = entry[key]
+    return out
+
+
+def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
+    """A list of the plant's before its unknown entries are filled in."""
+    known = np.asarray(values, float)
+    std, told = np.full(known.shape, None), np.full(known.shape, True)
+    return {"value": known.tolist(), "std": std.tolist(), "unit": unit, "identifiable": told.tolist()}
+
+
+def _one(x: np.ndarray | None) -> Any:
+    """A number where there is one joint, a list where there are several."""
+    if x is None:
+        return None
+    x = np.atleast_1d(x)
+    return float(x[0]) if x.size == 1 else [float(v) for v in x]
+
+
+def _worst(gaps: Sequence[Gap], pick: str) -> Any:
+    values = [_pick(g, pick) for g in gaps]
+    values = [v for v in values if v is not None]
+    return _one(np.max(values, axis=0)) if values else None
+
+
+def _pick(gap: Gap, what: str) -> np.ndarray | None:
+    domain, _, field = what.partition(".")
+    part = gap.force if domain == "force" else gap.simulation
+    return None if part is None else getattr(part, field)
+
+
+def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[str, Any]:
+    """The `gap` object of result.json."""
+    fit, others = gaps[0], gaps[1:]
+    units = session.machine.units
+    out: dict[str, Any] = {
+        "unit": units.label("force"),
+        "band_hz": session.recipe.band_hz(session.fit.log.rate_hz),
+        "fit": _one(fit.force.rms),
+        "validation": _worst(others, "force.rms"),
+        "noise_floor": _one(floor),
+        "relative": {
+            "fit": _one(fit.force.relative), "validation": _worst(others, "force.relative")
+        },
+        "simulation": {
+            "unit": units.label("position"),
+            "fit": _one(_pick(fit, "simulation.rms")),
+            "validation": _worst(others, "simulation.rms"),
+            "relative": {
+                "fit": _one(_pick(fit, "simulation.relative")),
+                "validation": _worst(others, "simulation.relative"),
+            },
+            "command_relative": {
+                "fit": _one(_pick(fit, "simulation.command_relative")),
+                "validation": _worst(others, "simulation.command_relative"),
+            },
+        },
+    }
+    if len(others) > 1:
+        out["validations"] = {
+            g.name: {
+                "force": _one(g.force.rms), "relative": _one(g.force.relative),
+                "simulation": _one(_pick(g, "simulation.rms")),
+                "simulation_relative": _one(_pick(g, "simulation.relative")),
+            }
+            for g in others
+        }
+    return out
+
+
+def derived(session: Session, estimate: Estimate) -> list[Derived]:
+    """Natural frequency; friction in its other form where the case states the gravity that it refers to."""
+    from jaxid.estimators.common.derived import dry_friction, natural_frequency
+
+    friction = [] if session.case.plant.gravity is None else dry_friction(estimate)
+    return [*natural_frequency(estimate), *friction]
+
+
+def derived_json(session: Session, estimate: Estimate) -> dict[str, Any]:
+    """The `derived` object of results; nothing where there is none."""
+    told = [d for d in derived(session, estimate) if np.isfinite(d.std)]
+    follows = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in told}
+    return {"derived": follows} if follows else {}
+
+
+def identification_json(result: Identification) -> dict[str, Any]:
+    """Content of result.json."""
+    estimate = result.estimate
+    return {
+        "method": estimate.method,
+        "converged": estimate.converged,
+        "message": estimate.message,
+        "samples": estimate.samples,
+        "parameters": parameters_json(estimate),
+        **derived_json(result.session, estimate),
+        "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
+        **estimate.details,
+        "gap": gap_json(result.session, result.gaps, result.noise_floor),
+        "preprocess": recipe_json(result.session),
+        "notes": notes(result.session, estimate),
+    }
+
+
+def recipe_json(session: Session) -> dict[str, Any]:
+    """How the logs were filtered, chosen or stated."""
+    r = session.recipe
+    stated = {"median": r.median} if r.median else {}
+    if r.derivatives == "parabolic":
+        stated["reach"] = r.reach
+    return {
+        "cutoff_hz": r.cutoff_hz, "order": r.order, "decimation": r.decimation, "trim": r.trim,
+        "rest_velocity": list(r.rest_velocity), "align_hold": r.align_hold,
+        "derivatives": r.derivatives, **stated,
+    }
+
+
+def notes(session: Session, estimate: Estimate) -> list[str]:
+    """What a reader should know: warnings on the logs, and how the fit was done."""
+    warnings = [f"{f.where}: {f.what}; {f.mend}" for f in session.findings]
+    return [*warnings, *estimate.notes]
+
+
+def effect_json(found: Found, estimate: Estimate) -> dict[str, Any]:
+    """One entry of `effects` in discovery.json."""
+    own = parameters_json(estimate, found.names)
+    return {
+        "kind": found.kind,
+        found.place[0]: found.place[1],
+        "parameters": {name.rpartition(".")[2]: entry for name, entry in own.items()},
+        "evidence": found.score.evidence,
+        "alternatives": [_alternative(s, estimate.machine.plant) for s in found.alternatives],
+    }
+
+
+def _alternative(score: Score, plant: Plant) -> dict[str, Any]:
+    c = score.candidate
+    return {"kind": c.kind, **_place(c, plant), "evidence": score.evidence}
+
+
+def _place(c: Candidate, plant: Plant) -> dict[str, int]:
+    """Joint or spring of a candidate, where the machine has several."""
+    return dict([plant.place(c.port)]) if several_places(plant) else {}
+
+
+def where_json(result: Discovery) -> dict[str, Any] | None:
+    """The `where` object of discovery.json."""
+    w = result.where
+    if w is None:
+        return None
+    return {
+        "joint": w.joint, "variable": w.variable, "region": list(w.region),
+        "intervals": [list(i) for i in w.intervals], "text": w.text,
+        "frequency_hz": w.frequency_hz,
+    }
+
+
+def discovery_json(result: Discovery) -> dict[str, Any]:
+    """Content of discovery.json."""
+    own = result.session.machine.parameters.names
+    before, after = result.gaps_before, result.gaps_after
+    on = "validation" if len(after) > 1 else "fit"
+    judged = slice(1, None) if len(after) > 1 else slice(0, 1)
+    units = result.session.machine.units
+    return {
+        "verdict": result.verdict,
+        "converged": result.converged,
+        "where": where_json(result),
+        "effects": [effect_json(e, result.after) for e in result.effects],
+        "experiments": [proposal_json(p, units) for p in result.proposals],
+        "steps": [
+            step_json(r, result.session.machine.plant) for k, r in enumerate(result.rounds)
+            # The baseline, and what changed it; the last round mostly adds nothing.
+            if k == 0 or r.step.added or r.step.dropped
+        ],
+        "gap": {
+            "unit": units.label("force"),
+            "band_hz": result.session.recipe.band_hz(result.session.fit.log.rate_hz),
+            "before": _worst(before[judged], "force.rms"),
+            "after": _worst(after[judged], "force.rms"),
+            "noise_floor": _one(result.noise_floor),
+            "on": on,
+            "relative": {
+                "before": _worst(before[judged], "force.relative"),
+                "after": _worst(after[judged], "force.relative"),
+            },
+            "simulation": {
+                "unit": units.label("position"),
+                "before": _worst(before[judged], "simulation.rms"),
+                "after": _worst(after[judged], "simulation.rms"),
+            },
+        },
+        "parameters": {
+            k: v for k, v in parameters_json(result.after).items()
+            if any(n == k or n.startswith(f"{k}[") for n in own)
+        },
+        **derived_json(result.session, result.after),
+        "unidentifiable": [{"combination": c} for c in result.after.precision.unidentifiable],
+        "fit_gap": gap_json(result.session, after, result.noise_floor),
+        "method": result.after.method,
+        "preprocess": recipe_json(result.session),
+        "notes": [*notes(result.session, result.after), *turned_down(result)],
+    }
+
+
+def turned_down(result: Discovery, most: int = 3) -> list[str]:
+    """Why effects were taken out again, and why the best of what the last round left were not added."""
+    if not result.rounds:
+        return []
+    present = {e.kind for e in result.session.machine.plant.effects}
+    steps = [r.step for r in result.rounds]
+    lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.why]
+    if "static_friction" not in present and result.unseen:
+        lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
+    session = result.session
+    loop = session.machine.controller is not None and session.fit.log.reference is not None
+    if result.verdict == "unexplained" and loop and "prior" not in session.case.output_error:
+        # Force rows hold no sample at rest, and what depends on whether speed grows is blurred in them.
+        lines.append(
+            "what acts at rest, or where speed stands still, may show in the simulated loop: state "
+            "`[output_error] prior`, how far off the guesses may be, and effects are looked for there"
+        )
+    last = [s for s in steps if s.added is None and s.dropped is None][-1]
+    left = [s for s in last.scores if s.reason and s.evidence > last.threshold]
+    for score in left[:most]:
+        name, nats = score.candidate.label, score.evidence
+        lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
+    if session.machine.plant.coupled and not result.proposals:
+        tied = [e.label for e in result.effects if e.alternatives]
+        told = f"no experiment was designed that tells {', '.join(tied)} from rivals"
+        lines += [f"{told}: --experiments does, in minutes"] if tied else []
+    return lines
+
+
+def step_json(r: Any, plant: Plant) -> dict[str, Any]:
+    """One entry of `steps`: what was added (or dropped), where, and the gap after it."""
+    step = r.step
+    changed = step.added.candidate if step.added else step.dropped
+    out = {
+        "added": step.added.candidate.kind if step.added else None,
+        **(_place(changed, plant) if changed else {}),
+        "fit": _one(r.fit), "validation": _one(r.validation),
+    }
+    if step.dropped is not None:
+        out["dropped"] = step.dropped.kind
+    return out
+
+
+def save_identification(result: Identification, folder: Path, *, force: bool = False) -> Path:
+    """Write result.json and report.html."""
+    from jaxid.results.report.build import identification_report
+
+    ready_folder(folder, ["result.json", "report.html"], force=force)
+    write_whole(folder / "report.html", identification_report(result))
+    write_json(folder / "result.json", identification_json(result))
+    return folder
+
+
+def discovery_files(result: Discovery) -> list[str]:
+    """Names of what `save_discovery` writes."""
+    return ["discovery.json", "report.html", *[p.file for p in result.proposals if p.separates]]
+
+
+def save_discovery(result: Discovery, folder: Path, *, force: bool = False) -> Path:
+    """Write discovery.json, report.html and a CSV for every experiment that is proposed."""
+    from jaxid.results.report.build import discovery_report
+
+    ready_folder(folder, discovery_files(result), force=force)
+    for proposal in result.proposals:
+        if proposal.separates:
+            write_whole(folder / proposal.file, signal_csv(proposal.signal, proposal.time, proposal.values))
+    write_whole(folder / "report.html", discovery_report(result))
+    write_json(folder / "discovery.json", discovery_json(result))
+    return folder

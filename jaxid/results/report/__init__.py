@@ -1,0 +1,19 @@
+"""One HTML page that tells what was found, with its plots inside."""
+
+from typing import Any
+
+from jaxid.results.report.data import CandidateScore as CandidateScore
+from jaxid.results.report.data import LogView as LogView
+from jaxid.results.report.data import ParameterRow as ParameterRow
+from jaxid.results.report.data import ReportData as ReportData
+from jaxid.results.report.data import SearchStep as SearchStep
+from jaxid.results.report.data import WherePlot as WherePlot
+
+
+def __getattr__(name: str) -> Any:
+    """The page itself, which imports matplotlib, only where it is asked for."""
+    if name in ("render", "write_report"):
+        from jaxid.results.report import page
+
+        return getattr(page, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,234 @@
+"""From the results of identify and discover to a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.estimators.minimal.report import minimal_rows
+from jaxid.results import as_json as results
+from jaxid.results.proposals import sentence
+from jaxid.results.report.data import (
+    CandidateScore,
+    ExperimentView,
+    HistoryView,
+    LogView,
+    ParameterRow,
+    ReportData,
+    SearchStep,
+    WherePlot,
+)
+from jaxid.results.report.page import render
+
+if TYPE_CHECKING:
+    from jaxid.commands.identify import Gap, Identification
+    from jaxid.discovery.result import Discovery, Round
+    from jaxid.discovery.separating.propose import Proposal
+    from jaxid.estimators.estimate import Estimate
+    from jaxid.session import Run, Session
+
+
+def identification_report(result: Identification) -> str:
+    """The report of `identify`, as one page of HTML."""
+    content = results.identification_json(result)
+    session = result.session
+    rows, below = minimal_rows(content["minimal"]) if "minimal" in content else ((), ())
+    return render(
+        ReportData(
+            title=f"Identification of {session.case.path.stem}",
+            command="identify",
+            verdict=None,
+            summary_lines=(),
+            gap=content["gap"],
+            unidentifiable=tuple(content["unidentifiable"]),
+            views=_views(session, None, result.gaps, drives="directions" in content),
+            converged=result.converged,
+            within_prior=content if "directions" in content else None,
+            coefficients=tuple(rows),
+            statistics=tuple(below),
+            history=history_of(result.estimate),
+            **_common(session, result.estimate, content["notes"]),
+        )
+    )
+
+
+def discovery_report(result: Discovery) -> str:
+    """The report of `discover`, as one page of HTML."""
+    content = results.discovery_json(result)
+    session = result.session
+    before = result.gaps_before if result.effects else None
+    return render(
+        ReportData(
+            title=f"What is missing in {session.case.path.stem}",
+            command="discover",
+            verdict=result.verdict,
+            summary_lines=(),
+            gap=content["gap"],
+            unidentifiable=tuple(content["unidentifiable"]),
+            effects=tuple(content["effects"]),
+            where=content["where"],
+            steps=tuple(_step(r) for r in result.rounds),
+            where_plot=_where_plot(result),
+            experiments=tuple(_experiment(p, session) for p in result.proposals),
+            views=_views(session, before, result.gaps_after),
+            converged=result.converged,
+            **_common(session, result.after, content["notes"]),
+        )
+    )
+
+
+def views(result: Identification | Discovery) -> tuple[LogView, ...]:
+    """The logs of a result as the plots take them, for notebooks."""
+    if hasattr(result, "gaps"):
+        return _views(result.session, None, result.gaps)
+    return _views(result.session, result.gaps_before, result.gaps_after)
+
+
+def history_of(estimate: Estimate) -> HistoryView | None:
+    """How a recursive estimate went, for the report and for notebooks; None for any other."""
+    history = estimate.details.get("recursive", {}).get("history")
+    if history is None:
+        return None
+    free = estimate.machine.parameters.free
+    value, std = (np.stack([history[k][f.name] for f in free], axis=1) for k in ("value", "std"))
+    return HistoryView(
+        history["time"], [f.name for f in free], [f.unit for f in free], value, std, history["residual"]
+    )
+
+
+def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
+    return {
+        "case_name": session.case.path.name,
+        "log_name": Path(session.fit.log.source).name,
+        "parameters": _rows(estimate),
+        "derived": _derived(session, estimate),
+        "units": units_of(session),
+        "notes": tuple(notes),
+        "versions": {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")},
+    }
+
+
+def units_of(session: Session) -> dict[str, str]:
+    """Labels of position, velocity, force and time."""
+    units = session.machine.units
+    return {
+        "position": units.label("position"), "velocity": units.label("position/time"),
+        "force": units.label("force"), "time": "s",
+    }
+
+
+def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
+    rows = zip(
+        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        strict=True,
+    )
+    return tuple(
+        ParameterRow(
+            f.name, float(v) if told else None, float(s) if told else None, f.unit, bool(told)
+        )
+        for f, v, s, told in rows
+    )
+
+
+def _derived(session: Session, estimate: Estimate) -> tuple[ParameterRow, ...]:
+    """What follows from the parameters."""
+    told = [d for d in results.derived(session, estimate) if np.isfinite(d.std)]
+    return tuple(ParameterRow(d.name, d.value, d.std, d.unit) for d in told)
+
+
+def _views(
+    session: Session, before: Sequence[Gap] | None, after: Sequence[Gap], drives: bool = False
+) -> tuple[LogView, ...]:
+    """The logs, by joint; `drives`: with what their loops command."""
+    earlier = before or [None] * len(after)
+    joints = np.flatnonzero(session.fit.log.measured).tolist()
+    driven = _driven if drives else lambda *of: {}
+    return tuple(
+        replace(_view(run, old, new, joint, len(joints)), **driven(session, run, new, joint))
+        for run, old, new in zip(session.runs, earlier, after, strict=True)
+        for joint in joints
+    )
+
+
+def _driven(session: Session, run: Run, gap: Gap, joint: int) -> dict[str, np.ndarray]:
+    """Declared force of a joint's drive, logged and simulated; nothing where either is not there."""
+    gain = session.machine.gain
+    drive = session.machine.plant.drive_of(joint, gain.size)
+    if drive is None or gap.simulation is None or gap.simulation.command is None:
+        return {}
+    both = {"drive_measured": run.log.force, "drive_simulated": gap.simulation.command}
+    return {name: (command * gain)[:, drive] for name, command in both.items()}
+
+
+def _view(run: Run, before: Gap | None, after: Gap, joint: int, joints: int) -> LogView:
+    data, log = run.data, run.log
+    rows = data.moving[:, joint]
+    name = run.name if joints == 1 else f"{run.name}, joint {joint + 1}"
+
+    def simulated(gap: Gap | None) -> np.ndarray | None:
+        return None if gap is None or gap.simulation is None else gap.simulation.position[:, joint]
+
+    return LogView(
+        name=name,
+        joint=joint,
+        time=log.time,
+        position_measured=log.position[:, joint],
+        position_simulated_before=simulated(before),
+        position_simulated_after=simulated(after),
+        band_time=log.time[data.kept][rows],
+        velocity=data.at_kept(data.qd)[rows, joint],
+        position=data.at_kept(data.q)[rows, joint],
+        force_measured=after.force.measured[rows, joint],
+        residual_before=None if before is None else before.force.residual[rows, joint],
+        residual_after=after.force.residual[rows, joint],
+    )
+
+
+def _step(r: Round) -> SearchStep:
+    step = r.step
+    added = step.added.candidate if step.added else None
+    return SearchStep(
+        added=added.label if added else None,
+        dropped=step.dropped.label if step.dropped else None,
+        gap_fit=float(np.max(r.fit)),
+        gap_validation=None if r.validation is None else float(np.max(r.validation)),
+        candidates=tuple(
+            CandidateScore(s.candidate.label, s.evidence, s.candidate is added) for s in step.scores
+        ),
+        threshold=step.threshold,
+    )
+
+
+def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
+    units, limits = session.machine.units, proposal.limits
+    loop = proposal.signal == "reference"
+    driven = session.machine.plant.at_drives
+    # A command has no unit of its own where the gain turns it into a force.
+    own = np.all(session.machine.gain == 1.0)
+    ends = (driven(limits.low), driven(limits.high)) if loop else (-limits.force, limits.force)
+    return ExperimentView(
+        text=sentence(proposal, units),
+        signal=proposal.signal,
+        unit=units.label("position") if loop else units.label("force") if own else "command",
+        time=proposal.time,
+        values=proposal.values if proposal.separates else None,
+        limits=np.stack(ends, axis=1),
+        speed=driven(limits.speed) if loop else None,
+    )
+
+
+def _where_plot(result: Discovery) -> WherePlot | None:
+    w = result.where
+    if w is None:
+        return None
+    label = result.session.machine.units.label
+    unit = {
+        "velocity": label("position/time"), "position": label("position"),
+        "acceleration": label("position/time2"), "force": label("force"),
+    }.get(w.variable, label("position") if w.variable.startswith("elongation") else "s")
+    return WherePlot(w.variable, unit, w.x, w.mean, w.low, w.high)

@@ -1,0 +1,69 @@
+"""How a recursive estimate went: each parameter over time, with its standard deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxid.results.report.axes import FONT, TEXT, dress, time_label
+from jaxid.results.report.data import HistoryView
+from jaxid.results.report.numbers import pretty_unit, scaled_unit
+
+_VALUE = "#0072b2"
+_UNTOLD = "#8a8a8a"
+_RESIDUAL = "#d55e00"
+# Of the history, what sets the scale: the way in from the start may be much larger than all that follows.
+_SETTLED = 0.1
+_MARGIN = 0.15
+# Panels beside each other need so much width [in].
+_TWO = 8.0
+
+
+def plot_history(
+    view: HistoryView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 2.2)
+) -> Figure:
+    """Draw every parameter over time in a panel of its own, and the running residual in the last.
+
+    Args:
+        view: The history.
+        units: Labels of "time" and "force".
+        size: Width, and height of a row of panels at most [in].
+    """
+    columns = 2 if size[0] >= _TWO else 1
+    rows = -(-(len(view.names) + 1) // columns)
+    figure = Figure(figsize=(size[0], min(size[1], 2.2) * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    for k, (name, unit) in enumerate(zip(view.names, view.units, strict=True)):
+        axes[k].set_title(name, loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
+        _parameter(axes[k], view.time, view.value[:, k], view.std[:, k])
+        dress(axes[k], "", f"[{pretty_unit(unit)}]" if pretty_unit(unit) else "[1]")
+    last = axes[len(view.names)]
+    factor, unit = scaled_unit(units["force"], [view.residual])
+    last.set_title("running residual (RMS)", loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
+    last.plot(view.time, view.residual / factor, color=_RESIDUAL, lw=1.2)
+    last.set_ylim(bottom=0.0)
+    dress(last, "", f"[{unit}]")
+    for ax in axes[len(view.names) + 1 :]:
+        ax.set_visible(False)
+    for ax in axes[: len(view.names) + 1][-columns:]:
+        ax.set_xlabel(time_label(units), fontsize=FONT, color=TEXT)
+        ax.tick_params(labelbottom=True)
+    return figure
+
+
+def _parameter(ax: Axes, time: np.ndarray, value: np.ndarray, std: np.ndarray) -> None:
+    """A line, grey where nothing but the start tells the value, with a band of one standard deviation."""
+    told = np.isfinite(std)
+    ax.plot(time, value, color=_UNTOLD, lw=1.0, ls=(0, (4, 3)))
+    ax.plot(time, np.where(told, value, np.nan), color=_VALUE, lw=1.3)
+    ax.fill_between(time, value - std, value + std, color=_VALUE, alpha=0.25, lw=0)
+    settled = slice(int(np.ceil(_SETTLED * len(time))), None)
+    wide = np.nan_to_num(std[settled])
+    ends = np.concatenate([value[settled] - wide, value[settled] + wide])
+    ends = ends[np.isfinite(ends)]
+    if ends.size and np.ptp(ends) > 0:
+        margin = _MARGIN * np.ptp(ends)
+        ax.set_ylim(ends.min() - margin, ends.max() + margin)

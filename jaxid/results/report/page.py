@@ -1,0 +1,194 @@
+"""The report as one HTML file that needs neither network nor scripts."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import re
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from jaxid.results.report import plots
+from jaxid.results.report import words as tables
+from jaxid.results.report.data import ExperimentView, HistoryView, LogView, ReportData
+from jaxid.results.report.history_plots import plot_history
+from jaxid.results.report.numbers import is_number, nats, pretty_unit, short
+
+View = LogView | ExperimentView | HistoryView
+
+_NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
+_RASTER_DPI = 130  # chosen: sharp on a phone, and ten clouds stay below a megabyte
+
+
+def write_report(data: ReportData, path: Path) -> None:
+    """Write the report, whole or not at all.
+
+    Args:
+        data: What it shows.
+        path: The HTML file; its folder must exist. A file that is there is replaced.
+    """
+    path = Path(path)
+    text = render(data)
+    # In the same folder, as only there replacing is one step of the file system.
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def render(data: ReportData) -> str:
+    """Make the report's HTML.
+
+    Args:
+        data: What it shows.
+
+    Returns:
+        The whole page.
+    """
+    return filled(
+        "page.html",
+        data=data,
+        verdict=tables.verdict_words(data),
+        verdict_class=tables.verdict_class(data),
+        answer=tables.answer(data),
+        gap=tables.gap_table(data),
+        parameters=tables.parameter_lines((*data.parameters, *data.derived)),
+        effects=tables.effect_entries(data.effects),
+        unidentifiable=tables.unidentifiable_lines(data.unidentifiable),
+        directions=tables.direction_lines(data.within_prior["directions"]) if data.within_prior else [],
+        within_prior_words=tables.within_prior_words(data.within_prior or {}),
+        untold=[row.name for row in data.parameters if not row.identifiable],
+        steps=tables.step_lines(data),
+        force_unit=pretty_unit(str(data.units["force"])),
+        rankings=_rankings(data),
+        where=tables.where_lines(data),
+        notes=[tables.unbroken(note) for note in data.notes],
+        where_figure=_where_figure(data),
+        history=_history(data),
+        experiments=[_experiment(data, view) for view in data.experiments],
+        views=[_view_entry(data, view, i) for i, view in enumerate(data.views)],
+    )
+
+
+def filled(template: str, **entries: object) -> str:
+    """A page of this folder with its entries, and with the style that all of them share."""
+    folder = resources.files("jaxid.results.report")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        loader=FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
+    )
+    style = (folder / "page.css").read_text(encoding="utf-8")
+    return environment.get_template(template).render(style=Markup(style), **entries)
+
+
+def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
+    units = data.units
+    floor = data.gap.get("noise_floor")
+    floor = floor[view.joint] if isinstance(floor, list) else floor
+    floor = floor if is_number(floor) else None
+    simulated = _simulated(view)
+    residual = view.residual_before is not None or view.residual_after is not None
+    words = f"{view.name}: measured{' and simulated' if simulated else ''} position over time"
+    entry = {
+        "name": view.name,
+        "anchor": f"log-{number}",
+        "simulated": simulated,
+        "fit": _picture(words, plots.plot_fit, view, units),
+        "drive": None,
+        "force": None,
+        "against": [],
+    }
+    if view.drive_simulated is not None:
+        words = f"{view.name}: force of the drive over time, measured and simulated"
+        entry["drive"] = _picture(words, plots.plot_drive, view, units)
+    if len(view.band_time):
+        words = f"{view.name}: measured force and force residual over time"
+        draw = plots.plot_residual_over_time
+        entry["force"] = _picture(words, draw, view, units, noise_floor=floor)
+    if residual and len(view.band_time):
+        for variable in ("velocity", "position", "time"):
+            figure = plots.plot_residual_against(view, units, variables=(variable,))
+            entry["against"].append(image(figure, f"{view.name}: force residual over {variable}"))
+    return entry
+
+
+def _simulated(view: LogView) -> bool:
+    pair = (view.position_simulated_before, view.position_simulated_after)
+    return any(line is not None for line in pair)
+
+
+def _rankings(data: ReportData) -> list[dict]:
+    rankings = []
+    for number, step in enumerate(data.steps):
+        if step.candidates:
+            best = plots.ranked(step)[0]
+            words = (
+                f"Step {number}: evidence of {len(step.candidates)} candidates; the best is "
+                f"{best.kind} with {nats(best.evidence)}, threshold {short(step.threshold)}"
+            )
+            figure = plots.plot_candidates(step)
+            title = f"Step {number}: {tables.step_words(number, step)}"
+            rankings.append({"title": title, "image": image(figure, words)})
+    return rankings
+
+
+def _experiment(data: ReportData, view: ExperimentView) -> dict:
+    entry = {"text": tables.unbroken(view.text), "image": None}
+    if view.values is not None:
+        words = f"Proposed {view.signal} over time"
+        entry["image"] = _picture(words, plots.plot_experiment, view, data.units)
+    return entry
+
+
+def _history(data: ReportData) -> dict | None:
+    if data.history is None:
+        return None
+    return _picture("Estimates and running residual over time", plot_history, data.history, data.units)
+
+
+def _where_figure(data: ReportData) -> dict | None:
+    if data.where_plot is None or len(data.where_plot[2]) == 0:
+        return None
+    figure = plots.plot_where(data.where_plot, data.units, tables.where_region(data))
+    return image(figure, f"Mean force residual over {data.where_plot[0]}")
+
+
+def _picture(words: str, draw, view: View, units: Mapping, **options: object) -> dict:
+    """Draw a plot over time twice: wide, and again for narrow screens."""
+    wide = image(draw(view, units, **options), words)
+    wide["narrow"] = image(draw(view, units, size=_NARROW, **options), words)["source"]
+    return wide
+
+
+def image(figure: Figure, words: str) -> dict:
+    """Turn a figure into what an img element needs.
+
+    Args:
+        figure: The figure.
+        words: What it shows, for those who cannot see it.
+    """
+    buffer = io.StringIO()
+    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    figure.set_dpi(_RASTER_DPI)
+    # savefig would lay out and draw everything twice.
+    FigureCanvasSVG(figure).print_svg(buffer, metadata=nothing)
+    text = re.sub(r' d="[^"]+"', _rounded, buffer.getvalue())
+    width, height = (round(96 * inches) for inches in figure.get_size_inches())
+    # An image rather than an inline element: identifiers of several drawings cannot clash.
+    code = base64.b64encode(text.encode()).decode("ascii")
+    source = f"data:image/svg+xml;base64,{code}"
+    return {"source": source, "alt": words, "width": width, "height": height, "narrow": None}
+
+
+def _rounded(path: re.Match) -> str:
+    """Cut a path's coordinates to a hundredth of a point, which halves the file."""
+    return re.sub(r"(\.\d\d)\d+", r"\1", path.group())

@@ -1,0 +1,327 @@
+"""The figures of a report, one function each; notebooks may call them too.
+
+They return bare `matplotlib.figure.Figure` objects and leave matplotlib's global state alone.
+Colours are Okabe and Ito's, which stay apart for colour-blind readers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxid.results.report.axes import FONT, TEXT, bucket_count, dress, legend, span, time_axes, time_label
+from jaxid.results.report.curves import binned_mean, drawable, envelope, segments, thinned
+from jaxid.results.report.data import CandidateScore, ExperimentView, LogView, SearchStep, WherePlot
+from jaxid.results.report.numbers import is_number, nats, scaled_unit, short
+
+MEASURED = "#8a8a8a"
+BEFORE = "#d55e00"
+AFTER = "#0072b2"
+_IDLE = "#b4bcc4"
+# Darker shades for the means, which stand on a cloud of their own colour.
+_DARK = {BEFORE: "#7a3600", AFTER: "#00344f"}
+_MOST_POINTS = 4000
+_FEW = 200
+_JOINTS = (AFTER, "#009e73", "#cc79a7", "#56b4e9")
+
+
+def plot_fit(
+    view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
+) -> Figure:
+    """Measured and simulated position over time, with what parts them below.
+
+    Args:
+        view: The log; without simulated positions only the measured one is drawn.
+        units: Labels of "position" and "time".
+        size: Width and height [inch].
+
+    Returns:
+        The figure.
+    """
+    return _compared(view, drawable(view.position_measured), _simulated(view), "position", units, size)
+
+
+def plot_drive(
+    view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
+) -> Figure:
+    """Declared force of the drive over time, as logged and as the simulated loop commands it.
+
+    Args:
+        view: The log; it must have both.
+        units: Labels of "force" and "time".
+        size: Width and height [inch].
+
+    Returns:
+        The figure, with what parts them below.
+    """
+    simulated = [("simulated", AFTER, drawable(view.drive_simulated))]
+    return _compared(view, drawable(view.drive_measured), simulated, "force", units, size)
+
+
+def _compared(
+    view: LogView, measured: np.ndarray, simulated: Sequence[tuple[str, str, np.ndarray]], what: str,
+    units: Mapping[str, str], size: tuple[float, float],
+) -> Figure:
+    """A measured quantity and lines beside it over time, with what parts them below."""
+    figure, top, below = time_axes(size, 2 if simulated else 1, ratios=(3, 2))
+    many = bucket_count(size)
+    factor, unit = scaled_unit(units[what], [measured])
+    top.plot(*envelope(view.time, measured / factor, many), color=MEASURED, lw=3.0)
+    names = ["measured"]
+    small, small_unit = scaled_unit(units[what], [measured - s[2] for s in simulated])
+    for label, color, line in simulated:
+        top.plot(*envelope(view.time, line / factor, many), color=color, lw=1.1)
+        gap = (measured - line) / small
+        below.plot(*envelope(view.time, gap, many), color=color, lw=1.1)
+        names.append(label)
+    span(top, view)
+    dress(top, "" if simulated else time_label(units), f"{what} [{unit}]")
+    if simulated:
+        below.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
+        dress(below, time_label(units), f"measured −\nsimulated [{small_unit}]")
+    legend(top, names)
+    return figure
+
+
+def plot_residual_over_time(
+    view: LogView,
+    units: Mapping[str, str],
+    *,
+    noise_floor: float | None = None,
+    size: tuple[float, float] = (11.5, 4.8),
+) -> Figure:
+    """Measured force over time, and below it what the model leaves unexplained.
+
+    Args:
+        view: The log.
+        units: Labels of "force" and "time".
+        noise_floor: RMS that sensor noise alone leaves, drawn as a pair of lines; may be None.
+        size: Width and height [inch].
+
+    Returns:
+        The figure.
+    """
+    residuals = _residuals(view)
+    figure, top, below = time_axes(size, 2 if residuals else 1, ratios=(2, 3))
+    many = bucket_count(size)
+    factor, unit = scaled_unit(units["force"], [view.force_measured])
+    line = envelope(view.band_time, np.asarray(view.force_measured) / factor, many)
+    top.plot(*line, color=MEASURED, lw=1.0)
+    span(top, view)
+    dress(top, "" if residuals else time_label(units), f"force\nmeasured [{unit}]")
+    if not residuals:
+        return figure
+    small, small_unit = scaled_unit(units["force"], [r[2] for r in residuals])
+    for label, color, residual in residuals:
+        line = envelope(view.band_time, residual / small, many)
+        below.plot(*line, color=color, lw=0.9, label=label)
+    if is_number(noise_floor):
+        for sign in (-1.0, 1.0):
+            line = below.axhline(sign * noise_floor / small, color=TEXT, lw=0.9, ls=(0, (4, 3)))
+        line.set_label("± noise floor (RMS)")
+    below.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
+    dress(below, time_label(units), f"force residual [{small_unit}]")
+    legend(below)
+    return figure
+
+
+def plot_residual_against(
+    view: LogView,
+    units: Mapping[str, str],
+    *,
+    variables: Sequence[str] = ("velocity", "position", "time"),
+    size: tuple[float, float] | None = None,
+) -> Figure:
+    """Force residual against other quantities: before above, after below, on one scale.
+
+    Args:
+        view: The log.
+        units: Labels of "force" and of the variables.
+        variables: Which of "velocity", "position" and "time", one column each.
+        size: Width and height [inch]; by default by the number of panels.
+
+    Returns:
+        The figure: samples as dots, their mean over bins as a line.
+
+    Raises:
+        ValueError: If the log has no residual at all.
+    """
+    residuals = _residuals(view)
+    if not residuals:
+        raise ValueError(f"log {view.name!r} has no force residual to plot.")
+    rows, columns = len(residuals), len(variables)
+    size = size or (4.3 * columns, 0.7 + 1.75 * rows)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, sharey=True, sharex="col", squeeze=False)
+    small, unit = scaled_unit(units["force"], [r[2] for r in residuals])
+    for column, variable in enumerate(variables):
+        x = view.band_time if variable == "time" else getattr(view, variable)
+        factor, x_unit = scaled_unit(units[variable], [] if variable == "time" else [x])
+        for row, (label, color, residual) in enumerate(residuals):
+            ax = axes[row, column]
+            _cloud(ax, np.asarray(x) / factor, residual / small, color, _groups(variable, x))
+            name = f"{variable} [{x_unit}]" if row == rows - 1 else ""
+            dress(ax, name, f"residual [{unit}]" if column == 0 else "")
+            ax.set_title(label, loc="left", fontsize=FONT, color=color, fontweight="bold")
+    return figure
+
+
+def ranked(step: SearchStep) -> list[CandidateScore]:
+    """Order the candidates of a step, best first; those that could not be fitted come last."""
+
+    def key(candidate: CandidateScore) -> float:
+        return -candidate.evidence if is_number(candidate.evidence) else np.inf
+
+    return sorted(step.candidates, key=key)
+
+
+def plot_candidates(step: SearchStep) -> Figure:
+    """Evidence of all candidates of one step, best first, against the threshold.
+
+    Args:
+        step: The step; candidates that could not be fitted are listed without a bar.
+
+    Returns:
+        The figure.
+    """
+    candidates = ranked(step)
+    scores = np.array([c.evidence if is_number(c.evidence) else 0.0 for c in candidates])
+    height = 0.95 + 0.235 * max(len(candidates), 1)
+    figure = Figure(figsize=(4.9, height), layout="constrained")
+    ax = figure.add_subplot()
+    right = max(scores.max(initial=0.0), step.threshold, 1e-9)
+    # A candidate that does great harm must not squeeze the bars that matter.
+    left = max(scores.min(initial=0.0), -0.5 * right)
+    rows = np.arange(len(candidates))
+    colors = [AFTER if c.accepted else _IDLE for c in candidates]
+    ax.barh(rows, np.maximum(scores, left), color=colors, height=0.68)
+    for row, (candidate, score) in enumerate(zip(candidates, scores, strict=True)):
+        text = nats(candidate.evidence) if is_number(candidate.evidence) else "not fitted"
+        text += " (bar cut)" if score < left else ""
+        weight = "bold" if candidate.accepted else "normal"
+        style = {"fontsize": FONT - 1, "color": TEXT, "va": "center", "fontweight": weight}
+        # On white, as the threshold's line may pass behind it.
+        style["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
+        at = (max(score, 0.0), row)
+        ax.annotate(text, at, (4, 0), textcoords="offset points", **style)
+    ax.axvline(step.threshold, color=BEFORE, lw=1.2, ls=(0, (4, 3)))
+    ax.axvline(0.0, color=TEXT, lw=0.6)
+    ax.set_title(
+        f"threshold {short(step.threshold)}", loc="right", fontsize=FONT - 0.5, color=_DARK[BEFORE]
+    )
+    ax.set_xlim(left * 1.05, right * 1.18)
+    ax.set_ylim(len(candidates) - 0.4, -0.6)
+    dress(ax, "evidence: gain in held-out log-likelihood [nats]", "")
+    ax.set_yticks(rows, [c.kind for c in candidates], fontsize=FONT - 0.5)
+    ax.grid(axis="y", visible=False)
+    return figure
+
+
+def plot_where(
+    plot: WherePlot | tuple, units: Mapping[str, str], region: Sequence[float] | None = None
+) -> Figure:
+    """The residual's mean over one variable, and where it leaves the model.
+
+    Args:
+        plot: The bins.
+        units: Label of "force".
+        region: The two ends of the stretch where the residual stands out; may be None.
+
+    Returns:
+        The figure.
+    """
+    plot = WherePlot(*plot)
+    small, unit = scaled_unit(units["force"], [plot.mean, plot.low, plot.high])
+    factor, x_unit = scaled_unit(plot.unit, [plot.x])
+    x = np.asarray(plot.x) / factor
+    mean, low, high = (drawable(v) / small for v in plot[3:])
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    ax = figure.add_subplot()
+    if region is not None and len(region) == 2 and all(is_number(r) for r in region):
+        ends = [r / factor for r in region]
+        ax.axvspan(*ends, color="#f0e442", alpha=0.28, lw=0, label="region named")
+    ax.fill_between(x, low, high, color=BEFORE, alpha=0.25, lw=0, label="confidence band")
+    ax.plot(x, mean, color=BEFORE, lw=1.4, marker="o", ms=3, label="mean residual")
+    ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
+    dress(ax, f"{plot.variable} [{x_unit}]", f"force residual [{unit}]")
+    legend(ax)
+    return figure
+
+
+def plot_experiment(
+    view: ExperimentView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
+) -> Figure:
+    """A proposed signal over time within its limits; below a reference, its speed.
+
+    Args:
+        view: The experiment; its values must be there.
+        units: Labels of "velocity" and "time".
+        size: Width and height [inch].
+
+    Returns:
+        The figure.
+    """
+    loop = view.speed is not None
+    figure, top, below = time_axes(size, 2 if loop else 1, ratios=(3, 2))
+    many, joints = bucket_count(size), view.values.shape[1]
+    factor, unit = scaled_unit(view.unit, [view.values])
+    for k, values in enumerate(view.values.T):
+        name = view.signal if joints == 1 else f"{view.signal}, joint {k + 1}"
+        top.plot(*envelope(view.time, values / factor, many), lw=1.2, label=name, color=_JOINTS[k % 4])
+    _limits(top, view.limits / factor)
+    dress(top, "" if loop else time_label(units), f"{view.signal} [{unit}]")
+    legend(top)
+    if loop:
+        speed = np.gradient(view.values, view.time, axis=0)
+        factor, unit = scaled_unit(units["velocity"], [speed])
+        for k, values in enumerate(speed.T):
+            below.plot(*envelope(view.time, values / factor, many), lw=1.0, color=_JOINTS[k % 4])
+        _limits(below, np.stack([-view.speed, view.speed], axis=1) / factor)
+        dress(below, time_label(units), f"velocity [{unit}]")
+    return figure
+
+
+def _limits(ax: Axes, limits: np.ndarray) -> None:
+    """Dashed lines at the ends of every joint's range."""
+    for k, value in enumerate(np.unique(limits)):
+        ax.axhline(value, color=BEFORE, lw=1.0, ls=(0, (4, 3)), label="limits" if k == 0 else None)
+
+
+def _simulated(view: LogView) -> list[tuple[str, str, np.ndarray]]:
+    named = (
+        ("simulated before", BEFORE, drawable(view.position_simulated_before)),
+        ("after", AFTER, drawable(view.position_simulated_after)),
+    )
+    there = [entry for entry in named if entry[2] is not None]
+    return there if len(there) > 1 else [("simulated", *entry[1:]) for entry in there]
+
+
+def _residuals(view: LogView) -> list[tuple[str, str, np.ndarray]]:
+    named = (
+        ("before", BEFORE, drawable(view.residual_before)),
+        ("after", AFTER, drawable(view.residual_after)),
+    )
+    there = [entry for entry in named if entry[2] is not None]
+    # Alone it is neither before nor after anything.
+    return there if len(there) > 1 else [("residual", *entry[1:]) for entry in there]
+
+
+def _groups(variable: str, x: np.ndarray) -> np.ndarray | None:
+    """Number the stretches over which a mean may be drawn as one line."""
+    if variable == "time":
+        return segments(np.asarray(x))
+    # Dry friction jumps where the velocity changes its sign.
+    return (np.asarray(x) >= 0.0).astype(int) if variable == "velocity" else None
+
+
+def _cloud(ax: Axes, x: np.ndarray, y: np.ndarray, color: str, groups: np.ndarray | None) -> None:
+    some = thinned(len(x), _MOST_POINTS)
+    # As an image: thousands of dots would be megabytes of SVG. A handful is drawn to be seen one by one.
+    few = len(x) <= _FEW
+    look = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.4}
+    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, **look)
+    ax.axhline(0.0, color=TEXT, lw=0.6)
+    ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8)

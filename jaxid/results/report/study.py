@@ -1,0 +1,97 @@
+"""The report of a study as one HTML page that needs neither network nor scripts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.results.report.numbers import pretty_unit, short
+from jaxid.results.report.page import filled, image
+from jaxid.results.report.study_plots import others_of, plot_coverage, plot_errors, plot_scatter
+from jaxid.studies.result import conditions
+from jaxid.studies.settings import SETTINGS, setting_of, words_of
+
+if TYPE_CHECKING:
+    from jaxid.studies.result import Study
+
+
+def study_report(result: Study) -> str:
+    """The page.
+
+    Args:
+        result: What it shows.
+    """
+    rows, table = result.summary, result.table
+    others = others_of(rows)
+    figures = [
+        (
+            "Errors",
+            "The RMS error of all runs that were used, bias included. "
+            + ("" if len(others) > 1 else "Dotted: the mean σ that the estimator reports. ")
+            + "Black: what no unbiased estimate from the readings can go below, the start and "
+            "the command known exactly.",
+            image(plot_errors(rows), "RMS error of every estimator, by parameter"),
+        ),
+        (
+            "Do the intervals hold the truth?",
+            "Bars are what this number of runs leaves uncertain (95 %)."
+            + (f" Of each estimator from left to right: {'; '.join(others)}." if len(others) > 1 else ""),
+            image(plot_coverage(rows), "Coverage of 95 % intervals, by parameter"),
+        ),
+    ]
+    for setting, own in conditions(table):
+        title = f"Errors in units of their reported σ: {words_of(setting)}"
+        words = "Beyond 4.5 σ everything is counted in the outermost bar."
+        figures.append((title, words, image(plot_scatter(own), title)))
+    settings = [name for name in SETTINGS if name in table.dims]
+    tried = "; ".join(
+        f"{name.replace('_', ' ')} {', '.join(f'{x:g}' for x in table[name].values)}" for name in settings
+    )
+    return filled(
+        "study.html", title=result.title, rows=[_line(r) for r in rows], settings=settings,
+        failures=[f | {"where": words_of(f)} for f in result.failures],
+        named=[n | {"where": words_of(n)} for n in result.named],
+        runs=table.sizes["run"], seconds=short(result.seconds, 3), figures=figures,
+        tried=tried, answer=_answer(result), tracking=[_followed(r) for r in result.tracking],
+    )
+
+
+def _followed(row: dict) -> dict:
+    return {
+        **row, "unit": pretty_unit(row["unit"]), "settings": [f"{x:g}" for x in setting_of(row).values()],
+        "sizes": [short(x, 3) for name in ("rms", "peak") for x in row[name].values()],
+    }
+
+
+def _line(row: dict) -> dict:
+    percent = lambda x: f"{100 * x:.1f}" if np.isfinite(x) else "–"
+    number = lambda x: short(x, 3) if np.isfinite(x) else "–"
+    return {
+        **row, "unit": pretty_unit(row["unit"]), "true": number(row["true"]),
+        "settings": [f"{x:g}" for x in setting_of(row).values()],
+        **{k: number(row[k]) for k in ("bias", "spread", "rmse", "std", "bound")},
+        **{k: percent(row[k]) for k in ("coverage_68", "coverage_95", "failed")},
+    }
+
+
+def _answer(result: Study) -> str:
+    """The study in a sentence or two."""
+    rows = [r for r in result.summary if r["used"]]
+    if not rows:
+        return "No run gave an estimate."
+    held: dict[str, list[float]] = {}
+    for r in rows:
+        held.setdefault(r["estimator"], []).append(r["coverage_95"])
+    # Some estimators give no standard deviation.
+    told = {name: np.array(x)[np.isfinite(x)] for name, x in held.items()}
+    parts = [f"{name}: {100 * np.mean(x):.0f} %" for name, x in told.items() if len(x)]
+    failed = sum(f["runs"] for f in result.failures)
+    fits = result.table["converged"].size
+    lines = [f"{failed} of {fits} fits gave no value for some parameter."]
+    if parts:
+        held_words = "95 % intervals held the truth, over all parameters and settings, in: "
+        lines.insert(0, f"{held_words}{'; '.join(parts)}.")
+    silent = [str(name) for name in result.table.estimator.values if str(name) not in held]
+    lines += [f"{', '.join(silent)} gave none at all."] if silent else []
+    return " ".join(lines)

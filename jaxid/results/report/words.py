@@ -1,0 +1,362 @@
+"""The words and tables of a report: what the JSON results hold, laid out for reading."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from jaxid.model.plant import PLACES
+from jaxid.results.report.data import ParameterRow, ReportData, SearchStep
+from jaxid.results.report.numbers import (
+    ABSENT,
+    is_number,
+    nats,
+    percent,
+    plain,
+    pretty_unit,
+    scaled_unit,
+    short,
+    with_std,
+)
+
+_MOST_INTERVALS = 12
+# Weights up to this are left out of a combination that is told.
+SLIGHT = 0.1
+
+
+@dataclass(frozen=True)
+class GapRow:
+    """One line of the gap table, still as numbers; None where there is none."""
+
+    quantity: str
+    log: str
+    unit: str
+    before: float | None = None
+    after: float | None = None
+    floor: float | None = None
+    relative: float | None = None
+
+
+def verdict_words(data: ReportData) -> str:
+    """Say the verdict in plain words, such as "found: coulomb_friction"."""
+    if data.verdict == "found":
+        return "found: " + ", then ".join(_named(e, data.effects) for e in data.effects)
+    if data.verdict is not None:
+        return {"nothing_missing": "nothing is missing"}.get(data.verdict, data.verdict)
+    if data.converged is False:
+        return "did not converge"
+    known = sum(row.identifiable for row in data.parameters)
+    count = str(known) if known == len(data.parameters) else f"{known} of {len(data.parameters)}"
+    return f"{count} parameter{'' if len(data.parameters) == 1 else 's'} identified"
+
+
+def verdict_class(data: ReportData) -> str:
+    """Name the badge's style: "good", "open" or "bad"."""
+    if data.converged is False:
+        return "bad"
+    if data.verdict == "unexplained":
+        return "open"
+    if data.verdict is None and not all(row.identifiable for row in data.parameters):
+        return "open"
+    return "good"
+
+
+def answer(data: ReportData) -> str:
+    """Join the summary's lines into one paragraph; compose one where there is none."""
+    lines = [line.strip() for line in data.summary_lines if line.strip()]
+    if not lines:
+        openings = {
+            "found": "The declared model lacks physics that the log shows",
+            "nothing_missing": "What the declared model leaves unexplained is sensor noise",
+            "unexplained": "Model and log disagree, and no known effect explains it",
+        }
+        lines = [openings.get(data.verdict, "The declared model was fitted to the log")]
+        # One line for each quantity, of two joints at most one each: the table below has the other logs.
+        rows = [r for r in _gap_rows(data) if is_number(r.after)]
+        groups: dict[str, list[GapRow]] = {}
+        for row in (r for r in rows if r.log == rows[0].log):
+            groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
+        for quantity, own in groups.items():
+            lines += [_gaps_words(quantity, own)] if len(own) > 2 else [_gap_words(row) for row in own]
+    return unbroken(" ".join(line if line[-1] in ".!?:;" else f"{line}." for line in lines))
+
+
+def unbroken(text: str) -> str:
+    """Keep numbers and their units on one line of the page."""
+    return re.sub(r"(?<=\d) (?=[a-zA-Zµ%±]{1,3}\b|±)", "\u00a0", text)
+
+
+def place_words(entry: Mapping) -> str:
+    """Say where an effect acts: "joint 2", "spring 3", or nothing."""
+    for key in PLACES:
+        if entry.get(key) is not None:
+            return f"{key} {entry[key]}"
+    return ""
+
+
+def gap_table(data: ReportData) -> dict:
+    """Lay out the gap as headings and lines, without the columns that hold nothing."""
+    rows = _gap_rows(data)
+    after = "gap" if all(row.before is None for row in rows) else "after"
+    heads = ["disagreement (RMS)", "log", "before", after, "noise floor"]
+    heads += [f"{after} ÷ floor", "relative to the measured"]
+    lines = [_gap_cells(row) for row in rows]
+    kept = [i for i in range(len(heads)) if i < 2 or any(c[i] != ABSENT for c in lines)]
+    return {
+        "heads": [heads[i] for i in kept],
+        "lines": [[cells[i] for i in kept] for cells in lines],
+        "band": short(data.gap["band_hz"]) if is_number(data.gap.get("band_hz")) else None,
+    }
+
+
+def parameter_lines(rows: Sequence[ParameterRow]) -> list[dict]:
+    """Format the parameters; lists become one line for each entry, counted from 1."""
+    return [_parameter_line(row) for whole in rows for row in _expanded(whole)]
+
+
+def effect_entries(effects: Sequence[Mapping]) -> list[dict]:
+    """Format the effects that were found: place, parameters, evidence, alternatives."""
+    entries = []
+    for effect in effects:
+        rows = [
+            ParameterRow(name, p.get("value"), p.get("std"), p.get("unit") or "")
+            for name, p in (effect.get("parameters") or {}).items()
+        ]
+        others = [
+            {"kind": f"{a.get('kind', '')} {place_words(a)}".strip(), "evidence": nats(a.get("evidence"))}
+            for a in effect.get("alternatives") or ()
+        ]
+        entries.append(
+            {
+                "kind": effect["kind"],
+                "place": place_words(effect),
+                "parameters": parameter_lines(rows),
+                "evidence": nats(effect.get("evidence")),
+                "alternatives": others,
+            }
+        )
+    return entries
+
+
+def unidentifiable_lines(entries: Sequence[Mapping]) -> list[dict]:
+    """Explain each combination that the log cannot tell, largest weight first."""
+    lines = []
+    for entry in entries:
+        terms = _terms(entry["combination"])
+        lines.append({"terms": terms, "single": len(terms) == 1})
+    return lines
+
+
+def _terms(combination: Mapping[str, float], least: float = 0.0) -> list[dict]:
+    """Names and weights of a combination, largest first, without those up to a size."""
+    weights = {k: w for k, w in combination.items() if is_number(w) and abs(w) > least}
+    ranked = sorted(weights.items(), key=lambda item: -abs(item[1]))
+    return [{"name": n, "weight": ("+" if w > 0 else "") + plain(w, 2)} for n, w in ranked]
+
+
+def direction_lines(directions: Sequence[Mapping]) -> list[dict]:
+    """Format the combinations that a fit within a prior tells."""
+    lines = []
+    for entry in directions:
+        value, std = with_std(entry["value"], entry["std"])
+        profile = entry.get("profile")
+        rise = dict(zip(profile["at_std"], profile["rise"], strict=True)) if profile else {}
+        lines.append({
+            "terms": _terms(entry["combination"], SLIGHT), "value": value, "std": std,
+            "white": with_std(entry["value"], entry["std_white"])[1],
+            "profile": [short(rise[at], 2) for at in (-2.0, 2.0)] if rise else None,
+        })
+    return lines
+
+
+def within_prior_words(content: Mapping) -> list[str]:
+    """What a fit within a prior says beside its directions; nothing of any other."""
+    if "criterion_percent" not in content:
+        return []
+    lines = [f"criterion: {short(content['criterion_percent'], 3)} % of the squared deviation from the mean"]
+    starts = content.get("starts")
+    if starts:
+        shown = f"starts: {starts['same_optimum']} of {starts['count']} end at the same cost"
+        if starts["flat"]:
+            shown += f"; {starts['flat']} from which the simulation does not move were led on first"
+        lines.append(shown)
+    return lines
+
+
+def where_lines(data: ReportData) -> dict | None:
+    """Say in words where the disagreement sits."""
+    where = data.where
+    if not where:
+        return None
+    variable = where.get("variable")
+    unit = pretty_unit(_variable_unit(data, variable))
+    facts = [("acts at", place_words(where)), ("stands out over", variable or "")]
+    region = where_region(data)
+    if region and len(region) == 2 and all(is_number(r) for r in region):
+        text = f"{short(region[0], 3)} to {short(region[1], 3)} {unit}"
+        facts.append(("region", text.strip()))
+    spans = where.get("intervals") or []
+    if spans:
+        listed = [f"{short(a)}–{short(b)}" for a, b in spans[:_MOST_INTERVALS]]
+        more = f" and {len(spans) - len(listed)} more" if len(spans) > len(listed) else ""
+        facts.append(("when", f"{', '.join(listed)} {data.units.get('time', 's')}{more}"))
+    return {"text": unbroken(where.get("text") or ""), "facts": [f for f in facts if f[1]]}
+
+
+def where_region(data: ReportData) -> Sequence[float] | None:
+    """Range of the variable in which the residual is largest; None of a line in its spectrum."""
+    where = data.where or {}
+    return None if is_number(where.get("frequency_hz")) else where.get("region")
+
+
+def step_lines(data: ReportData) -> list[dict]:
+    """Format the steps of the search."""
+    lines = []
+    for number, step in enumerate(data.steps):
+        best = next((c.evidence for c in step.candidates if c.accepted), None)
+        lines.append(
+            {
+                "number": number,
+                "change": step_words(number, step),
+                "fit": plain(step.gap_fit),
+                "validation": plain(step.gap_validation),
+                "tried": len(step.candidates) or ABSENT,
+                "evidence": nats(best),
+                "threshold": short(step.threshold) if step.candidates else ABSENT,
+            }
+        )
+    return lines
+
+
+def step_words(number: int, step: SearchStep) -> str:
+    """Say what a step changed."""
+    changes = [f"{step.added} added"] if step.added else []
+    changes += [f"{step.dropped} dropped"] if step.dropped else []
+    if changes:
+        return ", ".join(changes)
+    return "declared model, refitted" if number == 0 else "nothing added"
+
+
+def _named(effect: Mapping, effects: Sequence[Mapping]) -> str:
+    # On a machine of one joint the place says nothing.
+    places = {place_words(e) for e in effects}
+    place = place_words(effect)
+    return f"{effect['kind']} ({place})" if places - {"", "joint 1"} and place else effect["kind"]
+
+
+def _variable_unit(data: ReportData, variable: str | None) -> str:
+    if data.where_plot is not None and data.where_plot[0] == variable:
+        return data.where_plot[1]
+    return data.units.get(variable or "", "")
+
+
+def _gap_words(row: GapRow) -> str:
+    _, log, before, after, *_ = _gap_cells(row)
+    fall = f"falls from {before} to {after}" if row.before is not None else f"is {after}"
+    floor = f", at a noise floor of {_gap_cells(row)[4]}" if is_number(row.floor) else ""
+    return f"The {row.quantity} residual on the {log} log {fall} (RMS){floor}"
+
+
+def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
+    """The same of many joints at once, as ranges."""
+    numbers = [x for r in rows for x in (r.before, r.after, r.floor) if is_number(x)]
+    scale, unit = scaled_unit(rows[0].unit, numbers)
+
+    def span(values: list[float | None]) -> str:
+        told = [x / scale for x in values if is_number(x)]
+        ends = dict.fromkeys(plain(x) for x in (min(told), max(told))) if told else ()
+        return f"{'–'.join(ends)} {unit}".strip() if ends else ""
+
+    before, after, floor = (span([getattr(r, k) for r in rows]) for k in ("before", "after", "floor"))
+    fall = f"falls from {before} to {after}" if before else f"is {after}"
+    over = f", at noise floors of {floor}" if floor else ""
+    return f"The {quantity} residual of the {len(rows)} joints on the {rows[0].log} log {fall} (RMS){over}"
+
+
+def _gap_rows(data: ReportData) -> list[GapRow]:
+    gap = data.gap
+    motion = gap.get("simulation") or {}
+    force = {"quantity": "force", "unit": gap.get("unit"), "floor": gap.get("noise_floor")}
+    position = {"quantity": "simulated position", "unit": motion.get("unit")}
+    if "before" in gap or "after" in gap:
+        log = gap.get("on") or "fit"
+        rows = _by_joint(log=log, before=gap.get("before"), after=gap.get("after"), **force)
+        rows += _other_log(data, log, force)
+        if motion:
+            both = {"before": motion.get("before"), "after": motion.get("after")}
+            rows += _by_joint(log=log, **both, **position)
+        return rows
+    return _fitted_rows(gap, force) + _fitted_rows(motion, position)
+
+
+def _fitted_rows(gap: Mapping, shared: Mapping) -> list[GapRow]:
+    relative = gap.get("relative") or {}
+    each = gap.get("validations") or {}
+    rows = []
+    for log in ("fit", "validation"):
+        if gap.get(log) is not None and not (log == "validation" and each):
+            rows += _by_joint(log=log, after=gap[log], relative=relative.get(log), **shared)
+    for name, value in each.items():
+        worst = relative.get("validation") if value == gap.get("validation") else None
+        rows += _by_joint(log=f"validation: {name}", after=value, relative=worst, **shared)
+    return rows
+
+
+def _other_log(data: ReportData, log: str, force: Mapping) -> list[GapRow]:
+    if not data.steps:
+        return []
+    other = "fit" if log == "validation" else "validation"
+    ends = [getattr(step, f"gap_{other}") for step in (data.steps[0], data.steps[-1])]
+    if not all(is_number(end) for end in ends):
+        return []
+    # The floor is only given for the log that was judged, and steps hold one number for all joints.
+    several = isinstance(data.gap.get("after"), (list, tuple))
+    shared = {**force, "floor": None, "quantity": "force, worst joint" if several else "force"}
+    return _by_joint(log=other, before=ends[0], after=ends[1], **shared)
+
+
+def _by_joint(**columns: object) -> list[GapRow]:
+    """Make one line, or one for each joint where the numbers are lists."""
+    lengths = [len(v) for v in columns.values() if isinstance(v, (list, tuple))]
+    if not lengths:
+        return [GapRow(**{**columns, "unit": columns["unit"] or ""})]
+    rows = []
+    for i in range(max(lengths)):
+        one = {k: v[i] if isinstance(v, (list, tuple)) else v for k, v in columns.items()}
+        one["quantity"] = f"{one['quantity']}, joint {i + 1}"
+        rows.append(GapRow(**{**one, "unit": one["unit"] or ""}))
+    return rows
+
+
+def _gap_cells(row: GapRow) -> list[str]:
+    numbers = (row.before, row.after, row.floor)
+    scale, unit = scaled_unit(row.unit, [n for n in numbers if is_number(n)])
+    texts = [f"{plain(n / scale)} {unit}".strip() if is_number(n) else ABSENT for n in numbers]
+    judged = is_number(row.after) and is_number(row.floor) and row.floor > 0
+    ratio = f"{row.after / row.floor:.2f}" if judged else ABSENT
+    return [row.quantity, row.log, *texts, ratio, percent(row.relative)]
+
+
+def _expanded(row: ParameterRow) -> list[ParameterRow]:
+    if not isinstance(row.value, (list, tuple)):
+        return [row]
+    stds = row.std if isinstance(row.std, (list, tuple)) else [row.std] * len(row.value)
+    pairs = zip(row.value, stds, strict=True)
+    return [
+        replace(row, name=f"{row.name}[{i}]", value=value, std=std)
+        for i, (value, std) in enumerate(pairs, start=1)
+    ]
+
+
+def _parameter_line(row: ParameterRow) -> dict:
+    value, std = with_std(row.value, row.std) if row.identifiable else (ABSENT, ABSENT)
+    relative = percent(row.std, row.value) if row.identifiable else ABSENT
+    return {
+        "name": row.name,
+        "value": value,
+        "std": std,
+        "relative": relative,
+        "unit": pretty_unit(row.unit),
+        "identifiable": row.identifiable and is_number(row.value),
+    }

@@ -1,0 +1,327 @@
+"""The log that a case would give: reference or input in, sensors' readings out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxid.case.case import Case, load_case
+from jaxid.errors import InputError
+from jaxid.files import write_whole
+from jaxid.logs.log import Log
+from jaxid.machine import Machine, build_machine, disturbance_at
+from jaxid.model.plant import Plant
+from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.references import make_reference
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.loops import Drive, Trajectory, closed_loop, needed_substeps, open_loop
+
+
+@dataclass(frozen=True)
+class Virtual:
+    """A simulated log.
+
+    Args:
+        log: As a sensor would have recorded it.
+        trajectory: The motion behind it, without noise, one row a tick.
+        columns: Names of the columns, as the case's [log] has them; else q, u, ref, or q1, q2 and so on.
+    """
+
+    log: Log
+    trajectory: Trajectory
+    columns: dict[str, str | list[str]]
+
+    def csv(self) -> str:
+        """The log as a table with a header, every digit kept."""
+        log = self.log
+        load = "load_position" in self.columns
+        known = log.position[:, list(log.measured)]
+        parts = {"time": log.time[:, None], "position": known[:, :-1] if load else known}
+        parts |= {"load_position": known[:, -1:]} if load else {}
+        parts["force"] = log.force
+        if log.reference is not None:
+            parts["reference"] = log.reference
+        header = []
+        for key, values in parts.items():
+            names = self.columns[key]
+            header += [names] if isinstance(names, str) else [*names]
+            if values.shape[1] != (1 if isinstance(names, str) else len(names)):
+                raise InputError(
+                    f"[log] {key} names {names!r} for {values.shape[1]} columns",
+                    mend="give a list with one name a joint",
+                )
+        rows = np.concatenate([*parts.values()], axis=1)
+        lines = [",".join(repr(float(v)) for v in row) for row in rows]
+        return "\n".join([",".join(header), *lines]) + "\n"
+
+    def save(self, path: str | Path) -> Path:
+        """Write the log as CSV, whole or not at all."""
+        write_whole(Path(path), self.csv())
+        return Path(path)
+
+
+def simulate(case: Case | str | Path, *, seed: int = 0) -> Virtual:
+    """Simulate the log that a case would give, at its true values where it has any.
+
+    Args:
+        case: The case, or its file; it needs [simulation] with duration and sample_rate, and
+            [reference] (with a [controller]) or [input].
+        seed: Of the sensors' noise.
+
+    Raises:
+        InputError: If the case does not say what to simulate.
+    """
+    scene = Scene.of(case if isinstance(case, Case) else load_case(case))
+    return alone(scene.virtual(scene.machine, np.random.default_rng(seed)))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a case says of a simulation, ready to run with any values of its parameters.
+
+    Args:
+        case: The case.
+        machine: At its true values where it has any.
+        drive: How the command acts.
+        signal: Reference (in a loop) or input at every tick, by drive.
+        position, velocity: At the start.
+        every: The log holds one tick in so many.
+    """
+
+    case: Case
+    machine: Machine
+    drive: Drive
+    signal: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    every: int = 1
+
+    @classmethod
+    def of(cls, case: Case, *, longer_delays: float = 1.0) -> Scene:
+        """The scene of a case.
+
+        Args:
+            case: The case.
+            longer_delays: How many times the case's delays may be, where parameters are drawn.
+
+        Raises:
+            InputError: If the case does not say what to simulate.
+        """
+        where, setting = str(case.path), case.simulation
+        if "load_acceleration" in case.log:
+            raise InputError(
+                "a simulated log has no load_acceleration", where=f"{where}, [log]",
+                mend="leave it out of the case that is simulated",
+            )
+        for key in ("duration", "sample_rate"):
+            if key not in setting:
+                raise InputError(
+                    f"[simulation] has no {key}", where=where, mend=f"add {key} = ... to [simulation]"
+                )
+        rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+        machine = build_machine(case, true=True, period=1 / rate)
+        joints = case.plant.joints
+        position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
+        velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
+        refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
+        _refuse_massless(machine.plant, position, where)
+        if machine.controller is None:
+            if not case.input:
+                raise InputError(
+                    "nothing drives the plant", where=where,
+                    mend="add an [input], or a [reference] and a [controller]",
+                )
+            command = make_reference(
+                case.input, rate, duration, case.folder, where=f"{where}, [input]", plant=machine.plant
+            )
+            drive = _drive(case, machine, 1 / rate, longer_delays)
+            return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
+        if not case.reference:
+            raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
+        period = machine.controller.period
+        reference = make_reference(
+            case.true_reference, 1 / period, duration, case.folder, where=f"{where}, [reference]",
+            plant=machine.plant,
+        )
+        reference = _by_drive(reference, machine)
+        if reference.shape[1] == joints:
+            refuse_impossible(machine.plant, reference, f"{where}, [reference]", period)
+        machine = _scaled(machine, reference, period)
+        drive = _drive(case, machine, period, longer_delays)
+        _refuse_coarse(case, machine, drive, reference, position)
+        every = max(1, round(1 / (rate * period)))
+        if abs(1 / (rate * period * every) - 1) > 1e-3:
+            raise InputError(
+                f"a loop of {1 / period:g} Hz cannot be logged at sample_rate = {rate:g}", where=where,
+                mend="take the loop's rate, or a whole part of it",
+            )
+        return cls(case, machine, drive, reference, position, velocity, every)
+
+    def virtual(self, machine: Machine, rng: np.random.Generator) -> Steps[Virtual]:
+        """The log of a machine like the scene's, one run at a time.
+
+        Args:
+            machine: Its plant and its sensor count.
+            rng: Draws the sensors' noise.
+        """
+        joints = self.case.plant.joints
+        # A law that measures the command sees the noise that the log has.
+        measures = "estimator" in type(machine.controller).of_machine if machine.controller else False
+        inertial, drives = machine.sensor.inertial, machine.gain.size
+        columns = joints + drives * (measures or inertial is not None)
+        columns += 0 if inertial is None else inertial.count
+        noise = rng.standard_normal((len(self.signal), columns))
+        times = self.drive.period * np.arange(len(self.signal))
+        start, sensor = (self.position, self.velocity), (machine.sensor, noise)
+        looped = machine.controller is not None
+        if looped:
+            extra = disturbance_at(machine.disturbance, times)
+            signal = self.signal if machine.course is None else np.asarray(machine.course.at(times)())
+            args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
+            run = yield Solve(_closed_run, args)
+        else:
+            sensor = (machine.sensor, noise[:, :joints])
+            run = yield Solve(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
+        _refuse_ended(machine.plant, run, self.drive.period, str(self.case.path))
+        pick = slice(None, None, self.every)
+        reference = signal[pick] if looped else None
+        reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
+        shape = command.shape if machine.sensor.force_noise is not None else (0, 0)
+        more = noise[pick, joints : joints + drives] if measures else rng.standard_normal(shape)
+        log = _log(self.case, machine, times[pick], reading, command, more, reference)
+        return Virtual(log, run, _columns(self.case, reference=looped))
+
+
+_closed_run = eqx.filter_jit(closed_loop)
+
+
+@eqx.filter_jit
+def _open_run(
+    plant: Plant, drive: Drive, command: Array, position: Array, velocity: Array, sensor: Sensor,
+    noise: Array,
+) -> Trajectory:
+    run = open_loop(plant, drive, command, position, velocity)
+    return eqx.tree_at(lambda r: r.reading, run, sensor.read(run.position, noise))
+
+
+def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:
+    """One signal for every drive, where there is one for all."""
+    return np.broadcast_to(signal, (len(signal), machine.gain.size))
+
+
+def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
+    """Exact sticking, unless the case states a sharpness: then friction is smoothed."""
+    delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
+    delays = machine.plant.command_delays(machine.gain.size)
+    longest = int(np.ceil(longer * float(delays.max()) / period)) + 1 if delayed else 0
+    hold = "linear" if machine.hold == "band_limited" else machine.hold
+    return Drive(
+        machine.gain, period, hold, int(case.simulation.get("substeps", 4)),
+        "sharpness" not in case.simulation, longest,
+    )
+
+
+def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
+    """Refuse an arm that some motion moves without kinetic energy: its acceleration would be infinite."""
+    if not plant.coupled:
+        return
+    q = jnp.asarray(position, dtype=jnp.float64)
+    zero = jnp.zeros_like(q)
+    mass = np.asarray(jax.jacfwd(lambda a: plant.inertial(q, zero, a))(zero))
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(mass), 1e-300))
+    if np.diagonal(mass).min() <= 0 or np.linalg.eigvalsh(mass * np.outer(scale, scale))[0] < 1e-12:
+        joint = int(np.argmin(np.diagonal(mass))) + 1
+        raise InputError(
+            f"the mass matrix at initial_position is not positive definite (least about joint {joint})",
+            where=where, mend="give the links mass and inertia that bodies can have",
+        )
+
+
+def refuse_impossible(
+    plant: Plant, positions: np.ndarray, where: str, period: float | None = None
+) -> None:
+    """Refuse positions that the machine cannot take; `period` is the time from one to the next."""
+    found = plant.impossible(positions)
+    if found is not None:
+        row, what = found
+        when = "" if period is None else f" at t = {row * period:.4g} s"
+        raise InputError(what + when, where=where, mend="keep away from it, or check the lengths")
+
+
+def _refuse_ended(plant: Plant, run: Trajectory, period: float, where: str) -> None:
+    """Refuse a motion that ended where the machine cannot go on."""
+    known = np.isfinite(run.position).all(axis=1)
+    if known.all():
+        return
+    last = max(int(np.argmin(known)) - 1, 0)
+    q, v = np.asarray(run.position)[last], np.asarray(run.velocity)[last]
+    found = plant.impossible(q + period * np.arange(3)[:, None] * v)
+    if found is not None:
+        raise InputError(
+            f"the motion ends at t = {last * period:.4g} s: {found[1]}", where=where,
+            mend="keep reference or input away from it, or check gains and lengths",
+        )
+
+
+def _refuse_coarse(
+    case: Case, machine: Machine, drive: Drive, reference: np.ndarray, position: np.ndarray
+) -> None:
+    """Refuse a step too coarse for the smoothed sign: its trajectory only looks plausible."""
+    if drive.set_valued:
+        return
+    u = jnp.zeros_like(jnp.asarray(reference[:: max(1, len(reference) // 50)]))
+    q = jnp.broadcast_to(position, (len(u), case.plant.joints))
+    needed = needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
+    if needed > drive.substeps:
+        raise InputError(
+            f"[simulation] substeps = {drive.substeps} is too coarse for sharpness = "
+            f"{case.simulation['sharpness']:g}", where=str(case.path),
+            mend=f"set substeps = {needed}, a larger sharpness, or none (friction then sticks exactly)",
+        )
+
+
+def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
+    """The velocity that the smoothed sign's sharpness multiplies: the reference's largest."""
+    speed = float(np.abs(np.diff(reference, axis=0)).max() / period)
+    if speed == 0.0:
+        return machine
+    plant = replace(machine.plant, velocity_scale=np.asarray(speed))
+    return machine.with_plant(plant, machine.parameters)
+
+
+def _log(
+    case: Case, machine: Machine, times: np.ndarray, reading: np.ndarray, command: np.ndarray,
+    noise: np.ndarray, reference: np.ndarray | None,
+) -> Log:
+    command = np.asarray(machine.sensor.read_command(np.asarray(command), noise))
+    if not np.all(np.isfinite(reading)):
+        raise InputError(
+            "the simulation diverged", where=str(case.path),
+            mend="check gains and parameters, or raise substeps in [simulation]",
+        )
+    reading = np.array(reading)
+    if case.plant.cls.load is not None and not case.load_column:
+        reading[:, case.plant.cls.load] = np.nan
+    return Log(
+        time=times, position=reading, force=command, reference=reference,
+        hold=machine.hold, source=f"simulation of {case.path.name}",
+    )
+
+
+def _columns(case: Case, *, reference: bool) -> dict[str, str | list[str]]:
+    joints, drives = case.plant.joints - (case.plant.cls.load is not None), case.plant.drives
+    names: dict[str, str | list[str]] = {"time": "t"}
+    for key, name, count in (("position", "q", joints), ("force", "u", drives), ("reference", "ref", drives)):
+        names[key] = name if count == 1 else [f"{name}{k + 1}" for k in range(count)]
+    if case.plant.cls.load is not None and (not case.log or "load_position" in case.log):
+        names["load_position"] = "q_load"
+    names.update({k: v for k, v in case.log.items() if k in names})
+    if not reference:
+        names.pop("reference")
+    return names

@@ -1,0 +1,1 @@
+"""Sensors: encoders with resolution and noise, gyroscopes and accelerometers."""

@@ -1,0 +1,74 @@
+"""What the log and the controller see of the motion: quantised, noisy readings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxid.sensors.inertial import InertialSensors
+
+# Noise of so many counts leaves of the rounding's error nothing that goes with the signal
+# (Schuchman 1964; Gaussian noise, to 1 %).
+_DITHERS = 0.5
+
+
+class Sensor(eqx.Module):
+    """An encoder and a force reading; None where a figure is not known.
+
+    Args:
+        position_resolution: One count [m or rad].
+        position_noise: Standard deviation of white noise before rounding [m or rad].
+        force_noise: Standard deviation on the logged command, in its units.
+        hold: Ticks of the loop for which a reading of a position is held.
+        inertial: Gyroscopes and accelerometers; None where there are none.
+    """
+
+    position_resolution: Array | None = None
+    position_noise: Array | None = None
+    force_noise: Array | None = None
+    hold: int = eqx.field(static=True, default=1)
+    inertial: InertialSensors | None = None
+
+    def read(self, q: Array, noise: Array | None = None) -> Array:
+        """Reading of a position; rounded with a straight-through gradient.
+
+        The true derivative of rounding is zero almost everywhere and infinite in between: through
+        a loop it makes sensitivities useless. The straight-through one is that of the mean.
+        """
+        if noise is not None and self.position_noise is not None:
+            q = q + self.position_noise * noise
+        if self.position_resolution is None:
+            return q
+        counts = jnp.round(q / self.position_resolution) * self.position_resolution
+        return q + jax.lax.stop_gradient(counts - q)
+
+    def read_command(self, u: Array, noise: Array | None = None) -> Array:
+        """Reading of a command, in its units."""
+        return u if noise is None or self.force_noise is None else u + self.force_noise * noise
+
+    @property
+    def mean(self) -> Sensor:
+        """What it reads on average: without rounding, where noise of half a count or more dithers it.
+
+        Rounding is then one more white noise, and whether a simulated reading falls on this side of a
+        count or that says nothing of a log in which noise decided it; of a cost it makes a rough one.
+        """
+        noise, count = self.position_noise, self.position_resolution
+        if noise is None or count is None or not np.all(np.asarray(noise) >= _DITHERS * np.asarray(count)):
+            return self
+        return replace(self, position_resolution=None)
+
+    @property
+    def position_std(self) -> Array | None:
+        """Standard deviation of the reading, rounding included; None where nothing is known."""
+        parts = []
+        if self.position_noise is not None:
+            parts.append(jnp.square(self.position_noise))
+        if self.position_resolution is not None:
+            parts.append(jnp.square(self.position_resolution) / 12)
+        return jnp.sqrt(sum(parts)) if parts else None

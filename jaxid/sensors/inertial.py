@@ -1,0 +1,236 @@
+"""Gyroscopes and accelerometers on links: what they read, and what the joints do by their readings.
+
+A reading is scale times the quantity along the sensor's own axes, plus bias and noise, clipped to its range.
+Gyroscopes read the angular velocity of their link, accelerometers the acceleration of their place less
+that of gravity. Both follow from the place of the link's frame alone, differentiated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxid.dynamics.rhs import small_solve
+from jaxid.model.plant import Plant, as_array
+
+KINDS = ("gyroscope", "accelerometer")
+AXES = ("x", "y", "z")
+# What is held from before counts as so much of the readings' weight: only where these say nothing.
+_HELD = 1e-9
+# And of a joint's variance by that alone, more than this is left only where some motion is not told.
+_SAYS = 1e-3
+
+
+class Inertial(eqx.Module):
+    """One sensor on a link.
+
+    Args:
+        kind: One of `KINDS`.
+        link: 0-based.
+        axes: Of its own that it reads, 0-based.
+        position: Of an accelerometer in the link's frame, (3,) [m].
+        rotation: From the link's axes to its own, a rotation vector, (3,) [rad].
+        scale: Reading over quantity, by axis it reads.
+        bias: Reading at nothing, likewise [rad/s or m/s^2].
+        noise: Standard deviation of a reading [rad/s or m/s^2].
+        range: Largest absolute reading; infinite: none.
+    """
+
+    kind: str = eqx.field(static=True)
+    link: int = eqx.field(static=True)
+    noise: Array = eqx.field(converter=as_array)
+    axes: tuple[int, ...] = eqx.field(static=True, default=(0, 1, 2))
+    position: Array = eqx.field(converter=as_array, default=(0.0, 0.0, 0.0))
+    rotation: Array = eqx.field(converter=as_array, default=(0.0, 0.0, 0.0))
+    scale: Array = eqx.field(converter=as_array, default=1.0)
+    bias: Array = eqx.field(converter=as_array, default=0.0)
+    range: Array = eqx.field(converter=as_array, default=np.inf)
+
+    def along(self, x: Float[Array, "3 ..."]) -> Float[Array, "axes ..."]:
+        """Of a vector in its link's axes, what it measures."""
+        own = _turned(self.rotation)
+        return jnp.stack([jnp.tensordot(own[:, k], x, 1) for k in self.axes])
+
+    @property
+    def gyroscope(self) -> bool:
+        """Whether it is one."""
+        return self.kind == "gyroscope"
+
+
+class InertialSensors(eqx.Module):
+    """All of a machine's, and how they are fused.
+
+    Velocity by the gyroscopes, then acceleration by the accelerometers, are weighted least squares of their
+    readings at the measured position; readings at the end of their range have no weight.
+
+    Args:
+        sensors: As they are.
+        known: As they are taken to be: with bias, scale and rotation where calibrated, else without.
+        hold: Ticks of the loop for which what is fused is held.
+    """
+
+    sensors: tuple[Inertial, ...]
+    known: tuple[Inertial, ...]
+    hold: int = eqx.field(static=True, default=1)
+
+    @property
+    def count(self) -> int:
+        """Readings in all."""
+        return sum(len(s.axes) for s in self.sensors)
+
+    @property
+    def accelerates(self) -> bool:
+        """Whether there are accelerometers."""
+        return any(s.kind == "accelerometer" for s in self.sensors)
+
+    def read(
+        self, plant: Plant, q: Array, qd: Array, qdd: Array, noise: Float[Array, " count"] | None = None
+    ) -> Float[Array, " count"]:
+        """Readings of all; `noise` are standard normal numbers."""
+        out, at = [], 0
+        for s, x in zip(self.sensors, _quantities(self.sensors, plant, q, qd, qdd), strict=True):
+            x = s.scale * x + s.bias
+            x = x if noise is None else x + s.noise * noise[at : at + x.size]
+            out.append(jnp.clip(x, -s.range, s.range))
+            at += x.size
+        return jnp.concatenate(out)
+
+    def fused(
+        self, plant: Plant, q: Float[Array, " n"], readings: Float[Array, " count"],
+        velocity: Float[Array, " n"], acceleration: Float[Array, " n"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, ""]]:
+        """Velocity and acceleration of all joints, and whether the readings tell them.
+
+        Args:
+            plant: Whose frames the sensors are on.
+            q: Measured position.
+            readings: Of all sensors, in their order.
+            velocity, acceleration: What they are taken to be where readings are out of range.
+        """
+        zero, rows = jnp.zeros_like(q), _slopes(self.known, plant, q)
+        velocity, sound = self._solved(True, rows, [0.0] * len(rows), readings, velocity)
+        if not self.accelerates:
+            return velocity, acceleration, sound
+        rest = _quantities(self.known, plant, q, velocity, zero)
+        acceleration, also = self._solved(False, rows, rest, readings, acceleration)
+        return velocity, acceleration, sound & also
+
+    def _solved(
+        self, gyroscopes: bool, rows: list[Array], rest: list, readings: Array, held: Array
+    ) -> tuple[Array, Array]:
+        """What gyroscopes, or accelerometers, say of a quantity in which they are affine."""
+        ends = np.cumsum([0, *(len(s.axes) for s in self.known)])
+        own = [k for k, s in enumerate(self.known) if s.gyroscope == gyroscopes]
+        seen, weight, inside = [], [], []
+        for k in own:
+            s, x = self.known[k], readings[ends[k] : ends[k + 1]]
+            seen.append((x - s.bias) / s.scale - rest[k])
+            weight.append(jnp.broadcast_to((s.scale / s.noise) ** 2, x.shape))
+            inside.append(jnp.abs(x) < s.range)
+        seen, weight, inside = (jnp.concatenate(x) for x in (seen, weight, inside))
+        rows = jnp.concatenate([rows[k] for k in own])
+        prior = _HELD * jnp.sum(weight[:, None] * rows**2) / held.size
+        weight = jnp.where(inside, weight, 0.0)
+        normal = jnp.sum((weight[:, None] * rows)[:, :, None] * rows[:, None, :], axis=0)
+        normal = normal + prior * jnp.eye(held.size)
+        moment = jnp.sum((weight * seen)[:, None] * rows, axis=0) + prior * held
+        inverse = jax.vmap(small_solve, (None, 0))(normal, jnp.eye(held.size))
+        return jnp.sum(inverse * moment, axis=1), jnp.all(prior * jnp.diagonal(inverse) < _SAYS)
+
+
+def _places(sensors: tuple[Inertial, ...], plant: Plant) -> Callable[[Array], tuple[Array, Array]]:
+    """Axes of the sensors' links, and the sensors' places, as functions of the position."""
+
+    def places(q: Array) -> tuple[Array, Array]:
+        frames = {link: plant.frame(link, q) for link in sorted({s.link for s in sensors})}
+        axes = jnp.stack([frames[s.link][0] for s in sensors])
+        origins = [frames[s.link][1] + jnp.sum(frames[s.link][0] * s.position, axis=1) for s in sensors]
+        return axes, jnp.stack(origins)
+
+    return places
+
+
+def _quantities(
+    sensors: tuple[Inertial, ...], plant: Plant, q: Array, qd: Array, qdd: Array
+) -> list[Float[Array, " axes"]]:
+    """What each measures, along its axes [rad/s or m/s^2]."""
+    places = _places(sensors, plant)
+
+    def rate(q: Array, qd: Array) -> tuple:
+        return jax.jvp(places, (q,), (qd,))
+
+    ((axes, _), (turn, _)), (_, (_, second)) = jax.jvp(rate, (q, qd), (qd, qdd))
+    turning, free = _vector(axes, turn[..., None])[..., 0], second - plant.base_gravity
+    moving = jnp.sum(axes * free[:, :, None], axis=1)
+    return [s.along(turning[k] if s.gyroscope else moving[k]) for k, s in enumerate(sensors)]
+
+
+def _slopes(sensors: tuple[Inertial, ...], plant: Plant, q: Array) -> list[Float[Array, "axes n"]]:
+    """Derivative of what each measures in the joints' velocities, or accelerations."""
+    places = _places(sensors, plant)
+    turn, move = jax.jacfwd(places)(q)
+    axes = places(q)[0]
+    turning = _vector(axes, turn)
+    moving = jnp.sum(axes[:, :, :, None] * move[:, :, None, :], axis=1)
+    return [s.along(turning[k] if s.gyroscope else moving[k]) for k, s in enumerate(sensors)]
+
+
+def _vector(axes: Float[Array, "s 3 3"], turn: Float[Array, "s 3 3 n"]) -> Float[Array, "s 3 n"]:
+    """Angular velocities in the turning axes, of the derivatives of these."""
+    across = jnp.sum(axes[:, :, :, None, None] * turn[:, :, None, :, :], axis=1)
+    return jnp.stack([across[:, 2, 1], across[:, 0, 2], across[:, 1, 0]], axis=1)
+
+
+def _turned(rotation: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """A sensor's axes, as columns, in those of its link, by Rodrigues' formula."""
+    angle = jnp.sqrt(jnp.sum(rotation**2) + 1e-300)
+    x, y, z = rotation / angle
+    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    square = jnp.sum(cross[:, :, None] * cross[None, :, :], axis=1)
+    return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * square
+
+
+def scale_factor(raw: Float[np.ndarray, " time"], known: Float[np.ndarray, " time"]) -> float:
+    """What raw readings are multiplied by to match a known motion, by least squares.
+
+    Noise of the readings lowers it, by the square of its part in them; `calibrate` has no such bias.
+
+    Source:
+        Righettini et al. (2025), Robotics 14, 36, (47) and (48).
+    """
+    return float(raw @ known / (raw @ raw))
+
+
+def calibrate(
+    raw: Float[np.ndarray, "time axes"], known: Float[np.ndarray, "time 3"]
+) -> tuple[Float[np.ndarray, "axes 3"], Float[np.ndarray, " axes"], Float[np.ndarray, "axes 4"]]:
+    """Scale, mounting and bias of a sensor from a known motion, by least squares.
+
+    Args:
+        raw: Its readings.
+        known: What it should have read along its link's axes.
+
+    Returns:
+        Matrix from the one to the other (scale times mounting, without a demand that axes be at right
+        angles), bias, and the standard deviations of both, for white noise.
+
+    Raises:
+        ValueError: If the motion does not excite all that is asked, or is too short.
+    """
+    columns = np.concatenate([known, np.ones((len(known), 1))], axis=1)
+    if len(columns) <= 4:
+        raise ValueError(f"{len(columns)} samples do not tell 4 numbers an axis; take more.")
+    size = np.sqrt(np.mean(columns**2, axis=0))
+    values = np.linalg.svd(columns / np.where(size > 0, size, 1.0), compute_uv=False)
+    if not np.all(size > 0) or values[-1] < 1e-9 * values[0]:
+        raise ValueError("the motion does not turn (or accelerate) along three axes, at several rates.")
+    found, *_ = np.linalg.lstsq(columns, raw, rcond=None)
+    left = raw - columns @ found
+    variance = np.sum(left**2, axis=0) / (len(columns) - 4)
+    std = np.sqrt(variance[:, None] * np.diagonal(np.linalg.inv(columns.T @ columns)))
+    return found[:3].T, found[3], std

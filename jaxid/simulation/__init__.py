@@ -1,0 +1,1 @@
+"""Simulation: control loops, solvers, step sizes, and replays of a log."""

@@ -1,0 +1,350 @@
+"""From plant, loop and input to a trajectory: a fixed-step scan, and diffrax.
+
+The scan over the samples serves sampled loops and fits; between samples it takes fixed steps or a
+solver of diffrax. `with_diffrax` serves a force that is any function of time, on the same right-hand
+side. A command that is held is held outside the integration step: a continuous controller is a
+different model from a sampled one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.controllers import Controller, Tick
+from jaxid.dynamics.dry_friction import set_valued_step
+from jaxid.dynamics.rhs import State, acceleration, affine_flow, course, step, vector_field
+from jaxid.model.plant import Plant
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.solvers import RELATIVE, Adaptive
+
+if TYPE_CHECKING:
+    import diffrax
+
+# Largest product of step and fastest decay for which the fourth-order step keeps both trajectory
+# and gradient (2.78 is where it turns unstable; past 1 the gradient error grows beyond 1 %).
+_LARGEST_STEP = 1.0
+
+
+class Trajectory(eqx.Module):
+    """What a simulation returns, one row a sample.
+
+    Args:
+        position: (time, n) [m or rad].
+        velocity: (time, n).
+        command: Logged command, (time, m), before the declared gain.
+        reading: Position as the sensor reports it, (time, n).
+        found: What a law that identifies had found, see `Controller.told`; else None.
+    """
+
+    position: Float[Array, "time n"]
+    velocity: Float[Array, "time n"]
+    command: Float[Array, "time m"]
+    reading: Float[Array, "time n"]
+    found: Any = None
+
+
+class Drive(eqx.Module):
+    """How a sampled force acts: declared gain, hold and delay.
+
+    Args:
+        gain: Declared force per unit of command, (m,).
+        period: Time between samples of the command [s].
+        hold: "zero_order", "linear" or "band_limited".
+        substeps: Integration steps a sample.
+        set_valued: Whether dry friction sticks exactly (replay) or is smoothed (gradients).
+        longest_delay: Samples of past command kept for delays in a closed loop.
+        solver: Takes the place of fixed steps where given; dry friction is then smoothed.
+    """
+
+    gain: Array
+    period: float = eqx.field(static=True)
+    hold: str = eqx.field(static=True, default="zero_order")
+    substeps: int = eqx.field(static=True, default=1)
+    set_valued: bool = eqx.field(static=True, default=False)
+    longest_delay: int = eqx.field(static=True, default=0)
+    solver: Adaptive | None = None
+
+    def stepper(
+        self, plant: Plant, x: State, ends: tuple[Array, ...]
+    ) -> Callable[[State, tuple[Array, ...], Array], State]:
+        """What advances a state by one sample, given the force at its ends, and the time.
+
+        To be called outside the loop over the samples: where the plant's forces are affine, its
+        flow is one matrix, worked out here once.
+
+        Args:
+            plant: The plant.
+            x, ends: A state and the force at the ends of a sample, for their shapes; one force
+                where it is held.
+        """
+        if self.solver is not None:
+            whole, solver = jnp.asarray(self.period), self.solver
+            return lambda x, ends, t: solver(plant, x, ends, t, whole)
+        h = jnp.asarray(self.period / self.substeps)
+        flow = affine_flow(plant, x, ends, jnp.zeros(()), h) if self.set_valued else None
+
+        def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
+            if not self.set_valued:
+                return step(plant, x, course(ends), t, h)
+            bound = None if flow is None else lambda x, *reaction: flow(x, ends, *reaction)
+            return set_valued_step(plant, x, course(ends), t, h, bound)[0]
+
+        def several(x: State, ends: tuple[Array, ...], t: Array) -> State:
+            def inner(x: State, k: Array) -> tuple[State, None]:
+                part = [course(ends)((k + i) / self.substeps) for i in range(len(ends))]
+                return one(x, tuple(part), t + k * h), None
+
+            return jax.lax.scan(inner, x, jnp.arange(self.substeps, dtype=jnp.float64))[0]
+
+        return one if self.substeps == 1 else several
+
+
+def open_loop(
+    plant: Plant,
+    drive: Drive,
+    command: Float[Array, "time m"],
+    position: Float[Array, " n"],
+    velocity: Float[Array, " n"],
+    sensor: Sensor | None = None,
+    reset: tuple[Array, Array, Array] | None = None,
+    start: Array | float = 0.0,
+    own: tuple | None = None,
+    past: Float[Array, "earlier m"] | None = None,
+) -> Trajectory:
+    """Simulate a plant under a logged command.
+
+    Args:
+        plant: The plant.
+        drive: How the command acts.
+        command: Logged command, (time, m).
+        position, velocity: At the first sample.
+        sensor: What reads the position; absent: exact.
+        reset: Samples at which a segment starts (time,) bool, and the positions and velocities
+            to restart from, (time, n); for multiple shooting.
+        start: Time of the first sample, from the start of the log [s].
+        own: Own states of the effects there; absent: as if the drive had long been at its force.
+        past: Logged command before the first sample, for what a delay still holds back; absent:
+            as at the first sample.
+    """
+    earlier = 0 if past is None else past.shape[0]
+    known = command if past is None else jnp.concatenate([past, command])
+    before, after = (f[earlier:] for f in interval_forces(plant, drive, known))
+    times = start + drive.period * jnp.arange(command.shape[0])
+    x0 = State(position, velocity, plant.initial_states(before[0]) if own is None else own)
+    held = drive.hold == "zero_order"
+    advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
+    n = command.shape[0]
+    flag, q_new, v_new = (
+        (jnp.zeros(n, bool), jnp.zeros((n, 1)), jnp.zeros((n, 1))) if reset is None else reset
+    )
+
+    def tick(x: State, now: tuple) -> tuple[State, tuple]:
+        u0, u1, t, restart, q, v = now
+        if reset is not None:
+            x = State(jnp.where(restart, q, x.q), jnp.where(restart, v, x.qd), x.own)
+        return advance(x, (u0,) if held else (u0, u1), t), (x.q, x.qd)
+
+    _, (q, v) = jax.lax.scan(tick, x0, (before, after, times, flag, q_new, v_new))
+    reading = q if sensor is None else sensor.read(q)
+    return Trajectory(q, v, command, reading)
+
+
+def interval_forces(
+    plant: Plant, drive: Drive, command: Float[Array, "time m"]
+) -> tuple[Array, Array]:
+    """Declared force at the start and the end of every interval, delay applied.
+
+    A delay that is no whole number of samples is averaged over the interval: taken literally, a
+    held command has zero gradient in it.
+    """
+    force = drive.gain * command
+    n, drives = force.shape
+    shift = plant.command_delays(drives) / drive.period
+    whole = jnp.floor(shift).astype(int)
+    part = shift - whole
+    k = jnp.arange(n)[:, None] - whole
+
+    def at(k: Array) -> Array:
+        return jnp.take_along_axis(force, jnp.clip(k, 0, n - 1), axis=0)
+
+    start = (1 - part) * at(k) + part * at(k - 1)
+    if drive.hold == "zero_order":
+        return start, start
+    return start, (1 - part) * at(k + 1) + part * at(k)
+
+
+def closed_loop(
+    plant: Plant,
+    drive: Drive,
+    controller: Controller,
+    reference: Float[Array, "ticks m"],
+    disturbance: Float[Array, "ticks m"],
+    position: Float[Array, " n"],
+    velocity: Float[Array, " n"],
+    sensor: Sensor | None = None,
+    noise: Float[Array, "ticks n"] | None = None,
+) -> Trajectory:
+    """Simulate a plant in its sampled loop.
+
+    Args:
+        plant: The plant.
+        drive: How the command acts; `drive.period` is the controller's.
+        controller: The law.
+        reference: Of the joints that are driven, at every tick, (ticks, m).
+        disturbance: Added to the command at every tick, before its limit.
+        position, velocity: At the first tick.
+        sensor: What the controller reads; absent: exact.
+        noise: Standard normal numbers for the sensor's noise, of the positions and, where there are more
+            columns, of the measured commands and the inertial sensors; absent: none.
+
+    Returns:
+        One row a tick.
+    """
+    sensor, n = Sensor() if sensor is None else sensor, position.size
+    driven = plant.driven(position.size)
+    path = controller.path(reference)
+    first = jax.tree.map(lambda x: x[0], path)
+    memory = controller.start(Tick(position, first, driven), velocity, path)
+    times = drive.period * jnp.arange(reference.shape[0])
+    tick0 = Tick(sensor.read(position), first, driven)
+    held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
+    past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
+    x0 = State(position, velocity, plant.initial_states(held))
+    advance = drive.stepper(plant, x0, (held,))
+
+    inertial, m = sensor.inertial, drive.gain.size
+
+    def sensed(x: State, reading: Array, moved: tuple, noise: Array | None, renews: Array) -> tuple:
+        """Velocity and acceleration by inertial sensors, whether they are new, and what is to be kept."""
+        before, v, a = moved
+        mean = (x.qd - before) / drive.period
+        raw = inertial.read(plant, x.q, x.qd, mean, noise)
+        new_v, new_a, sound = inertial.fused(plant, reading, raw, v, a)
+        v, a = jnp.where(renews, new_v, v), jnp.where(renews, new_a, a)
+        return (v, a if inertial.accelerates else None, renews & sound), (x.qd, v, a)
+
+    def tick(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
+        x, memory, past, last, held, moved = carry
+        path, disturbance, noise, t, fresh, renews = now
+        reading = sensor.read(x.q, None if noise is None else noise[:n])
+        if fresh is not None:
+            reading = held = jnp.where(fresh, reading, held)
+        v, a, renewed = None, None, True
+        if inertial is not None:
+            more = None if noise is None or noise.shape[0] <= n + m else noise[n + m :]
+            (v, a, renewed), moved = sensed(x, reading, moved, more, renews)
+        seen = Tick(reading, path, driven, True if fresh is None else fresh, v, a, last, renewed)
+        u, memory = controller.command(seen, memory, disturbance)
+        force, past = _delayed_force(plant, drive, u, past)
+        new = advance(x, (force,), t)
+        last = None if last is None else sensor.read_command(u, noise[n : n + m])
+        return (new, memory, past, last, held, moved), (x.q, x.qd, u, reading, controller.told(memory))
+
+    fresh = None if sensor.hold == 1 else jnp.arange(len(times)) % sensor.hold == 0
+    measures = noise is not None and noise.shape[1] > n and sensor.force_noise is not None
+    last, held = held / drive.gain if measures else None, None if fresh is None else position
+    moved = None if inertial is None else (velocity, velocity, jnp.zeros_like(velocity))
+    renews = None if inertial is None else jnp.arange(len(times)) % inertial.hold == 0
+    inputs = (path, disturbance, noise, times, fresh, renews)
+    _, (q, v, u, reading, found) = jax.lax.scan(tick, (x0, memory, past, last, held, moved), inputs)
+    return Trajectory(q, v, u, reading, found)
+
+
+def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[Array, Array]:
+    """Declared force over the coming interval, and the updated memory of past ones."""
+    force = drive.gain * u
+    if drive.longest_delay == 0:
+        return force, past
+    past = jnp.concatenate([force[None], past[:-1]])
+    shift = jnp.clip(plant.command_delays(u.size) / drive.period, 0.0, drive.longest_delay)
+    # Hat weights over the last samples: linear interpolation without a data-dependent index.
+    samples = jnp.arange(drive.longest_delay + 1)[:, None]
+    weight = jnp.maximum(0.0, 1.0 - jnp.abs(samples - shift))
+    return jnp.sum(weight * past, axis=0), past
+
+
+def with_diffrax(
+    plant: Plant,
+    force: Callable[[Array], Array],
+    times: Float[Array, " time"],
+    position: Float[Array, " n"],
+    velocity: Float[Array, " n"],
+    *,
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    step_length: float | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int = 1_000_000,
+) -> tuple[Float[Array, "time n"], Float[Array, "time n"]]:
+    """Simulate with any diffrax solver on the same right-hand side (smoothed friction).
+
+    Args:
+        plant: The plant.
+        force: Declared force as a function of time, (m,).
+        times: Where the motion is wanted [s].
+        position, velocity: At times[0].
+        solver: Default Tsit5.
+        controller: Step-size control; default PID at 1e-8, or constant where `step_length` is given.
+        step_length: Fixed step [s].
+        adjoint: How diffrax differentiates; default its own.
+        max_steps: Longest run.
+
+    Returns:
+        Positions and velocities, (time, n).
+    """
+    import diffrax
+
+    if controller is None:
+        controller = (
+            diffrax.ConstantStepSize()
+            if step_length is not None
+            else diffrax.PIDController(rtol=RELATIVE, atol=1e-10)
+        )
+    x0 = State(position, velocity, plant.initial_states(force(times[0])))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(vector_field),
+        solver or diffrax.Tsit5(),
+        times[0],
+        times[-1],
+        step_length,
+        x0,
+        args=(plant, force),
+        saveat=diffrax.SaveAt(ts=times),
+        stepsize_controller=controller,
+        adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
+        max_steps=max_steps,
+    )
+    return solution.ys.q, solution.ys.qd
+
+
+def needed_substeps(plant: Plant, drive: Drive, q: Array, v: Array, u: Array) -> int:
+    """Integration steps a sample that the smoothed sign asks for along a motion.
+
+    Past that, the trajectory still looks plausible while its gradient is garbage: level times
+    step over (mass times width) must not exceed about one.
+
+    Args:
+        plant: The plant.
+        drive: Its period counts.
+        q, v, u: Motion and declared force at some samples, (time, n) and (time, m).
+    """
+    times = jnp.zeros(q.shape[0])
+
+    def damping(q: Array, v: Array, u: Array, t: Array) -> Array:
+        own = plant.initial_states(u)
+        slope = jax.jacfwd(lambda v: acceleration(plant, State(q, v, own), u, t))(v)
+        return jnp.abs(slope).max()
+
+    # A motion that passes through rest between two samples meets the corner all the same.
+    passes = v * jnp.concatenate([v[1:], v[-1:]]) < 0
+    v = jnp.concatenate([v, jnp.where(passes, 0.0, v)])
+    q, u, times = (jnp.concatenate([a, a]) for a in (q, u, times))
+    worst = eqx.filter_jit(jax.vmap(damping))(q, v, u, times).max()
+    return max(1, int(np.ceil(float(worst) * drive.period / _LARGEST_STEP)))

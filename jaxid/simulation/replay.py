@@ -1,0 +1,350 @@
+"""A machine run over the input of a log: in its loop where the controller is known, else open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.interpolate
+import scipy.signal
+from jaxtyping import Array, Float
+
+from jaxid.controllers import Controller
+from jaxid.dynamics.hidden_joints import resting
+from jaxid.errors import InputError
+from jaxid.logs.log import Log
+from jaxid.machine import Machine, disturbance_at
+from jaxid.model.plant import Plant
+from jaxid.numerics import filters as signals
+from jaxid.references.unknown import Course
+from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
+from jaxid.simulation.solvers import Adaptive
+from jaxid.simulation.step_size import needed_steps
+
+# Ticks of past command that a delay in a loop may reach back.
+_LONGEST_DELAY = 12
+# Samples within which an error of a loop's start shows, and by how much more than the rest they are off then.
+_FIRST, _FAR_MORE = 100, 5.0
+# A band-limited command is refined so often, then joined by lines.
+_REFINE = 8
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """How a replay integrates.
+
+    Args:
+        set_valued: Dry friction sticks exactly; else it is smoothed.
+        substeps: Integration steps between samples of the command.
+        longest_delay: Samples of past command kept, for delays in a loop.
+        segment: Samples after which an open-loop run restarts from the log; None: never.
+        solver: One of `jaxid.simulation.solvers.SOLVERS`, which takes the place of the fixed steps and
+            smooths dry friction; None: fixed steps.
+    """
+
+    set_valued: bool = True
+    substeps: int = 1
+    longest_delay: int = 0
+    segment: int | None = None
+    solver: str | None = None
+
+    @property
+    def sticks(self) -> bool:
+        """Whether dry friction sticks exactly."""
+        return self.set_valued and self.solver is None
+
+
+class Replay(eqx.Module):
+    """Inputs of a log, ready to drive a plant; call it with the plant.
+
+    Args:
+        drive: How the command acts.
+        controller: The law; None: open loop.
+        sensor: What the controller reads.
+        reference, disturbance: By drive, at every tick (closed loop); a `Course` where it has unknowns.
+        command: Logged command (open loop), refined where it is band-limited.
+        position, velocity: At the start.
+        restart: Flags, positions and velocities of segments (open loop).
+        every: The log holds one tick in so many.
+        follow: How positions at the start go along with those of joints that have an encoder, (n, k).
+    """
+
+    drive: Drive
+    controller: Controller | None
+    sensor: Sensor
+    reference: Array | Course | None
+    disturbance: Array | None
+    command: Array | None
+    position: Float[Array, " n"]
+    velocity: Float[Array, " n"]
+    restart: tuple[Array, Array, Array] | None
+    every: int = eqx.field(static=True)
+    follow: Float[Array, "n k"]
+
+    def __call__(self, plant: Plant, nudge: Array | None = None) -> Trajectory:
+        """Trajectory at the samples of the log.
+
+        Args:
+            plant: The plant.
+            nudge: Added to position and velocity at the start, (2 n,).
+        """
+        q, v = self.position, self.velocity
+        if nudge is not None:
+            q, v = q + nudge[: q.size], v + nudge[q.size :]
+        if self.controller is not None:
+            reference = self.reference() if isinstance(self.reference, Course) else self.reference
+            run = closed_loop(
+                plant, self.drive, self.controller, reference, self.disturbance, q, v,
+                self.sensor,
+            )
+        else:
+            run = open_loop(plant, self.drive, self.command, q, v, None, self.restart)
+        return jax.tree.map(lambda a: a[:: self.every], run)
+
+    def started(self, start: Float[Array, " k"]) -> Replay:
+        """The same run, joints that have an encoder moved by so much and the others at rest with them."""
+        return replace(self, position=self.position + self.follow @ start)
+
+    def following(self, places: tuple, theta: Float[Array, " p"]) -> Replay:
+        """The same run with what is unknown of its reference at theta."""
+        if not isinstance(self.reference, Course):
+            return self
+        return replace(self, reference=self.reference.with_unknowns(places, theta))
+
+
+def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) -> Replay:
+    """Prepare a log to drive its machine.
+
+    Args:
+        machine: The machine; with a controller the loop is closed.
+        log: The log; in a loop it needs a reference.
+        numerics: How to integrate; default exact sticking, steps as fine as the plant asks.
+
+    Raises:
+        InputError: If the loop is to be closed and the log has no reference, or its rate does not
+            fit the controller's.
+    """
+    numerics = numerics or Numerics(substeps=needed_steps(machine, log))
+    position, follow = resting(machine.plant, log.filled[0], machine.gain.size, log.measured)
+    velocity = follow @ start_velocity(log)[list(log.measured)]
+    start = (position, velocity)
+    if machine.controller is None:
+        return _open(machine, log, numerics, start, follow)
+    period = machine.controller.period
+    every = max(1, round(log.period / period))
+    if abs(log.period / period / every - 1) > 1e-3:
+        raise InputError(
+            f"{log.source}: one sample every {log.period:g} s is no whole multiple of the "
+            f"controller's period {period:g} s; resample the log or correct [controller] period."
+        )
+    if log.reference is None and machine.course is None:
+        raise InputError(
+            f"{log.source}: the loop cannot be simulated without a reference; name its column "
+            "as reference in [log], or leave out [controller] to simulate from the measured force."
+        )
+    driven = log.force.shape[1]
+    if log.reference is not None and log.reference.shape[1] not in (1, driven):
+        raise InputError(
+            f"{log.source}: the reference has {log.reference.shape[1]} columns for {driven} drives; "
+            "name one a drive in [log]."
+        )
+    ticks = log.time[0] + period * np.arange((log.samples - 1) * every + 1)
+    if log.reference is None:
+        reference, times = machine.course.at(ticks - log.time[0]), ticks
+    elif every == 1:
+        reference, times = log.reference, log.time
+    else:
+        # Akima's cubic passes a ramp of speed exactly and does not ring at a step. A line between samples
+        # ten ticks apart is off by a hundredth of a millimetre at 0.8 m/s^2, and bends an inertia by 10 %.
+        curve = scipy.interpolate.Akima1DInterpolator(log.time, log.reference, axis=0)
+        reference, times = curve(np.minimum(ticks, log.time[-1])), ticks
+    disturbance = disturbance_at(machine.disturbance, times, log)
+    return Replay(
+        _drive(machine, log, numerics, period, "zero_order"), machine.controller,
+        machine.sensor.mean, reference, disturbance, None, *start, None, every, follow,
+    )
+
+
+def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: str) -> Drive:
+    solver = None
+    if numerics.solver is not None:
+        sizes = float(np.std(log.filled, axis=0).max()), float(machine.plant.velocity_scale)
+        solver = Adaptive.sized(numerics.solver, *sizes)
+    return Drive(
+        machine.gain, period, hold, numerics.substeps,
+        numerics.sticks, numerics.longest_delay, solver,
+    )
+
+
+def from_rest(replay: Replay) -> Replay:
+    """The same run, nothing moving at its start."""
+    return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
+
+
+def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
+    """Whether far more is left of the first samples of a run than of those behind them.
+
+    Args:
+        off: Measured less simulated; NaN where there is no reading.
+    """
+    squares = np.nanmean(np.square(off), axis=1)
+    return bool(np.mean(squares[:_FIRST]) > _FAR_MORE * np.mean(squares[_FIRST:]))
+
+
+def with_sensor(replay: Replay, sensor: Sensor) -> Replay:
+    """The same run, its controller reading by another sensor."""
+    return eqx.tree_at(lambda r: r.sensor, replay, sensor, is_leaf=lambda x: isinstance(x, Sensor))
+
+
+def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100) -> Replay:
+    """An open-loop run whose initial position and velocity fit the first samples of its log.
+
+    A slope through noisy samples is a poor velocity, worse where an oscillation is sampled ten
+    times a period; the plant itself knows how the first samples hang together.
+
+    Args:
+        replay: The run.
+        plant: The plant.
+        log: The log.
+        samples: How many count.
+    """
+    if replay.controller is not None or replay.restart is not None:
+        return replay
+    count = min(samples, log.samples)
+    short = eqx.tree_at(
+        lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1]
+    )
+    nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
+    n = replay.position.size
+    moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
+    if not bool(jnp.all(jnp.isfinite(nudge))):
+        return replay
+    return eqx.tree_at(lambda r: (r.position, r.velocity), replay, moved)
+
+
+@eqx.filter_jit
+def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, ...]) -> Array:
+    def residual(nudge: Array) -> Array:
+        return ((replay(plant, nudge).position - position) * np.array(measured)).ravel()
+
+    def improve(_: int, nudge: Array) -> Array:
+        jacobian = jax.jacfwd(residual)(nudge)
+        scale = jnp.linalg.norm(jacobian, axis=0) + 1e-300
+        step = jnp.linalg.lstsq(jacobian / scale, residual(nudge))[0] / scale
+        return nudge - step
+
+    # Three steps: the start enters almost linearly over so short a run.
+    return jax.lax.fori_loop(0, 3, improve, jnp.zeros(2 * replay.position.size))
+
+
+def _open(
+    machine: Machine, log: Log, numerics: Numerics, start: tuple[np.ndarray, np.ndarray], follow: np.ndarray
+) -> Replay:
+    command, period, hold, every = log.force, log.period, log.hold, 1
+    if hold == "band_limited":
+        command, every = _refined(command), _REFINE
+        period, hold = period / every, "linear"
+        numerics = replace(numerics, substeps=max(1, round(numerics.substeps / every)))
+    drive = _drive(machine, log, numerics, period, hold)
+    restart = None
+    if numerics.segment:
+        flags, q, v = _segments(log, numerics.segment, every)
+        seen = list(log.measured)
+        restart = flags, start[0] + (q - start[0])[:, seen] @ follow.T, v[:, seen] @ follow.T
+    return Replay(
+        drive, None, machine.sensor.mean, None, None, command, *start, restart, every, follow,
+    )
+
+
+def _refined(command: np.ndarray) -> np.ndarray:
+    """Band-limited interpolation, of an odd extension so that the ends do not ring."""
+    n = len(command)
+    pad = min(n - 1, 200)
+    whole = np.concatenate(
+        [2 * command[0] - command[pad:0:-1], command, 2 * command[-1] - command[-2 : -pad - 2 : -1]]
+    )
+    fine = scipy.signal.resample(whole, len(whole) * _REFINE, axis=0)
+    return fine[pad * _REFINE : (pad + n - 1) * _REFINE + 1]
+
+
+def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
+    """Restart every `length` samples from the measured position and its local slope."""
+    n = (log.samples - 1) * every + 1
+    flags = np.zeros(n, bool)
+    q, v = np.zeros((n, log.filled.shape[1])), np.zeros((n, log.filled.shape[1]))
+    noise = signals.high_band_std(log.filled)
+    for k in range(0, log.samples, length):
+        flags[k * every] = True
+        q[k * every], v[k * every] = local_line(log, k, noise)
+    return flags, q, v
+
+
+# Reaches of the parabola that gives a velocity [samples], and how far, in standard deviations, a wider
+# one may stray from what a narrower one says.
+_REACHES = (2, 3, 5, 7, 10)
+_STRAY = 2.0
+
+
+def local_line(
+    log: Log, k: int, noise: Float[np.ndarray, " n"] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at sample k, by joint, from parabolas through its neighbours.
+
+    As wide as noise asks and the motion allows: a machine that starts with a jerk is nowhere near a
+    parabola for twenty samples. The widest one counts that agrees with all narrower ones.
+
+    Args:
+        log: The log.
+        k: The sample.
+        noise: Standard deviation of a reading, by joint; absent: read off the log.
+    """
+    noise = signals.high_band_std(log.filled) if noise is None else noise
+    position = velocity = low = high = None
+    for reach in _REACHES:
+        q, v, size = _parabola(log, k, reach)
+        # Wide enough that rounding alone, in a log without noise, is no disagreement.
+        spread = _STRAY * size * noise + 1e-12 * np.abs(v)
+        if velocity is None:
+            position, velocity, low, high = q, v, v - spread, v + spread
+            going = np.ones(q.shape, bool)
+            continue
+        low, high = np.maximum(low, v - spread), np.minimum(high, v + spread)
+        going = going & (low <= high)
+        position, velocity = np.where(going, q, position), np.where(going, v, velocity)
+    return position, velocity
+
+
+def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Value and slope at sample k, and the standard deviation of the slope for readings of one."""
+    lo = int(np.clip(k - reach, 0, max(log.samples - 2 * reach - 1, 0)))
+    x = log.filled[lo : lo + 2 * reach + 1]
+    t = log.period * (np.arange(lo, lo + len(x)) - k)
+    fit = np.linalg.pinv(np.vander(t / log.period, 3, increasing=True))
+    q, v = fit[0] @ x, fit[1] @ x / log.period
+    return q, v, float(np.linalg.norm(fit[1]) / log.period)
+
+
+def start_velocity(log: Log) -> np.ndarray:
+    """Velocity at the first sample."""
+    return local_line(log, 0)[1]
+
+
+def exact_numerics(machine: Machine, log: Log, steps: int | None = None) -> Numerics:
+    """Integration for a run of which nothing is differentiated: dry friction sticks exactly.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        steps: Between samples of the command; absent: as many as the machine asks for.
+
+    Raises:
+        TooStiffError: If the machine asks for more steps than any sound one.
+    """
+    delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
+    looped = machine.controller is not None
+    steps = needed_steps(machine, log) if steps is None else steps
+    return Numerics(substeps=steps, longest_delay=_LONGEST_DELAY if delayed and looped else 0)

@@ -1,0 +1,48 @@
+"""The rooms of jaxid in the order of imports: each may import from those before it, and from itself.
+
+A newcomer reads the package in this order. A room is a folder or a module directly under `jaxid/`.
+"""
+
+ROOMS = {
+    "errors": "one-line errors with a hint",
+    "_platform": "float64 and XLA's loop option",
+    "_cache": "compiled code on disk",
+    "files": "writing outputs whole or not at all",
+    "numerics": "smooth functions, filters, precision, batched calls; no machine",
+    "model": "parameters, effects, and the balance of a plant: one statement of the physics",
+    "dynamics": "readings of the balance: right-hand side, dry friction, residuals",
+    "effects": "physical effects, a family a file",
+    "plants": "machines, one a file",
+    "controllers": "control laws, a family a file",
+    "logs": "reading, checking and filtering logs",
+    "references": "reference trajectories, one a file",
+    "sensors": "encoders and inertial sensors",
+    "arms": "inertial parameters of linkages",
+    "case": "case files",
+    "machine": "a plant with its actuator, controller and sensors",
+    "simulation": "loops, solvers, and replays of a log",
+    "session": "a case with its logs, opened and checked",
+    "scene": "a case set up for simulation",
+    "gap": "the gap between simulation and measurement",
+    "estimators": "estimators, one a file or folder",
+    "experiment_design": "experiments that identify the unknowns best",
+    "discovery": "the search for missing effects",
+    "studies": "Monte-Carlo studies",
+    "results": "results as JSON, text and report",
+    "commands": "the commands, one a file",
+    "demo": "the demonstration and its log",
+    "cli": "the command line",
+}
+
+# Imports that run against the order, each with its reason. None may be added without one.
+AGAINST = {
+    ("discovery", "commands"): "gaps are computed by `identify` still",
+    ("discovery", "results"): "a result prints and saves itself",
+    ("studies", "commands"): "a study of `discover` runs it",
+    ("studies", "results"): "a result prints and saves itself",
+    ("results", "commands"): "types only",
+    ("experiment_design", "discovery"): "the improvement of shapes stands there still",
+    ("experiment_design", "results"): "the CSV of a signal is written there still",
+    ("gap", "estimators"): "the force balance stands there still",
+    ("machine", "estimators"): "the adaptive controller carries an estimator",
+}
