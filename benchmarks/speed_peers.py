@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from speed_rows import Row, compare
 
-from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns
 from jaxid.numerics.filters import Decimator
+from jaxid.simulation.force_balance import ForceData, force_and_columns
 
 KP, KV, WIDTH = 160.18, 243.45, 1e-3
 

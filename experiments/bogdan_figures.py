@@ -14,9 +14,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from jaxid.build import build_machine
 from jaxid.case.case import Case, load_case
 from jaxid.commands.identify import Identification
-from jaxid.machine import build_machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.scene import Scene

@@ -25,10 +25,10 @@ import numpy as np
 from common import Table, copied, parser_of
 
 import jaxid
+from jaxid.build import build_machine
 from jaxid.estimators import METHODS
 from jaxid.estimators.algebraic.online import Online, Told, window_rows
 from jaxid.estimators.estimate import Estimate
-from jaxid.machine import build_machine
 from jaxid.numerics.lanes import alone
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

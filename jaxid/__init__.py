@@ -8,6 +8,7 @@ _platform.configure()
 
 if TYPE_CHECKING:
     from jaxid.case.case import load_case as load_case
+    from jaxid.commands.design import design as design
     from jaxid.commands.discover import discover as discover
     from jaxid.commands.live import Live as Live
     from jaxid.commands.live import follow as follow
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from jaxid.effects import register as register_effect  # noqa: F401
     from jaxid.errors import InputError as InputError
     from jaxid.estimators.recursive.real_time import RealTime as RealTime
-    from jaxid.experiment_design.in_loop import design as design
     from jaxid.logs.log import Log as Log
     from jaxid.logs.log import read_log as read_log
     from jaxid.plants import PLANTS as PLANTS
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 _HOMES = {
     "discover": ("jaxid.commands.discover", "discover"),
     "identify": ("jaxid.commands.identify", "identify"),
-    "simulate": ("jaxid.scene", "simulate"),
+    "simulate": ("jaxid.commands.simulate", "simulate"),
     "check": ("jaxid.commands.check", "check"),
-    "design": ("jaxid.experiment_design.in_loop", "design"),
+    "design": ("jaxid.commands.design", "design"),
     "study": ("jaxid.commands.study", "study"),
     "load_case": ("jaxid.case.case", "load_case"),
     "read_log": ("jaxid.logs.log", "read_log"),

@@ -224,7 +224,7 @@ def _run_simulate(args: argparse.Namespace) -> int:
     path = ready_file(Path(args.o), force=args.force)
     with _progress(args, 2) as tell:
         tell("simulating")
-        from jaxid.scene import simulate
+        from jaxid.commands.simulate import simulate
 
         virtual = simulate(args.case, seed=args.seed)
     virtual.save(path)
@@ -237,7 +237,7 @@ def _run_design(args: argparse.Namespace) -> int:
 
     path = ready_file(Path(args.o), force=args.force)
     with _progress(args, 4) as tell:
-        from jaxid.experiment_design.in_loop import design
+        from jaxid.commands.design import design
 
         found = design(args.case, progress=tell)
     found.save(path)

@@ -121,3 +121,17 @@ def ready_file(path: Path, *, force: bool = False) -> Path:
     if not path.parent.is_dir():
         raise InputError("has no such folder", where=str(path), mend="make the folder first")
     return path
+
+
+def signal_csv(signal: str, time: np.ndarray, values: np.ndarray) -> str:
+    """Time and a signal as `[reference] kind = "csv"` (or `[input]`) takes them, every digit kept.
+
+    Args:
+        signal: "reference" or "input".
+        time: Ticks [s].
+        values: (ticks, m).
+    """
+    names = [signal] if values.shape[1] == 1 else [f"{signal}_{k + 1}" for k in range(values.shape[1])]
+    rows = np.column_stack([time, values])
+    lines = [",".join(repr(float(v)) for v in row) for row in rows]
+    return "\n".join([",".join(["t", *names]), *lines]) + "\n"

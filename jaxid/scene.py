@@ -11,15 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxid.case.case import Case, load_case
+from jaxid.build import build_machine
+from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.logs.log import Log
-from jaxid.machine import Machine, build_machine, disturbance_at
+from jaxid.machine import Machine
 from jaxid.model.plant import Plant
-from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.lanes import Solve, Steps
 from jaxid.references import make_reference
 from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, needed_substeps, open_loop
 
 
@@ -64,21 +66,6 @@ class Virtual:
         """Write the log as CSV, whole or not at all."""
         write_whole(Path(path), self.csv())
         return Path(path)
-
-
-def simulate(case: Case | str | Path, *, seed: int = 0) -> Virtual:
-    """Simulate the log that a case would give, at its true values where it has any.
-
-    Args:
-        case: The case, or its file; it needs [simulation] with duration and sample_rate, and
-            [reference] (with a [controller]) or [input].
-        seed: Of the sensors' noise.
-
-    Raises:
-        InputError: If the case does not say what to simulate.
-    """
-    scene = Scene.of(case if isinstance(case, Case) else load_case(case))
-    return alone(scene.virtual(scene.machine, np.random.default_rng(seed)))
 
 
 @dataclass(frozen=True)

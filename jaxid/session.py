@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.build import build_machine
 from jaxid.case.case import Case, load_case
 from jaxid.errors import InputError
 from jaxid.logs.log import Log, read_log, with_load
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
-from jaxid.machine import Machine, build_machine
+from jaxid.machine import Machine
 from jaxid.references import make_reference
 from jaxid.simulation.step_size import needed_steps
 

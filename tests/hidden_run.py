@@ -16,8 +16,7 @@ from hidden_chains import ChainCase
 from search_setup import case_text, log_of, write_case
 
 import jaxid
-from jaxid.commands.identify import Gap
-from jaxid.gap import force_gap
+from jaxid.gap import Gap, force_gap
 from jaxid.logs.log import Log
 
 Record = dict

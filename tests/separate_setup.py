@@ -12,7 +12,7 @@ from stepper_machines import Setup
 
 from jaxid.commands.discover import start_search
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.screen import Score
+from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search
 from jaxid.discovery.separating.propose import Proposal, propose
 from jaxid.session import open_session

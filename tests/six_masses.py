@@ -11,11 +11,11 @@ import numpy as np
 from chain_stepper import ChainMachine, simulate_under
 from stepper import Sensor
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.commands.live import Live
 from jaxid.estimators.algebraic.online import Told
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine
 
 CASE = Path(__file__).parent.parent / "experiments" / "cases" / "chain6.toml"
 # What is asked of each kind of parameter, relative.

@@ -8,7 +8,7 @@ import pytest
 from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, affine_flow, course, step
 from jaxid.effects import EFFECTS
-from jaxid.model.plant import Action, Effect
+from jaxid.model.effect import Action, Effect
 from jaxid.numerics.affine import affine
 from jaxid.plants import Axis
 

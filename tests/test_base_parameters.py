@@ -10,8 +10,8 @@ from test_serial_arm import ROWS, arm
 
 from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.base_parameters import base_parameters, inertial_regressor, standard_parameters
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
-from jaxid.machine import build_machine
 from jaxid.plants import Axis, pa10
 
 # (2.16) of the PA-10 report: no torque depends on them.

@@ -8,10 +8,10 @@ import pytest
 import stages
 
 import jaxid
+from jaxid.build import build_machine
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.within_prior.problem import Problem
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine
 from jaxid.session import open_session
 from jaxid.simulation.replay import make_replay
 from jaxid.simulation.step_size import calmed

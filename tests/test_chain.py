@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from hidden_chains import ChainCase, text_of_chain
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.commands.discover import discover
 from jaxid.commands.identify import identify
+from jaxid.commands.simulate import simulate
 from jaxid.discovery.candidates import Samples as SearchSamples
 from jaxid.discovery.candidates import evaluate, points
 from jaxid.discovery.superset import build_union
@@ -25,10 +27,8 @@ from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.gap import force_gap
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine
 from jaxid.plants.chain import Chain
 from jaxid.results.as_json import identification_json
-from jaxid.scene import simulate
 from jaxid.session import open_session
 from jaxid.simulation.loops import Drive, interval_forces, open_loop
 

@@ -7,15 +7,15 @@ import pytest
 from adaptive_arm import TEXT, TRUTH, driven, written
 from two_links import TwoLinks
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.commands.live import Live
+from jaxid.commands.simulate import simulate
 from jaxid.controllers import Tick
 from jaxid.controllers.computed_torque import ComputedTorque, inverse_dynamics
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.machine import build_machine
 from jaxid.plants import Axis
-from jaxid.scene import simulate
 from jaxid.simulation.loops import Drive, closed_loop
 
 ENCODER = "velocity_average = 4\nreach = 8"

@@ -11,6 +11,7 @@ import pytest
 
 import jaxid
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.estimators import _start, need_consistent
@@ -18,7 +19,6 @@ from jaxid.estimators.common.consistency import need_bodies
 from jaxid.estimators.common.interior import inner_start
 from jaxid.estimators.common.levenberg_marquardt import eliminated
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine
 from jaxid.numerics.lanes import alone
 
 RNG = np.random.default_rng(4)

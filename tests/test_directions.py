@@ -11,6 +11,7 @@ import pytest
 import stages
 
 import jaxid
+from jaxid.build import build_machine
 from jaxid.cli import main
 from jaxid.commands.identify import identify_many
 from jaxid.estimators import _beside_the_guesses, steps_of
@@ -19,7 +20,6 @@ from jaxid.estimators.within_prior import rounds as directions_rounds
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.estimators.within_prior.problem import criterion_steps
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import alone
 from jaxid.results.report.words import within_prior_words

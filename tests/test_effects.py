@@ -11,10 +11,10 @@ from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.residuals import residual_along
 from jaxid.dynamics.rhs import State
 from jaxid.effects import EFFECTS
-from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.filters import Decimator
 from jaxid.plants import Axis
+from jaxid.simulation.force_balance import ForceData, force_residual
 
 each_row = pytest.mark.parametrize("row", ROWS.values(), ids=[*ROWS])
 

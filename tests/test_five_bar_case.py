@@ -10,12 +10,12 @@ from five_bar_oracle import PLANT, Robot
 from five_bar_stepper import followed
 from written_logs import write_csv
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.recursive.estimate import recursive_steps
 from jaxid.experiment_design.in_loop import _Bench
-from jaxid.machine import build_machine
 from jaxid.numerics.lanes import alone
 from jaxid.session import open_session
 

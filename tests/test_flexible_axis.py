@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.dynamics.hidden_joints import complete_motion
@@ -17,11 +18,11 @@ from jaxid.errors import InputError
 from jaxid.estimators import METHODS
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine, position_noise
 from jaxid.numerics.lanes import alone
 from jaxid.results.as_json import derived_json
 from jaxid.session import open_session
 from jaxid.simulation.replay import make_replay
+from jaxid.simulation.sensor_noise import position_noise
 
 # Of the paper's aims for the first model: motor inertia 1 %, load inertia 2 %, stiffness 2 %, Coulomb 5 %.
 WITHIN = {

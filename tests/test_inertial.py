@@ -9,10 +9,10 @@ import scipy.spatial.transform
 from adaptive_arm import TRUTH, written
 from test_serial_arm import GRAVITY, ROWS, arm, case, mujoco_model
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
+from jaxid.commands.simulate import simulate
 from jaxid.errors import InputError
-from jaxid.machine import build_machine
-from jaxid.scene import simulate
 from jaxid.sensors.inertial import Inertial, InertialSensors, calibrate, scale_factor
 
 BOTH = ("gyroscope", "accelerometer")

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine, disturbance_at
-from jaxid.model.plant import Effect, Plant, as_array, parameter
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import as_array, parameter
+from jaxid.model.plant import Plant
 from jaxid.plants import PLANTS
+from jaxid.simulation.disturbance import disturbance_at
 
 CASE = """
 [plant]

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import stages
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
-from jaxid.machine import build_machine
 from jaxid.model.unknowns import label
 from jaxid.plants.chain import Chain
 from jaxid.plants.micropositioning_stage import MicropositioningStage

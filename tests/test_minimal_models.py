@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
@@ -16,7 +17,6 @@ from jaxid.estimators.minimal.matrices import linear_balance
 from jaxid.estimators.minimal.models import form_of, structure_of
 from jaxid.estimators.minimal.polynomials import adjugate, determinant, product, scaled
 from jaxid.logs.prepare import Recipe
-from jaxid.machine import build_machine
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import alone
 from jaxid.session import open_session

@@ -18,7 +18,9 @@ from jaxid.estimators.power import power
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, Recipe
 from jaxid.machine import Machine
-from jaxid.model.plant import Effect, Plant, parameter
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import parameter
+from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.model.unknowns import Free, Parameters
 from jaxid.session import open_session

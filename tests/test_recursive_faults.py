@@ -6,11 +6,11 @@ import pytest
 from recursive_axis import COULOMB, GAIN, VISCOUS, estimate, slide, with_table, written_axis
 from search_setup import case_text, write_case
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.commands.identify import identify
 from jaxid.errors import InputError
 from jaxid.estimators.recursive.estimate import recursive_steps
-from jaxid.machine import build_machine
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,12 @@ from jaxid.commands.discover import discover
 from jaxid.discovery.separating import propose as separate
 from jaxid.discovery.separating.rivals import loss
 from jaxid.errors import InputError
+from jaxid.experiment_design.improve import improved
 from jaxid.experiment_design.shapes import Shapes, basis
+from jaxid.files import signal_csv
 from jaxid.model.units import Units
 from jaxid.references import make_reference
-from jaxid.results.proposals import proposal_json, sentence, signal_csv
+from jaxid.results.proposals import proposal_json, sentence
 
 SPRINGS = ("cubic_stiffness", "quadratic_stiffness")
 
@@ -202,7 +204,7 @@ def test_no_more_evaluations_than_may_be_spent():
         return float(np.sum((p - 3.0) ** 4)), 4 * (p - 3.0) ** 3
 
     start = np.zeros(3)
-    value, where = separate.improved(bowl, start, bowl(start), 4)
+    value, where = improved(bowl, start, bowl(start), 4)
     assert len(asked) == 1 + 4
     assert value == min(np.sum((p - 3.0) ** 4) for p in asked)
     assert value < np.sum((start - 3.0) ** 4)

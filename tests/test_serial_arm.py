@@ -8,7 +8,7 @@ import pytest
 
 from jaxid.dynamics.rhs import State, acceleration, step
 from jaxid.effects import EFFECTS
-from jaxid.model.plant import parameters_of
+from jaxid.model.parameter import parameters_of
 from jaxid.plants import DenavitHartenberg, SerialArm, pa10
 
 PA10 = [

@@ -10,11 +10,11 @@ from two_links import TwoLinks, followed
 from written_logs import write_csv
 
 from jaxid.arms.base_parameters import base_parameters
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.discovery.at_rest.break_away import break_away
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.machine import build_machine
 from jaxid.session import open_session
 
 FRICTION = """

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.commands.identify import identify
-from jaxid.machine import build_machine
-from jaxid.scene import simulate
+from jaxid.commands.simulate import simulate
 from jaxid.simulation.replay import make_replay
 
 STUDY = Path(__file__).parent.parent / "experiments" / "cases" / "study.toml"

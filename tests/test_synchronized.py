@@ -9,11 +9,11 @@ from adaptive_arm import written
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxid.commands.simulate import simulate
 from jaxid.errors import InputError
 from jaxid.references import make_reference
 from jaxid.references.s_curve import Bounds, plan_s_curve
 from jaxid.references.synchronized import plan_line
-from jaxid.scene import simulate
 
 RATE = 4000.0
 # Table 3 of the five-bar's paper, in degrees: 210/s, 1680/s^2, 25200/s^3, lower bounds negative.

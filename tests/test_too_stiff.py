@@ -7,9 +7,9 @@ from cli_setup import recorded, run, text
 from search_setup import case_text, log_of, write_case
 from written_logs import write_csv
 
-from jaxid.commands.identify import gaps
 from jaxid.discovery.at_rest.break_away import break_away
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.gap import gaps
 from jaxid.session import open_session
 from jaxid.simulation.step_size import TooStiffError, _rounded, needed_steps
 

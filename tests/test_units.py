@@ -3,7 +3,8 @@
 import pytest
 
 from jaxid.effects import EFFECTS
-from jaxid.model.plant import Scales, parameters_of
+from jaxid.model.effect import Scales
+from jaxid.model.parameter import parameters_of
 from jaxid.model.units import Units
 from jaxid.plants import PLANTS
 

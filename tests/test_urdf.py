@@ -11,9 +11,9 @@ from two_links import TwoLinks, followed
 from written_logs import write_csv
 
 import jaxid
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.case.urdf import read_urdf
-from jaxid.machine import build_machine
 from jaxid.plants import SerialArm
 
 GRAVITY = (1.5, -2.0, -9.2)

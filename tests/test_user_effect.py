@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from case_faults import message, more, write
 
+from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.effects import EFFECTS
-from jaxid.machine import build_machine
 
 OWN_EFFECT = """
 from jaxid.model.plant import Action, Effect, parameter
@@ -88,7 +88,7 @@ OWN_FAULTS = {
     "no such file": ('"my.py:Wind"', ["my.py", "does not exist", "there is: mine.py"]),
     "no such class": ('"mine.py:Wnid"', ["Wnid is not there", "'Wind'"]),
     "no class": ('"mine.py"', ["names no class", "my_effects.py:MyEffect"]),
-    "not an effect": ('"mine.py:NotAnEffect"', ["not a subclass of jaxid.model.plant.Effect"]),
+    "not an effect": ('"mine.py:NotAnEffect"', ["not a subclass of jaxid.model.effect.Effect"]),
     "no act": ('"mine.py:Idle"', ["no method act", "define act"]),
 }
 

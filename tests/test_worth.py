@@ -17,10 +17,10 @@ from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import _felt
 from jaxid.discovery.where import _between
-from jaxid.estimators.inverse_dynamics import ForceData, force_residual
 from jaxid.gap import noise_density
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import open_session
+from jaxid.simulation.force_balance import ForceData, force_residual
 
 DELAY, LAG = "input_delay", "actuator_lag"
 

@@ -12,7 +12,9 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from jaxid.model.plant import Plant, carries_force, parameters_of
+from jaxid.model.effect import carries_force
+from jaxid.model.parameter import parameters_of
+from jaxid.model.plant import Plant
 
 # What is left of a column beside those chosen counts as rounding below this part of it; chosen: columns of
 # real arms part by 1e-3 and more (a squared length of 3 cm), rounding is 1e-14.

@@ -11,15 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.case.entries import (
-    EffectEntry,
-    PlantEntry,
-    check_kinds,
-    read_effects,
-    read_kind,
-    read_plant,
-    read_search,
-)
+from jaxid.case.declared import EffectEntry, PlantEntry
+from jaxid.case.entries import check_kinds, read_effects, read_kind, read_plant, read_search
 from jaxid.case.reference import read_signal, read_unknown_reference
 from jaxid.case.schema import Key, Keys, Spot, read_table
 from jaxid.case.sensors import read_inertial_sensors
@@ -45,7 +38,8 @@ from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError, suggest
 from jaxid.logs.log import LOG_KEYS
-from jaxid.model.plant import Effect, parameters_of
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import parameters_of
 
 
 @dataclass(frozen=True)

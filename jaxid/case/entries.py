@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.links import LINKED, check_links, read_links, read_links_of_urdf, read_shafts
 from jaxid.case.places import check_places, read_ports
 from jaxid.case.schema import (
@@ -27,59 +27,14 @@ from jaxid.case.user_effect import user_effect
 from jaxid.case.values import Value, read_value, read_values
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.model.plant import PLACES, Effect, ParameterInfo, Plant, parameters_of
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import ParameterInfo, parameters_of
+from jaxid.model.plant import PLACES, Plant
 from jaxid.model.units import Units
 from jaxid.plants import PLANTS
 
 # Of a plant whose lists say how many joints it has.
 _MOST_JOINTS = 50
-
-
-@dataclass(frozen=True)
-class PlantEntry:
-    """[plant] of a case.
-
-    Args:
-        cls: Its class.
-        parameters: One value, or a list, by name.
-        units: Labels.
-        vertical: Whether weight acts along the axis.
-        gravity: Its acceleration [m/s^2]; None: the class's own.
-        joints: How many there are.
-        actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
-        options: What else its class takes, by field: the geometry and the shafts of an arm.
-        names: Of its joints, where these have any: in a URDF file.
-    """
-
-    cls: type[Plant]
-    parameters: dict[str, Value | tuple[Value, ...]]
-    units: Units
-    vertical: bool
-    gravity: float | None
-    joints: int
-    actuated: tuple[int, ...] | None = None
-    options: dict[str, Any] = field(default_factory=dict)
-    names: tuple[str, ...] = ()
-
-    @property
-    def drives(self) -> int:
-        """How many drives there are."""
-        return self.joints if self.actuated is None else len(self.actuated)
-
-
-@dataclass(frozen=True)
-class EffectEntry:
-    """One of [[effects]].
-
-    Args:
-        cls: Its class.
-        parameters: By name, one value for each of `ports`.
-        ports: Where it acts: joints from 0 on, and behind them springs, shafts, passive angles or tools.
-    """
-
-    cls: type[Effect]
-    parameters: dict[str, tuple[Value, ...]]
-    ports: tuple[int, ...]
 
 
 def read_kind(table: dict[str, Any], known: Any, spot: Spot) -> str:

@@ -14,7 +14,8 @@ from jaxid.case.places import check_places
 from jaxid.case.schema import Key, Keys, Spot, choice, number, read_table, several, text, whole
 from jaxid.case.urdf import Urdf, read_urdf
 from jaxid.case.values import Value, read_value, read_values
-from jaxid.model.plant import Plant, parameters_of
+from jaxid.model.parameter import parameters_of
+from jaxid.model.plant import Plant
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg
 from jaxid.plants.geometry import JOINTS, Geometry
 

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from jaxid.case.schema import Spot, count, several, whole
 from jaxid.errors import suggest
-from jaxid.model.plant import PLACES, Effect
+from jaxid.model.effect import Effect
+from jaxid.model.plant import PLACES
 
 if TYPE_CHECKING:
-    from jaxid.case.entries import PlantEntry
+    from jaxid.case.declared import PlantEntry
 
 
 # What a place is called, where that is not its key.

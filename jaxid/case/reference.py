@@ -9,7 +9,7 @@ from jaxid.case.entries import read_kind
 from jaxid.case.schema import Spot
 from jaxid.case.values import Value, read_value
 from jaxid.errors import InputError
-from jaxid.model.plant import ParameterInfo
+from jaxid.model.parameter import ParameterInfo
 from jaxid.references import REFERENCES
 from jaxid.references import Key as ReferenceKey
 

@@ -14,7 +14,8 @@ from types import ModuleType
 from jaxid.case.schema import Spot
 from jaxid.effects import EFFECTS
 from jaxid.errors import suggest
-from jaxid.model.plant import SIGNS, Effect, parameters_of
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import SIGNS, parameters_of
 from jaxid.model.units import Units
 
 # Module and time of change by file: a case that is loaded twice gets the same class twice, so
@@ -49,7 +50,7 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
     cls = getattr(module, name, None)
     if not (isinstance(cls, type) and issubclass(cls, Effect) and cls is not Effect):
         known = [n for n, c in vars(module).items() if _is_effect_of(c, module)]
-        what = "is not a subclass of jaxid.model.plant.Effect" if cls is not None else "is not there"
+        what = "is not a subclass of jaxid.model.effect.Effect" if cls is not None else "is not there"
         raise spot.refuse(kind, f": {name} {what}", suggest(name, known))
     if not hasattr(cls, "kind"):
         cls.kind = kind

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from jaxid.case.schema import Key, Spot, count, number, read_table, shown
-from jaxid.model.plant import ParameterInfo
+from jaxid.model.parameter import ParameterInfo
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.case.case import Case
-from jaxid.estimators.inverse_dynamics import (
-    ForceData,
-    force_precision,
-    force_residual,
-    force_size,
-    sharpened,
-)
+from jaxid.estimators.inverse_dynamics import force_precision
 from jaxid.files import ready_folder, write_json
 from jaxid.gap import noise_floor
 from jaxid.logs.log import Log
@@ -27,6 +21,7 @@ from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.precision import Precision
 from jaxid.session import Session, open_session
+from jaxid.simulation.force_balance import ForceData, force_residual, force_size, sharpened
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.case.case import Case
-from jaxid.commands.identify import Gap, gaps
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
 from jaxid.discovery.noise import sensor_colour
 from jaxid.discovery.result import Discovery, Found, Round
-from jaxid.discovery.screen import Score
+from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import proposals
 from jaxid.discovery.superset import build_union
@@ -24,13 +23,14 @@ from jaxid.discovery.where import Where, locate
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators import need_known_reference
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import ForceData, inverse_dynamics
+from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import output_error
-from jaxid.gap import noise_floor
+from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.unknowns import free_effect
 from jaxid.session import Session, open_session
+from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.step_size import TooStiffError
 
 # A refit in simulation may cost this factor in the force domain, not more: then it has bent the

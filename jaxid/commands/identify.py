@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -13,30 +13,12 @@ from jaxid.case.case import Case, load_case
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS, steps_of
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import OUTPUTS, SHORT
-from jaxid.gap import ForceGap, SimulationGap, force_gap, noise_floor, simulation_gap
+from jaxid.estimators.output_error import OUTPUTS
+from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.log import Log
-from jaxid.machine import Machine
 from jaxid.numerics.lanes import Soon, Steps, alone, together
-from jaxid.session import Run, Session, open_session
-from jaxid.simulation.replay import exact_numerics, from_rest, make_replay, start_shows, with_fitted_start
+from jaxid.session import Session, open_session
 from jaxid.simulation.solvers import SOLVERS
-from jaxid.simulation.step_size import TooStiffError
-
-
-@dataclass(frozen=True)
-class Gap:
-    """How far a machine is from one log.
-
-    Args:
-        name: Of the log.
-        force: In force, by inverse dynamics.
-        simulation: In position, by simulation; None where it diverges.
-    """
-
-    name: str
-    force: ForceGap
-    simulation: SimulationGap | None
 
 
 @dataclass(frozen=True)
@@ -189,41 +171,3 @@ def _gaps_of(session: Session) -> Soon | None:
     return Soon(gaps, (machine, session.runs), key)
 
 
-def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:
-    """Gap of a machine on each log."""
-    return tuple(
-        Gap(r.name, force_gap(r.machine(machine), r.data), _shown(r.machine(machine), r.log))
-        for r in runs
-    )
-
-
-def _shown(machine: Machine, log: Log) -> SimulationGap | None:
-    """The gap in position; in a loop that of a start at rest where it shows, or may, and is nearer.
-
-    Where a log begins with a jerk, a parabola through its first readings is no velocity, however few:
-    six masses that start from rest were off by up to half a millimetre, whatever the parameters.
-    """
-    gap = simulated(machine, log)
-    if gap is None or gap.command is None:
-        return gap
-    if log.samples > SHORT and not start_shows((log.position - gap.position)[:, list(log.measured)]):
-        return gap
-    rested = simulated(machine, log, at_rest=True)
-    nearer = rested is not None and np.nansum(rested.rms**2) < np.nansum(gap.rms**2)
-    return rested if nearer else gap
-
-
-def simulated(machine: Machine, log: Log, *, at_rest: bool = False) -> SimulationGap | None:
-    """Gap in position over the whole log; None where the simulation cannot run or diverges."""
-    if machine.controller is not None and log.reference is None and machine.course is None:
-        machine = replace(machine, controller=None)
-    # Nothing is differentiated here: friction sticks exactly, break-away friction too.
-    try:
-        numerics = exact_numerics(machine, log)
-    except TooStiffError:
-        return None
-    replay = make_replay(machine, log, numerics)
-    replay = from_rest(replay) if at_rest else with_fitted_start(replay, machine.plant, log)
-    gap = simulation_gap(machine, replay, log)
-    seen = list(log.measured)
-    return gap if np.all(np.isfinite(gap.rms[seen])) and np.all(gap.relative[seen] < 1e3) else None

@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxid.build import build_machine
 from jaxid.case.case import Case, load_case
 from jaxid.controllers import Controller, Tick, base
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import Memory, Online, Told
 from jaxid.estimators.recursive.recursion import Told as Estimate
 from jaxid.logs.log import Log
-from jaxid.machine import Machine, build_machine
+from jaxid.machine import Machine
 from jaxid.scene import Scene
 
 # A joint is taken to rest below this part of its reference's largest speed, and below so many

@@ -19,8 +19,8 @@ from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
 from jaxid.files import check_folder, mark_folder, write_json, write_whole
 from jaxid.logs.log import Log
-from jaxid.machine import position_noise
 from jaxid.numerics.lanes import alone
+from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError
 from jaxid.studies.levels import Level
 from jaxid.studies.plan import Plan, at_once, digest_of, same

@@ -17,12 +17,14 @@ import scipy.optimize
 from jaxtyping import Array, Bool, Float
 
 from jaxid.estimators.common.levenberg_marquardt import Transform
-from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model.plant import Effect, Plant, parameters_of
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import parameters_of
+from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, Parameters, scatter, seeds
 from jaxid.numerics.lanes import in_threads
+from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual
 
 # An effect with more starts than this is evaluated on a plant of its own, all starts at once.
 _FEW = 8

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxid.commands.identify import Gap
-from jaxid.discovery.screen import Score
+from jaxid.discovery.score import Score
 from jaxid.discovery.where import Where
 from jaxid.estimators.estimate import Estimate
+from jaxid.gap import Gap
 from jaxid.session import Session
 
 if TYPE_CHECKING:

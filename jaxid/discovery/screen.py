@@ -13,6 +13,7 @@ from jaxid.discovery import evidence as ev
 from jaxid.discovery.columns import independent, left_over, orthonormal, span, stacked, unit
 from jaxid.discovery.noise import fit_whitener
 from jaxid.discovery.pairs import Pairs, score_pairs
+from jaxid.discovery.score import Score
 
 if TYPE_CHECKING:
     from jaxid.discovery.search import Search
@@ -23,37 +24,6 @@ _SURROGATES = 200
 _HIDDEN = 0.01
 # Points whose products are taken at once: few enough for memory, enough for matrix products to pay.
 _TOGETHER = 64
-
-
-@dataclass(frozen=True)
-class Score:
-    """Evidence of one candidate.
-
-    Args:
-        candidate: Which.
-        start: Index of its best start.
-        guess: Where its refit starts.
-        second: Where it starts too: of an effect in the drive, the start that by itself brings the
-            residual down most. A linear screen promises wonders of a start that touches few samples.
-        evidence: Held-out gain in log-likelihood on the log [nats].
-        validation: The same on the validation logs; None without any.
-        theta: All unknowns of the union after its refit; None where it was only screened.
-        reason: Why it was turned down; empty where it was not.
-    """
-
-    candidate: cand.Candidate
-    start: int
-    guess: np.ndarray
-    evidence: float
-    second: np.ndarray | None = None
-    validation: float | None = None
-    theta: np.ndarray | None = None
-    reason: str = ""
-
-    @property
-    def total(self) -> float:
-        """Evidence of log and validation together."""
-        return self.evidence + (self.validation or 0.0)
 
 
 @dataclass

@@ -11,7 +11,8 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import RELEVANT, Worth
-from jaxid.discovery.screen import Score, Screen, guess_pair, screen_candidates
+from jaxid.discovery.score import Score
+from jaxid.discovery.screen import Screen, guess_pair, screen_candidates
 from jaxid.discovery.selection import MODEST, few, margin, modest, simplest
 from jaxid.logs.prepare import Prepared
 from jaxid.numerics.precision import NoiseModel

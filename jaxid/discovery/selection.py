@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jaxid.discovery.screen import Score
+from jaxid.discovery.score import Score
 
 # So many of the best candidates are refitted; a linear screen at a start is not the last word.
 REFITTED = 5

@@ -13,11 +13,13 @@ from jaxtyping import Array, Bool
 from jaxid.discovery.candidates import Candidate, Union
 from jaxid.discovery.user_effects import check_foreign, is_foreign
 from jaxid.effects import EFFECTS
-from jaxid.estimators.inverse_dynamics import ForceData, sharpened, whole_motion
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model.plant import Effect, Plant, Scales, carries_force, parameters_of, port_motion
+from jaxid.model.effect import Effect, Scales, carries_force
+from jaxid.model.parameter import parameters_of
+from jaxid.model.plant import Plant, port_motion
 from jaxid.model.unknowns import Free, Parameters, colours, free_effect, label
+from jaxid.simulation.force_balance import ForceData, sharpened, whole_motion
 
 
 def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:

@@ -11,11 +11,13 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxid.errors import InputError
-from jaxid.estimators.inverse_dynamics import ForceData, force_and_columns, force_residual, sharpened
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model.plant import Effect, Plant, Scales, parameters_of
+from jaxid.model.effect import Effect, Scales
+from jaxid.model.parameter import parameters_of
+from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, free_effect
+from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual, sharpened
 
 # So many kept samples tell whether an effect is sound.
 _ROWS = 400

@@ -5,7 +5,8 @@ from __future__ import annotations
 from jaxtyping import Array
 
 from jaxid.effects.registry import register
-from jaxid.model.plant import Action, Effect, Scales, Signals, parameter
+from jaxid.model.effect import Action, Effect, Scales, Signals
+from jaxid.model.parameter import parameter
 from jaxid.numerics import smooth
 
 # Corner of the saturation, relative to its limit: 0.7e-3 of the limit is missing at the corner.

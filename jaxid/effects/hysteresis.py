@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxid.effects.registry import register
-from jaxid.model.plant import Action, Effect, Scales, Signals, parameter
+from jaxid.model.effect import Action, Effect, Scales, Signals
+from jaxid.model.parameter import parameter
 from jaxid.numerics import smooth
 
 

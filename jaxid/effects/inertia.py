@@ -5,7 +5,8 @@ from __future__ import annotations
 from jaxtyping import Array
 
 from jaxid.effects.registry import register
-from jaxid.model.plant import Action, Effect, Signals, parameter
+from jaxid.model.effect import Action, Effect, Signals
+from jaxid.model.parameter import parameter
 
 
 @register("added_mass")

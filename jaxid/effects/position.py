@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxid.effects.registry import register
-from jaxid.model.plant import Action, Effect, Scales, Signals, parameter
+from jaxid.model.effect import Action, Effect, Scales, Signals
+from jaxid.model.parameter import parameter
 
 
 @register("constant_force")

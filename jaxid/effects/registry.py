@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jaxid.model.plant import Effect
+from jaxid.model.effect import Effect
 
 EFFECTS: dict[str, type[Effect]] = {}
 

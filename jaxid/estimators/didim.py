@@ -25,14 +25,7 @@ from jaxtyping import Array, Float
 from jaxid.errors import InputError
 from jaxid.estimators.common.rerun import Rerun, best_step, settled, span
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import (
-    ForceData,
-    force_and_columns,
-    force_precision,
-    force_size,
-    inverse_dynamics_steps,
-    sharpened,
-)
+from jaxid.estimators.inverse_dynamics import force_precision, inverse_dynamics_steps
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -41,6 +34,7 @@ from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import Solve, Steps, alone
 from jaxid.numerics.precision import Precision
+from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics, Replay
 
 _MOST_STEPS = 30

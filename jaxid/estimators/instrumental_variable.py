@@ -15,20 +15,14 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.estimators.common.rerun import Rerun, best_step, settled, span
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import (
-    ForceData,
-    force_and_columns,
-    force_precision,
-    force_size,
-    inverse_dynamics_steps,
-    sharpened,
-)
+from jaxid.estimators.inverse_dynamics import force_precision, inverse_dynamics_steps
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters
 from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics
 
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard

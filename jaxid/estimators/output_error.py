@@ -18,8 +18,9 @@ from jaxtyping import Array
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.estimate import Estimate
+from jaxid.gap import SHORT
 from jaxid.logs.log import Log
-from jaxid.machine import Machine, position_noise
+from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, scatter
 from jaxid.numerics.lanes import Solve, Steps, alone
@@ -34,6 +35,7 @@ from jaxid.simulation.replay import (
     start_shows,
     with_fitted_start,
 )
+from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.solvers import RELATIVE
 
 # What a fit may compare.
@@ -45,10 +47,6 @@ _LOST = 0.5
 # factor of the position noise. Elsewhere the model's own error would bend the start, which the first
 # samples tell far better.
 _NOISE_LIMITED = 3.0
-# In a loop an error of the start dies out. On a log of at most so many samples it may not be small
-# beside the rest, and the start is fitted too where that explains more than so many times chance; on a longer
-# one a start at rest is tried where the start shows.
-SHORT = 2000
 _CLEARLY = 10.0
 # See `turning_steps`: what a step misses, how much of the noise that may be, and most steps for it.
 _TURNING = 0.04

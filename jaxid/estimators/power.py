@@ -30,7 +30,7 @@ from jaxid.dynamics.residuals import drive_own_states, drive_ratio
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import ForceData, linear_scale, sharpened
+from jaxid.estimators.inverse_dynamics import linear_scale
 from jaxid.logs.prepare import Prepared, lasting
 from jaxid.machine import Machine
 from jaxid.model.plant import Balance, Plant
@@ -38,6 +38,7 @@ from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import Solve, Steps, alone
 from jaxid.numerics.precision import assess
+from jaxid.simulation.force_balance import ForceData, sharpened
 
 # A hill of speed stands out by this part of the RMS speed.
 _HILL = 0.5

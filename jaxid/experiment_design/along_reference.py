@@ -14,17 +14,17 @@ import scipy.linalg
 from jaxtyping import Array, Float
 
 from jaxid.arms.base_parameters import independent
+from jaxid.build import build_machine
 from jaxid.case.case import Case
 from jaxid.case.tables import CRITERIA
-from jaxid.discovery.separating.propose import improved
 from jaxid.dynamics.residuals import balance_along
 from jaxid.errors import InputError
+from jaxid.experiment_design.improve import improved
 from jaxid.experiment_design.shapes import largest
-from jaxid.files import write_whole
-from jaxid.machine import Machine, build_machine
+from jaxid.files import signal_csv, write_whole
+from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
-from jaxid.results.proposals import signal_csv
 
 HARMONICS = 5
 # Samples for each period of the fastest harmonic while a trajectory is sought, and room for peaks in between.

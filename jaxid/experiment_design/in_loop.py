@@ -13,23 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.case.case import Case, load_case
-from jaxid.discovery.separating.propose import improved
-from jaxid.discovery.separating.rivals import Bounds
+from jaxid.build import build_machine
+from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.estimators.within_prior.fit import expected_steps
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.estimators.within_prior.problem import Problem, residual_of, with_sensor
 from jaxid.estimators.within_prior.rounding import rounds
-from jaxid.experiment_design.along_reference import Excitation, excite
-from jaxid.experiment_design.limits import Limits, Peaks, kept_within
+from jaxid.experiment_design.improve import improved
+from jaxid.experiment_design.limits import Bounds, Limits, Peaks, kept_within
 from jaxid.experiment_design.shapes import Shapes, basis
-from jaxid.files import write_whole
-from jaxid.machine import Machine, build_machine
+from jaxid.files import signal_csv, write_whole
+from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import alone
-from jaxid.results.proposals import signal_csv
 from jaxid.scene import refuse_impossible
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive, needed_substeps
@@ -106,33 +104,16 @@ def _shown(values: np.ndarray) -> str:
     return ", ".join(f"{v:.3g}" for v in np.ravel(values))
 
 
-def design(
-    case: Case | str | Path, *, progress: Callable[[str], None] = lambda text: None
-) -> Design | Excitation:
-    """Find the reference (in a loop) or the input that tells a case's unknowns best, at its guesses.
-
-    Of an arm, and of any case with a key in [design], the reference is taken to be followed: see
-    `jaxid.experiment_design.along_reference.excite`. Else:
-
-    The logarithm of the information's determinant is raised through the simulation by gradients (D-optimal;
-    Bayesian: each guess is a prior of the relative width `[output_error] prior`, 0.5 where absent), over sums
-    of sines and a tour from end to end, within [limits].
+def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
+    """Find the signal with the largest information determinant, by gradients through the simulation.
 
     Args:
-        case: The case, or its file; it needs [simulation] duration and sample_rate, [limits] stroke and
-            speed (in open loop force), and in [sensor] the noise of what `[output_error] on` compares.
+        case: The case, with what `jaxid.design` asks of it.
         progress: Called with a line at every stage.
 
     Raises:
-        InputError: If the case lacks any of these, or no experiment keeps within the limits.
-
-    Source:
-        Chaloner and Verdinelli (1995), "Bayesian experimental design: a review".
+        InputError: If no experiment keeps within the limits.
     """
-    case = case if isinstance(case, Case) else load_case(case)
-    _check(case)
-    if case.plant.cls.linked or case.design:
-        return excite(case, progress)
     bench = _Bench.of(case)
     progress("looking at sines and tours")
     both = lambda p: _valued(bench, p)
@@ -152,17 +133,6 @@ def design(
     progress("expecting what each will tell")
     kept = [p for p in (*starts, *map(bench.within, found)) if p is not None]
     return bench.designed([bench.shapes.signal(p) for p in kept])
-
-
-def _check(case: Case) -> None:
-    """Refuse a case without what any design needs."""
-    where = str(case.path)
-    for table, key in (("simulation", "duration"), ("simulation", "sample_rate"), ("limits", "stroke"),
-                       ("limits", "speed")):
-        if key not in getattr(case, table):
-            raise InputError(f"[{table}] has no {key}", where=where, mend=f"add {key} = ... to [{table}]")
-    if not build_machine(case, period=1 / float(case.simulation["sample_rate"])).parameters.free:
-        raise InputError("nothing is unknown", where=where, mend="give a parameter as { guess = ... }")
 
 
 @dataclass(frozen=True)

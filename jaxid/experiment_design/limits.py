@@ -6,12 +6,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from jaxid.experiment_design.shapes import largest
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.simulation.loops import Trajectory
+
+# Going beyond this part of a limit costs: as much as a factor e in evidence at the limit itself.
+_FROM = 0.97
 
 if TYPE_CHECKING:
     from jaxid.experiment_design.shapes import Shapes
@@ -111,3 +119,26 @@ class Peaks:
             return np.max(x.reshape(-1, x.shape[-1]), axis=0)
 
         return cls(-most(-position), most(position), most(np.abs(velocity)), most(np.abs(command)))
+
+
+class Bounds(eqx.Module):
+    """`Limits` as arrays."""
+
+    low: Array
+    high: Array
+    speed: Array
+    force: Array
+
+    @classmethod
+    def of(cls, limits: Limits) -> Bounds:
+        """The limits' arrays."""
+        return cls(*(jnp.asarray(x) for x in (limits.low, limits.high, limits.speed, limits.force)))
+
+    def cost(self, run: Trajectory) -> Array:
+        """What it costs that a motion comes near them or goes beyond; zero well within."""
+        half = 0.5 * (self.high - self.low)
+        off = jnp.abs(run.position - 0.5 * (self.low + self.high)) / half
+        parts = (off, jnp.abs(run.velocity) / self.speed, jnp.abs(run.command) / self.force)
+        return sum(
+            jnp.sum(jnp.square(jax.nn.relu(largest(x) - _FROM) / (1 - _FROM))) for x in parts
+        )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 if TYPE_CHECKING:
-    from jaxid.model.plant import Action, Effect, Signals
+    from jaxid.model.effect import Action, Effect, Signals
 
 
 def alike(effects: Sequence[Effect], drives: Sequence[int | None]) -> list[list[int]]:

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxid.model.plant import Effect, Plant, parameters_of
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import parameters_of
+from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 
 # Lower bound of what must be positive, relative to its guess: keeps a solver off zero, far below

@@ -6,7 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxid.model.plant import Effect, Plant, as_array, parameter
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import as_array, parameter
+from jaxid.model.plant import Plant
 
 # Effects that are a parameter of the plant by another name: on joints, and on springs.
 _OF_JOINTS = {"added_mass": "mass", "viscous_friction": "damping"}

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.model.plant import Effect, Plant, as_array, parameter
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import as_array, parameter
+from jaxid.model.plant import Plant
 
 # Sine of the angle between the distal links below which they count as one line. Chosen: the tool then moves a
 # hundred times as fast as the elbows, and what it weighs at the joints has grown ten thousandfold.

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxid.model.plant import Effect, Plant, as_array, parameter
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import as_array, parameter
+from jaxid.model.plant import Plant
 
 _INERTIAS = ("motor_inertia", "load_inertia")
 # Of motor, load and coupling.

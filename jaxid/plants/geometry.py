@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.model.plant import as_array
+from jaxid.model.parameter import as_array
 
 JOINTS = ("revolute", "prismatic")
 

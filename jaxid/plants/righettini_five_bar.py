@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from jaxtyping import Array
 
-from jaxid.model.plant import Effect
+from jaxid.model.effect import Effect
 from jaxid.plants.five_bar import FiveBar
 
 

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.model.plant import Effect, Plant, as_array, parameter
+from jaxid.model.effect import Effect
+from jaxid.model.parameter import as_array, parameter
+from jaxid.model.plant import Plant
 from jaxid.plants.geometry import Geometry
 
 _FIRST = ("inertia*position", "free")

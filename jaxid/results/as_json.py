@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.files import ready_folder, write_json, write_whole
+from jaxid.files import ready_folder, signal_csv, write_json, write_whole
 from jaxid.model.unknowns import leaf, several_places
-from jaxid.results.proposals import proposal_json, signal_csv
+from jaxid.results.proposals import proposal_json
 
 if TYPE_CHECKING:
-    from jaxid.commands.identify import Gap, Identification
+    from jaxid.commands.identify import Identification
     from jaxid.discovery.candidates import Candidate
     from jaxid.discovery.result import Discovery, Found
-    from jaxid.discovery.screen import Score
+    from jaxid.discovery.score import Score
     from jaxid.estimators.common.derived import Derived
     from jaxid.estimators.estimate import Estimate
+    from jaxid.gap import Gap
     from jaxid.model.plant import Plant
     from jaxid.session import Session
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jaxid.effects import EFFECTS
-from jaxid.model.plant import parameters_of
+from jaxid.model.parameter import parameters_of
 from jaxid.model.units import Units
 from jaxid.plants import PLANTS
 from jaxid.results.as_text import aligned

@@ -72,15 +72,3 @@ def _one(x: np.ndarray) -> float | list[float]:
     return values[0] if len(values) == 1 else values
 
 
-def signal_csv(signal: str, time: np.ndarray, values: np.ndarray) -> str:
-    """Time and a signal as `[reference] kind = "csv"` (or `[input]`) takes them, every digit kept.
-
-    Args:
-        signal: "reference" or "input".
-        time: Ticks [s].
-        values: (ticks, m).
-    """
-    names = [signal] if values.shape[1] == 1 else [f"{signal}_{k + 1}" for k in range(values.shape[1])]
-    rows = np.column_stack([time, values])
-    lines = [",".join(repr(float(v)) for v in row) for row in rows]
-    return "\n".join([",".join(["t", *names]), *lines]) + "\n"

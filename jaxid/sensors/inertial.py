@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxid.dynamics.rhs import small_solve
-from jaxid.model.plant import Plant, as_array
+from jaxid.model.parameter import as_array
+from jaxid.model.plant import Plant
 
 KINDS = ("gyroscope", "accelerometer")
 AXES = ("x", "y", "z")

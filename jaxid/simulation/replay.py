@@ -16,11 +16,12 @@ from jaxid.controllers import Controller
 from jaxid.dynamics.hidden_joints import resting
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
-from jaxid.machine import Machine, disturbance_at
+from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
 from jaxid.references.unknown import Course
 from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
 from jaxid.simulation.solvers import Adaptive
 from jaxid.simulation.step_size import needed_steps

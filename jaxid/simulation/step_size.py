@@ -13,7 +13,8 @@ from jaxid.effects.friction import ViscousFriction
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.model.plant import Plant, as_array
+from jaxid.model.parameter import as_array
+from jaxid.model.plant import Plant
 
 # Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
 _FINE = 0.2

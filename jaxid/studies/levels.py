@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 
+from jaxid.build import build_machine
 from jaxid.case.case import Case
 from jaxid.errors import InputError
-from jaxid.machine import Machine, build_machine
+from jaxid.machine import Machine
 from jaxid.scene import Scene
 from jaxid.studies.settings import SETTINGS
 

@@ -21,11 +21,12 @@ from jaxid.effects.friction import CoulombFriction, StaticFriction, StribeckFric
 from jaxid.estimators.estimate import Estimate
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
-from jaxid.machine import Machine, position_noise
+from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.session import Run
 from jaxid.simulation.loops import Drive, open_loop
+from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError, needed_steps
 
 # Fewest starts that can tell a level from a chance.

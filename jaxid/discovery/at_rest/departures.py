@@ -13,13 +13,14 @@ from jaxtyping import Array, Float
 
 from jaxid.controllers import Controller, Tick
 from jaxid.dynamics.residuals import drive_own_states
-from jaxid.estimators.inverse_dynamics import ForceData
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
-from jaxid.machine import Machine, disturbance_at
+from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
 from jaxid.session import Run
+from jaxid.simulation.disturbance import disturbance_at
+from jaxid.simulation.force_balance import ForceData
 
 # Readings that agree within this range, in standard deviations of their noise, are a rest: noise
 # alone does otherwise once in a thousand times. There must be as many of them as a reversal

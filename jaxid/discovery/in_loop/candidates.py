@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.discovery.candidates import Candidate, Union
-from jaxid.discovery.screen import Score
+from jaxid.discovery.score import Score
 from jaxid.discovery.superset import build_union
 from jaxid.discovery.where import Where
 from jaxid.effects.coupling import Backlash, JointFlexibility

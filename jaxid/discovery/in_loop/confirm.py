@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxid.commands.identify import simulated
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.search import Search
+from jaxid.gap import simulated
 from jaxid.machine import Machine
 from jaxid.session import Run, Session
 

@@ -14,15 +14,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.commands.identify import gaps
 from jaxid.discovery.candidates import Candidate, effect_at
 from jaxid.discovery.in_loop.candidates import Begin, Fit, Look, Loop
 from jaxid.discovery.result import Discovery, Found, Round
-from jaxid.discovery.screen import Score
+from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.estimators import steps_of
 from jaxid.estimators.within_prior.fit import directions_steps
-from jaxid.gap import noise_floor
+from jaxid.gap import gaps, noise_floor
 from jaxid.machine import Machine
 from jaxid.model.unknowns import Free, free_effect
 from jaxid.numerics.lanes import alone

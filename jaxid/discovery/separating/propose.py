@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,21 +9,21 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Float
 
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.screen import Score
+from jaxid.discovery.score import Score
 from jaxid.discovery.separating.playback import Outcome, Stage, compared, exact
-from jaxid.discovery.separating.rivals import Bench, Bounds, Duel, Pair, loss
-from jaxid.estimators.inverse_dynamics import ForceData
-from jaxid.experiment_design.limits import Limits, Peaks, kept_within
+from jaxid.discovery.separating.rivals import Bench, Duel, Pair, loss
+from jaxid.experiment_design.improve import improved
+from jaxid.experiment_design.limits import Bounds, Limits, Peaks, kept_within
 from jaxid.experiment_design.shapes import Shapes, basis
-from jaxid.machine import position_noise
 from jaxid.numerics.precision import NoiseModel
 from jaxid.sensors.encoder import Sensor
 from jaxid.session import Session
+from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.loops import Drive, needed_substeps
+from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError, needed_steps
 
 if TYPE_CHECKING:
@@ -270,27 +269,3 @@ def _optimised(
     return [p for _, p in sorted(found, key=lambda f: f[0])]
 
 
-def improved(
-    both: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray,
-    first: tuple[float, np.ndarray], evaluations: int,
-) -> tuple[float, np.ndarray]:
-    """The least value that so many evaluations beside the first find, and where."""
-    seen = [(first[0], start.copy())]
-
-    def counted(p: np.ndarray) -> tuple[float, np.ndarray]:
-        if np.array_equal(p, start):
-            return first
-        if len(seen) > evaluations:
-            raise _Spent
-        value, slope = both(p)
-        seen.append((value, p.copy()))
-        return value, slope
-
-    # The solver's own limit holds between line searches only, and one takes up to twenty.
-    with contextlib.suppress(_Spent):
-        scipy.optimize.minimize(counted, start, jac=True, method="L-BFGS-B")
-    return min(seen, key=lambda found: found[0])
-
-
-class _Spent(Exception):
-    """The evaluations that may be spent are spent."""

@@ -17,20 +17,18 @@ from jaxtyping import Array, Float
 
 from jaxid.controllers import Controller
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.screen import Score
-from jaxid.estimators.inverse_dynamics import ForceData, force_residual
-from jaxid.experiment_design.limits import Limits
-from jaxid.experiment_design.shapes import Shapes, largest
+from jaxid.discovery.score import Score
+from jaxid.experiment_design.limits import Bounds
+from jaxid.experiment_design.shapes import Shapes
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.sensors.encoder import Sensor
+from jaxid.simulation.force_balance import ForceData, force_residual
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
 
 if TYPE_CHECKING:
     from jaxid.discovery.search import Search
 
-# Going beyond this part of a limit costs: as much as a factor e in evidence at the limit itself.
-_FROM = 0.97
 # Curvature below this part of the largest is nothing that a fit could use.
 _BLIND = 1e-10
 
@@ -187,29 +185,6 @@ class Bench(eqx.Module):
         """A force as rows of unit white noise."""
         columns = [jnp.convolve(x, w)[: x.size] for x, w in zip(e.T, self.whiten, strict=True)]
         return jnp.stack(columns, axis=1)
-
-
-class Bounds(eqx.Module):
-    """`Limits` as arrays."""
-
-    low: Array
-    high: Array
-    speed: Array
-    force: Array
-
-    @classmethod
-    def of(cls, limits: Limits) -> Bounds:
-        """The limits' arrays."""
-        return cls(*(jnp.asarray(x) for x in (limits.low, limits.high, limits.speed, limits.force)))
-
-    def cost(self, run: Trajectory) -> Array:
-        """What it costs that a motion comes near them or goes beyond; zero well within."""
-        half = 0.5 * (self.high - self.low)
-        off = jnp.abs(run.position - 0.5 * (self.low + self.high)) / half
-        parts = (off, jnp.abs(run.velocity) / self.speed, jnp.abs(run.command) / self.force)
-        return sum(
-            jnp.sum(jnp.square(jax.nn.relu(largest(x) - _FROM) / (1 - _FROM))) for x in parts
-        )
 
 
 class Duel(eqx.Module):

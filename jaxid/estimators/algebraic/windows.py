@@ -22,7 +22,7 @@ from jaxid.dynamics.residuals import drive_own_states, drive_ratio
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import ForceData, linear_scale, sharpened
+from jaxid.estimators.inverse_dynamics import linear_scale
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -31,6 +31,7 @@ from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import Solve, Steps, alone
 from jaxid.numerics.precision import assess
+from jaxid.simulation.force_balance import ForceData, sharpened
 
 # Windows: so many periods of the band edge each, half overlapping. Shorter ones hold too little
 # motion to tell inertia from friction, longer ones too much of the noise's drift.

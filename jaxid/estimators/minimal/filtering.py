@@ -11,8 +11,9 @@ from jaxtyping import Float
 from jaxid.estimators.minimal.models import Structure
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import A_PERIOD, Recipe, choose_recipe, spaced, trimmed
-from jaxid.machine import Machine, position_noise
+from jaxid.machine import Machine
 from jaxid.numerics import filters as signals
+from jaxid.simulation.sensor_noise import position_noise
 
 # The band ends so many times above the highest natural frequency, as published (60 for 30 Hz).
 _ABOVE = 2.0

@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from jaxid.errors import InputError
 from jaxid.estimators.minimal.polynomials import Matrix
-from jaxid.model.plant import Balance, Effect, Plant
+from jaxid.model.effect import Effect
+from jaxid.model.plant import Balance, Plant
 from jaxid.model.unknowns import effect_name
 from jaxid.numerics.affine import depends, is_affine
 

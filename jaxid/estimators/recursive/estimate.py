@@ -25,7 +25,8 @@ from jaxid.estimators.recursive.recursion import Memory, Recursion, column_squar
 from jaxid.estimators.recursive.rows import Rows, rows_steps
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model.plant import carries_force, parameters_of
+from jaxid.model.effect import carries_force
+from jaxid.model.parameter import parameters_of
 from jaxid.numerics.lanes import Solve, Steps
 
 # So many samples the start counts as.

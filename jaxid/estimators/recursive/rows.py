@@ -17,13 +17,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxid.dynamics.residuals import balance_along
 from jaxid.errors import InputError
-from jaxid.estimators.inverse_dynamics import ForceData, measured_force, sharpened, whole_motion
 from jaxid.logs.prepare import Prepared, smeared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import Solve, Steps
+from jaxid.simulation.force_balance import ForceData, measured_force, sharpened, whole_motion
 
 # Part of itself by which a column may differ elsewhere among the unknowns: of rounding.
 _LINEAR = 1e-6

@@ -26,10 +26,11 @@ from jaxid.results.report.data import (
 from jaxid.results.report.page import render
 
 if TYPE_CHECKING:
-    from jaxid.commands.identify import Gap, Identification
+    from jaxid.commands.identify import Identification
     from jaxid.discovery.result import Discovery, Round
     from jaxid.discovery.separating.propose import Proposal
     from jaxid.estimators.estimate import Estimate
+    from jaxid.gap import Gap
     from jaxid.session import Run, Session
 
 

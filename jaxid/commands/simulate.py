@@ -1,0 +1,26 @@
+"""The command `simulate`: the log that a case would give."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.case.case import Case, load_case
+from jaxid.numerics.lanes import alone
+from jaxid.scene import Scene, Virtual
+
+
+def simulate(case: Case | str | Path, *, seed: int = 0) -> Virtual:
+    """Simulate the log that a case would give, at its true values where it has any.
+
+    Args:
+        case: The case, or its file; it needs [simulation] with duration and sample_rate, and
+            [reference] (with a [controller]) or [input].
+        seed: Of the sensors' noise.
+
+    Raises:
+        InputError: If the case does not say what to simulate.
+    """
+    scene = Scene.of(case if isinstance(case, Case) else load_case(case))
+    return alone(scene.virtual(scene.machine, np.random.default_rng(seed)))

@@ -1,0 +1,181 @@
+"""Physical effects: the signals they see, what they do, and where a search for them starts."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array
+
+from jaxid.model.parameter import ParameterInfo, parameters_of
+
+
+class Signals(eqx.Module):
+    """All that an effect may look at, in the coordinate of its port.
+
+    Args:
+        y: Coordinate [m or rad].
+        yd: Its velocity.
+        ydd: Its acceleration.
+        u: Force of the drive after the effects declared before this one [N or N m]; zero where
+            none drives the port.
+        t: Time from the start of the log [s].
+        width: Velocity over which the sign is smoothed.
+        dry_scale: Factor on every level of dry friction (drift).
+        gravity: Acceleration of gravity along the port; zero on a horizontal axis [m/s^2].
+        normal: Force that presses the sliding surfaces together [N].
+        stiffness: Of the plant's own spring, where the port is its elongation [N/m or N m/rad]; else zero.
+        damping: Likewise [N s/m or N m s/rad].
+    """
+
+    y: Array
+    yd: Array
+    ydd: Array
+    u: Array
+    t: Array
+    width: Array
+    dry_scale: Array
+    gravity: Array
+    normal: Array
+    stiffness: Array
+    damping: Array
+
+
+class Action(eqx.Module):
+    """All that an effect may do; every entry may be left out.
+
+    Args:
+        force: On the port [N or N m]; may depend on the acceleration (added mass).
+        dry: Level of set-valued friction; its force is -dry times a direction in [-1, 1].
+        stick: Level above `dry` that must be overcome to leave rest.
+        rising: Level above `dry` while speed grows, forwards and backwards.
+        drive: What leaves the actuator path in place of `Signals.u`.
+        rate: Time derivative of the effect's own state; affine in that state.
+    """
+
+    force: Array | float = 0.0
+    dry: Array | float = 0.0
+    stick: Array | float = 0.0
+    rising: tuple[Array, Array] | None = None
+    drive: Array | None = None
+    rate: Array | None = None
+
+
+@dataclass(frozen=True)
+class Scales:
+    """How large the quantities of a log are; where a search starts, never what it finds.
+
+    Args:
+        position: Half the stroke. velocity, acceleration, force: root mean squares while moving.
+        peak_velocity, peak_force: Largest absolute values.
+        period: Sampling time [s].
+        duration: Length of the log [s].
+    """
+
+    position: float
+    velocity: float
+    acceleration: float
+    force: float
+    peak_velocity: float
+    peak_force: float
+    period: float
+    duration: float
+
+    def natural(self, dimension: str) -> float:
+        """Size at which a parameter of this dimension would explain all of the force."""
+        base = {
+            "force": self.force, "position": self.position, "time": self.position / self.velocity,
+        }
+        if "inertia" in dimension:
+            base["inertia"] = self.force / self.acceleration
+        over, _, under = dimension.partition("/")
+        value = 1.0
+        for words, sign in ((over, 1), (under, -1)):
+            for word in words.split("*") if words not in ("", "1") else ():
+                name, power = re.fullmatch(r"([a-z]+)(\d?)", word).groups()
+                value *= base[name] ** (sign * int(power or 1))
+        return value
+
+
+class Effect(eqx.Module):
+    """A physical effect that can be added to a plant.
+
+    A subclass declares its parameters with `parameter`, implements `act`, and is registered with
+    `jaxid.effects.register`. Nothing else is needed for the command line, the regressor, the
+    search and the tables to know it.
+    """
+
+    kind: ClassVar[str]
+    port: int = eqx.field(static=True, default=0, kw_only=True)
+
+    def act(self, x: Signals, state: Array | None) -> Action:
+        """What the effect does at one instant."""
+        raise NotImplementedError
+
+    def initial_state(self, u: Array) -> Array | None:
+        """Own state at the start, where the drive has long been at `u`; None without memory.
+
+        A number, or a vector whose rate has constant coefficients (a linear oscillator).
+        """
+        return None
+
+    def command_delay(self) -> Array | float:
+        """By how much the effect delays the command [s]."""
+        return 0.0
+
+    def dry_drift(self, t: Array) -> Array | float:
+        """Relative change of every dry-friction level at time t."""
+        return 0.0
+
+    # Whether the effect is a force beside the others, in proportion to those of its parameters
+    # that carry a force. False for what sits in the drive or acts on other effects.
+    adds_force: ClassVar[bool] = True
+    # Whether it changes what the drive of its joint delivers.
+    in_drive: ClassVar[bool] = False
+    # Whether it is the law of a spring: of a plant with springs, its place is an elongation.
+    of_spring: ClassVar[bool] = False
+    # Whether only a plant with springs of its own (True), or only one without (False), can have it.
+    with_springs: ClassVar[bool | None] = None
+    # Whether it is the same along every direction: then it may act on a tool, which moves along several.
+    any_direction: ClassVar[bool] = False
+    # Whether a search looks for it on stages only: elsewhere what differs by direction is taken for it.
+    of_stages: ClassVar[bool] = False
+    # Whether a search looks for it only where [discover] asks: elsewhere a simpler effect is taken for it.
+    on_request: ClassVar[bool] = False
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        """Values from which a search starts, one dictionary a start.
+
+        What enters linearly needs one start of natural size. What enters nonlinearly takes a grid,
+        fine enough that least squares closes the rest.
+        """
+        own = parameters_of(cls).items()
+        return [{n: scales.natural(i.dimension) for n, i in own if not i.optional}]
+
+    @classmethod
+    def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
+        """Bounds within which a search keeps a parameter, beside its sign.
+
+        Beyond them the effect would only imitate another (a ripple longer than the stroke is any
+        smooth force of position).
+        """
+        return {}
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        """Values at which the effect does next to nothing and its derivatives still exist."""
+        return scaled(cls, cls.starts(scales)[0], 1e-9)
+
+
+def carries_force(info: ParameterInfo) -> bool:
+    """Whether an added force is in proportion to a parameter."""
+    return info.dimension.startswith(("force", "inertia"))
+
+
+def scaled(cls: type[Effect], values: dict[str, float], factor: float) -> dict[str, float]:
+    """The same effect, factor times as strong."""
+    infos = parameters_of(cls)
+    return {n: v * factor if carries_force(infos[n]) else v for n, v in values.items()}

@@ -1,0 +1,64 @@
+"""Disturbances that are added to the command in a loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError
+from jaxid.logs.log import Log
+from jaxid.logs.readers import read_columns
+
+# A disturbance switches at start + k (on + off); the tick at that very instant still sees the
+# old value, and a time stamp that is off by its rounding must not change that. In parts of
+# on + off: half a microsecond at a usual 0.5 s, far below any tick, above the jitter of logs.
+_SWITCH = 1e-6
+
+
+def disturbance_at(
+    disturbance: Mapping[str, float] | str | None,
+    times: Float[np.ndarray, " ticks"],
+    log: Log | None = None,
+) -> Float[np.ndarray, "ticks _"]:
+    """Sample what is added to the command in a loop.
+
+    A square wave is on for start < t <= start + on, and so on every on + off: the tick at the
+    very instant of switching still sees the old value, however its time stamp is rounded.
+
+    Args:
+        disturbance: A square wave, the name of a column, or None for zero.
+        times: The ticks [s], on the clock of the log.
+        log: Whose file has the column; its values are held between its samples.
+
+    Returns:
+        The disturbance at each tick, in units of the command.
+
+    Raises:
+        InputError: If there is no such column, or no log to have it.
+    """
+    times = np.asarray(times, dtype=np.float64)
+    if disturbance is None:
+        return np.zeros((times.size, 1))
+    if isinstance(disturbance, str):
+        return _column(disturbance, times, log)
+    cycle = disturbance["on"] + disturbance["off"]
+    since = times - disturbance.get("start", 0.0) - _SWITCH * cycle
+    on = (since > 0) & (np.mod(since, cycle) < disturbance["on"])
+    return np.where(on, disturbance["level"], 0.0)[:, None]
+
+
+def _column(name: str, times: np.ndarray, log: Log | None) -> np.ndarray:
+    where = f"disturbance = '{name}'"
+    if log is None:
+        mend = "give { level, on, off, start } in its place"
+        raise InputError("a column needs a log to stand in", where=where, mend=mend)
+    values = read_columns(log.source, [name], log.rows)[0][name]
+    if not np.isfinite(values).all():
+        row = log.rows[0] + int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+        mend = "mend that row, or cut it out with rows"
+        raise InputError(f"row {row} is not a number", where=f"{log.source}, {where}", mend=mend)
+    # A tick belongs to the sample at its own instant, however that is rounded.
+    held = np.searchsorted(log.time, times + 1e-3 * log.period, side="right") - 1
+    return values[np.clip(held, 0, len(values) - 1)]

@@ -1,0 +1,115 @@
+"""The balance of forces along a prepared log: residual, regressor, measured force."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxid.dynamics.hidden_joints import complete_motion
+from jaxid.dynamics.residuals import residual_along
+from jaxid.logs.prepare import Prepared
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import scatter
+from jaxid.numerics import filters as signals
+
+
+class ForceData(eqx.Module):
+    """Arrays of a prepared log, as compiled code takes them.
+
+    Args:
+        q, qd, qdd, force: At the log's rate.
+        weight: Of each kept sample, (kept, n); zero where it does not count.
+        start: Time of the first sample, from the start of the log [s].
+    """
+
+    q: Float[Array, "time n"]
+    qd: Float[Array, "time n"]
+    qdd: Float[Array, "time n"]
+    force: Float[Array, "time m"]
+    weight: Float[Array, "kept n"]
+    start: Float[Array, ""]
+    period: float = eqx.field(static=True)
+    hold: float = eqx.field(static=True)
+    decimator: signals.Decimator = eqx.field(static=True)
+    measured: tuple[bool, ...] = eqx.field(static=True, default=(True,))
+    steps: int = eqx.field(static=True, default=1)
+
+    @classmethod
+    def of(cls, data: Prepared, rows: np.ndarray | None = None) -> ForceData:
+        """Arrays of a prepared log; weight one for `rows`, by default every moving sample."""
+        rows = data.moving if rows is None else rows
+        return cls(
+            data.q, data.qd, data.qdd, data.force, rows.astype(np.float64),
+            np.asarray(data.start), data.period, data.hold, data.recipe.decimator, data.measured,
+            data.steps,
+        )
+
+
+def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
+    """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
+    delays = plant.command_delays(data.force.shape[1])
+    u = signals.delayed(data.force, delays, data.period, hold=data.hold)
+    motion = whole_motion(plant, data, u)
+    return data.decimator(residual_along(plant, *motion, u, data.period, data.start))
+
+
+def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration of all joints, also of those without an encoder, (time, n)."""
+    times = data.start + data.period * jnp.arange(data.q.shape[0])
+    return complete_motion(
+        plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps
+    )
+
+
+@eqx.filter_jit
+def force_and_columns(
+    plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array | None = None
+) -> tuple[Float[Array, "kept n"], Float[Array, "kept n c"]]:
+    """Force residual of a plant and its Jacobian in the unknowns at some places.
+
+    Args:
+        plant: The plant.
+        places: Of the unknowns.
+        data: The log.
+        theta: The unknowns.
+        directions: In which the derivatives are taken, (unknowns, c). Absent: each unknown has its own.
+    """
+
+    def residual(step: Array) -> tuple[Array, Array]:
+        moved = theta + (step if directions is None else directions @ step)
+        e = force_residual(scatter(places, plant, moved), data)
+        return e, e
+
+    count = theta.size if directions is None else directions.shape[1]
+    jacobian, e = jax.jacfwd(residual, has_aux=True)(jnp.zeros(count))
+    return e, jacobian
+
+
+def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
+    """Declared force by joint through the same filter [N or N m]; zero where none is driven."""
+    u = signals.delayed(data.force, jnp.zeros(()), data.period, hold=data.hold)
+    return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
+
+
+def sharpened(plant: Plant, data: Prepared) -> Plant:
+    """The plant with a sign as sharp as its log allows.
+
+    The width is a third of the rest velocity: samples nearer to zero are left out, so that the
+    smoothing biases nothing.
+    """
+    return eqx.tree_at(
+        lambda p: (p.sharpness, p.velocity_scale),
+        plant,
+        (np.asarray(1 / 3), np.asarray(min(data.recipe.rest_velocity))),
+    )
+
+
+def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
+    """2-norm of the measured force at the samples that count."""
+    return jnp.linalg.norm(jnp.where(data.weight > 0, measured_force(plant, data), 0.0))
+
+
+force_size = eqx.filter_jit(_size)

@@ -1,0 +1,21 @@
+"""Noise of readings, as stated or as a log shows it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.logs.log import Log
+from jaxid.machine import Machine
+from jaxid.numerics import filters as signals
+
+
+def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
+    """Standard deviation of a reading of each joint, as stated, else off the log's high band.
+
+    Zero where a joint has no encoder.
+    """
+    stated = machine.sensor.position_std
+    if stated is None:
+        stated = signals.high_band_std(log.filled)
+    return np.broadcast_to(np.asarray(stated), log.position.shape[1]) * log.measured
