@@ -61,16 +61,25 @@ def plant(theta: np.ndarray, sharpness: float = 1e-3) -> Axis:
 def replay(reference: np.ndarray, numerics: Numerics) -> Replay:
     """The run in the loop, from rest, the reading exact."""
     law = CascadePD(
-        kp=jnp.asarray(160.18), kv=jnp.asarray(243.45), limit=jnp.asarray(10.0), period=PERIOD,
+        kp=jnp.asarray(160.18),
+        kv=jnp.asarray(243.45),
+        limit=jnp.asarray(10.0),
+        period=PERIOD,
         velocity_average=2,
     )
-    drive = Drive(
-        jnp.asarray([GAIN]), PERIOD, "zero_order", numerics.substeps, numerics.set_valued
-    )
+    drive = Drive(jnp.asarray([GAIN]), PERIOD, "zero_order", numerics.substeps, numerics.set_valued)
     zero = jnp.zeros((len(reference), 1))
     return Replay(
-        drive, law, Sensor(), jnp.asarray(reference)[:, None], zero, None,
-        jnp.zeros(1), jnp.zeros(1), None, 1,
+        drive,
+        law,
+        Sensor(),
+        jnp.asarray(reference)[:, None],
+        zero,
+        None,
+        jnp.zeros(1),
+        jnp.zeros(1),
+        None,
+        1,
     )
 
 
@@ -137,7 +146,15 @@ def fit(run: Replay, base: Axis, theta: np.ndarray, measured: np.ndarray) -> Min
     measured = jnp.asarray(measured)[:, None]
     weight, active = jnp.ones(measured.shape), np.ones(len(PLACES), bool)
     minimum = _fit(
-        run, PLACES, base, measured, weight, jnp.asarray(theta), TRANSFORM, BOUNDS, "position",
+        run,
+        PLACES,
+        base,
+        measured,
+        weight,
+        jnp.asarray(theta),
+        TRANSFORM,
+        BOUNDS,
+        "position",
         active,
     )
     return jax.block_until_ready(minimum)

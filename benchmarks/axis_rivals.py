@@ -36,13 +36,17 @@ def _rates(t, x, theta, force, period, width):
     return np.array([x[1], (u - c * x[1] - f * np.tanh(x[1] / width) + f0) / m])
 
 
-def solve_ivp(
-    theta: tuple, force: np.ndarray, period: float, width: float, atol: float
-) -> np.ndarray:
+def solve_ivp(theta: tuple, force: np.ndarray, period: float, width: float, atol: float) -> np.ndarray:
     """RK45 at rtol 1e-6 under the held force that the loop gave; the right-hand side by numba."""
     times = period * np.arange(len(force))
     solution = scipy.integrate.solve_ivp(
-        _rates, (0.0, times[-1]), [0.0, 0.0], "RK45", t_eval=times, rtol=1e-6, atol=atol,
+        _rates,
+        (0.0, times[-1]),
+        [0.0, 0.0],
+        "RK45",
+        t_eval=times,
+        rtol=1e-6,
+        atol=atol,
         args=(theta, force, period, width),
     )
     return solution.y[0]
@@ -69,8 +73,12 @@ OPTIMISTIX = {
 
 @eqx.filter_jit
 def optimistix_fit(
-    solver: optx.AbstractLeastSquaresSolver, run: Replay, base: Axis, start: jax.Array,
-    measured: jax.Array, scaled: bool,
+    solver: optx.AbstractLeastSquaresSolver,
+    run: Replay,
+    base: Axis,
+    start: jax.Array,
+    measured: jax.Array,
+    scaled: bool,
 ) -> tuple[jax.Array, jax.Array]:
     """A solver of optimistix on jaxid's residual from jaxid's start: unknowns, half the sum of squares.
 

@@ -163,9 +163,7 @@ def measure_cold(chosen: Sequence[Case], path: Path) -> None:
             out = subprocess.run(
                 [command, "discover", *words, "--quiet"], capture_output=True, text=True, env=environment
             )
-            seconds.append(
-                {"id": case.id, "seconds": time.perf_counter() - begin, "status": out.returncode}
-            )
+            seconds.append({"id": case.id, "seconds": time.perf_counter() - begin, "status": out.returncode})
     path.write_text(json.dumps(seconds))
 
 

@@ -33,9 +33,8 @@ def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
     totals = {
         "named right, all visible": share(map(judge.right, single)),
         "named right, worst effect": min(
-            (
-                share(judge.right(r) for r in single if r["what"] == k) for k in _whats(single)
-            ), default=None,
+            (share(judge.right(r) for r in single if r["what"] == k) for k in _whats(single)),
+            default=None,
         ),
         "false positives": share(map(judge.false_positive, nulls)),
         "both named, visible pairs": share(judge.right(r) for r in pairs),
@@ -43,9 +42,7 @@ def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
         "parameters within 3 deviations": share(
             x <= judge.DEVIATIONS for r in named for x in judge.deviations(r)
         ),
-        "outside: unexplained and pointed at": share(
-            judge.pointed_at(r) for r in _visible(by["outside"])
-        ),
+        "outside: unexplained and pointed at": share(judge.pointed_at(r) for r in _visible(by["outside"])),
     }
     return {
         "counts": {group: len(rows) for group, rows in by.items()},
@@ -106,9 +103,7 @@ def glance(table: dict) -> str:
     for what in dict.fromkeys(r["what"] for r in table["effects"]):
         own = {r["noise"]: r for r in table["effects"] if r["what"] == what}
         cells = [f"{own[n]['right']}/{own[n]['visible']}" if n in own else "" for n in noises]
-        wrong = Counter(
-            w["said"] for w in table["wrong"] if w["id"].startswith(f"effects/{what}/")
-        )
+        wrong = Counter(w["said"] for w in table["wrong"] if w["id"].startswith(f"effects/{what}/"))
         rows.append(
             [what, *cells, _text(own["all"]["closed"]), _text(own["all"]["seconds"]),
              "; ".join(f"{said}: {n}" for said, n in wrong.items())]

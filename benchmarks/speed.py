@@ -79,9 +79,7 @@ class Sides:
 
     def loop_normal(self) -> np.ndarray:
         normal, gradient = np.zeros((4, 4)), np.zeros(4)
-        loops.rk4_normal(
-            self.known, self.reference, self.measured, LOOP, REST, normal, gradient
-        )
+        loops.rk4_normal(self.known, self.reference, self.measured, LOOP, REST, normal, gradient)
         return normal
 
     def loop_sets(self) -> np.ndarray:
@@ -118,9 +116,7 @@ class Sides:
         """Cost that a fit by optimistix reaches."""
         run, start = self.runs[name], jnp.asarray(axis.START)
         method = rivals.OPTIMISTIX[solver]
-        return lambda: np.asarray(
-            rivals.optimistix_fit(method, run, self.base, start, self.seen, scaled)[1]
-        )
+        return lambda: np.asarray(rivals.optimistix_fit(method, run, self.base, start, self.seen, scaled)[1])
 
     def scipy_fit(self, name: str) -> Callable:
         return lambda: rivals.lm_fit(name, self.reference, self.measured, LOOP, axis.START).x
@@ -192,7 +188,9 @@ def against_optimistix(sides: Sides, n: int, cold: int) -> list[Row]:
     for name in ("smooth", "ideal"):
         what = "fit, {}" + (", ideal" if name == "ideal" else "") + " (cost)"
         for solver, scaled in (
-            ("LevenbergMarquardt", False), ("LevenbergMarquardt", True), ("Dogleg", False)
+            ("LevenbergMarquardt", False),
+            ("LevenbergMarquardt", True),
+            ("Dogleg", False),
         ):
             rival = f"optimistix {solver}" + (", scaled" if scaled else "")
             theirs = sides.optimistix_cost(name, solver, scaled)
@@ -213,8 +211,13 @@ def cold_row(quantity: str, name: str, solver: str, repeats: int) -> Row:
     (mine, other), (fast, rival_fast) = np.median(pairs, axis=0)[:, 0], pairs.min(axis=0)[:, 0]
     a, b = pairs[0, :, 2]
     row = Row(
-        quantity, f"optimistix {solver}", float(mine), float(other), float(mine / other),
-        float(fast / rival_fast), float(abs(a - b) / b),
+        quantity,
+        f"optimistix {solver}",
+        float(mine),
+        float(other),
+        float(mine / other),
+        float(fast / rival_fast),
+        float(abs(a - b) / b),
     )
     print(line(row), flush=True)
     return row
@@ -260,10 +263,7 @@ def start_times(repeats: int) -> dict[str, float]:
     words["import jaxid, with JAX"] = ("-c", "import jaxid, jaxid.simulation.loops")
     if (HERE.parent / "jaxid" / "cli.py").exists():
         words["jaxid --help"] = ("-c", "from jaxid.cli import main; main(['--help'])")
-    seconds = {
-        name: min(in_process(*w)[0] for _ in range(repeats))
-        for name, w in words.items()
-    }
+    seconds = {name: min(in_process(*w)[0] for _ in range(repeats)) for name, w in words.items()}
     nothing = seconds.pop("nothing")
     return {name: s - nothing for name, s in seconds.items()}
 
@@ -274,18 +274,22 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{n: version(n) for n in names}}
 
 
-def report(
-    rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float], scale: dict
-) -> str:
+def report(rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float], scale: dict) -> str:
     shown = ", ".join(f"{k} {v}" for k, v in versions().items())
     flag = all(c["loop_flag"] for c in compiled.values())
     lines = [
-        "# Speed", "",
+        "# Speed",
+        "",
         "Written by `python benchmarks/speed.py`; what is measured is in `benchmarks/README.md`.",
-        "", f"{os.cpu_count()} CPU cores, {shown}.", "",
-        *table(rows), "",
-        f"Loop flag in all compiled loops: {'yes' if flag else '**no**'}.", "",
-        "| once a process | s | CPU s |", "|---|---|---|",
+        "",
+        f"{os.cpu_count()} CPU cores, {shown}.",
+        "",
+        *table(rows),
+        "",
+        f"Loop flag in all compiled loops: {'yes' if flag else '**no**'}.",
+        "",
+        "| once a process | s | CPU s |",
+        "|---|---|---|",
         *[f"| {name} | {s:.2f} | |" for name, s in starts.items()],
         *[f"| {name} | {wall:.2f} | {cpu:.2f} |" for name, (wall, cpu) in fits.items()],
         *[
@@ -329,8 +333,12 @@ def main() -> int:
         folder.mkdir(exist_ok=True)
         (folder / "speed.md").write_text(text)
         data = {
-            "cpu_count": os.cpu_count(), "versions": versions(),
-            "rows": [asdict(r) for r in rows], "compile": compiled, "first_fits": fits, "starts": starts,
+            "cpu_count": os.cpu_count(),
+            "versions": versions(),
+            "rows": [asdict(r) for r in rows],
+            "compile": compiled,
+            "first_fits": fits,
+            "starts": starts,
             "scale": scale,
         }
         (folder / "speed.json").write_text(json.dumps(data, indent=1) + "\n")

@@ -98,8 +98,11 @@ class MuJoCo:
             return ([1e6 * r for r in residual], *rest)
 
         found, _ = self.sysid.optimize(
-            initial_params=self.parameters(axis.START), residual_fn=scaled, optimizer="mujoco",
-            verbose=False, x_scale="jac",
+            initial_params=self.parameters(axis.START),
+            residual_fn=scaled,
+            optimizer="mujoco",
+            verbose=False,
+            x_scale="jac",
         )
         return found.as_vector()
 
@@ -185,16 +188,35 @@ def against_peers(sides: object, few: int) -> list[Row]:
         peer = MuJoCo(sides.reference)
         forward = sides.forward("ideal")
         # Different worlds: what is compared is a run, and what a fit finds.
-        rows.append(compare("forward, ideal step", forward, "mujoco.sysid, a rollout",
-                            lambda: np.append(peer.rollout(), [0.0, 0.0]), None, few, 0.1))
-        rows.append(compare("fit, warm, ideal", sides.fit("ideal"), "mujoco.sysid optimize", peer.fit,
-                            None, 2, 0.05))
+        rows.append(
+            compare(
+                "forward, ideal step",
+                forward,
+                "mujoco.sysid, a rollout",
+                lambda: np.append(peer.rollout(), [0.0, 0.0]),
+                None,
+                few,
+                0.1,
+            )
+        )
+        rows.append(
+            compare("fit, warm, ideal", sides.fit("ideal"), "mujoco.sysid optimize", peer.fit, None, 2, 0.05)
+        )
     if installed("jax_sysid"):
         peer = JaxSysid(sides.reference, sides.measured)
         rows.append(compare("fit, warm", sides.fit("smooth"), "jax-sysid, L-BFGS", peer.fit, None, 2, 0.05))
     if installed("figaroh"):
         run = sides.runs["ideal"](sides.base)
         known = motion_of(np.asarray(run.position)[:, 0], np.asarray(run.velocity)[:, 0])
-        rows.append(compare("regressor and least squares", Regressor(*known).fit, "figaroh, Pinocchio",
-                            Figaroh(*known).fit, None, few, 0.05))
+        rows.append(
+            compare(
+                "regressor and least squares",
+                Regressor(*known).fit,
+                "figaroh, Pinocchio",
+                Figaroh(*known).fit,
+                None,
+                few,
+                0.05,
+            )
+        )
     return rows

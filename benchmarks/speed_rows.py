@@ -51,7 +51,12 @@ def timed(function: Callable) -> float:
 
 
 def compare(
-    quantity: str, ours: Callable, rival: str, theirs: Callable, aim: float | None, repeats: int,
+    quantity: str,
+    ours: Callable,
+    rival: str,
+    theirs: Callable,
+    aim: float | None,
+    repeats: int,
     tolerance: float,
 ) -> Row:
     """Check that both compute the same, then time them in turn."""
@@ -62,8 +67,14 @@ def compare(
     times = np.array([(timed(ours), timed(theirs)) for _ in range(repeats)])
     (mine, other), (fast, rival_fast) = np.median(times, axis=0), times.min(axis=0)
     row = Row(
-        quantity, rival, float(mine), float(other), float(mine / other), float(fast / rival_fast),
-        difference, aim,
+        quantity,
+        rival,
+        float(mine),
+        float(other),
+        float(mine / other),
+        float(fast / rival_fast),
+        difference,
+        aim,
     )
     print(line(row), flush=True)
     return row
@@ -81,7 +92,10 @@ def in_process(*words: str, **environment: str) -> tuple[float, str]:
     """Wall time and output of a fresh Python."""
     begin = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, check=True,
+        [sys.executable, *words],
+        capture_output=True,
+        text=True,
+        check=True,
         env={**os.environ, **environment},
     )
     return time.perf_counter() - begin, done.stdout

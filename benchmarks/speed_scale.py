@@ -73,7 +73,7 @@ def fit(samples: int, repeats: int) -> dict:
     """One log of so many samples: seconds of simulating, preparing and fitting, cold and warm."""
     import jaxid
     from jaxid.estimators import METHODS
-    from jaxid.numerics.lanes import alone
+    from jaxid.numerics.lanes import run_alone
 
     with tempfile.TemporaryDirectory() as folder:
         case = Path(folder) / "case.toml"
@@ -84,7 +84,7 @@ def fit(samples: int, repeats: int) -> dict:
         prepared = _timed(lambda: jaxid.open_session(case, log), repeats)
         out = {"samples": log.samples, "simulate_s": made, "prepare_s": float(np.median(prepared))}
         for method in ("inverse_dynamics", "output_error"):
-            seconds = _timed(lambda m=method: alone(METHODS[m](session)), repeats + 1)
+            seconds = _timed(lambda m=method: run_alone(METHODS[m](session)), repeats + 1)
             out[method] = {"cold_s": seconds[0], "warm_s": float(np.median(seconds[1:]))}
     return out | {"memory": _memory()}
 
@@ -140,13 +140,13 @@ def chain_case(masses: int, seconds: float) -> str:
 [plant]
 kind = "chain"
 [plant.parameters]
-mass = {each('{ guess = 1.6, true = 2.0 }')}
-damping = {each('8.0')}
-stiffness = [{', '.join(['1500.0'] * (masses + 1))}]
+mass = {each("{ guess = 1.6, true = 2.0 }")}
+damping = {each("8.0")}
+stiffness = [{", ".join(["1500.0"] * (masses + 1))}]
 [[effects]]
 kind = "coulomb_friction"
-level = {each('{ guess = 2.0, true = 3.0 }')}
-joint = [{', '.join(str(k + 1) for k in range(masses))}]
+level = {each("{ guess = 2.0, true = 3.0 }")}
+joint = [{", ".join(str(k + 1) for k in range(masses))}]
 """
     return plant + LOOP.format(kp=3000.0, kd=80.0, targets="0.03, -0.02, 0.01, 0.04, 0.0", speed=0.2,
                                acceleration=4.0, seconds=seconds)  # fmt: skip
@@ -209,7 +209,10 @@ def commands() -> list[dict]:
     demo = HERE.parent / "jaxid" / "demo"
     case, log, other = (str(demo / name) for name in ("case.toml", "log.csv", "validation.csv"))
     words = {
-        "--help": ["--help"], "plants": ["plants"], "effects": ["effects"], "check": ["check", case, log],
+        "--help": ["--help"],
+        "plants": ["plants"],
+        "effects": ["effects"],
+        "check": ["check", case, log],
         "identify": ["identify", case, log],
         "identify --method inverse_dynamics": ["identify", case, log, "--method", "inverse_dynamics"],
         "discover --validate": ["discover", case, log, "--validate", other],

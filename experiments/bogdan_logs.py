@@ -20,7 +20,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.estimators.within_prior.problem import criterion_steps
 from jaxid.logs.log import Log
-from jaxid.numerics.lanes import alone, cores, together
+from jaxid.numerics.lanes import cores, run_alone, run_batched
 from jaxid.session import open_session
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -42,8 +42,14 @@ def noise_of(data: int, resolution: float) -> float:
 
 
 def logs_of(
-    data: int, runs: int, *, rigid: bool = True, resolution: float = stages.COUNT, noise: float | None = None,
-    reference: np.ndarray | None = None, truths: Sequence[Mapping[str, float]] = (),
+    data: int,
+    runs: int,
+    *,
+    rigid: bool = True,
+    resolution: float = stages.COUNT,
+    noise: float | None = None,
+    reference: np.ndarray | None = None,
+    truths: Sequence[Mapping[str, float]] = (),
 ) -> tuple[list[Log], np.ndarray]:
     """Logs that differ in noise, and in where within its first count the motor stood: that too [rad].
 
@@ -58,12 +64,22 @@ def logs_of(
     for k in range(runs):
         stage = stages.machine(data, rigid=rigid, **(truths[k] if truths else {}))
         made = stages.record(
-            stage, reference, noise=noise, resolution=resolution, seed=k, step=5e-6 if rigid else 2e-6,
+            stage,
+            reference,
+            noise=noise,
+            resolution=resolution,
+            seed=k,
+            step=5e-6 if rigid else 2e-6,
             start=first + starts[k],
         )
         out.append(
-            Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
-                reference=reference[:, None], source=f"run {k} of data {data}")
+            Log(
+                time=made["t"],
+                position=made["q"][:, None],
+                force=made["i"][:, None],
+                reference=reference[:, None],
+                source=f"run {k} of data {data}",
+            )
         )
     return out, starts
 
@@ -87,8 +103,16 @@ def off_in_sigma(
     return np.array([(d["value"] - t) / d["std"] for d, t in zip(directions, at, strict=True)])
 
 
-def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, believed: bool = False,
-            more: str = ON_FORCE, **stated: Any) -> Path:
+def case_of(
+    folder: Path,
+    name: str,
+    data: int,
+    *,
+    guess: int | None = None,
+    believed: bool = False,
+    more: str = ON_FORCE,
+    **stated: Any,
+) -> Path:
     """A case file; guesses at the truth, drawn up to 50 % around it, or as the prior says that they are."""
     draw = stages.believed if believed else stages.drawn
     drawn = None if guess is None else draw(guess, PRIOR, data)
@@ -98,8 +122,11 @@ def case_of(folder: Path, name: str, data: int, *, guess: int | None = None, bel
 
 
 def studied(
-    cases: Path | Sequence[Path], logs: Sequence[Log], starts: np.ndarray,
-    true: Mapping[str, float] | Sequence[Mapping[str, float]], on: str = "force",
+    cases: Path | Sequence[Path],
+    logs: Sequence[Log],
+    starts: np.ndarray,
+    true: Mapping[str, float] | Sequence[Mapping[str, float]],
+    on: str = "force",
 ) -> tuple[list[Estimate], list[dict[str, Any]]]:
     """Estimates, and what `judged` says of each, of logs that are not refused; `true` of all or of each."""
     cases = [cases] * len(logs) if isinstance(cases, Path) else cases
@@ -115,7 +142,7 @@ def studied(
     opened = [open_session(case, log).fit.log for _, case, log, *_ in kept]
     theta = [_ordered(own, machine.parameters.names) for *_, own in kept]
     steps = [criterion_steps(machine, log, t, on=on) for log, t in zip(opened, theta, strict=True)]
-    at = together(steps, 16)
+    at = run_batched(steps, 16)
     return [e for e, *_ in kept], [judged(*of, c) for of, c in zip(kept, at, strict=True)]
 
 
@@ -132,7 +159,9 @@ def judged(
     far, near = (prior.inward(theta) for theta in (_ordered(true, estimate.names), estimate.theta))
     freedom = log.samples - len(estimate.details["directions"])
     return {
-        "converged": bool(estimate.converged), "percent": found, "ratio": found / percent,
+        "converged": bool(estimate.converged),
+        "percent": found,
+        "ratio": found / percent,
         "effective": estimate.details["effective_parameters"],
         "nats": float(0.5 * (freedom * (percent / found - 1) + far @ far - near @ near)),
         "off": off_in_sigma(estimate, case, log, start, true).tolist(),
@@ -140,7 +169,10 @@ def judged(
 
 
 def apart(
-    file: Path, cases: Sequence[Path], logs: Sequence[Log], starts: np.ndarray,
+    file: Path,
+    cases: Sequence[Path],
+    logs: Sequence[Log],
+    starts: np.ndarray,
     truths: Sequence[Mapping[str, float]],
 ) -> list[dict[str, Any]]:
     """What came of each fit, one to a core at a time: of many steps each, they are slower side by side.
@@ -175,5 +207,5 @@ def _fitted(run: int, case: Path, log: Log, start: float, true: Mapping[str, flo
         raise estimate
     opened = open_session(case, log)
     truth = _ordered(true, opened.machine.parameters.names)
-    at = alone(criterion_steps(opened.machine, opened.fit.log, truth, on="force"))
+    at = run_alone(criterion_steps(opened.machine, opened.fit.log, truth, on="force"))
     return {"run": run, **judged(estimate, case, log, start, true, at)}

@@ -30,11 +30,16 @@ from bogdan_scatter import calibrated, elastic, nearest, scatter, within
 
 # Of the published table: relative precision of data 1 and 2 [%].
 PUBLISHED = {
-    "motor_inertia": (2.02, 2.00), "viscous_friction[1].coefficient": (2.37, 6.43),
-    "coulomb_friction[1].level": (1.27, 1.08), "table_mass": (1.64, 2.63),
-    "viscous_friction[2].coefficient": (2.01, 2.13), "coulomb_friction[2].level": (1.90, 1.77),
-    "velocity_hysteresis[2].level": (3.51, 7.29), "velocity_hysteresis[2].level_negative": (1.75, 3.14),
-    "velocity_hysteresis[2].velocity": (3.12, 4.05), "cogging[2].amplitude": (1.58, 3.51),
+    "motor_inertia": (2.02, 2.00),
+    "viscous_friction[1].coefficient": (2.37, 6.43),
+    "coulomb_friction[1].level": (1.27, 1.08),
+    "table_mass": (1.64, 2.63),
+    "viscous_friction[2].coefficient": (2.01, 2.13),
+    "coulomb_friction[2].level": (1.90, 1.77),
+    "velocity_hysteresis[2].level": (3.51, 7.29),
+    "velocity_hysteresis[2].level_negative": (1.75, 3.14),
+    "velocity_hysteresis[2].velocity": (3.12, 4.05),
+    "cogging[2].amplitude": (1.58, 3.51),
     "cogging[2].phase": (2.17, 2.98),
 }
 RUNS = 48
@@ -51,7 +56,7 @@ def published(folder: Path, runs: int) -> None:
         except jaxid.InputError as error:
             print(f"\ndata {data}: refused: {error}", flush=True)
             continue
-        found.save(folder / f"data{data}", force=True)
+        found.save(folder / f"data{data}", overwrite=True)
         estimate = found.estimate
         truth = np.array([stages.TRUTH[data][n] for n in estimate.names])
         table = Table(
@@ -63,8 +68,9 @@ def published(folder: Path, runs: int) -> None:
         guesses = stages.drawn(data, data=data)
         for name, true, value, std in zip(estimate.names, truth, estimate.theta, estimate.std, strict=True):
             told = f"{100 * std / abs(value):.1f}" if np.isfinite(std) else "not told"
-            table.row(name, f"{true:.3g}", f"{guesses[name]:.3g}", f"{value:.3g}", told,
-                      PUBLISHED[name][data - 1])
+            table.row(
+                name, f"{true:.3g}", f"{guesses[name]:.3g}", f"{value:.3g}", told, PUBLISHED[name][data - 1]
+            )
         table.show(time.perf_counter() - start)
         sigmas = off_in_sigma(estimate, case, log, begin, stages.TRUTH[data])
         for d, off in zip(estimate.details["directions"], sigmas, strict=True):
@@ -84,8 +90,12 @@ def begun(folder: Path, runs: int) -> None:
         case = case_of(folder, f"from_{name}", 1, guess=1, more=f'{ON_FORCE}start = "{name}"\n')
         estimate = jaxid.identify(case, log).estimate
         off = off_in_sigma(estimate, case, log, begin, stages.TRUTH[1])
-        table.row(name, f"{estimate.details['criterion_percent']:.2f}", estimate.steps,
-                  ", ".join(f"{o:+.1f}" for o in off))
+        table.row(
+            name,
+            f"{estimate.details['criterion_percent']:.2f}",
+            estimate.steps,
+            ", ".join(f"{o:+.1f}" for o in off),
+        )
     table.show(time.perf_counter() - start)
 
 
@@ -104,7 +114,7 @@ def unrecorded(folder: Path, runs: int) -> None:
     case = case_of(folder, "unrecorded", 1, guess=1, more=ON_FORCE + stated, reference="")
     (log,), _ = logs_of(1, 1)
     found = jaxid.identify(case, replace(log, reference=None))
-    found.save(folder / "unrecorded", force=True)
+    found.save(folder / "unrecorded", overwrite=True)
     table = Table(
         f"Data 1 without its reference: criterion {found.estimate.details['criterion_percent']:.2f} %",
         ["of the reference", "true", "guess", "found", "sigma"],
@@ -112,8 +122,13 @@ def unrecorded(folder: Path, runs: int) -> None:
     for name, std in zip(found.estimate.names, found.estimate.std, strict=True):
         where, _, key = name.partition(".")
         if where == "reference":
-            table.row(key, f"{true[key]:.4g}", f"{true[key] * REFERENCE_OFF[key]:.4g}",
-                      f"{found.value(name):.4g}", f"{std:.2g}" if np.isfinite(std) else "not told")
+            table.row(
+                key,
+                f"{true[key]:.4g}",
+                f"{true[key] * REFERENCE_OFF[key]:.4g}",
+                f"{found.value(name):.4g}",
+                f"{std:.2g}" if np.isfinite(std) else "not told",
+            )
     table.show(time.perf_counter() - start)
 
 
@@ -121,8 +136,16 @@ def position(folder: Path, runs: int) -> None:
     """The position in place of the current, which the paper says goes wrong: whether and why."""
     table = Table(
         f"Output error on current and on position: {runs // 2} runs of data 1, and 64 starts 50 % off",
-        ["fitted", "encoder", "directions", "off, of 1st and 2nd", "their sigma", "in 1.96 sigma",
-         "over truth's", "starts alike"],
+        [
+            "fitted",
+            "encoder",
+            "directions",
+            "off, of 1st and 2nd",
+            "their sigma",
+            "in 1.96 sigma",
+            "over truth's",
+            "starts alike",
+        ],
     )
     start = time.perf_counter()
     for on in ("force", "position"):
@@ -141,8 +164,11 @@ def position(folder: Path, runs: int) -> None:
             wrong = np.sqrt(np.nanmean((std * np.array([two(o) for o in off])) ** 2, axis=0))
             share = lambda x: ", ".join(f"{50 * v:.2g} %" for v in x)
             table.row(
-                "current" if on == "force" else on, name, f"{np.mean([len(o) for o in off]):.1f}",
-                share(wrong), share(np.nanmedian(std, axis=0)),
+                "current" if on == "force" else on,
+                name,
+                f"{np.mean([len(o) for o in off]):.1f}",
+                share(wrong),
+                share(np.nanmedian(std, axis=0)),
                 f"{np.mean(np.abs(np.concatenate(off)) < 1.96):.0%}",
                 f"{np.mean([r['ratio'] for r in rows]):.3f}",
                 f"{alike['same_optimum']} of {alike['count']}",
@@ -180,8 +206,15 @@ def designed(folder: Path, runs: int) -> None:
     many = case_of(folder, "designed_starts", 1, guess=1, more=ON_FORCE + "starts = 32\n")
     table = Table(
         f"{DESIGNED} designed logs of either screw: in how many each parameter is told, and how far off",
-        ["parameter", "expected", "visible", "rigid: told", "sigma off at most", "elastic: told",
-         "sigma off at most"],
+        [
+            "parameter",
+            "expected",
+            "visible",
+            "rigid: told",
+            "sigma off at most",
+            "elastic: told",
+            "sigma off at most",
+        ],
     )
     cells: dict[str, list[str]] = {n: [] for n in names}
     for rigid in (True, False):
@@ -219,14 +252,20 @@ def load(folder: Path, runs: int) -> None:
         stages.machine(1), reference, noise=noise_of(1, stages.COUNT), step=2e-6, start=first + begin
     )
     scale = np.round(made["x"] / SCALE) * SCALE
-    log = Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None],
-              reference=reference[:, None], load_position=scale[:, None], source="the designed log")
+    log = Log(
+        time=made["t"],
+        position=made["q"][:, None],
+        force=made["i"][:, None],
+        reference=reference[:, None],
+        load_position=scale[:, None],
+        source="the designed log",
+    )
     stated = ON_FORCE.replace('"force"', '"both"')
     case = case_of(folder, "load", 1, guess=1, coupling="elastic", more=stated)
     counts = f"position_resolution = {stages.COUNT!r}"
     case.write_text(case.read_text().replace(counts, f"position_resolution = [{stages.COUNT!r}, {SCALE!r}]"))
     found = jaxid.identify(case, log)
-    found.save(folder / "load", force=True)
+    found.save(folder / "load", overwrite=True)
     off = ", ".join(f"{o:+.1f}" for o in off_in_sigma(found.estimate, case, log, begin, stages.TRUTH[1]))
     table = 1e6 * found.gaps[0].simulation.rms[1]
     e, seconds = found.estimate, time.perf_counter() - start
@@ -253,7 +292,7 @@ def hidden(folder: Path, runs: int) -> None:
     start = time.perf_counter()
     case, log = stages.long_case(folder, stages.to_and_fro())
     found = jaxid.discover(case, log)
-    found.save(folder / "hidden", force=True)
+    found.save(folder / "hidden", overwrite=True)
     print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")
 
 
@@ -265,7 +304,7 @@ def one_way(folder: Path, runs: int) -> None:
         start = time.perf_counter()
         case.write_text(stated + more)
         found = jaxid.discover(case, log)
-        found.save(folder / name, force=True)
+        found.save(folder / name, overwrite=True)
         print(f"\n{name}: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}", flush=True)
 
 
@@ -288,7 +327,9 @@ def short(folder: Path, runs: int) -> None:
     start = time.perf_counter()
     for data in (1, 2):
         for name, resolution, noise in (
-            ("exact", 0.0, None), ("500 counts", stages.COUNT, None), ("exact", 0.0, QUIET),
+            ("exact", 0.0, None),
+            ("500 counts", stages.COUNT, None),
+            ("exact", 0.0, QUIET),
         ):
             logs, _ = logs_of(data, runs, resolution=resolution, noise=noise)
             whole = case_of(folder, f"short{data}", data, resolution=resolution)
@@ -314,8 +355,22 @@ def short(folder: Path, runs: int) -> None:
 STUDIES: dict[str, Callable[[Path, int], None]] = {
     f.__name__: f
     for f in (
-        published, begun, unrecorded, scatter, within, nearest, elastic, calibrated, position, designed, load,
-        needles, frictions, hidden, one_way, short,
+        published,
+        begun,
+        unrecorded,
+        scatter,
+        within,
+        nearest,
+        elastic,
+        calibrated,
+        position,
+        designed,
+        load,
+        needles,
+        frictions,
+        hidden,
+        one_way,
+        short,
     )
 }
 

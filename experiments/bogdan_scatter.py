@@ -14,11 +14,20 @@ from common import Table
 
 # Of `scatter` and its like: data set, encoder, its count, whether the screw is rigid.
 ROWS = (
-    (1, "500 counts", stages.COUNT, True), (2, "500 counts", stages.COUNT, True), (2, "exact", 0.0, True),
-    (1, "500 counts", stages.COUNT, False), (1, "exact", 0.0, True),
+    (1, "500 counts", stages.COUNT, True),
+    (2, "500 counts", stages.COUNT, True),
+    (2, "exact", 0.0, True),
+    (1, "500 counts", stages.COUNT, False),
+    (1, "exact", 0.0, True),
 )
 COLUMNS = [
-    "converged", "told", "criterion %", "over truth's", "1 - effective/n", "never above", "in 1.96 sigma",
+    "converged",
+    "told",
+    "criterion %",
+    "over truth's",
+    "1 - effective/n",
+    "never above",
+    "in 1.96 sigma",
     "in 3 sigma",
 ]
 
@@ -30,9 +39,14 @@ def _cells(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     # A stage far off the guesses may not simulate with the steps that those ask for: then there is none.
     ratio = np.array([r["ratio"] for r in rows if np.isfinite(r["ratio"])])
     return [
-        f"{mean('converged'):.0%}", f"{off.size / len(rows):.2f}", f"{mean('percent'):.2f}",
-        f"{ratio.mean():.3f}", f"{1 - mean('effective') / 100:.3f}", f"{np.mean(ratio <= 1):.1%}",
-        f"{np.mean(off < 1.96):.1%}", f"{np.mean(off < 3):.1%}",
+        f"{mean('converged'):.0%}",
+        f"{off.size / len(rows):.2f}",
+        f"{mean('percent'):.2f}",
+        f"{ratio.mean():.3f}",
+        f"{1 - mean('effective') / 100:.3f}",
+        f"{np.mean(ratio <= 1):.1%}",
+        f"{np.mean(off < 1.96):.1%}",
+        f"{np.mean(off < 3):.1%}",
     ]
 
 

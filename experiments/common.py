@@ -14,9 +14,7 @@ from jaxid.results.as_text import aligned
 
 def parser_of(doc: str, default: str) -> argparse.ArgumentParser:
     """Command line of an experiment."""
-    parser = argparse.ArgumentParser(
-        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", metavar="DIR", type=Path, default=Path(default), help=f"default: {default}")
     return parser
 

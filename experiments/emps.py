@@ -21,8 +21,10 @@ import jaxid
 # Janot, Gautier & Brunot (2019): IDIM-LS and closed-loop simulation. The offset stands on the side
 # of friction there: as a force on the joint its sign is the other.
 PUBLISHED = {
-    "inertia": (95.109, "kg"), "viscous_friction.coefficient": (203.50, "N s/m"),
-    "coulomb_friction.level": (20.39, "N"), "constant_force.level": (3.165, "N"),
+    "inertia": (95.109, "kg"),
+    "viscous_friction.coefficient": (203.50, "N s/m"),
+    "coulomb_friction.level": (20.39, "N"),
+    "constant_force.level": (3.165, "N"),
 }
 
 METHODS = ("inverse_dynamics", "instrumental_variable", "didim", "power")
@@ -56,7 +58,8 @@ def methods(folder: Path, log: Path) -> None:
     head += [f"{what}, {file}" for what in ("force", "position", "command") for file in ("fit", "pulses")]
     table = Table(
         "the published model by every method; then the force by inverse dynamics, position and command "
-        "in the simulated loop, errors in % of what was measured", head,
+        "in the simulated loop, errors in % of what was measured",
+        head,
     )
     aligned = folder / "emps_aligned.toml"
     recipe = (folder / "emps_recipe.toml").read_text()
@@ -95,12 +98,18 @@ def missing(folder: Path, log: Path) -> None:
             f"position, {new.name}", f"{100 * a.relative[0]:.5f}", f"{100 * b.relative[0]:.5f}", position, "%"
         )
         table.row(
-            f"force, {new.name}", f"{100 * a.command_relative[0]:.2f}", f"{100 * b.command_relative[0]:.2f}",
-            force, "%",
+            f"force, {new.name}",
+            f"{100 * a.command_relative[0]:.2f}",
+            f"{100 * b.command_relative[0]:.2f}",
+            force,
+            "%",
         )
         table.row(
-            f"inverse dynamics, {new.name}", f"{100 * old.force.relative[0]:.2f}",
-            f"{100 * new.force.relative[0]:.2f}", "", "%",
+            f"inverse dynamics, {new.name}",
+            f"{100 * old.force.relative[0]:.2f}",
+            f"{100 * new.force.relative[0]:.2f}",
+            "",
+            "%",
         )
     table.show(time.perf_counter() - start)
     print(found)

@@ -27,8 +27,10 @@ GAINS = (0.93, 1.06)
 # By hinge (joints 1, 2, then the passive angles), of sign v, v, v |v|, v^3 [N m (s/rad)^k]. The quadratic
 # terms are negative, as those that were published; the whole dissipates at any velocity.
 FRICTION = {
-    "coulomb_friction": (5.0, 4.0, 0.02, 0.02, 0.02), "viscous_friction": (4.6, 3.6, 0.01, 0.01, 0.01),
-    "quadratic_drag": (-1.2, -0.9, 0.0, 0.0, 0.0), "cubic_friction": (0.17, 0.13, 0.0, 0.0, 0.0),
+    "coulomb_friction": (5.0, 4.0, 0.02, 0.02, 0.02),
+    "viscous_friction": (4.6, 3.6, 0.01, 0.01, 0.01),
+    "quadratic_drag": (-1.2, -0.9, 0.0, 0.0, 0.0),
+    "cubic_friction": (0.17, 0.13, 0.0, 0.0, 0.0),
 }
 KP, KD = 150.0, 4.0  # at the motors [N m/rad], [N m s/rad]
 # PD law of the paper: nothing of the model fed forward.
@@ -40,7 +42,14 @@ GYRO_NOISE, ACCELERATION_NOISE = 1.5e-3, 0.2  # rad/s, rad/s^2
 # Table 3, and where the condition index is above 0.2.
 SPEED, ACCELERATION, JERK = np.deg2rad([210.0, 1680.0, 25_200.0])
 POLYGON = [
-    [1.2, 0.3], [1.5, 0.3], [2.0, 0.85], [2.65, 1.6], [2.6, 1.9], [2.0, 1.7], [1.5, 1.3], [1.2, 0.65],
+    [1.2, 0.3],
+    [1.5, 0.3],
+    [2.0, 0.85],
+    [2.65, 1.6],
+    [2.6, 1.9],
+    [2.0, 1.7],
+    [1.5, 1.3],
+    [1.2, 0.65],
 ]
 HOME = [1.5, 0.5]
 STEP = 5e-5  # of the exact robot [s]
@@ -93,8 +102,15 @@ def friction_text(orders: int, where: str = "", guess: Callable[[str, int], str]
 
 
 def case_text(
-    law: str, *, friction: str | None = None, gain: str | Sequence = "{ guess = 1.0 }", seed: int = 0,
-    duration: float = 40.0, more: str = "", tip_mass: str = "2.72", inertial: bool = True,
+    law: str,
+    *,
+    friction: str | None = None,
+    gain: str | Sequence = "{ guess = 1.0 }",
+    seed: int = 0,
+    duration: float = 40.0,
+    more: str = "",
+    tip_mass: str = "2.72",
+    inertial: bool = True,
     period: float = PERIOD,
 ) -> str:
     """A case: the model of the robot, a law for [controller], random targets."""
@@ -165,9 +181,16 @@ def along(live: jaxid.Live, what: Callable) -> tuple[np.ndarray, ...]:
 
 
 def driven(
-    live: jaxid.Live, machine: Robot, *, seconds: float | None = None, seed: int = 0,
-    torque_noise: float = 0.0, inertial: bool = True, gains: Sequence[float] = GAINS,
-    drift: Callable[[float], float | np.ndarray] | None = None, period: float = PERIOD,
+    live: jaxid.Live,
+    machine: Robot,
+    *,
+    seconds: float | None = None,
+    seed: int = 0,
+    torque_noise: float = 0.0,
+    inertial: bool = True,
+    gains: Sequence[float] = GAINS,
+    drift: Callable[[float], float | np.ndarray] | None = None,
+    period: float = PERIOD,
 ) -> Ran:
     """Drive the exact robot by a case's controller.
 

@@ -42,29 +42,51 @@ LONG = 100.0
 FREQUENCY = float(np.sqrt(8e5 * (1 / 72.3 + 1 / 34.8)) / (2 * np.pi))  # Hz, free motor, free load
 # Of the paper: value, and half of the published 2 sigma.
 TABLE_2 = {
-    "motor_inertia": (72.3, 0.175), "viscous_friction[1].coefficient": (92.0, 1.685),
-    "coulomb_friction[1].level": (10.0, 0.15), "stiffness": (8.0e5, 3.2e3), "damping": (126.0, 17.45),
-    "load_inertia": (34.8, 0.18), "viscous_friction[2].coefficient": (110.0, 1.675),
+    "motor_inertia": (72.3, 0.175),
+    "viscous_friction[1].coefficient": (92.0, 1.685),
+    "coulomb_friction[1].level": (10.0, 0.15),
+    "stiffness": (8.0e5, 3.2e3),
+    "damping": (126.0, 17.45),
+    "load_inertia": (34.8, 0.18),
+    "viscous_friction[2].coefficient": (110.0, 1.675),
     "coulomb_friction[2].level": (10.4, 0.15),
 }
 # What Tables 2 to 5 print.
 PAPER = {
     "(6)": {n: f"{v:.4g}" for n, (v, _) in TABLE_2.items()},
     "(7) as printed": {
-        "motor_inertia": "69.6", "viscous_friction[1].coefficient": "170", "stiffness": "8.3e+05",
-        "coulomb_friction[1].level": "22.8", "damping": "430", "load_inertia": "35.5",
+        "motor_inertia": "69.6",
+        "viscous_friction[1].coefficient": "170",
+        "stiffness": "8.3e+05",
+        "coulomb_friction[1].level": "22.8",
+        "damping": "430",
+        "load_inertia": "35.5",
         "viscous_friction[2].coefficient": "-29.8",
     },
     "(13)": {
-        "motor_inertia": "71", "viscous_friction[1].coefficient": "210 (sum)", "load_inertia": "35",
-        "coulomb_friction[1].level": "20 (sum)", "stiffness": "8.5e+05", "damping": "-30",
+        "motor_inertia": "71",
+        "viscous_friction[1].coefficient": "210 (sum)",
+        "load_inertia": "35",
+        "coulomb_friction[1].level": "20 (sum)",
+        "stiffness": "8.5e+05",
+        "damping": "-30",
     },
 }
-AIMS = {"motor_inertia": 1, "load_inertia": 2, "stiffness": 2, "coulomb_friction[1].level": 5,
-        "coulomb_friction[2].level": 5}  # %
+AIMS = {
+    "motor_inertia": 1,
+    "load_inertia": 2,
+    "stiffness": 2,
+    "coulomb_friction[1].level": 5,
+    "coulomb_friction[2].level": 5,
+}  # %
 FILES = {"both encoders": True, "motor alone": False}
 METHODS = (
-    "inverse_dynamics", "instrumental_variable", "didim", "power", "output_error", "minimal_model",
+    "inverse_dynamics",
+    "instrumental_variable",
+    "didim",
+    "power",
+    "output_error",
+    "minimal_model",
 )
 
 
@@ -94,9 +116,12 @@ def first_model(folder: Path) -> bool:
         table.row(name, f"{value:.4g}", f"{std:.2g}", *(cell_of(f.estimate, name) for f in found.values()))
     swings = [frequency_of(f.session, f.estimate) for f in found.values()]
     table.row("natural frequency [Hz]", f"{FREQUENCY:.2f}", "", *(f"{f:.2f}" for f in swings))
-    table.row("residual over force [%]", "7", "", *(
-        f"{100 * f.gaps[0].force.relative[0]:.2f}" for f in found.values()
-    ))
+    table.row(
+        "residual over force [%]",
+        "7",
+        "",
+        *(f"{100 * f.gaps[0].force.relative[0]:.2f}" for f in found.values()),
+    )
     table.show(time.perf_counter() - begin)
     return all(_sound(f) for k, f in found.items() if k != "published filter")
 
@@ -106,7 +131,8 @@ def minimal_models(folder: Path) -> bool:
     begin = time.perf_counter()
     log = axes.record(duration=SECONDS, sensor=QUIET)
     ways = {
-        "(6)": ("minimal_model", {}), "(7)": ("minimal_model", {"load": False, "accelerometer": True}),
+        "(6)": ("minimal_model", {}),
+        "(7)": ("minimal_model", {"load": False, "accelerometer": True}),
         "(7) as printed": ("minimal_model_printed", {"load": False, "accelerometer": True}),
         "(13)": ("minimal_model", {"load": False}),
         **{f"motor alone, {m}": (m, {"load": False}) for m in ("inverse_dynamics", "didim", "output_error")},
@@ -273,12 +299,17 @@ def hidden(folder: Path) -> bool:
         "backlash": (axes.machine().with_effect("backlash", 2, gap=60e-6), axes.text()),
     }
     for kind, (machine, text) in cases.items():
-        written(folder, f"{kind}_other", axes.record(
-            machine, duration=6.0, reference=axes.trapezoids(6.0, stroke=0.1, speed=0.15), seed=9
-        ), text)
+        written(
+            folder,
+            f"{kind}_other",
+            axes.record(
+                machine, duration=6.0, reference=axes.trapezoids(6.0, stroke=0.1, speed=0.15), seed=9
+            ),
+            text,
+        )
         case, data = written(folder, kind, axes.record(machine), text)
         found = jaxid.discover(case, data, validate=[folder / f"{kind}_other.csv"])
-        found.save(folder / f"{kind}_report", force=True)
+        found.save(folder / f"{kind}_report", overwrite=True)
         print(found)
         good &= found.kinds == [kind]
         if kind == "joint_flexibility" and good:
@@ -290,9 +321,13 @@ def hidden(folder: Path) -> bool:
 
 
 PARTS: dict[str, Callable[[Path], bool]] = {
-    "first_model": first_model, "minimal_models": minimal_models, "trajectories": trajectories,
+    "first_model": first_model,
+    "minimal_models": minimal_models,
+    "trajectories": trajectories,
     "added_mass": added_mass,
-    "motor_alone": motor_alone, "resolution": resolution, "hidden": hidden,
+    "motor_alone": motor_alone,
+    "resolution": resolution,
+    "hidden": hidden,
 }
 
 

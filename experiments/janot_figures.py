@@ -7,14 +7,13 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 _SHOWN = {
-    "load_inertia": "load inertia", "stiffness": "stiffness",
+    "load_inertia": "load inertia",
+    "stiffness": "stiffness",
     "coulomb_friction[1].level": "Coulomb friction, motor",
 }
 
 
-def resolution(
-    path: Path, counts: list[int], errors: dict[tuple[str, str, int], dict[str, float]]
-) -> None:
+def resolution(path: Path, counts: list[int], errors: dict[tuple[str, str, int], dict[str, float]]) -> None:
     """Error by counts a revolution: a row a parameter, a column a set of sensors, a line a method."""
     sensors = list(dict.fromkeys(s for s, _, _ in errors))
     methods = list(dict.fromkeys(m for _, m, _ in errors))

@@ -51,8 +51,11 @@ from stepper import Loop, Machine, Sensor, simulate
 
 # Table C.I: joint, and viscous and Coulomb friction forwards and backwards.
 TABLE = {
-    2: (3.57, 14.26, 7.64, 18.25), 3: (1.64, 3.27, 1.70, 4.15), 4: (2.58, 6.93, 2.89, 4.95),
-    5: (1.61, 3.75, 1.64, 3.64), 7: (0.27, 0.82, 0.21, 1.23),
+    2: (3.57, 14.26, 7.64, 18.25),
+    3: (1.64, 3.27, 1.70, 4.15),
+    4: (2.58, 6.93, 2.89, 4.95),
+    5: (1.61, 3.75, 1.64, 3.64),
+    7: (0.27, 0.82, 0.21, 1.23),
 }
 
 
@@ -68,12 +71,18 @@ def frictions(folder: Path) -> None:
         effects = {
             "viscous_friction": {"coefficient": (vp + vn) / 2},
             "asymmetric_viscous": {"coefficient": (vp - vn) / 2},
-            "coulomb_friction": {"level": (cp + cn) / 2}, "constant_force": {"level": -(cp - cn) / 2},
+            "coulomb_friction": {"level": (cp + cn) / 2},
+            "constant_force": {"level": -(cp - cn) / 2},
         }
         reference, speed = plateaus()
         loop = Loop("pd", reference=reference, kp=2000.0, kd=120.0)
         made = simulate(
-            Machine(0.5, effects), loop, NOISE, rate=RATE, duration=len(reference) / RATE, seed=joint,
+            Machine(0.5, effects),
+            loop,
+            NOISE,
+            rate=RATE,
+            duration=len(reference) / RATE,
+            seed=joint,
             step=2e-5,
         )
         log = Log(time=made["t"], position=made["position"], force=made["force"], source=f"joint {joint}")
@@ -81,8 +90,12 @@ def frictions(folder: Path) -> None:
         (folder / f"friction{joint}.toml").write_text(FRICTION)
         found = jaxid.identify(folder / f"friction{joint}.toml", log, method="inverse_dynamics").estimate
         # From sums and differences to either way; sigma likewise.
-        names = ("viscous_friction.coefficient", "asymmetric_viscous.coefficient", "coulomb_friction.level",
-                 "constant_force.level")
+        names = (
+            "viscous_friction.coefficient",
+            "asymmetric_viscous.coefficient",
+            "coulomb_friction.level",
+            "constant_force.level",
+        )
         index = [found.names.index(n) for n in names]
         ways = np.array([[1, 1, 0, 0], [0, 0, 1, -1], [1, -1, 0, 0], [0, 0, 1, 1]])
         values = ways @ found.theta[index]
@@ -100,7 +113,8 @@ FRICTION = case_text(
     {
         "viscous_friction": {"coefficient": unknown(1.0)},
         "asymmetric_viscous": {"coefficient": unknown(0.0)},
-        "coulomb_friction": {"level": unknown(1.0)}, "constant_force": {"level": unknown(0.0)},
+        "coulomb_friction": {"level": unknown(1.0)},
+        "constant_force": {"level": unknown(0.0)},
     },
 )
 
@@ -137,8 +151,10 @@ def situations(folder: Path) -> None:
         runs = [released(name, v) for v in grid]
         curves[name] = np.array([_until(r) for r in runs])
         pa10_figures.velocities(folder / f"released_{name}.png", name, runs, FASTEST)
-    table = Table("velocity that remains [rad/s] after one at the start; at 1.2 the joint is at its limit",
-                  ["", *[f"{v:.1f}" for v in grid]])
+    table = Table(
+        "velocity that remains [rad/s] after one at the start; at 1.2 the joint is at its limit",
+        ["", *[f"{v:.1f}" for v in grid]],
+    )
     for name, values in curves.items():
         table.row(name, *[f"{v:.3f}" for v in values])
     low, high = 0.1, 1.1
@@ -147,8 +163,10 @@ def situations(folder: Path) -> None:
         gains = _until(released("s3", middle, duration=40.0)) > middle
         low, high = (low, middle) if gains else (middle, high)
     table.show(time.perf_counter() - start)
-    print(f"crossing: parts the starts of s3 at {low:.4f}, what remains of s4 at {curves['s4'].mean():.4f}; "
-          f"(f_c - f~_c) / (f~_v - f_v) = {CROSSING} rad/s")
+    print(
+        f"crossing: parts the starts of s3 at {low:.4f}, what remains of s4 at {curves['s4'].mean():.4f}; "
+        f"(f_c - f~_c) / (f~_v - f_v) = {CROSSING} rad/s"
+    )
     pa10_figures.settled(folder / "settled.png", grid, curves)
 
 
@@ -210,9 +228,12 @@ def dominant(folder: Path) -> None:
 def flexible(kp: float, stiffness: float) -> dict[str, np.ndarray]:
     """The same joint of which half the inertia sits behind a spring; friction and encoder at the motor."""
     machine = ChainMachine(
-        [INERTIA / 2, INERTIA / 2], [0.0, 0.0], [0.0, stiffness, 0.0],
+        [INERTIA / 2, INERTIA / 2],
+        [0.0, 0.0],
+        [0.0, stiffness, 0.0],
         {("viscous_friction", 1): {"coefficient": VISCOUS}, ("coulomb_friction", 1): {"level": COULOMB}},
-        actuated=[1], coupling=[0.0, 2.0, 0.0],
+        actuated=[1],
+        coupling=[0.0, 2.0, 0.0],
     )
     duration = 40.0
     loop = replace(law("s4", kp=kp), reference=np.zeros(round(duration * RATE)))
@@ -224,7 +245,11 @@ def flexible(kp: float, stiffness: float) -> dict[str, np.ndarray]:
 VISCOUS_ONLY = {"viscous_friction": {"coefficient": unknown(12.0)}}
 DRY = VISCOUS_ONLY | {"coulomb_friction": {"level": unknown(2.0)}}
 SWUNG = {
-    "kind": "friction_compensation", "kp": 400.0, "kd": 0.0, "coulomb": 10.1, "viscous": 3.0,
+    "kind": "friction_compensation",
+    "kp": 400.0,
+    "kd": 0.0,
+    "coulomb": 10.1,
+    "viscous": 3.0,
     "period": 1 / RATE,
 }
 
@@ -233,9 +258,7 @@ def same_logs(folder: Path) -> None:
     """What the log of a swing tells by other methods, and what `discover` says of viscous friction alone."""
     start = time.perf_counter()
     # Read finely: what the reading's noise does in the loop's difference would shake the joint.
-    made = swinging(
-        400.0, 0.3, duration=8.0, sensor=Sensor(position_noise=1e-7, force_noise=0.2), step=5e-6
-    )
+    made = swinging(400.0, 0.3, duration=8.0, sensor=Sensor(position_noise=1e-7, force_noise=0.2), step=5e-6)
     keys = dict(position="position", force="force", reference="reference")
     log = Log(time=made["t"], **{k: made[v] for k, v in keys.items()}, source="the swing")
     (folder / "swing.toml").write_text(case_text(unknown(6.0), DRY, controller=SWUNG))
@@ -250,9 +273,11 @@ def same_logs(folder: Path) -> None:
     table.show(time.perf_counter() - start)
     (folder / "viscous_only.toml").write_text(case_text(unknown(6.0), VISCOUS_ONLY, controller=SWUNG))
     found = jaxid.discover(folder / "viscous_only.toml", log)
-    found.save(folder / "viscous_only", force=True)
-    print(f"\ntold of viscous friction only: {found.verdict}: {', '.join(found.kinds)}"
-          f" ({time.perf_counter() - start:.1f} s)\n{found}")
+    found.save(folder / "viscous_only", overwrite=True)
+    print(
+        f"\ntold of viscous friction only: {found.verdict}: {', '.join(found.kinds)}"
+        f" ({time.perf_counter() - start:.1f} s)\n{found}"
+    )
 
 
 def tracking(folder: Path) -> None:
@@ -260,19 +285,25 @@ def tracking(folder: Path) -> None:
     start = time.perf_counter()
     reference, speed = plateaus()
     run = lambda loop: simulate(
-        JOINT, replace(loop, reference=reference, kp=300.0, kd=30.0), NOISE, rate=RATE,
-        duration=len(reference) / RATE, step=2e-5,
+        JOINT,
+        replace(loop, reference=reference, kp=300.0, kd=30.0),
+        NOISE,
+        rate=RATE,
+        duration=len(reference) / RATE,
+        step=2e-5,
     )
     plain = run(Loop("friction_compensation"))
     log = Log(time=plain["t"], position=plain["position"], force=plain["force"], source="plateaus")
     (folder / "tracking.toml").write_text(FRICTION)
     found = jaxid.identify(folder / "tracking.toml", log, method="inverse_dynamics")
-    friction = {"coulomb": found.value("coulomb_friction.level"),
-                "viscous": found.value("viscous_friction.coefficient")}
+    friction = {
+        "coulomb": found.value("coulomb_friction.level"),
+        "viscous": found.value("viscous_friction.coefficient"),
+    }
     runs = {
-        "PD": plain, "and friction": run(Loop("friction_compensation", **friction)),
-        "and inertia": run(
-            Loop("friction_compensation", inertia=found.value("inertia"), **friction)),
+        "PD": plain,
+        "and friction": run(Loop("friction_compensation", **friction)),
+        "and inertia": run(Loop("friction_compensation", inertia=found.value("inertia"), **friction)),
     }
     table = Table("tracking error [mrad]", ["", "RMS", "largest", "RMS of PD over it"])
     errors = {name: 1e3 * (r["reference"] - r["true_position"]) for name, r in runs.items()}
@@ -284,9 +315,18 @@ def tracking(folder: Path) -> None:
 
 
 STUDIES: dict[str, Callable[[Path], None]] = {
-    f.__name__: f for f in (
-        pa10_arm.dependencies, pa10_arm.excitation, pa10_arm.identification, frictions, situations,
-        limit_cycle, dominant, pa10_configurations.configurations, same_logs, tracking,
+    f.__name__: f
+    for f in (
+        pa10_arm.dependencies,
+        pa10_arm.excitation,
+        pa10_arm.identification,
+        frictions,
+        situations,
+        limit_cycle,
+        dominant,
+        pa10_configurations.configurations,
+        same_logs,
+        tracking,
         pa10_drive.drive,
     )
 }

@@ -21,7 +21,7 @@ from jaxid.experiment_design.along_reference import Excitation
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.plants import SerialArm, pa10
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -32,9 +32,49 @@ CASES = Path(__file__).parent / "cases"
 # Table 4.1, by row from the first: of d11 ... d77 those that a base parameter stands in, "1" as it is, "t"
 # times a function of the angles. As printed: row 6 lacks d22 = 1, and row 36 is mY_R6.
 PRINTED = (
-    "1", "t", "t", "", "", "", "", "", "tt", "tt", "t", "t", "t 1", "t", "t", "ttt", "ttt", "tt", "tt",
-    "tt 1", "tt", "tt", "tttt", "tttt", "ttt", "ttt", "ttt 1", "ttt", "ttt", "ttttt", "ttttt", "tttt", "tttt",
-    "tttt 1", "tttt", "tttt", "tttttt", "tttttt", "ttttt", "ttttt", "ttttt 1", "ttttt", "ttttt",
+    "1",
+    "t",
+    "t",
+    "",
+    "",
+    "",
+    "",
+    "",
+    "tt",
+    "tt",
+    "t",
+    "t",
+    "t 1",
+    "t",
+    "t",
+    "ttt",
+    "ttt",
+    "tt",
+    "tt",
+    "tt 1",
+    "tt",
+    "tt",
+    "tttt",
+    "tttt",
+    "ttt",
+    "ttt",
+    "ttt 1",
+    "ttt",
+    "ttt",
+    "ttttt",
+    "ttttt",
+    "tttt",
+    "tttt",
+    "tttt 1",
+    "tttt",
+    "tttt",
+    "tttttt",
+    "tttttt",
+    "ttttt",
+    "ttttt",
+    "ttttt 1",
+    "ttttt",
+    "ttttt",
 )
 # Of the torque [N m], as the case says, and friction [N m s/rad], [N m], of the size of table C.I.
 NOISE = np.array([2.0, 2.0, 1.0, 1.0, 0.3, 0.3, 0.3])
@@ -50,7 +90,13 @@ METHODS = (*CONSISTENT, "instrumental_variable")
 ORDER = ("xx", "xy", "xz", "yz", "zz", "x", "y")
 # Where links are symmetric: masses and centres of mass, and products of inertia, which follow from them.
 KNOWN = (
-    "mass", "first_moment_x", "first_moment_y", "first_moment_z", "inertia_xy", "inertia_xz", "inertia_yz",
+    "mass",
+    "first_moment_x",
+    "first_moment_y",
+    "first_moment_z",
+    "inertia_xy",
+    "inertia_xz",
+    "inertia_yz",
 )
 
 
@@ -118,11 +164,10 @@ def identification(folder: Path) -> None:
     arm = arm_of(random_bodies(rng))
     fitted, other = (jaxid.design(folder / f"{name}.toml") for name in ("determinant", "condition"))
     run = arm_stepper.followed(arm, fitted.position, rate=200.0, kp=KP, kd=KD)
-    position, force = (run[k] + noise * rng.standard_normal(run[k].shape) for k, noise in
-                       (("q", 1e-6), ("u", NOISE)))
-    log = Log(
-        time=fitted.time, position=position, force=force, reference=fitted.position, source="loop"
+    position, force = (
+        run[k] + noise * rng.standard_normal(run[k].shape) for k, noise in (("q", 1e-6), ("u", NOISE))
     )
+    log = Log(time=fitted.time, position=position, force=force, reference=fitted.position, source="loop")
     noise = NOISE * rng.standard_normal(other.position.shape)
     measured = arm.torque(other.position, other.velocity, other.acceleration) + noise
     law = f'\n[controller]\nkind = "pd"\nkp = {KP.tolist()}\nkd = {KD.tolist()}\nperiod = 0.005\n'
@@ -135,7 +180,8 @@ def identification(folder: Path) -> None:
     cells = lambda x: [f"{x:.3f}" for x in x]
     table.row("", "the noise alone", "", "", *cells(_rms(noise, other) / NOISE), "")
     for what, text, methods in (
-        ("base parameters", base, (*METHODS, "reweighted")), ("links that bodies can be", whole, CONSISTENT),
+        ("base parameters", base, (*METHODS, "reweighted")),
+        ("links that bodies can be", whole, CONSISTENT),
     ):
         (folder / "arm.toml").write_text(text)
         session = jaxid.open_session(folder / "arm.toml", log, method="inverse_dynamics")
@@ -144,7 +190,7 @@ def identification(folder: Path) -> None:
             if method == "reweighted":
                 found = inverse_dynamics(session.machine, session.fit.data, reweighted=True)
             else:
-                found = alone(steps_of(method, session))
+                found = run_alone(steps_of(method, session))
             seconds = f"{time.perf_counter() - start:.0f}"
             left = _left(found.machine.plant, other, measured) / NOISE
             table.row(what, method, found.converged, found.steps, *cells(left), seconds)
@@ -223,7 +269,8 @@ def _ball(line: str) -> str:
     key = line.partition(" = ")[0]
     free = lambda *values: "[" + ", ".join(f"{{ guess = {v} }}" for v in values) + "]"
     balls = {
-        "mass": "{ guess = 3.0 }", "first_moment": free(0.0, 0.0, 0.0),
+        "mass": "{ guess = 3.0 }",
+        "first_moment": free(0.0, 0.0, 0.0),
         "inertia": free(0.1, 0.0, 0.0, 0.1, 0.0, 0.1),
     }
     return f"{key} = {balls[key]}" if key in balls else line

@@ -51,12 +51,22 @@ def limit_cycle(k: int, inertia: float, rate: float = RATE, average: int = 1) ->
     # Five time constants of what is left of the damping; at least thirty swings.
     duration = max(10 * inertia * CROSSING / more, 60 * np.pi * np.sqrt(inertia / kp))
     loop = Loop(
-        "friction_compensation", kp=kp, coulomb=COULOMB[k] + more, velocity_average=average,
-        viscous=VISCOUS[k] - more / CROSSING - kp / (2 * rate), reference=np.zeros(round(duration * rate)),
+        "friction_compensation",
+        kp=kp,
+        coulomb=COULOMB[k] + more,
+        velocity_average=average,
+        viscous=VISCOUS[k] - more / CROSSING - kp / (2 * rate),
+        reference=np.zeros(round(duration * rate)),
     )
     begin = 8 / np.pi * CROSSING * np.sqrt(inertia / kp)
     log = simulate(
-        joint(k, inertia), loop, EXACT, rate=rate, duration=duration, step=5e-5, initial_position=begin,
+        joint(k, inertia),
+        loop,
+        EXACT,
+        rate=rate,
+        duration=duration,
+        step=5e-5,
+        initial_position=begin,
         log_rate=RATE,
     )
     return settled(log)[1]
@@ -67,11 +77,19 @@ def swing(k: int, inertia: float, sensor: Sensor = EXACT, average: int = 1) -> t
     kp = STIFFNESS[k]
     duration = 1.6 * 2 * np.pi * np.sqrt(LARGEST[k] / kp)
     loop = Loop(
-        "friction_compensation", kp=kp, viscous=VISCOUS[k] - kp / (2 * RATE), velocity_average=average,
+        "friction_compensation",
+        kp=kp,
+        viscous=VISCOUS[k] - kp / (2 * RATE),
+        velocity_average=average,
         reference=np.zeros(round(duration * RATE)),
     )
     made = simulate(
-        joint(k, inertia), loop, sensor, rate=RATE, duration=duration, step=1e-5,
+        joint(k, inertia),
+        loop,
+        sensor,
+        rate=RATE,
+        duration=duration,
+        step=1e-5,
         initial_position=BEGINS * COULOMB[k] / kp,
     )
     return loop, made
@@ -96,11 +114,14 @@ def identified(folder: Path, method: str) -> Callable[[int, float], float]:
             "coulomb_friction": {"level": unknown(0.5 * COULOMB[k])},
         }
         law = {"kp": float(loop.kp), "kd": 0.0, "coulomb": 0.0, "viscous": float(loop.viscous)}
-        (folder / "swing.toml").write_text(case_text(
-            unknown(0.5 * inertia), friction,
-            controller={"kind": "friction_compensation", **law, "period": 1 / RATE},
-            sensor={"position_noise": FINE.position_noise, "force_noise": FINE.force_noise},
-        ))
+        (folder / "swing.toml").write_text(
+            case_text(
+                unknown(0.5 * inertia),
+                friction,
+                controller={"kind": "friction_compensation", **law, "period": 1 / RATE},
+                sensor={"position_noise": FINE.position_noise, "force_noise": FINE.force_noise},
+            )
+        )
         keys = {k: made[k] for k in ("position", "force", "reference")}
         log = Log(time=made["t"], **keys, source=f"joint {k + 1}")
         return jaxid.identify(folder / "swing.toml", log, method=method).value("inertia")
@@ -177,7 +198,11 @@ def stacked(arm: SerialArm, base: BaseParameters, q: np.ndarray, measured: np.nd
 
 
 def solve(
-    plant: SerialArm, base: BaseParameters, k: int, q: np.ndarray, measured: np.ndarray,
+    plant: SerialArm,
+    base: BaseParameters,
+    k: int,
+    q: np.ndarray,
+    measured: np.ndarray,
     known: tuple[str, ...] = (),
 ) -> DominantInertias:
     """What joint k, from 1, tells of the sums that are not known; all else is as the plant has it."""

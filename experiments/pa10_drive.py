@@ -39,8 +39,10 @@ def machine(supply: float) -> Machine:
     return Machine(
         INERTIA,
         {
-            "viscous_friction": {"coefficient": VISCOUS}, "coulomb_friction": {"level": COULOMB},
-            "actuator_gain": {"gain": ACTUAL}, "actuator_offset": {"level": stiff * OFFSET},
+            "viscous_friction": {"coefficient": VISCOUS},
+            "coulomb_friction": {"level": COULOMB},
+            "actuator_gain": {"gain": ACTUAL},
+            "actuator_offset": {"level": stiff * OFFSET},
             "saturation": {"limit": stiff * INPUT},
             "voltage_limit": {"stall": CONSTANT * supply / RESISTANCE, "velocity": supply / CONSTANT},
         },
@@ -82,9 +84,13 @@ def drive(folder: Path) -> None:
             runs[supply, limit] = log = moved(supply, limit)
             clips = np.abs(log["true_command"] + OFFSET) > INPUT
             table.row(
-                f"{supply:.0f} V", f"{limit:.1f} V", f"{log['true_force'].max():.1f}",
-                f"{log['true_force'].min():.1f}", f"{100 * clips.mean():.2f} %",
-                f"{np.abs(log['true_velocity']).max():.3f}", f"{supply / CONSTANT:.3f}",
+                f"{supply:.0f} V",
+                f"{limit:.1f} V",
+                f"{log['true_force'].max():.1f}",
+                f"{log['true_force'].min():.1f}",
+                f"{100 * clips.mean():.2f} %",
+                f"{np.abs(log['true_velocity']).max():.3f}",
+                f"{supply / CONSTANT:.3f}",
             )
     table.show(time.perf_counter() - start)
     pa10_figures.supplies(folder / "supplies.png", runs, FASTEST)
@@ -135,7 +141,9 @@ def _physical(value) -> tuple[float, ...]:
     stiff = value("actuator_gain.gain") * DECLARED
     supply = value("voltage_limit.velocity") * CONSTANT
     return (
-        stiff / CONSTANT, value("actuator_offset.level") / stiff, supply,
+        stiff / CONSTANT,
+        value("actuator_offset.level") / stiff,
+        supply,
         CONSTANT * supply / value("voltage_limit.stall"),
     )
 
@@ -157,7 +165,7 @@ def hidden(folder: Path) -> None:
         more = f"[discover]\ncandidates = {asked}\n" if asked else ""
         (folder / "hidden.toml").write_text(told + more)
         found = jaxid.discover(folder / "hidden.toml", fit, validate=[other])
-        found.save(folder / f"hidden{len(asked)}", force=True)
+        found.save(folder / f"hidden{len(asked)}", overwrite=True)
         names = ", ".join(found.kinds)
         table.row(what, found.verdict, names, f"{time.perf_counter() - begun:.0f}")
         print(found)
@@ -172,12 +180,16 @@ def case_of(gain: float, inertia: float | dict[str, float], effects: dict) -> st
 
 
 FRICTION = {
-    "viscous_friction": {"coefficient": unknown(8.0)}, "coulomb_friction": {"level": unknown(5.0)},
+    "viscous_friction": {"coefficient": unknown(8.0)},
+    "coulomb_friction": {"level": unknown(5.0)},
 }
 # The report's margin of 0.3 V bounds it. Without bounds a search pushes it into saturation: the drive is then
 # a constant that constant_force cancels, a perfect fit to any log.
 BOUNDED = {"actuator_offset": {"level": unknown(0.0, min=-6.7, max=6.7)}}
 CHAIN = {
-    **FRICTION, "actuator_gain": {"gain": unknown(1.0)}, **BOUNDED, "saturation": {"limit": unknown(250.0)},
+    **FRICTION,
+    "actuator_gain": {"gain": unknown(1.0)},
+    **BOUNDED,
+    "saturation": {"limit": unknown(250.0)},
     "voltage_limit": {"stall": unknown(600.0), "velocity": unknown(0.9)},
 }

@@ -21,7 +21,9 @@ JOINT = Machine(
 CROSSING, FASTEST = 0.5, 1.2
 # Coulomb and viscous friction that are compensated; the last two cross the joint's own.
 SITUATIONS = {
-    "s1": (9.0, 3.6), "s2": (10.2, 4.4), "s3": (9.1, 4.0 + 0.5 / CROSSING),
+    "s1": (9.0, 3.6),
+    "s2": (10.2, 4.4),
+    "s3": (9.1, 4.0 + 0.5 / CROSSING),
     "s4": (10.1, 4.0 - 0.5 / CROSSING),
 }
 RATE, FAST = 1000.0, 20_000.0
@@ -41,14 +43,28 @@ def released(
     """The joint let go with a velocity and no spring."""
     loop = replace(law(situation), reference=np.zeros(round(duration * rate)))
     return simulate(
-        JOINT, loop, EXACT, rate=rate, duration=duration, step=5e-5, initial_velocity=velocity,
+        JOINT,
+        loop,
+        EXACT,
+        rate=rate,
+        duration=duration,
+        step=5e-5,
+        initial_velocity=velocity,
         log_rate=RATE,
     )
 
 
 def swinging(
-    kp: float, start: float, *, machine: Machine = JOINT, duration: float = 40.0, rate: float = RATE,
-    situation: str = "s4", sensor: Sensor = EXACT, step: float = 5e-5, **more: float,
+    kp: float,
+    start: float,
+    *,
+    machine: Machine = JOINT,
+    duration: float = 40.0,
+    rate: float = RATE,
+    situation: str = "s4",
+    sensor: Sensor = EXACT,
+    step: float = 5e-5,
+    **more: float,
 ) -> dict[str, np.ndarray]:
     """The joint let go at an angle against a spring K_p."""
     loop = replace(law(situation, kp=kp, **more), reference=np.zeros(round(duration * rate)))
@@ -76,10 +92,12 @@ def unknown(guess: float, **bounds: float) -> dict[str, float]:
 
 
 def case_text(
-    inertia: float | dict[str, float], effects: dict[str, dict[str, float | dict[str, float]]],
+    inertia: float | dict[str, float],
+    effects: dict[str, dict[str, float | dict[str, float]]],
     **tables: dict[str, float | str],
 ) -> str:
     """The case of one joint; a reference is logged where there is a controller."""
+
     def entry(value: float | str | dict[str, float]) -> str:
         if isinstance(value, dict):
             return "{ " + ", ".join(f"{k} = {v!r}" for k, v in value.items()) + " }"

@@ -12,8 +12,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from five_bar_robot import PERIOD, Ran
 
-UNITS = {"coulomb_friction": "N m", "viscous_friction": "N m s/rad", "quadratic_drag": "N m s²/rad²",
-         "cubic_friction": "N m s³/rad³", "actuator_gain": "1"}
+UNITS = {
+    "coulomb_friction": "N m",
+    "viscous_friction": "N m s/rad",
+    "quadratic_drag": "N m s²/rad²",
+    "cubic_friction": "N m s³/rad³",
+    "actuator_gain": "1",
+}
 
 
 def errors(path: Path, runs: dict[str, Ran], shown: float = 6.0) -> None:
@@ -42,8 +47,13 @@ def histories(path: Path, runs: dict[str, tuple[list[str], np.ndarray, Ran]]) ->
             for k, n in enumerate(names):
                 if n.startswith(kind + "["):
                     joint = n.partition("[")[2][0]
-                    ax.plot(times, ran.estimates[:, k], style, color=f"C{int(joint) - 1}",
-                            label=f"joint {joint}, {state}")
+                    ax.plot(
+                        times,
+                        ran.estimates[:, k],
+                        style,
+                        color=f"C{int(joint) - 1}",
+                        label=f"joint {joint}, {state}",
+                    )
             final = ran.estimates[-1, [n.startswith(kind + "[") for n in names]]
             low, high = ax.get_ylim() if style == "--" else (np.inf, -np.inf)
             spread = max(np.ptp(final), 0.3 * np.abs(final).max(), 1e-3)

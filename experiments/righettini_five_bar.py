@@ -29,7 +29,8 @@ ADAPTIVE = 'kind = "adaptive"\ngate_velocity = 0.05\nhalf_life = 600.0'
 TORQUE = 'kind = "computed_torque"'
 # Factors by which errors shrink from law to law, joints 1 and 2: RMS and peak.
 PUBLISHED = {
-    "computed torque": ((2.44, 2.04), (3.88, 3.78)), "adaptive": ((5.05, 3.68), (1.40, 1.97)),
+    "computed torque": ((2.44, 2.04), (3.88, 3.78)),
+    "adaptive": ((5.05, 3.68), (1.40, 1.97)),
 }
 # Friction when warm, over that when cold.
 WARM = 0.7
@@ -143,7 +144,11 @@ def convergence(folder: Path) -> None:
     )
     kept = {}
     for scale, noise, instrument in (
-        (1.0, 0.0, "none"), (WARM, 0.0, "none"), (1.0, 0.5, "none"), (1.0, 0.5, "model"), (1.0, 2.0, "none"),
+        (1.0, 0.0, "none"),
+        (WARM, 0.0, "none"),
+        (1.0, 0.5, "none"),
+        (1.0, 0.5, "model"),
+        (1.0, 2.0, "none"),
         (1.0, 2.0, "model"),
     ):
         law = ADAPTIVE + f'\ninstrument = "{instrument}"'
@@ -155,8 +160,13 @@ def convergence(folder: Path) -> None:
         friction = np.array([np.abs(friction_of(names, e, SPEEDS) - true).max() for e in ran.estimates])
         friction /= true.max()
         table.row(
-            "cold" if scale == 1.0 else "warm", noise, instrument, f"{settled(times, gains, 0.02):.2f}",
-            f"{settled(times, friction, 0.05):.2f}", f"{gains[-1]:.2%}", f"{friction[-1]:.2%}",
+            "cold" if scale == 1.0 else "warm",
+            noise,
+            instrument,
+            f"{settled(times, gains, 0.02):.2f}",
+            f"{settled(times, friction, 0.05):.2f}",
+            f"{gains[-1]:.2%}",
+            f"{friction[-1]:.2%}",
         )
         if not noise:
             kept["cold" if scale == 1.0 else "warm"] = (names, times, ran)
@@ -253,8 +263,14 @@ def sensors(folder: Path) -> None:
         off /= true.max()
         gains = np.abs(ran.estimates[-1, :2] / robots.GAINS - 1).max()
         trusted = "never" if live.switched is None else f"{PERIOD * live.switched:.2f}"
-        table.row(name, *(pair(x) for x in sizes(ran, 20.0)), trusted, f"{settled(times, off, 0.05):.2f}",
-                  f"{gains:.2%}", f"{off[-1]:.2%}")
+        table.row(
+            name,
+            *(pair(x) for x in sizes(ran, 20.0)),
+            trusted,
+            f"{settled(times, off, 0.05):.2f}",
+            f"{gains:.2%}",
+            f"{off[-1]:.2%}",
+        )
     table.show(time.perf_counter() - begin)
 
 
@@ -272,10 +288,16 @@ def tolerances(folder: Path) -> None:
         f'[study]\nestimators = ["in_loop"]\nruns = 1000\ndraw = {TOLERANCE}\n'
     )
     path = folder / "tolerances.toml"
-    path.write_text(robots.case_text(
-        ADAPTIVE, friction=robots.friction_text(3, guess=true), seed=8, duration=8.0, more=more,
-        gain=[f"{{ guess = 1.0, true = {g} }}" for g in robots.GAINS],
-    ))
+    path.write_text(
+        robots.case_text(
+            ADAPTIVE,
+            friction=robots.friction_text(3, guess=true),
+            seed=8,
+            duration=8.0,
+            more=more,
+            gain=[f"{{ guess = 1.0, true = {g} }}" for g in robots.GAINS],
+        )
+    )
     out = folder / "tolerances"
     study = jaxid.study(path, folder=out, resume=out.exists())
     print(f"{study}\n{time.perf_counter() - begin:.0f} s")

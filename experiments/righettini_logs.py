@@ -42,7 +42,11 @@ def logged(folder: Path, name: str, machine: object, seconds: float = 15.0, seed
 
 
 MODELS = {
-    1: ("all", 4), 2: ("active", 4), 3: ("active", 3), 4: ("active", 2), 5: ("active", 1),
+    1: ("all", 4),
+    2: ("active", 4),
+    3: ("active", 3),
+    4: ("active", 2),
+    5: ("active", 1),
 }
 
 
@@ -65,7 +69,11 @@ def orders(folder: Path) -> None:
         left = residuals[f"({number})"] = found.gaps[0].force.rms
         running = found.estimate.details["recursive"]["running_residual"]
         table.row(
-            number, where, order, len(found.estimate.names), ", ".join(f"{x:.3f}" for x in left),
+            number,
+            where,
+            order,
+            len(found.estimate.names),
+            ", ".join(f"{x:.3f}" for x in left),
             ", ".join(f"{x:.3f}" for x in np.ravel(running)),
         )
     table.show(time.perf_counter() - begin)
@@ -80,7 +88,7 @@ def orders(folder: Path) -> None:
     for name, friction in (("third", active), ("first", first), ("hinge", hinge)):
         log = logged(folder, name, robot(friction=friction))
         found = jaxid.discover(path, log, max_effects=8)
-        found.save(folder / f"chosen_{name}", force=True)
+        found.save(folder / f"chosen_{name}", overwrite=True)
         print(f"\nfriction of the log: {name} ({time.perf_counter() - begin:.0f} s)\n{found}", flush=True)
 
 
@@ -96,9 +104,7 @@ def payload(folder: Path) -> None:
     path = folder / "unloaded.toml"
     path.write_text(case_text())
     gains = jaxid.identify(path, bare, method="inverse_dynamics").estimate.theta[:2].tolist()
-    table = Table(
-        f"A payload of {extra} kg", ["drive gains", "found [kg]", "sigma [kg]", "gains"]
-    )
+    table = Table(f"A payload of {extra} kg", ["drive gains", "found [kg]", "sigma [kg]", "gains"])
     for name, gain in (("of the unloaded run", gains), ("free", "{ guess = 1.0 }")):
         path = folder / "loaded.toml"
         path.write_text(case_text(gain=gain, tip_mass="{ guess = 2.0 }"))
@@ -106,8 +112,12 @@ def payload(folder: Path) -> None:
         at = estimate.names.index("tip_mass")
         free = isinstance(gain, str)
         shown = [estimate.value(f"actuator_gain[{k}].gain") for k in (1, 2)] if free else gain
-        table.row(name, f"{estimate.theta[at] - 2.72:.4f}", f"{estimate.std[at]:.4f}",
-                  ", ".join(f"{g:.4f}" for g in shown))
+        table.row(
+            name,
+            f"{estimate.theta[at] - 2.72:.4f}",
+            f"{estimate.std[at]:.4f}",
+            ", ".join(f"{g:.4f}" for g in shown),
+        )
     table.show(time.perf_counter() - begin)
 
 
@@ -123,5 +133,5 @@ def hidden(folder: Path) -> None:
         path = folder / f"hidden_{name}.toml"
         path.write_text(case_text(friction=stated, gain=robots.GAINS, more=SENSOR))
         found = jaxid.discover(path, log)
-        found.save(folder / f"hidden_{name}", force=True)
+        found.save(folder / f"hidden_{name}", overwrite=True)
         print(f"\nhidden: {name} ({time.perf_counter() - begin:.0f} s)\n{found}", flush=True)

@@ -77,9 +77,12 @@ def main() -> int:
     accepted = (
         abs(old[proposal.named] - old[proposal.rival]) < 3.0
         and abs(new[proposal.named] - new[proposal.rival]) > 100.0
-        and after.kinds == [TRUE] and not after.effects[0].alternatives
+        and after.kinds == [TRUE]
+        and not after.effects[0].alternatives
         and abs(value / COEFFICIENT - 1) < 0.05
-        and low >= 0.0 and high <= 0.25 and speed <= 0.15
+        and low >= 0.0
+        and high <= 0.25
+        and speed <= 0.15
     )
     print("accepted" if accepted else "NOT accepted")
     return 0 if accepted else 1

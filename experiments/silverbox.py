@@ -30,8 +30,11 @@ def main() -> int:
     table = Table("open-loop simulation, RMS position error", ["log", "linear", "found", "reference", "unit"])
     for old, new in zip(found.gaps_before, found.gaps_after, strict=True):
         table.row(
-            new.name, f"{1e3 * old.simulation.rms[0]:.2f}", f"{1e3 * new.simulation.rms[0]:.3f}",
-            REFERENCE_MV.get(new.name, ""), "mV",
+            new.name,
+            f"{1e3 * old.simulation.rms[0]:.2f}",
+            f"{1e3 * new.simulation.rms[0]:.3f}",
+            REFERENCE_MV.get(new.name, ""),
+            "mV",
         )
     table.show(time.perf_counter() - start)
     print(found)

@@ -94,17 +94,27 @@ def models(folder: Path) -> None:
     names = ("each joint alone", "arm, friction of joints", "arm, and of the shaft")
     for name, what in zip(("tx40_alone", "tx40_joints", "tx40"), names, strict=True):
         found = jaxid.identify(folder / f"{name}.toml", log, method="inverse_dynamics")
-        found.save(folder / name, force=True)
+        found.save(folder / name, overwrite=True)
         table.row(what, *[cell(found.gaps, k) for k in range(JOINTS)])
     table.show(time.perf_counter() - start)
     std = dict(zip(found.estimate.names, found.estimate.std, strict=True))
     both = lambda name: f"{found.value(name):.3g} +- {std[name]:.2g}"
     table = Table("friction found, and published", ["", "viscous [N m s/rad]", "", "Coulomb [N m]", ""])
     for k in range(JOINTS):
-        table.row(f"joint {k + 1}", both(f"viscous_friction[{k + 1}].coefficient"), f"{VISCOUS[k]:.3g}",
-                  both(f"coulomb_friction[{k + 1}].level"), COULOMB[k])
-    table.row("shaft", both("viscous_friction[shaft 1].coefficient"), SHAFT["viscous_friction"],
-              both("coulomb_friction[shaft 1].level"), SHAFT["coulomb_friction"])
+        table.row(
+            f"joint {k + 1}",
+            both(f"viscous_friction[{k + 1}].coefficient"),
+            f"{VISCOUS[k]:.3g}",
+            both(f"coulomb_friction[{k + 1}].level"),
+            COULOMB[k],
+        )
+    table.row(
+        "shaft",
+        both("viscous_friction[shaft 1].coefficient"),
+        SHAFT["viscous_friction"],
+        both("coulomb_friction[shaft 1].level"),
+        SHAFT["coulomb_friction"],
+    )
     table.show(time.perf_counter() - start)
     print(f"inertia of the shaft {both('added_mass[shaft 1].mass')} kg m^2, published {SHAFT['added_mass']}")
 
@@ -119,7 +129,7 @@ def hidden(folder: Path) -> None:
     (folder / "tx40_hidden.toml").write_text(text)
     say = lambda line: print(f"  {time.perf_counter() - start:5.0f} s: {line}", flush=True)
     found = jaxid.discover(folder / "tx40_hidden.toml", folder / "log.csv", refit=False, progress=say)
-    found.save(folder / "hidden", force=True)
+    found.save(folder / "hidden", overwrite=True)
     print(f"\nhidden: {found.verdict} ({time.perf_counter() - start:.1f} s)\n{found}")
 
 

@@ -27,9 +27,9 @@ from common import Table, copied, parser_of
 import jaxid
 from jaxid.build import build_machine
 from jaxid.estimators import METHODS
-from jaxid.estimators.algebraic.online import Online, Told, window_rows
+from jaxid.estimators.algebraic.online import Online, OnlineEstimate, window_rows
 from jaxid.estimators.estimate import Estimate
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import wi_figures
@@ -101,7 +101,7 @@ def first_instants(folder: Path) -> bool:
     return good
 
 
-def _locked(told: Told, names: list[str], true: dict[str, float], rate: float) -> list[str]:
+def _locked(told: OnlineEstimate, names: list[str], true: dict[str, float], rate: float) -> list[str]:
     """When the last parameter of each kind is within its aim for good, and all are trusted."""
     out = []
     error = 100 * np.abs(told.theta / np.array([true[n] for n in names]) - 1)
@@ -185,7 +185,7 @@ def cost(folder: Path) -> bool:
             start = time.perf_counter()
             found = jaxid.identify(case, log, method="algebraic").estimate
             middle = time.perf_counter()
-            alone(METHODS["algebraic"](session))
+            run_alone(METHODS["algebraic"](session))
             whole.append(middle - start)
             own.append(time.perf_counter() - middle)
         times.append(min(own))
@@ -212,7 +212,8 @@ def hidden(folder: Path) -> bool:
     begin, good = time.perf_counter(), True
     table = Table("hidden in the six masses, nothing declared", ["true", "verdict", "named", "evidence"])
     for kind, place, values in (
-        ("coulomb_friction", 3, {"level": 4.7}), ("cubic_stiffness", 4, {"coefficient": 4e5}),
+        ("coulomb_friction", 3, {"level": 4.7}),
+        ("cubic_stiffness", 4, {"coefficient": 4e5}),
         ("backlash", 4, {"gap": 1e-3}),
     ):
         case = undeclared(folder, f"hidden_{kind}")
@@ -227,8 +228,12 @@ def hidden(folder: Path) -> bool:
 
 
 PARTS: dict[str, Callable[[Path], bool]] = {
-    "first_instants": first_instants, "tracking": tracking, "partial": partial, "noise": noise,
-    "cost": cost, "hidden": hidden,
+    "first_instants": first_instants,
+    "tracking": tracking,
+    "partial": partial,
+    "noise": noise,
+    "cost": cost,
+    "hidden": hidden,
 }
 
 

@@ -45,7 +45,7 @@ def _with_loop_flag(flags: str) -> str:
     words = flags.split()
     for i, word in enumerate(words):
         if word.startswith(key):
-            words[i] = f"{word},{LOOP_FLAG[len(key):]}"
+            words[i] = f"{word},{LOOP_FLAG[len(key) :]}"
             return " ".join(words)
     return " ".join([*words, LOOP_FLAG])
 

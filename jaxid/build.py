@@ -23,7 +23,7 @@ from jaxid.model.parameter import ParameterInfo, as_array, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, Free, Parameters, effect_name, label
 from jaxid.references import REFERENCES
-from jaxid.references.unknown import Course
+from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.sensors.inertial import Inertial, InertialSensors
 
@@ -31,12 +31,12 @@ from jaxid.sensors.inertial import Inertial, InertialSensors
 _GATE = 1e-2
 
 
-def build_machine(case: Case, *, true: bool = False, period: float | None = None) -> Machine:
+def build_machine(case: Case, *, at_truth: bool = False, period: float | None = None) -> Machine:
     """Make a machine of a case.
 
     Args:
         case: The case.
-        true: Take the `true` values where there are any, in place of the guesses.
+        at_truth: Take the `true` values where there are any, in place of the guesses.
         period: Sampling time [s] of the log, which a controller without its own runs at; absent:
             what [log] or [simulation] give as sample_rate.
 
@@ -48,11 +48,11 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
             this version does not have.
     """
     if case.transmission is not None:
-        mend = "leave it out, and state what the joints do and their drives"
+        hint = "leave it out, and state what the joints do and their drives"
         what = "transmission goes with a measured log that is checked, fitted or searched"
-        raise InputError(what, where=f"{case.path}, [actuator]", mend=mend)
-    plant, free = _plant(case, true)
-    course, more = _course(case, true, plant)
+        raise InputError(what, where=f"{case.path}, [actuator]", hint=hint)
+    plant, free = _plant(case, at_truth)
+    unknown_reference, more = _course(case, at_truth, plant)
     gain = np.asarray(case.gain, dtype=np.float64) * np.asarray(plant.gearing)
     gain = np.broadcast_to(gain, (case.plant.drives,)).copy()
     controller = _controller(case, period, gain)
@@ -68,7 +68,7 @@ def build_machine(case: Case, *, true: bool = False, period: float | None = None
         disturbance=(case.controller or {}).get("disturbance"),
         sensor=sensor,
         hold=case.log.get("hold", "zero_order"),
-        course=course,
+        unknown_reference=unknown_reference,
     )
 
 
@@ -85,7 +85,8 @@ def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:
         if ticks % hold:
             raise InputError(
                 f"{name} = {ticks} ticks, and readings are new every {hold}",
-                where=f"{case.path}, [controller]", mend=f"take {name} = {hold}, or a multiple of it",
+                where=f"{case.path}, [controller]",
+                hint=f"take {name} = {hold}, or a multiple of it",
             )
     return Sensor(**given, hold=hold)
 
@@ -98,12 +99,12 @@ def _told(sensors: InertialSensors, plant: Plant, q: Array, readings: Array, zer
 def _held(rate: float, controller: Controller | None, where: str) -> int:
     """Ticks of the loop for which readings at this rate are held."""
     if controller is None:
-        mend = "leave it out; sample_rate says how often a log without a loop is read"
-        raise InputError("rate goes with a loop", where=where, mend=mend)
+        hint = "leave it out; sample_rate says how often a log without a loop is read"
+        raise InputError("rate goes with a loop", where=where, hint=hint)
     hold = round(1 / (rate * controller.period))
     if hold < 1 or abs(hold * rate * controller.period - 1) > 1e-3:
-        mend = f"take {1 / controller.period:g} Hz, the loop's, or a whole part of it"
-        raise InputError(f"rate = {rate:g} Hz does not fit the loop", where=where, mend=mend)
+        hint = f"take {1 / controller.period:g} Hz, the loop's, or a whole part of it"
+        raise InputError(f"rate = {rate:g} Hz does not fit the loop", where=where, hint=hint)
     return hold
 
 
@@ -130,18 +131,19 @@ def _inertial(case: Case, controller: Controller | None, plant: Plant) -> Inerti
         if not bool(_told(out, plant, q, readings, zero)):
             what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"
             raise InputError(
-                f"{what} do not tell the motion of every joint", where=f"{case.path}, [[inertial_sensors]]",
-                mend="add one of each kind on the last link, or with more axes, and a range beyond gravity",
+                f"{what} do not tell the motion of every joint",
+                where=f"{case.path}, [[inertial_sensors]]",
+                hint="add one of each kind on the last link, or with more axes, and a range beyond gravity",
             )
     return out
 
 
-def _plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
+def _plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
     """The plant with its effects, and the unknowns."""
-    plant, free = _bare_plant(case, true)
+    plant, free = _bare_plant(case, at_truth)
     for entry in case.effects:
         for at in range(len(entry.ports)):
-            plant, more = _with_effect(plant, entry, at, case, true)
+            plant, more = _with_effect(plant, entry, at, case, at_truth)
             free += more
     _check_weights(plant, case)
     return plant, free
@@ -154,11 +156,11 @@ def _check_weights(plant: Plant, case: Case) -> None:
             continue
         if not float(np.asarray(plant.port_normal(np.zeros(plant.joints)))[effect.port]) > 0:
             what = f"{label(plant, effect.kind, effect.port)} has a friction_coefficient where nothing weighs"
-            mend = "let [plant] gravity be positive, or give the friction by its level"
-            raise InputError(what, where=str(case.path), mend=mend)
+            hint = "let [plant] gravity be positive, or give the friction by its level"
+            raise InputError(what, where=str(case.path), hint=hint)
 
 
-def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
+def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
     """The plant without effects, and its own unknowns."""
     entry = case.plant
     known: dict[str, Any] = {"gravity": entry.gravity, "vertical": entry.vertical}
@@ -171,7 +173,7 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
     values: dict[str, Any] = {}
     for name, given in entry.parameters.items():
         listed = isinstance(given, tuple)
-        values[name] = _starts(given, true) if listed else given.start(true)
+        values[name] = _starts(given, at_truth) if listed else given.start(at_truth)
     plant = entry.cls(**values, **options, **entry.options)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
@@ -183,30 +185,30 @@ def _bare_plant(case: Case, true: bool) -> tuple[Plant, list[Free]]:
                 row = [(k, v)] if isinstance(v, Value) else [((k, i), x) for i, x in enumerate(v)]
                 for at, x in row:
                     number = k + 1 if isinstance(v, Value) else f"{k + 1}, {at[1] + 1}"
-                    free += _free(x, f"{name}[{number}]", (name,), info, motion, case, true, index=at)
+                    free += _free(x, f"{name}[{number}]", (name,), info, motion, case, at_truth, index=at)
         elif given is not None:
-            free += _free(given, name, (name,), info, info.motion, case, true)
+            free += _free(given, name, (name,), info, info.motion, case, at_truth)
     return plant, free
 
 
-def _starts(given: tuple, true: bool) -> list:
+def _starts(given: tuple, at_truth: bool) -> list:
     """Values of a list, or of a list of lists."""
-    return [v.start(true) if isinstance(v, Value) else _starts(v, true) for v in given]
+    return [v.start(at_truth) if isinstance(v, Value) else _starts(v, at_truth) for v in given]
 
 
 def _with_effect(
-    plant: Plant, entry: EffectEntry, at: int, case: Case, true: bool
+    plant: Plant, entry: EffectEntry, at: int, case: Case, at_truth: bool
 ) -> tuple[Plant, list[Free]]:
     """The plant with an effect on one of its ports, and the effect's unknowns."""
     values = {name: of_ports[at] for name, of_ports in entry.parameters.items()}
-    effect = entry.cls(port=entry.ports[at], **{name: v.start(true) for name, v in values.items()})
+    effect = entry.cls(port=entry.ports[at], **{name: v.start(at_truth) for name, v in values.items()})
     key = effect_name(plant, effect)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
         if name in values:
             path = ("effects", len(plant.effects), name)
             motion = plant.motion(effect.port)
-            free += _free(values[name], f"{key}.{name}", path, info, motion, case, true)
+            free += _free(values[name], f"{key}.{name}", path, info, motion, case, at_truth)
     return plant.with_effect(effect), free
 
 
@@ -217,7 +219,7 @@ def _free(
     info: ParameterInfo,
     motion: str | None,
     case: Case,
-    true: bool,
+    at_truth: bool,
     *,
     index: int | tuple[int, int] | None = None,
 ) -> list[Free]:
@@ -225,21 +227,21 @@ def _free(
     if not value.free:
         return []
     unit = case.plant.units.label(info.dimension, motion)
-    guess, bounds = value.start(true), (value.lower, value.upper)
+    guess, bounds = value.start(at_truth), (value.lower, value.upper)
     return [Free(name, path, unit, info.sign, guess, *bounds, index=index, true=value.true)]
 
 
-def _course(case: Case, true: bool, plant: Plant) -> tuple[Course | None, list[Free]]:
+def _course(case: Case, at_truth: bool, plant: Plant) -> tuple[UnknownReference | None, list[Free]]:
     """The reference that has unknowns, and these."""
     if not case.unknown_reference:
         return None, []
-    values = {name: v.start(true) for name, v in case.unknown_reference.items()}
-    course, free = Course.of(case.reference, values), []
-    motion, keys = plant.motion(plant.driven(plant.joints)[0]), REFERENCES[course.kind].keys
+    values = {name: v.start(at_truth) for name, v in case.unknown_reference.items()}
+    unknown_reference, free = UnknownReference.of(case.reference, values), []
+    motion, keys = plant.motion(plant.driven(plant.joints)[0]), REFERENCES[unknown_reference.kind].keys
     for name, value in case.unknown_reference.items():
         path, info = (REFERENCE, name), info_of(keys[name])
-        free += _free(value, f"{REFERENCE}.{name}", path, info, motion, case, true)
-    return course, free
+        free += _free(value, f"{REFERENCE}.{name}", path, info, motion, case, at_truth)
+    return unknown_reference, free
 
 
 def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controller | None:
@@ -260,7 +262,9 @@ def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controlle
     if cls.every_drive and case.plant.drives < case.plant.joints:
         raise InputError(
             f"kind = '{case.controller['kind']}' needs a drive at every joint: no reference says how the "
-            "others move", where=f"{case.path}, [controller]", mend="take kind = 'flatness'",
+            "others move",
+            where=f"{case.path}, [controller]",
+            hint="take kind = 'flatness'",
         )
     if "model" in cls.of_machine:
         # The law knows what the case guesses, whatever the machine truly is.
@@ -279,15 +283,20 @@ def _estimator(case: Case, machine: Machine, period: float, stated: Mapping[str,
 
     where, count = f"{case.path}, [controller]", len(machine.parameters.free)
     if not count:
-        mend = "take kind = 'computed_torque', or give a guess in place of a value"
-        raise InputError("kind = 'adaptive' has nothing to find: all is known", where=where, mend=mend)
+        hint = "take kind = 'computed_torque', or give a guess in place of a value"
+        raise InputError("kind = 'adaptive' has nothing to find: all is known", where=where, hint=hint)
     velocity = stated.get("gate_velocity", _GATE)
     at_guess = stated.get("start") == "guess"
     try:
         return RealTime.of(
-            machine, period, noise=1.0, spread=np.ones(count), gate_velocity=velocity,
+            machine,
+            period,
+            noise=1.0,
+            spread=np.ones(count),
+            gate_velocity=velocity,
             gate_acceleration=stated.get("gate_acceleration", np.inf),
-            half_life=stated.get("half_life", np.inf), summed=stated.get("rows") == "summed",
+            half_life=stated.get("half_life", np.inf),
+            summed=stated.get("rows") == "summed",
             instrument=stated.get("instrument") == "model",
             start=machine.parameters.guess if at_guess else None,
         )
@@ -298,7 +307,7 @@ def _estimator(case: Case, machine: Machine, period: float, stated: Mapping[str,
 def _log_period(case: Case, period: float | None) -> float:
     rate = case.log.get("sample_rate") or case.simulation.get("sample_rate")
     if period is None and rate is None:
-        mend = "add period = <its sampling time in s>"
+        hint = "add period = <its sampling time in s>"
         where = f"{case.path}, [controller]"
-        raise InputError("the controller's period is not known", where=where, mend=mend)
+        raise InputError("the controller's period is not known", where=where, hint=hint)
     return period if period is not None else 1.0 / rate

@@ -14,10 +14,19 @@ from jaxid import _cache
 from jaxid.errors import InputError, suggest
 
 METHODS = (
-    "output_error", "inverse_dynamics", "algebraic", "instrumental_variable", "didim", "power",
+    "output_error",
+    "inverse_dynamics",
+    "algebraic",
+    "instrumental_variable",
+    "didim",
+    "power",
     "recursive",
-    "algebraic_single_time", "algebraic_ratio", "algebraic_sign_changed", "algebraic_sign_unchanged",
-    "minimal_model", "minimal_model_printed",
+    "algebraic_single_time",
+    "algebraic_ratio",
+    "algebraic_sign_changed",
+    "algebraic_sign_unchanged",
+    "minimal_model",
+    "minimal_model_printed",
 )
 OUTPUTS = ("position", "force", "both")
 SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
@@ -59,14 +68,13 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line too, with exit status 2."""
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(message, mend=f"see {self.prog} --help")
+        raise InputError(message, hint=f"see {self.prog} --help")
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="jaxid",
-        description="Identify machines with friction, and find the physics that a simulation "
-        "is missing.",
+        description="Identify machines with friction, and find the physics that a simulation is missing.",
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _demo(commands)
@@ -122,7 +130,10 @@ def _logs(parser: argparse.ArgumentParser) -> None:
 
 def _validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--validate", metavar="LOG2", action="append", default=[],
+        "--validate",
+        metavar="LOG2",
+        action="append",
+        default=[],
         help="a log to validate on, beside the case's own; may be repeated",
     )
 
@@ -137,12 +148,14 @@ def _identify(commands: argparse._SubParsersAction) -> None:
     _logs(parser)
     parser.add_argument("--method", metavar="M", default="output_error", help=", ".join(METHODS))
     parser.add_argument(
-        "--on", metavar="WHAT",
+        "--on",
+        metavar="WHAT",
         help=f"what output_error fits in a closed loop: {', '.join(OUTPUTS)}; absent: as the case says, "
         "or position",
     )
     parser.add_argument(
-        "--solver", metavar="NAME",
+        "--solver",
+        metavar="NAME",
         help="let diffrax integrate in output_error, dry friction smoothed: "
         f"{', '.join(SOLVERS)}; absent: fixed steps, dry friction exact",
     )
@@ -156,7 +169,9 @@ def _discover(commands: argparse._SubParsersAction) -> None:
     _validate(parser)
     parser.add_argument("--max-effects", metavar="N", type=int, default=5, help="default: 5")
     parser.add_argument(
-        "--experiments", action=argparse.BooleanOptionalAction, default=None,
+        "--experiments",
+        action=argparse.BooleanOptionalAction,
+        default=None,
         help="design experiments that tell rivals apart; default: not of arms, where it takes minutes",
     )
 
@@ -182,7 +197,10 @@ def _progress(args: argparse.Namespace, stages: int):
     from tqdm import tqdm
 
     with tqdm(
-        total=stages, disable=args.quiet or not sys.stderr.isatty(), leave=False, unit="stage",
+        total=stages,
+        disable=args.quiet or not sys.stderr.isatty(),
+        leave=False,
+        unit="stage",
         bar_format="{desc:42.42s} |{bar}| {elapsed}",
     ) as bar:
 
@@ -199,7 +217,7 @@ def _ready(args: argparse.Namespace, *files: str) -> None:
     if args.o is not None:
         from jaxid.files import check_folder
 
-        check_folder(Path(args.o), files, force=args.force)
+        check_folder(Path(args.o), files, overwrite=args.force)
 
 
 def _run_plants(args: argparse.Namespace) -> int:
@@ -220,22 +238,22 @@ def _run_simulate(args: argparse.Namespace) -> int:
     from jaxid.files import ready_file
 
     if args.seed < 0:
-        raise InputError(f"--seed is {args.seed}", mend="give zero or more")
-    path = ready_file(Path(args.o), force=args.force)
+        raise InputError(f"--seed is {args.seed}", hint="give zero or more")
+    path = ready_file(Path(args.o), overwrite=args.force)
     with _progress(args, 2) as tell:
         tell("simulating")
         from jaxid.commands.simulate import simulate
 
-        virtual = simulate(args.case, seed=args.seed)
-    virtual.save(path)
-    print(f"{virtual.log.samples} samples at {virtual.log.rate_hz:g} Hz in {path}")
+        simulated_log = simulate(args.case, seed=args.seed)
+    simulated_log.save(path)
+    print(f"{simulated_log.log.samples} samples at {simulated_log.log.rate_hz:g} Hz in {path}")
     return 0
 
 
 def _run_design(args: argparse.Namespace) -> int:
     from jaxid.files import ready_file
 
-    path = ready_file(Path(args.o), force=args.force)
+    path = ready_file(Path(args.o), overwrite=args.force)
     with _progress(args, 4) as tell:
         from jaxid.commands.design import design
 
@@ -258,21 +276,24 @@ def _run_check(args: argparse.Namespace) -> int:
 
 def _run_identify(args: argparse.Namespace) -> int:
     if args.method not in METHODS:
-        raise InputError(
-            f"method {args.method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
-        )
+        raise InputError(f"method {args.method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     if args.solver is not None and args.solver not in SOLVERS:
-        raise InputError(f"solver {args.solver!r} is not known", mend=suggest(args.solver, SOLVERS))
+        raise InputError(f"solver {args.solver!r} is not known", hint=suggest(args.solver, SOLVERS))
     if args.on is not None and args.on not in OUTPUTS:
-        raise InputError(f"on {args.on!r} is not known", mend=suggest(args.on, OUTPUTS))
+        raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
     _ready(args, "result.json", "report.html")
     with _progress(args, 4) as tell:
         tell("starting")
         from jaxid.commands.identify import identify
 
         result = identify(
-            args.case, args.log, method=args.method, solver=args.solver, on=args.on,
-            validate=args.validate, progress=tell,
+            args.case,
+            args.log,
+            method=args.method,
+            solver=args.solver,
+            on=args.on,
+            validate=args.validate,
+            progress=tell,
         )
     print(result)
     return _finish(args, result, "result.json", "report.html")
@@ -280,7 +301,7 @@ def _run_identify(args: argparse.Namespace) -> int:
 
 def _run_discover(args: argparse.Namespace) -> int:
     if args.max_effects < 0:
-        raise InputError(f"--max-effects is {args.max_effects}", mend="give zero or more")
+        raise InputError(f"--max-effects is {args.max_effects}", hint="give zero or more")
     # An experiment's name follows from what is found: any that is there already may be meant.
     there = [] if args.o is None else [p.name for p in Path(args.o).glob("separate_*.csv")]
     _ready(args, "discovery.json", "report.html", *there)
@@ -289,8 +310,12 @@ def _run_discover(args: argparse.Namespace) -> int:
         from jaxid.commands.discover import discover
 
         result = discover(
-            args.case, args.log, validate=args.validate, max_effects=args.max_effects,
-            experiments=args.experiments, progress=tell,
+            args.case,
+            args.log,
+            validate=args.validate,
+            max_effects=args.max_effects,
+            experiments=args.experiments,
+            progress=tell,
         )
     print(result)
     from jaxid.results.as_json import discovery_files
@@ -312,8 +337,14 @@ def _run_study(args: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         result = study(
-            args.case, runs=args.runs, seed=args.seed, folder=args.o, resume=args.resume,
-            force=args.force, scheduler=args.scheduler, progress=tell,
+            args.case,
+            runs=args.runs,
+            seed=args.seed,
+            folder=args.o,
+            resume=args.resume,
+            overwrite=args.force,
+            scheduler=args.scheduler,
+            progress=tell,
         )
     print(result)
     if args.o is not None:
@@ -328,14 +359,14 @@ def _run_demo(args: argparse.Namespace) -> int:
 
     with _progress(args, 40) as tell:
         tell("starting")
-        text, converged = run_demo(Path(args.o), force=args.force, progress=tell)
+        text, converged = run_demo(Path(args.o), overwrite=args.force, progress=tell)
     print(text)
     return 0 if converged else 1
 
 
 def _finish(args: argparse.Namespace, result: object, *files: str) -> int:
     if args.o is not None:
-        result.save(args.o, force=args.force)
+        result.save(args.o, overwrite=args.force)
         print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in files)}")
     return 0 if getattr(result, "converged", True) else 1
 

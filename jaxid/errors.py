@@ -1,27 +1,27 @@
-"""The one exception for bad input, and the words that help to mend it."""
+"""The one exception for bad input, and the words that help to correct it."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """Input that jaxid cannot work with; its text is one line: where, what, the mend.
+    """Input that jaxid cannot work with; its text is one line: where, what, and a hint.
 
     The command line prints the text and ends with exit status 2, so it must be
     understandable without a traceback.
     """
 
-    def __init__(self, what: str, *, where: str = "", mend: str = ""):
+    def __init__(self, what: str, *, where: str = "", hint: str = ""):
         """Compose the line.
 
         Args:
             what: The fault, with the offending value and its unit.
             where: File, table, column or row in which it stands.
-            mend: What the user can do about it.
+            hint: What the user can do about it.
         """
         line = f"{where}: {what}" if where else what
-        if mend:
-            line = f"{line}; {mend}"
+        if hint:
+            line = f"{line}; {hint}"
         # Texts of other libraries may hold line breaks; a shell user wants one line.
         super().__init__(" ".join(line.split()))
 
@@ -35,7 +35,7 @@ def suggest(name: str, known: Iterable[str], *, limit: int = 12) -> str:
         limit: At most so many names are listed.
 
     Returns:
-        Words for the mend of an `InputError`.
+        Build the hint of an `InputError`.
     """
     names = list(known)
     if not names:

@@ -55,31 +55,32 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     write_whole(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
 
 
-def check_folder(folder: Path, files: Sequence[str], *, force: bool = False) -> None:
+def check_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False) -> None:
     """See that results may be written to a folder, before the work that makes them.
 
     Raises:
-        InputError: If it holds one of the files, jaxid did not make it, and `force` is not given;
+        InputError: If it holds one of the files, jaxid did not make it, and `overwrite` is not given;
             or if it is no folder.
     """
     there = next((p for p in (folder, *folder.parents) if p.exists()), folder)
     if there.exists() and not there.is_dir():
-        raise InputError("is a file, not a folder", where=str(there), mend="choose another -o")
+        raise InputError("is a file, not a folder", where=str(there), hint="choose another -o")
     taken = [f for f in files if (folder / f).exists()]
-    if taken and not (folder / _MARK).exists() and not force:
+    if taken and not (folder / _MARK).exists() and not overwrite:
         raise InputError(
-            f"holds {', '.join(taken)} already", where=str(folder),
-            mend="choose another -o, or overwrite with --force",
+            f"holds {', '.join(taken)} already",
+            where=str(folder),
+            hint="choose another -o, or overwrite with --force",
         )
 
 
-def ready_folder(folder: Path, files: Sequence[str], *, force: bool = False) -> Path:
+def ready_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False) -> Path:
     """Make a folder for results, where there is none.
 
     Raises:
         InputError: As `check_folder`, or if it cannot be made.
     """
-    check_folder(folder, files, force=force)
+    check_folder(folder, files, overwrite=overwrite)
     if not folder.exists():
         mark_folder(folder)
     return folder
@@ -96,30 +97,31 @@ def mark_folder(folder: Path) -> None:
         (folder / _MARK).write_text("made by jaxid\n", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"cannot be made: {error.strerror}", where=str(folder), mend="choose another -o"
+            f"cannot be made: {error.strerror}", where=str(folder), hint="choose another -o"
         ) from error
 
 
-def ready_file(path: Path, *, force: bool = False) -> Path:
+def ready_file(path: Path, *, overwrite: bool = False) -> Path:
     """See that a log may be written, before the work that makes it.
 
     Raises:
-        InputError: If it exists and `force` is not given, or its folder does not; or if it is a
+        InputError: If it exists and `overwrite` is not given, or its folder does not; or if it is a
             folder, or no CSV by its name.
     """
     if path.is_dir():
-        raise InputError("is a folder", where=str(path), mend="name a file: -o LOG.csv")
+        raise InputError("is a folder", where=str(path), hint="name a file: -o LOG.csv")
     if path.suffix.lower() != ".csv":
         raise InputError(
-            f"suffix {path.suffix!r}: the log is written as CSV", where=str(path),
-            mend="end its name in .csv",
+            f"suffix {path.suffix!r}: the log is written as CSV",
+            where=str(path),
+            hint="end its name in .csv",
         )
-    if path.exists() and not force:
+    if path.exists() and not overwrite:
         raise InputError(
-            "exists already", where=str(path), mend="choose another -o, or overwrite with --force"
+            "exists already", where=str(path), hint="choose another -o, or overwrite with --force"
         )
     if not path.parent.is_dir():
-        raise InputError("has no such folder", where=str(path), mend="make the folder first")
+        raise InputError("has no such folder", where=str(path), hint="make the folder first")
     return path
 
 

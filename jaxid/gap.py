@@ -15,7 +15,7 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
-from jaxid.session import Run
+from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, force_residual, measured_force, sharpened
 from jaxid.simulation.replay import (
     Replay,
@@ -66,7 +66,9 @@ def force_gap(machine: Machine, data: Prepared) -> ForceGap:
     # Of a joint that never moves nothing is said.
     samples = np.sum(np.isfinite(residual), axis=0)
     return ForceGap(
-        residual, np.asarray(measured), norm / np.sqrt(np.where(samples > 0, samples, np.nan)),
+        residual,
+        np.asarray(measured),
+        norm / np.sqrt(np.where(samples > 0, samples, np.nan)),
         norm / np.where(size > 0, size, np.nan),
     )
 
@@ -101,10 +103,11 @@ def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:
     closed = replay.controller is not None
     command = np.asarray(run.command) if closed else None
     return SimulationGap(
-        position, command, np.sqrt(np.mean(gap**2, axis=0)),
+        position,
+        command,
+        np.sqrt(np.mean(gap**2, axis=0)),
         np.linalg.norm(gap, axis=0) / np.linalg.norm(log.position, axis=0),
-        np.linalg.norm(log.force - command, axis=0) / np.linalg.norm(log.force, axis=0)
-        if closed else None,
+        np.linalg.norm(log.force - command, axis=0) / np.linalg.norm(log.force, axis=0) if closed else None,
     )
 
 
@@ -115,7 +118,9 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
 
 
 def noise_density(
-    machine: Machine, log: Log, data: Prepared,
+    machine: Machine,
+    log: Log,
+    data: Prepared,
     force_noise: Float[np.ndarray, " m"] | None = None,
 ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f n"]]:
     """One-sided density of the force that the sensors' noise alone leaves [N^2/Hz], by joint.
@@ -142,7 +147,8 @@ def noise_density(
     stiff, damped, heavy = (recipe.response(f, rate, k)[:, None, None] for k in range(3))
     impedance = _seen(
         -mass * w**2 * heavy + 1j * w * damping * damped + stiffness * stiff,
-        -mass * w**2 + 1j * w * damping + stiffness, data.measured,
+        -mass * w**2 + 1j * w * damping + stiffness,
+        data.measured,
     )
     through = recipe.decimator.response(f, rate)
     density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
@@ -198,11 +204,10 @@ class Gap:
     simulation: SimulationGap | None
 
 
-def gaps(machine: Machine, runs: Sequence[Run]) -> tuple[Gap, ...]:
+def gaps(machine: Machine, runs: Sequence[OpenedLog]) -> tuple[Gap, ...]:
     """Gap of a machine on each log."""
     return tuple(
-        Gap(r.name, force_gap(r.machine(machine), r.data), _shown(r.machine(machine), r.log))
-        for r in runs
+        Gap(r.name, force_gap(r.machine(machine), r.data), _shown(r.machine(machine), r.log)) for r in runs
     )
 
 
@@ -224,7 +229,7 @@ def _shown(machine: Machine, log: Log) -> SimulationGap | None:
 
 def simulated(machine: Machine, log: Log, *, at_rest: bool = False) -> SimulationGap | None:
     """Gap in position over the whole log; None where the simulation cannot run or diverges."""
-    if machine.controller is not None and log.reference is None and machine.course is None:
+    if machine.controller is not None and log.reference is None and machine.unknown_reference is None:
         machine = replace(machine, controller=None)
     # Nothing is differentiated here: friction sticks exactly, break-away friction too.
     try:

@@ -12,7 +12,7 @@ from jaxid.controllers import Controller
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.model.unknowns import Parameters
-from jaxid.references.unknown import Course
+from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 
 
@@ -30,7 +30,7 @@ class Machine:
             start [s], or the name of a column of the log; None: none.
         sensor: What is known of the measurement.
         hold: How the command runs between samples.
-        course: What the loop followed, with its unknowns, in a log that has no reference; None: unknown.
+        unknown_reference: What the loop followed, with its unknowns, where the log has no reference; None: known.
     """
 
     plant: Plant
@@ -41,7 +41,7 @@ class Machine:
     disturbance: Mapping[str, float] | str | None = None
     sensor: Sensor = Sensor()
     hold: str = "zero_order"
-    course: Course | None = None
+    unknown_reference: UnknownReference | None = None
 
     @property
     def hold_period(self) -> float | None:
@@ -57,7 +57,9 @@ class Machine:
         theta = np.asarray(theta, dtype=np.float64)
         parameters = self.parameters.with_guess(theta)
         plant = self.parameters.insert(self.plant, theta)
-        course = None if self.course is None else self.course.with_unknowns(self.parameters.places, theta)
-        return replace(self, plant=plant, parameters=parameters, course=course)
-
-
+        unknown_reference = (
+            None
+            if self.unknown_reference is None
+            else self.unknown_reference.with_unknowns(self.parameters.places, theta)
+        )
+        return replace(self, plant=plant, parameters=parameters, unknown_reference=unknown_reference)

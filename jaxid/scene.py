@@ -18,7 +18,7 @@ from jaxid.files import write_whole
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.references import make_reference
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
@@ -26,7 +26,7 @@ from jaxid.simulation.loops import Drive, Trajectory, closed_loop, needed_subste
 
 
 @dataclass(frozen=True)
-class Virtual:
+class SimulatedLog:
     """A simulated log.
 
     Args:
@@ -56,7 +56,7 @@ class Virtual:
             if values.shape[1] != (1 if isinstance(names, str) else len(names)):
                 raise InputError(
                     f"[log] {key} names {names!r} for {values.shape[1]} columns",
-                    mend="give a list with one name a joint",
+                    hint="give a list with one name a joint",
                 )
         rows = np.concatenate([*parts.values()], axis=1)
         lines = [",".join(repr(float(v)) for v in row) for row in rows]
@@ -103,16 +103,17 @@ class Scene:
         where, setting = str(case.path), case.simulation
         if "load_acceleration" in case.log:
             raise InputError(
-                "a simulated log has no load_acceleration", where=f"{where}, [log]",
-                mend="leave it out of the case that is simulated",
+                "a simulated log has no load_acceleration",
+                where=f"{where}, [log]",
+                hint="leave it out of the case that is simulated",
             )
         for key in ("duration", "sample_rate"):
             if key not in setting:
                 raise InputError(
-                    f"[simulation] has no {key}", where=where, mend=f"add {key} = ... to [simulation]"
+                    f"[simulation] has no {key}", where=where, hint=f"add {key} = ... to [simulation]"
                 )
         rate, duration = float(setting["sample_rate"]), float(setting["duration"])
-        machine = build_machine(case, true=True, period=1 / rate)
+        machine = build_machine(case, at_truth=True, period=1 / rate)
         joints = case.plant.joints
         position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
         velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
@@ -121,8 +122,9 @@ class Scene:
         if machine.controller is None:
             if not case.input:
                 raise InputError(
-                    "nothing drives the plant", where=where,
-                    mend="add an [input], or a [reference] and a [controller]",
+                    "nothing drives the plant",
+                    where=where,
+                    hint="add an [input], or a [reference] and a [controller]",
                 )
             command = make_reference(
                 case.input, rate, duration, case.folder, where=f"{where}, [input]", plant=machine.plant
@@ -130,10 +132,14 @@ class Scene:
             drive = _drive(case, machine, 1 / rate, longer_delays)
             return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
         if not case.reference:
-            raise InputError("there is nothing to follow", where=where, mend="add a [reference]")
+            raise InputError("there is nothing to follow", where=where, hint="add a [reference]")
         period = machine.controller.period
         reference = make_reference(
-            case.true_reference, 1 / period, duration, case.folder, where=f"{where}, [reference]",
+            case.true_reference,
+            1 / period,
+            duration,
+            case.folder,
+            where=f"{where}, [reference]",
             plant=machine.plant,
         )
         reference = _by_drive(reference, machine)
@@ -145,12 +151,13 @@ class Scene:
         every = max(1, round(1 / (rate * period)))
         if abs(1 / (rate * period * every) - 1) > 1e-3:
             raise InputError(
-                f"a loop of {1 / period:g} Hz cannot be logged at sample_rate = {rate:g}", where=where,
-                mend="take the loop's rate, or a whole part of it",
+                f"a loop of {1 / period:g} Hz cannot be logged at sample_rate = {rate:g}",
+                where=where,
+                hint="take the loop's rate, or a whole part of it",
             )
         return cls(case, machine, drive, reference, position, velocity, every)
 
-    def virtual(self, machine: Machine, rng: np.random.Generator) -> Steps[Virtual]:
+    def simulated_log(self, machine: Machine, rng: np.random.Generator) -> Steps[SimulatedLog]:
         """The log of a machine like the scene's, one run at a time.
 
         Args:
@@ -169,12 +176,16 @@ class Scene:
         looped = machine.controller is not None
         if looped:
             extra = disturbance_at(machine.disturbance, times)
-            signal = self.signal if machine.course is None else np.asarray(machine.course.at(times)())
+            signal = (
+                self.signal
+                if machine.unknown_reference is None
+                else np.asarray(machine.unknown_reference.at(times)())
+            )
             args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
-            run = yield Solve(_closed_run, args)
+            run = yield SolveRequest(_closed_run, args)
         else:
             sensor = (machine.sensor, noise[:, :joints])
-            run = yield Solve(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
+            run = yield SolveRequest(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
         _refuse_ended(machine.plant, run, self.drive.period, str(self.case.path))
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None
@@ -182,7 +193,7 @@ class Scene:
         shape = command.shape if machine.sensor.force_noise is not None else (0, 0)
         more = noise[pick, joints : joints + drives] if measures else rng.standard_normal(shape)
         log = _log(self.case, machine, times[pick], reading, command, more, reference)
-        return Virtual(log, run, _columns(self.case, reference=looped))
+        return SimulatedLog(log, run, _columns(self.case, reference=looped))
 
 
 _closed_run = eqx.filter_jit(closed_loop)
@@ -190,7 +201,12 @@ _closed_run = eqx.filter_jit(closed_loop)
 
 @eqx.filter_jit
 def _open_run(
-    plant: Plant, drive: Drive, command: Array, position: Array, velocity: Array, sensor: Sensor,
+    plant: Plant,
+    drive: Drive,
+    command: Array,
+    position: Array,
+    velocity: Array,
+    sensor: Sensor,
     noise: Array,
 ) -> Trajectory:
     run = open_loop(plant, drive, command, position, velocity)
@@ -209,8 +225,12 @@ def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
     longest = int(np.ceil(longer * float(delays.max()) / period)) + 1 if delayed else 0
     hold = "linear" if machine.hold == "band_limited" else machine.hold
     return Drive(
-        machine.gain, period, hold, int(case.simulation.get("substeps", 4)),
-        "sharpness" not in case.simulation, longest,
+        machine.gain,
+        period,
+        hold,
+        int(case.simulation.get("substeps", 4)),
+        "sharpness" not in case.simulation,
+        longest,
     )
 
 
@@ -226,19 +246,18 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
         joint = int(np.argmin(np.diagonal(mass))) + 1
         raise InputError(
             f"the mass matrix at initial_position is not positive definite (least about joint {joint})",
-            where=where, mend="give the links mass and inertia that bodies can have",
+            where=where,
+            hint="give the links mass and inertia that bodies can have",
         )
 
 
-def refuse_impossible(
-    plant: Plant, positions: np.ndarray, where: str, period: float | None = None
-) -> None:
+def refuse_impossible(plant: Plant, positions: np.ndarray, where: str, period: float | None = None) -> None:
     """Refuse positions that the machine cannot take; `period` is the time from one to the next."""
     found = plant.impossible(positions)
     if found is not None:
         row, what = found
         when = "" if period is None else f" at t = {row * period:.4g} s"
-        raise InputError(what + when, where=where, mend="keep away from it, or check the lengths")
+        raise InputError(what + when, where=where, hint="keep away from it, or check the lengths")
 
 
 def _refuse_ended(plant: Plant, run: Trajectory, period: float, where: str) -> None:
@@ -251,8 +270,9 @@ def _refuse_ended(plant: Plant, run: Trajectory, period: float, where: str) -> N
     found = plant.impossible(q + period * np.arange(3)[:, None] * v)
     if found is not None:
         raise InputError(
-            f"the motion ends at t = {last * period:.4g} s: {found[1]}", where=where,
-            mend="keep reference or input away from it, or check gains and lengths",
+            f"the motion ends at t = {last * period:.4g} s: {found[1]}",
+            where=where,
+            hint="keep reference or input away from it, or check gains and lengths",
         )
 
 
@@ -268,8 +288,9 @@ def _refuse_coarse(
     if needed > drive.substeps:
         raise InputError(
             f"[simulation] substeps = {drive.substeps} is too coarse for sharpness = "
-            f"{case.simulation['sharpness']:g}", where=str(case.path),
-            mend=f"set substeps = {needed}, a larger sharpness, or none (friction then sticks exactly)",
+            f"{case.simulation['sharpness']:g}",
+            where=str(case.path),
+            hint=f"set substeps = {needed}, a larger sharpness, or none (friction then sticks exactly)",
         )
 
 
@@ -283,21 +304,31 @@ def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
 
 
 def _log(
-    case: Case, machine: Machine, times: np.ndarray, reading: np.ndarray, command: np.ndarray,
-    noise: np.ndarray, reference: np.ndarray | None,
+    case: Case,
+    machine: Machine,
+    times: np.ndarray,
+    reading: np.ndarray,
+    command: np.ndarray,
+    noise: np.ndarray,
+    reference: np.ndarray | None,
 ) -> Log:
     command = np.asarray(machine.sensor.read_command(np.asarray(command), noise))
     if not np.all(np.isfinite(reading)):
         raise InputError(
-            "the simulation diverged", where=str(case.path),
-            mend="check gains and parameters, or raise substeps in [simulation]",
+            "the simulation diverged",
+            where=str(case.path),
+            hint="check gains and parameters, or raise substeps in [simulation]",
         )
     reading = np.array(reading)
     if case.plant.cls.load is not None and not case.load_column:
         reading[:, case.plant.cls.load] = np.nan
     return Log(
-        time=times, position=reading, force=command, reference=reference,
-        hold=machine.hold, source=f"simulation of {case.path.name}",
+        time=times,
+        position=reading,
+        force=command,
+        reference=reference,
+        hold=machine.hold,
+        source=f"simulation of {case.path.name}",
     )
 
 

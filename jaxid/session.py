@@ -21,7 +21,7 @@ from jaxid.simulation.step_size import needed_steps
 
 
 @dataclass(frozen=True)
-class Run:
+class OpenedLog:
     """One log with what was different when it was taken.
 
     Args:
@@ -56,13 +56,13 @@ class Session:
 
     case: Case
     machine: Machine
-    fit: Run
-    validations: tuple[Run, ...]
+    fit: OpenedLog
+    validations: tuple[OpenedLog, ...]
     recipe: Recipe
     findings: tuple[Finding, ...]
 
     @property
-    def runs(self) -> tuple[Run, ...]:
+    def runs(self) -> tuple[OpenedLog, ...]:
         """All logs, the fitted one first."""
         return (self.fit, *self.validations)
 
@@ -125,9 +125,7 @@ def open_session(
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
 
 
-def session_around(
-    case: Case, machine: Machine, log: Log, recipe: Recipe | None = None
-) -> Session:
+def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None = None) -> Session:
     """A session around a simulated log, which no file was read for and nothing can be wrong with.
 
     Args:
@@ -145,9 +143,7 @@ def session_around(
     return Session(case, _scaled(machine, run.data), run, (), recipe, ())
 
 
-def _read(
-    case: Case, log: Log | str | Path, *, columns: dict | None = None, whole: bool = False
-) -> Log:
+def _read(case: Case, log: Log | str | Path, *, columns: dict | None = None, whole: bool = False) -> Log:
     """A log, or that of a file by the case's columns or others; `whole`: all its rows."""
     joints, drives, load = case.plant.joints, case.plant.drives, case.plant.cls.load
     if not isinstance(log, Log):
@@ -162,8 +158,9 @@ def _read(
         if values is not None and values.shape[1] != width:
             what = "joint" if name == "position" else "drive"
             raise InputError(
-                f"{name} has {values.shape[1]} column(s) where {width} belong", where=log.source,
-                mend=f"give one column a {what}, in the order of the {what}s",
+                f"{name} has {values.shape[1]} column(s) where {width} belong",
+                where=log.source,
+                hint=f"give one column a {what}, in the order of the {what}s",
             )
     return _without_gears(case, log)
 
@@ -180,7 +177,8 @@ def _without_gears(case: Case, log: Log) -> Log:
     rows = np.asarray(case.transmission)
     moved = {
         name: np.linalg.solve(rows, getattr(log, name).T).T
-        for name in ("position", "velocity", "acceleration", "reference") if getattr(log, name) is not None
+        for name in ("position", "velocity", "acceleration", "reference")
+        if getattr(log, name) is not None
     }
     return replace(log, force=log.force * np.asarray(case.gain) @ rows, **moved)
 
@@ -206,20 +204,22 @@ def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
     driven = plant.at_drives(np.arange(plant.joints))
     stated = machine.sensor.position_resolution is not None
     findings = check_log(
-        log, command_limit=limit, motion=units.motion,
-        units={"position": units.position} if units.position else None, driven=driven,
-        fewest_levels=2 if held else FEWEST_LEVELS, resolution_stated=stated,
+        log,
+        command_limit=limit,
+        motion=units.motion,
+        units={"position": units.position} if units.position else None,
+        driven=driven,
+        fewest_levels=2 if held else FEWEST_LEVELS,
+        resolution_stated=stated,
     )
     impossible = plant.impossible(log.position) if all(log.measured) else None
     if impossible is not None:
         row, what = impossible
-        mend = "check the lengths, the zeros of the angles and their unit (rad)"
-        findings.append(Finding("error", f"row {log.rows[0] + row}: {what}", f"{log.source}, position", mend))
+        hint = "check the lengths, the zeros of the angles and their unit (rad)"
+        findings.append(Finding("error", f"row {log.rows[0] + row}: {what}", f"{log.source}, position", hint))
     inertia = plant.own_inertia()
     if inertia is not None:
-        slip = plausible_inertia(
-            log, np.asarray(inertia), machine.gain, motion=units.motion, driven=driven
-        )
+        slip = plausible_inertia(log, np.asarray(inertia), machine.gain, motion=units.motion, driven=driven)
         findings += [slip] if slip is not None else []
     raise_on_error(findings)
     return findings
@@ -232,9 +232,9 @@ def enough(machine: Machine) -> int:
 
 def _run(
     name: str, log: Log, machine: Machine, recipe: Recipe, needed: int, disturbance: dict | str | None
-) -> Run:
+) -> OpenedLog:
     log = recipe.cleaned(log)
-    return Run(name, log, _prepare(log, machine, recipe, needed), disturbance)
+    return OpenedLog(name, log, _prepare(log, machine, recipe, needed), disturbance)
 
 
 def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepared:
@@ -244,7 +244,8 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepare
             f"too short: {log.samples} samples leave {max(left, 0)} after decimation by "
             f"{recipe.decimation} and trimming {recipe.trim} at each end, as [preprocess] states or "
             "the log's noise asks",
-            where=log.source, mend="take a longer log, or lower decimation and trim in [preprocess]",
+            where=log.source,
+            hint="take a longer log, or lower decimation and trim in [preprocess]",
         )
     data = prepare(log, machine.gain, recipe, machine.hold_period)
     if not all(log.measured):
@@ -253,7 +254,8 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepare
         raise InputError(
             f"only {int(data.moving.sum())} samples move faster than the rest velocity "
             f"{min(recipe.rest_velocity):.3g}",
-            where=log.source, mend="take a log with more motion, or lower rest_velocity",
+            where=log.source,
+            hint="take a log with more motion, or lower rest_velocity",
         )
     return data
 

@@ -90,8 +90,14 @@ class Ran:
 
 
 def driven(
-    case: Path, *, encoder: float = 0.0, torque: float = 0.0, inertial: tuple[float, float] | None = None,
-    seed: int = 0, live: Live | None = None, ticks: int | None = None,
+    case: Path,
+    *,
+    encoder: float = 0.0,
+    torque: float = 0.0,
+    inertial: tuple[float, float] | None = None,
+    seed: int = 0,
+    live: Live | None = None,
+    ticks: int | None = None,
 ) -> Ran:
     """Drive textbook equations of motion by a case's controller.
 

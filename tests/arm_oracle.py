@@ -7,8 +7,16 @@ Lagrange's derivation; nothing is recursive, and no frame but the base's is used
 import numpy as np
 
 NAMES = (
-    "mass", "first_moment_x", "first_moment_y", "first_moment_z",
-    "inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz",
+    "mass",
+    "first_moment_x",
+    "first_moment_y",
+    "first_moment_z",
+    "inertia_xx",
+    "inertia_xy",
+    "inertia_xz",
+    "inertia_yy",
+    "inertia_yz",
+    "inertia_zz",
 )
 
 

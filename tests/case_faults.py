@@ -83,7 +83,7 @@ def second(keys: str) -> str:
     return more(f'[[validation]]\nname = "second"\n{keys}\n')
 
 
-# Each fault, and what its message must hold: table, key, mend.
+# Each fault, and what its message must hold: table, key, hint.
 FAULTS = {
     # names
     "unknown table": (more("[sensr]"), ["[sensr]", "'sensor'"]),
@@ -209,15 +209,18 @@ FAULTS = {
     "median even": (more("[preprocess]\nmedian = 4"), ["median = 4", "is even", "median = 5"]),
     "median of one": (more("[preprocess]\nmedian = 1"), ["median = 1", "at least 3"]),
     "derivatives": (
-        more('[preprocess]\nderivatives = "parabola"'), ["derivatives", "did you mean 'parabolic'"]
+        more('[preprocess]\nderivatives = "parabola"'),
+        ["derivatives", "did you mean 'parabolic'"],
     ),
     "reach of none": (
-        more('[preprocess]\nderivatives = "parabolic"\nreach = 0'), ["reach = 0", "at least 1"]
+        more('[preprocess]\nderivatives = "parabolic"\nreach = 0'),
+        ["reach = 0", "at least 1"],
     ),
     "starts without a prior": (more("[output_error]\nstarts = 4"), ["starts goes with prior only"]),
     "reach alone": (more("[preprocess]\nreach = 3"), ["reach", 'derivatives = "parabolic"']),
     "parabola of a low-pass": (
-        more('[preprocess]\nderivatives = "parabolic"\ncutoff_hz = 60.0'), ["cutoff_hz", "leave out one"]
+        more('[preprocess]\nderivatives = "parabolic"\ncutoff_hz = 60.0'),
+        ["cutoff_hz", "leave out one"],
     ),
     "align_hold": (more("[preprocess]\nalign_hold = 1"), ["align_hold", "true or false"]),
     # controller
@@ -278,6 +281,6 @@ FAULTS = {
     "noise factors": (more("[study]\nnoise = 1.0"), ["[study]", "noise = 1.0", "list"]),
     "runs": (more("[study]\nruns = 0"), ["[study]", "runs = 0", "at least 1"]),
     # TOML itself
-    "syntax": ("[plant]\nkind axis\n", ["not TOML", "line 2", "mend"]),
+    "syntax": ("[plant]\nkind axis\n", ["not TOML", "line 2", "correct"]),
     "twice": (swapped("gain = 35.15", "gain = 1\ngain = 2"), ["not TOML", "line"]),
 }

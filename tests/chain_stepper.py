@@ -232,9 +232,11 @@ def simulate_under(
         drive[driven] = machine.gains * u[k]
         chain_kernel.hold(masses, springs, q, v, drive, pull, 1.0 / rate, float(step))
     return {
-        "t": np.arange(count) / rate, "position": reading,
+        "t": np.arange(count) / rate,
+        "position": reading,
         "force": u + sensor.force_noise * random.standard_normal(u.shape),
-        "true_position": truth[:, :, 0], "true_velocity": truth[:, :, 1],
+        "true_position": truth[:, :, 0],
+        "true_velocity": truth[:, :, 1],
     }
 
 

@@ -13,7 +13,9 @@ from written_logs import write_csv
 from jaxid.cli import main
 
 TRUTH = {
-    "inertia": 95.1, "viscous_friction.coefficient": 203.5, "coulomb_friction.level": 20.39,
+    "inertia": 95.1,
+    "viscous_friction.coefficient": 203.5,
+    "coulomb_friction.level": 20.39,
 }
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})
 COULOMB = ("coulomb_friction", {"level": 20.39})

@@ -62,9 +62,7 @@ def clip(u: float, limit: float) -> float:
 
 
 ROWS: dict[str, Row] = {
-    "viscous_friction": Row(
-        "viscous_friction", {"coefficient": 200.0}, lambda x: x.u - 200.0 * x.v
-    ),
+    "viscous_friction": Row("viscous_friction", {"coefficient": 200.0}, lambda x: x.u - 200.0 * x.v),
     "coulomb_friction": Row(*COULOMB, lambda x: x.u - 30.0 * sign(x.v), dry=True),
     "coulomb_friction of mu": Row(
         "coulomb_friction",
@@ -85,23 +83,15 @@ ROWS: dict[str, Row] = {
         lambda x: x.u - 30.0 * math.exp(-((x.v / 0.08) ** 2)) * sign(x.v),
         dry=True,
     ),
-    "asymmetric_viscous": Row(
-        "asymmetric_viscous", {"coefficient": 100.0}, lambda x: x.u - 100.0 * abs(x.v)
-    ),
-    "quadratic_drag": Row(
-        "quadratic_drag", {"coefficient": 300.0}, lambda x: x.u - 300.0 * x.v * abs(x.v)
-    ),
+    "asymmetric_viscous": Row("asymmetric_viscous", {"coefficient": 100.0}, lambda x: x.u - 100.0 * abs(x.v)),
+    "quadratic_drag": Row("quadratic_drag", {"coefficient": 300.0}, lambda x: x.u - 300.0 * x.v * abs(x.v)),
     "cubic_friction": Row("cubic_friction", {"coefficient": 700.0}, lambda x: x.u - 700.0 * x.v**3),
     "quartic_friction": Row(
         "quartic_friction", {"coefficient": 2000.0}, lambda x: x.u - 2000.0 * x.v**3 * abs(x.v)
     ),
     "constant_force": Row("constant_force", {"level": 25.0}, lambda x: x.u + 25.0),
-    "linear_stiffness": Row(
-        "linear_stiffness", {"coefficient": 2000.0}, lambda x: x.u - 2000.0 * x.q
-    ),
-    "quadratic_stiffness": Row(
-        "quadratic_stiffness", {"coefficient": 3e4}, lambda x: x.u - 3e4 * x.q**2
-    ),
+    "linear_stiffness": Row("linear_stiffness", {"coefficient": 2000.0}, lambda x: x.u - 2000.0 * x.q),
+    "quadratic_stiffness": Row("quadratic_stiffness", {"coefficient": 3e4}, lambda x: x.u - 3e4 * x.q**2),
     "cubic_stiffness": Row("cubic_stiffness", {"coefficient": 5e5}, lambda x: x.u - 5e5 * x.q**3),
     "cogging": Row(
         "cogging",
@@ -109,14 +99,13 @@ ROWS: dict[str, Row] = {
         lambda x: x.u - 20.0 * math.cos(2 * math.pi * x.q / 0.02 + 0.4),
     ),
     # own state: friction over its level, here 0.6
-    "hysteresis": Row(
-        "hysteresis", {"stiffness": 1e5, "level": 30.0}, lambda x: x.u - 30.0 * x.z, own=0.6
-    ),
+    "hysteresis": Row("hysteresis", {"stiffness": 1e5, "level": 30.0}, lambda x: x.u - 30.0 * x.z, own=0.6),
     "velocity_hysteresis": Row(
         "velocity_hysteresis",
         {"level": 30.0, "velocity": 0.3, "level_negative": 12.0},
-        lambda x: x.u - math.exp(-((x.v / 0.3) ** 2)) * (
-            30.0 * (x.v > 0 and x.a > 0) - 12.0 * (x.v < 0 and x.a < 0)
+        lambda x: (
+            x.u
+            - math.exp(-((x.v / 0.3) ** 2)) * (30.0 * (x.v > 0 and x.a > 0) - 12.0 * (x.v < 0 and x.a < 0))
         ),
         dry=True,
         affine=False,

@@ -161,7 +161,7 @@ def acceleration(robot: Robot, q, v, torque) -> np.ndarray:
     return (end - v) / h
 
 
-def course(times, seed, home=(1.9, 1.24), peak=0.32, count=6, band=(0.4, 3.0)) -> np.ndarray:
+def unknown_reference(times, seed, home=(1.9, 1.24), peak=0.32, count=6, band=(0.4, 3.0)) -> np.ndarray:
     """Sines about a place amid the workspace, which a robot of `Robot()` can reach, (time, 2) [rad]."""
     rng = np.random.default_rng(seed)
     f, phase = rng.uniform(*band, (2, count)), rng.uniform(0, 2 * np.pi, (2, count))
@@ -170,21 +170,40 @@ def course(times, seed, home=(1.9, 1.24), peak=0.32, count=6, band=(0.4, 3.0)) -
 
 
 def followed(
-    robot: Robot, *, duration=10.0, rate=1000.0, noise=1e-6, force_noise=0.0, resolution=0.0, seed=0,
-    gains=(1.0, 1.0), reduction=20.0, kp=150.0, kd=4.0, step=1e-5, reference=None,
+    robot: Robot,
+    *,
+    duration=10.0,
+    rate=1000.0,
+    noise=1e-6,
+    force_noise=0.0,
+    resolution=0.0,
+    seed=0,
+    gains=(1.0, 1.0),
+    reduction=20.0,
+    kp=150.0,
+    kd=4.0,
+    step=1e-5,
+    reference=None,
 ) -> dict[str, np.ndarray]:
     """A log of a PD loop: t, q1, q2, measured motor torques u1, u2, r1, r2.
 
     gains: actual over measured torque of each drive. The law's gains count at the motors [N m/rad].
     """
     times = np.arange(round(duration * rate)) / rate
-    reference = course(times, seed) if reference is None else reference
+    reference = unknown_reference(times, seed) if reference is None else reference
     rng = np.random.default_rng(seed + 1)
     speed = (reference[1] - reference[0]) * rate
     out, steps = np.empty((len(times), 6)), round(1 / rate / step)
     _run(
-        *arrays(robot), reduction * np.asarray(gains), np.array([kp, kd]), reference,
-        noise * rng.standard_normal((len(times), 2)), resolution, 1 / rate, steps, out,
+        *arrays(robot),
+        reduction * np.asarray(gains),
+        np.array([kp, kd]),
+        reference,
+        noise * rng.standard_normal((len(times), 2)),
+        resolution,
+        1 / rate,
+        steps,
+        out,
         np.array([reference[0], speed]),
     )
     command = out[:, 2:4] + force_noise * rng.standard_normal((len(times), 2))

@@ -14,15 +14,25 @@ from stepper import Loop, Sensor
 RATE = 1000.0
 COUNT = 5e-3 / 100_000  # m: a lead of 5 mm, 100 000 counts a revolution
 TRUTH = {
-    "motor_inertia": 72.3, "load_inertia": 34.8, "stiffness": 8.0e5, "damping": 126.0,
-    "viscous_friction[1].coefficient": 92.0, "viscous_friction[2].coefficient": 110.0,
-    "coulomb_friction[1].level": 10.0, "coulomb_friction[2].level": 10.4,
+    "motor_inertia": 72.3,
+    "load_inertia": 34.8,
+    "stiffness": 8.0e5,
+    "damping": 126.0,
+    "viscous_friction[1].coefficient": 92.0,
+    "viscous_friction[2].coefficient": 110.0,
+    "coulomb_friction[1].level": 10.0,
+    "coulomb_friction[2].level": 10.4,
 }
 # The wrong values from which every fit starts.
 GUESS = {
-    "motor_inertia": 50.0, "load_inertia": 60.0, "stiffness": 4e5, "damping": 300.0,
-    "viscous_friction[1].coefficient": 200.0, "viscous_friction[2].coefficient": 40.0,
-    "coulomb_friction[1].level": 4.0, "coulomb_friction[2].level": 25.0,
+    "motor_inertia": 50.0,
+    "load_inertia": 60.0,
+    "stiffness": 4e5,
+    "damping": 300.0,
+    "viscous_friction[1].coefficient": 200.0,
+    "viscous_friction[2].coefficient": 40.0,
+    "coulomb_friction[1].level": 4.0,
+    "coulomb_friction[2].level": 25.0,
 }
 SENSOR = Sensor(position_resolution=COUNT, position_noise=0.5 * COUNT, force_noise=0.1)
 GAIN = 35.15  # N/V
@@ -38,7 +48,9 @@ def machine(**changed: float) -> ChainMachine:
         tuple(p[f"viscous_friction[{k}].coefficient"] for k in (1, 2)),
         (0.0, p["stiffness"], 0.0),
         {("coulomb_friction", k): {"level": p[f"coulomb_friction[{k}].level"]} for k in (1, 2)},
-        actuated=(1,), actuator_gain=GAIN, coupling=(0.0, p["damping"], 0.0),
+        actuated=(1,),
+        actuator_gain=GAIN,
+        coupling=(0.0, p["damping"], 0.0),
     )
 
 
@@ -56,8 +68,13 @@ def trapezoids(
 
 
 def record(
-    axis: ChainMachine | None = None, *, duration: float = 8.0, reference: np.ndarray | None = None,
-    pulses: dict[str, float] | None = PULSES, law: dict[str, float] = LAW, sensor: Sensor = SENSOR,
+    axis: ChainMachine | None = None,
+    *,
+    duration: float = 8.0,
+    reference: np.ndarray | None = None,
+    pulses: dict[str, float] | None = PULSES,
+    law: dict[str, float] = LAW,
+    sensor: Sensor = SENSOR,
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
     """A log of the axis in its loop, as `simulate_chain` returns it."""
@@ -71,9 +88,12 @@ def columns(log: dict[str, np.ndarray], noise: float = 0.01) -> dict[str, np.nda
     """What a user would have: t, q, q_load, a_load (through so much noise [m/s^2]), u, ref."""
     accelerometer = noise * np.random.default_rng(len(log["t"])).standard_normal(len(log["t"]))
     return {
-        "t": log["t"], "q": log["position"][:, 0], "q_load": log["position"][:, 1],
+        "t": log["t"],
+        "q": log["position"][:, 0],
+        "q_load": log["position"][:, 1],
         "a_load": log["true_acceleration"][:, 1] + accelerometer,
-        "u": log["force"][:, 0], "ref": log["reference"][:, 0],
+        "u": log["force"][:, 0],
+        "ref": log["reference"][:, 0],
     }
 
 
@@ -81,15 +101,27 @@ def write(log: dict[str, np.ndarray], path: Path, noise: float = 0.01) -> None:
     """Write those columns as CSV."""
     table = columns(log, noise)
     np.savetxt(
-        path, np.column_stack([*table.values()]), delimiter=",", header=",".join(table), comments="",
+        path,
+        np.column_stack([*table.values()]),
+        delimiter=",",
+        header=",".join(table),
+        comments="",
         fmt="%.12g",
     )
 
 
 def text(
-    *, load: bool = True, known: dict[str, float] | None = None, guess: dict[str, float] = GUESS,
-    pulses: dict[str, float] | None = PULSES, law: dict[str, float] = LAW, sensor: Sensor = SENSOR,
-    offset: bool = False, accelerometer: bool = False, joints: tuple[int, ...] = (1, 2), effects: str = "",
+    *,
+    load: bool = True,
+    known: dict[str, float] | None = None,
+    guess: dict[str, float] = GUESS,
+    pulses: dict[str, float] | None = PULSES,
+    law: dict[str, float] = LAW,
+    sensor: Sensor = SENSOR,
+    offset: bool = False,
+    accelerometer: bool = False,
+    joints: tuple[int, ...] = (1, 2),
+    effects: str = "",
 ) -> str:
     """The case file: all of the axis unknown but what is given as known.
 

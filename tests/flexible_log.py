@@ -17,7 +17,8 @@ LAW = {"kp": 40.0, "kv": 320.0, "velocity_average": 2}
 PULSES = {"level": 4.0, "on": 0.012, "off": 0.119, "start": 0.25}  # V, s: 83 ms excites 30 Hz
 # Guesses of the inertias and the damping are too large; these are too small.
 SMALL = {"stiffness": 8e5} | {
-    f"{name}[{joint}].{key}": value for joint in (1, 2)
+    f"{name}[{joint}].{key}": value
+    for joint in (1, 2)
     for name, key, value in (("viscous_friction", "coefficient", 100.0), ("coulomb_friction", "level", 10.0))
 }
 
@@ -37,8 +38,13 @@ def flexible_log(
     reference = moves(t, (0.0, 0.22, 0.05, 0.18), (0.08, 0.2, 0.13, 0.25), 1.5, 0.15)
     sensor = Sensor(position_resolution=resolution, force_noise=force_noise)
     return axes.record(
-        axes.machine(**changed), duration=duration, reference=reference, pulses=PULSES, law=LAW,
-        sensor=sensor, seed=1,
+        axes.machine(**changed),
+        duration=duration,
+        reference=reference,
+        pulses=PULSES,
+        law=LAW,
+        sensor=sensor,
+        seed=1,
     )
 
 
@@ -63,7 +69,13 @@ def case(
     """
     guess = {name: SMALL[name] / far if name in SMALL else true * far for name, true in TRUTH.items()}
     text = axes.text(
-        load=measured == "positions", accelerometer=measured == "acceleration", guess=guess, law=LAW,
-        pulses=PULSES, sensor=Sensor(), joints=joints, effects=effects,
+        load=measured == "positions",
+        accelerometer=measured == "acceleration",
+        guess=guess,
+        law=LAW,
+        pulses=PULSES,
+        sensor=Sensor(),
+        joints=joints,
+        effects=effects,
     )
     return text + extra

@@ -307,6 +307,4 @@ def _coarse_nulls() -> Iterator[HiddenCase]:
         for k, noise in enumerate(NOISES):
             for sensor in (True, False):
                 length = (k + sensor) % 2
-                yield HiddenCase(
-                    "nulls", what, "coarse", noise, 0, (), declared, sensor, not sensor, length
-                )
+                yield HiddenCase("nulls", what, "coarse", noise, 0, (), declared, sensor, not sensor, length)

@@ -51,8 +51,7 @@ def pointed_at(record: Record) -> bool:
         return line is not None and abs(line - frequency) < max(0.1, _LINE * frequency)
     bursts, intervals = record["outside"]["bursts"], where["intervals"]
     hit = [
-        any(a - _AIM <= start + length / 2 <= b + _AIM for a, b in intervals)
-        for start, length, _ in bursts
+        any(a - _AIM <= start + length / 2 <= b + _AIM for a, b in intervals) for start, length, _ in bursts
     ]
     # Intervals over the whole log would hold every burst and say nothing.
     total = sum(b - a for a, b in intervals)

@@ -80,9 +80,7 @@ def _emps_loop(bandwidth: float, rate: float) -> Loop:
     slower = bandwidth / 120.0
     own = machines.EMPS_LOOP
     average = own.velocity_average if rate >= 1000.0 else 1
-    return dataclasses.replace(
-        own, kp=own.kp * slower, kv=own.kv * slower, velocity_average=average
-    )
+    return dataclasses.replace(own, kp=own.kp * slower, kv=own.kv * slower, velocity_average=average)
 
 
 def _servo_loop(bandwidth: float, rate: float) -> Loop:
@@ -125,15 +123,19 @@ SCALES = {
 # The servo through an encoder of 500 counts, sampled every 5 ms: quick moves, so that 100 samples
 # hold several.
 COARSE = dataclasses.replace(
-    SCALES["servo"], waypoints=(0.0, 1.5, -1.0, 2.0), speeds=(15.0, 25.0, 20.0, 12.0), rest=0.0,
-    sines=(2.3, 4.1), sines_peak=0.15, durations=(1.0, 0.5, 1.0), bandwidth=_hz(r200=6.0),
+    SCALES["servo"],
+    waypoints=(0.0, 1.5, -1.0, 2.0),
+    speeds=(15.0, 25.0, 20.0, 12.0),
+    rest=0.0,
+    sines=(2.3, 4.1),
+    sines_peak=0.15,
+    durations=(1.0, 0.5, 1.0),
+    bandwidth=_hz(r200=6.0),
 )
 COARSE_RESOLUTION = 2.0 * math.pi / 500.0  # rad
 
 
-def coarse_setup(
-    seed: int, noise: float, duration: float, rate: float, *, validation: bool = False
-) -> Setup:
+def coarse_setup(seed: int, noise: float, duration: float, rate: float, *, validation: bool = False) -> Setup:
     """The servo through that encoder, with three times the friction."""
     setup = COARSE.setup(seed, noise, duration, rate, validation=validation)
     sensor = Sensor(COARSE_RESOLUTION, 3e-6 * noise, 5e-3 * noise)

@@ -112,7 +112,8 @@ class View:
         total = fade * gain * log["true_command"]
         whiten = Whitener(setup, fade)
         return cls(
-            whiten(force), whiten(baseline),
+            whiten(force),
+            whiten(baseline),
             {k: whiten(column) for k, column in one_parameter(case, setup, log).items()},
             float(np.linalg.norm(left) / np.linalg.norm(total)),
         )

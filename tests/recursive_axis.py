@@ -8,7 +8,7 @@ from stepper import Sensor
 from stepper_machines import emps_like
 
 from jaxid.estimators import METHODS
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.session import open_session
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})
@@ -26,7 +26,7 @@ def slide(duration=8.0, seed=0, **effects):
 
 
 def estimate(path, log, method="recursive"):
-    return alone(METHODS[method](open_session(path, log)))
+    return run_alone(METHODS[method](open_session(path, log)))
 
 
 def written_axis(folder):

@@ -55,7 +55,10 @@ class SearchCase:
     def text(self, off: float = 1.4) -> str:
         """The case file that does not know the effect."""
         text = case_text(
-            self.setup(0), self.declared, off=off, inertia_known=self.inertia_known,
+            self.setup(0),
+            self.declared,
+            off=off,
+            inertia_known=self.inertia_known,
             orientation=self.orientation,
         )
         return text + (f'[discover]\ncandidates = ["{self.kind}"]\n' if self.asked else "")

@@ -43,7 +43,10 @@ def case_text(
     machine, factor = setup.machine, [off, 1.0 / off]
     inertia = machine.inertia
     lines = [
-        "[plant]", 'kind = "axis"', f'motion = "{motion}"', f'orientation = "{orientation}"',
+        "[plant]",
+        'kind = "axis"',
+        f'motion = "{motion}"',
+        f'orientation = "{orientation}"',
         "[plant.parameters]",
         f"inertia = {inertia!r}" if inertia_known else f"inertia = {{ guess = {inertia / off!r} }}",
     ]
@@ -56,8 +59,10 @@ def case_text(
     if sensor:
         s = setup.sensor
         lines += [
-            "[sensor]", f"position_resolution = {s.position_resolution!r}",
-            f"position_noise = {s.position_noise!r}", f"force_noise = {s.force_noise!r}",
+            "[sensor]",
+            f"position_resolution = {s.position_resolution!r}",
+            f"position_noise = {s.position_noise!r}",
+            f"force_noise = {s.force_noise!r}",
         ]
     return "\n".join(lines) + "\n"
 

@@ -31,9 +31,7 @@ def hidden(
     own = machines.emps_like(0, noise, len(reference) / 1000.0)
     effects = {name: dict(v) for name, v in declared} | {kind: dict(values)}
     machine = dataclasses.replace(own.machine, effects=effects)
-    return dataclasses.replace(
-        own, machine=machine, loop=dataclasses.replace(own.loop, reference=reference)
-    )
+    return dataclasses.replace(own, machine=machine, loop=dataclasses.replace(own.loop, reference=reference))
 
 
 def curved(seconds: float = 8.0) -> tuple[Setup, Declared]:

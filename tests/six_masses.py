@@ -14,7 +14,7 @@ from stepper import Sensor
 from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.commands.live import Live
-from jaxid.estimators.algebraic.online import Told
+from jaxid.estimators.algebraic.online import OnlineEstimate
 from jaxid.logs.log import Log
 
 CASE = Path(__file__).parent.parent / "experiments" / "cases" / "chain6.toml"
@@ -34,7 +34,7 @@ class Driven(NamedTuple):
 
     log: Log
     live: Live
-    told: list[Told | None]
+    told: list[OnlineEstimate | None]
     position: np.ndarray
     velocity: np.ndarray
 
@@ -63,7 +63,12 @@ def machine(case: Path = CASE, actuated: list[int] | None = None) -> ChainMachin
 
 
 def driven(
-    case: Path, seconds: float, *, identify: bool = False, noise: float = 0.0, seed: int = 0,
+    case: Path,
+    seconds: float,
+    *,
+    identify: bool = False,
+    noise: float = 0.0,
+    seed: int = 0,
     on: ChainMachine | None = None,
 ) -> Driven:
     """The case's controller called tick by tick on the exact chain, `on` in place of the case's own.

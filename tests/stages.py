@@ -29,11 +29,18 @@ LAW = {"kp": 1.0, "ki": 12.0, "kd": 0.03, "derivative_filter": 0.01}
 def _table(j, bm, fm, mt, bt, ft, cs1, cs2, vs, kl, cp, psi) -> dict[str, float]:
     """A column of Table 1 in SI, by the names of a case."""
     return {
-        "motor_inertia": j, "viscous_friction[1].coefficient": bm, "coulomb_friction[1].level": fm,
-        "table_mass": mt / 1e3, "viscous_friction[2].coefficient": bt / R, "coulomb_friction[2].level": ft,
-        "velocity_hysteresis[2].level": cs1, "velocity_hysteresis[2].level_negative": cs2,
-        "velocity_hysteresis[2].velocity": vs * PITCH, "stiffness": kl * 1e9,
-        "cogging[2].amplitude": cp / R, "cogging[2].phase": psi,
+        "motor_inertia": j,
+        "viscous_friction[1].coefficient": bm,
+        "coulomb_friction[1].level": fm,
+        "table_mass": mt / 1e3,
+        "viscous_friction[2].coefficient": bt / R,
+        "coulomb_friction[2].level": ft,
+        "velocity_hysteresis[2].level": cs1,
+        "velocity_hysteresis[2].level_negative": cs2,
+        "velocity_hysteresis[2].velocity": vs * PITCH,
+        "stiffness": kl * 1e9,
+        "cogging[2].amplitude": cp / R,
+        "cogging[2].phase": psi,
     }
 
 
@@ -57,11 +64,11 @@ def machine(data: int = 1, rigid: bool = False, **changed: float) -> ChainMachin
     motor, table = p["motor_inertia"] / R**2, p["table_mass"]
     effects = {
         ("actuator_lag", 1): {"time_constant": LAG},
-        ("velocity_hysteresis", 2): {
-            k: p[f"velocity_hysteresis[2].{k}"] for k in _RISING
-        },
+        ("velocity_hysteresis", 2): {k: p[f"velocity_hysteresis[2].{k}"] for k in _RISING},
         ("cogging", 2): {
-            "amplitude": p["cogging[2].amplitude"], "period": PITCH, "phase": p["cogging[2].phase"],
+            "amplitude": p["cogging[2].amplitude"],
+            "period": PITCH,
+            "phase": p["cogging[2].phase"],
         },
     }
     dry = [p["coulomb_friction[1].level"] / R, p["coulomb_friction[2].level"]]
@@ -72,7 +79,11 @@ def machine(data: int = 1, rigid: bool = False, **changed: float) -> ChainMachin
         return ChainMachine((motor + table,), (sum(viscous),), (0.0, 0.0), one, actuator_gain=GAIN / R)
     effects |= {("coulomb_friction", k): {"level": dry[k - 1]} for k in (1, 2)}
     return ChainMachine(
-        (motor, table), tuple(viscous), (0.0, p["stiffness"], 0.0), effects, actuated=(1,),
+        (motor, table),
+        tuple(viscous),
+        (0.0, p["stiffness"], 0.0),
+        effects,
+        actuated=(1,),
         actuator_gain=GAIN / R,
     )
 
@@ -89,8 +100,14 @@ def move(duration: float, distance: float, speed: float, onset: float, ramp: flo
 
 
 def record(
-    stage: ChainMachine, reference: np.ndarray, *, noise: float = 0.0, resolution: float = COUNT,
-    start: float = 0.0, seed: int = 0, step: float = 5e-6,
+    stage: ChainMachine,
+    reference: np.ndarray,
+    *,
+    noise: float = 0.0,
+    resolution: float = COUNT,
+    start: float = 0.0,
+    seed: int = 0,
+    step: float = 5e-6,
 ) -> dict[str, np.ndarray]:
     """A log of the stage in its loop: t, q [rad], x [m], i [A] through noise [A], ref [rad], and the truth.
 
@@ -99,12 +116,22 @@ def record(
     gains = {k: v if k == "derivative_filter" else v / R for k, v in LAW.items()}
     loop = Loop("pid", reference=reference * R, limit=5.0, **gains)
     log = simulate_chain(
-        stage, [loop], Sensor(resolution * R, 0.0, noise), rate=RATE, duration=len(reference) / RATE,
-        seed=seed, step=step, initial_position=start * R,
+        stage,
+        [loop],
+        Sensor(resolution * R, 0.0, noise),
+        rate=RATE,
+        duration=len(reference) / RATE,
+        seed=seed,
+        step=step,
+        initial_position=start * R,
     )
     return {
-        "t": log["t"], "q": log["position"][:, 0] / R, "x": log["true_position"][:, -1],
-        "i": log["force"][:, 0], "ref": reference, "true_q": log["true_position"][:, 0] / R,
+        "t": log["t"],
+        "q": log["position"][:, 0] / R,
+        "x": log["true_position"][:, -1],
+        "i": log["force"][:, 0],
+        "ref": reference,
+        "true_q": log["true_position"][:, 0] / R,
         "true_i": log["true_command"][:, 0],
     }
 
@@ -116,8 +143,14 @@ def write(log: dict[str, np.ndarray], path, columns: tuple[str, ...] = ("t", "q"
 
 
 def text(
-    data: int = 1, *, guess: dict[str, float] | None = None, known: tuple[str, ...] = (),
-    coupling: str = "rigid", reference: str = 'reference = "ref"', resolution: float = COUNT, more: str = "",
+    data: int = 1,
+    *,
+    guess: dict[str, float] | None = None,
+    known: tuple[str, ...] = (),
+    coupling: str = "rigid",
+    reference: str = 'reference = "ref"',
+    resolution: float = COUNT,
+    more: str = "",
     load: bool = True,
 ) -> str:
     """The case file: everything unknown, guesses at the truth unless others are given.
@@ -144,18 +177,32 @@ def text(
 
     plant = ["motor_inertia", "table_mass", *(["stiffness"] if coupling == "elastic" else [])]
     lines = [
-        "[plant]", 'kind = "micropositioning_stage"', f'coupling = "{coupling}"', "[plant.parameters]",
-        f"pitch = {PITCH}", *[f"{n} = {entry(n)}" for n in plant],
+        "[plant]",
+        'kind = "micropositioning_stage"',
+        f'coupling = "{coupling}"',
+        "[plant.parameters]",
+        f"pitch = {PITCH}",
+        *[f"{n} = {entry(n)}" for n in plant],
         *effect("actuator_lag", "1", f"time_constant = {LAG}"),
         *effect("coulomb_friction", "", both("coulomb_friction.level")),
         *effect("viscous_friction", "", both("viscous_friction.coefficient")),
         *effect("velocity_hysteresis", "2", *own("velocity_hysteresis", *_RISING)),
         *effect("cogging", "2", f"period = {PITCH}", *own("cogging", "amplitude", "phase")),
-        "[actuator]", f"gain = {GAIN}", "[log]", 'time = "t"', 'position = "q"', 'force = "i"', reference,
+        "[actuator]",
+        f"gain = {GAIN}",
+        "[log]",
+        'time = "t"',
+        'position = "q"',
+        'force = "i"',
+        reference,
         *(['load_position = "x"'] if coupling == "elastic" and load else []),
-        "[controller]", 'kind = "pid"', *[f"{k} = {v}" for k, v in LAW.items()],
-        f"period = {1 / RATE}", "limit = 5.0",
-        *(["[sensor]", f"position_resolution = {resolution!r}"] if resolution else []), more,
+        "[controller]",
+        'kind = "pid"',
+        *[f"{k} = {v}" for k, v in LAW.items()],
+        f"period = {1 / RATE}",
+        "limit = 5.0",
+        *(["[sensor]", f"position_resolution = {resolution!r}"] if resolution else []),
+        more,
     ]
     return "\n".join(lines) + "\n"
 
@@ -206,11 +253,25 @@ def long_case(folder: Path, reference: np.ndarray) -> tuple[Path, Path]:
     write(log, folder / "hidden.csv")
     whole = text(1, resolution=fine)
     lines = [
-        "[plant]", 'kind = "micropositioning_stage"', 'coupling = "rigid"', "[plant.parameters]",
-        f"pitch = {PITCH}", "table_mass = 0.417", "motor_inertia = { guess = 1e-5 }",
-        "[[effects]]", 'kind = "actuator_lag"', "joint = 1", f"time_constant = {LAG}",
-        "[[effects]]", 'kind = "coulomb_friction"', "joint = 1", "level = { guess = 5e-3 }",
-        "[[effects]]", 'kind = "viscous_friction"', "joint = 1", "coefficient = { guess = 1e-4 }",
+        "[plant]",
+        'kind = "micropositioning_stage"',
+        'coupling = "rigid"',
+        "[plant.parameters]",
+        f"pitch = {PITCH}",
+        "table_mass = 0.417",
+        "motor_inertia = { guess = 1e-5 }",
+        "[[effects]]",
+        'kind = "actuator_lag"',
+        "joint = 1",
+        f"time_constant = {LAG}",
+        "[[effects]]",
+        'kind = "coulomb_friction"',
+        "joint = 1",
+        "level = { guess = 5e-3 }",
+        "[[effects]]",
+        'kind = "viscous_friction"',
+        "joint = 1",
+        "coefficient = { guess = 1e-4 }",
     ]
     (folder / "hidden.toml").write_text("\n".join(lines) + "\n" + whole[whole.index("[actuator]") :])
     return folder / "hidden.toml", folder / "hidden.csv"

@@ -36,7 +36,9 @@ EFFECTS = {
     "cubic_stiffness": {"coefficient": "stiffness3"},
     "cogging": {"amplitude": "cogging", "period": "cogging_period", "phase": "cogging_phase"},
     "velocity_hysteresis": {
-        "level": "rising_forth", "level_negative": "rising_back", "velocity": "rising_velocity",
+        "level": "rising_forth",
+        "level_negative": "rising_back",
+        "velocity": "rising_velocity",
     },
     "hysteresis": {"stiffness": "dahl_stiffness", "level": "dahl_level"},
     "actuator_gain": {"gain": "gain"},
@@ -146,9 +148,7 @@ def physics(machine: Machine) -> kernel.Physics:
     coulomb = effects.get("coulomb_friction", {})
     if "friction_coefficient" in coulomb:
         added = effects.get("added_mass", {}).get("mass", 0.0)
-        coulomb["level"] = (
-            coulomb.pop("friction_coefficient") * (machine.inertia + added) * STANDARD_GRAVITY
-        )
+        coulomb["level"] = coulomb.pop("friction_coefficient") * (machine.inertia + added) * STANDARD_GRAVITY
     fields = {}
     for kind, values in effects.items():
         if kind not in EFFECTS:
@@ -177,9 +177,7 @@ def control_law(loop: Loop) -> kernel.Law:
     pulses = {name: float(value) for name, value in (loop.disturbance or {}).items()}
     gains = {
         name: float(getattr(loop, name))
-        for name in (
-            "kp", "kv", "ki", "kd", "derivative_filter", "limit", "coulomb", "viscous", "inertia"
-        )
+        for name in ("kp", "kv", "ki", "kd", "derivative_filter", "limit", "coulomb", "viscous", "inertia")
     }
     average, windup = int(loop.velocity_average), bool(loop.anti_windup)
     return kernel.Law(kind=KINDS[loop.kind], average=average, anti_windup=windup, **gains, **pulses)

@@ -215,9 +215,7 @@ def acceleration(p, bursts, q, v, z, drive, t):
 @njit(cache=True)
 def pulse(law, t):
     """Square disturbance on the command at t [s]."""
-    since = (
-        t - law.start + 1e-9
-    )  # chosen: a tick that falls on an edge belongs to what begins there
+    since = t - law.start + 1e-9  # chosen: a tick that falls on an edge belongs to what begins there
     if law.level == 0.0 or since < 0.0 or since % (law.on + law.off) >= law.on + 1e-12:
         return 0.0
     return law.level

@@ -26,9 +26,7 @@ def single_move(t: np.ndarray, distance: float, speed: float, acceleration: floa
     rising, falling = 0.5 * acceleration * t**2, length - 0.5 * acceleration * left**2
     cruise = peak * (t - 0.5 * peak / acceleration)
     ramp = peak / acceleration
-    return math.copysign(1.0, distance) * np.where(
-        t < ramp, rising, np.where(left < ramp, falling, cruise)
-    )
+    return math.copysign(1.0, distance) * np.where(t < ramp, rising, np.where(left < ramp, falling, cruise))
 
 
 def move_time(distance: float, speed: float, acceleration: float) -> float:
@@ -64,9 +62,7 @@ def moves(
     return position
 
 
-def multisine(
-    t: np.ndarray, frequencies: Sequence[float], peak: float, seed: int = 0
-) -> np.ndarray:
+def multisine(t: np.ndarray, frequencies: Sequence[float], peak: float, seed: int = 0) -> np.ndarray:
     """Sum of equal sines of random phase, scaled to `peak` and shifted to start at zero.
 
     Args:
@@ -76,16 +72,12 @@ def multisine(
         seed: Of the phases.
     """
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi, len(frequencies))
-    wave = sum(
-        np.sin(2.0 * math.pi * f * t + phase) for f, phase in zip(frequencies, phases, strict=True)
-    )
+    wave = sum(np.sin(2.0 * math.pi * f * t + phase) for f, phase in zip(frequencies, phases, strict=True))
     wave = wave * (peak / np.abs(wave).max())
     return wave - wave[0]
 
 
-def random_bursts(
-    duration: float, count: int, length: float, amplitude: float, seed: int = 0
-) -> list:
+def random_bursts(duration: float, count: int, length: float, amplitude: float, seed: int = 0) -> list:
     """Force pulses of either sign at random times, for `Machine.bursts`.
 
     Args:
@@ -98,8 +90,7 @@ def random_bursts(
     random = np.random.default_rng(seed)
     starts, signs = np.sort(random.uniform(0.0, duration, count)), random.choice([-1.0, 1.0], count)
     return [
-        (float(start), length, float(sign) * amplitude)
-        for start, sign in zip(starts, signs, strict=True)
+        (float(start), length, float(sign) * amplitude) for start, sign in zip(starts, signs, strict=True)
     ]
 
 
@@ -141,9 +132,7 @@ def varied(seed: int, values: Sequence[float], spread: float) -> np.ndarray:
     """Values as they stand for seed 0, else each scaled at random by 1 +/- spread."""
     if seed == 0:
         return np.array(values, dtype=float)
-    return np.array(values) * np.random.default_rng(seed).uniform(
-        1.0 - spread, 1.0 + spread, len(values)
-    )
+    return np.array(values) * np.random.default_rng(seed).uniform(1.0 - spread, 1.0 + spread, len(values))
 
 
 EMPS_WAYPOINTS = (0.0, 0.01693, 0.08182, 0.22942, 0.24635, 0.22942, 0.16454, 0.01693)  # m
@@ -162,17 +151,13 @@ def emps_like(seed: int = 0, noise: float = 1.0, duration: float = 25.0) -> Setu
     """
     t = np.arange(round(duration * 1000.0)) / 1000.0
     stroke = varied(seed, [1.0], 0.2)[0]
-    reference = moves(
-        t, stroke * np.array(EMPS_WAYPOINTS), varied(seed, EMPS_SPEEDS, 0.2), EMPS_ACCELERATION
-    )
+    reference = moves(t, stroke * np.array(EMPS_WAYPOINTS), varied(seed, EMPS_SPEEDS, 0.2), EMPS_ACCELERATION)
     machine = Machine(
         inertia=95.1,
         actuator_gain=35.15065,
         effects={"viscous_friction": {"coefficient": 203.5}, "coulomb_friction": {"level": 20.39}},
     )
-    sensor = Sensor(
-        position_resolution=5e-8, position_noise=1.2e-8 * noise, force_noise=2e-3 * noise
-    )
+    sensor = Sensor(position_resolution=5e-8, position_noise=1.2e-8 * noise, force_noise=2e-3 * noise)
     loop = dataclasses.replace(EMPS_LOOP, reference=reference)
     return Setup(machine, loop, sensor, rate=1000.0, duration=duration, seed=seed)
 
@@ -197,9 +182,7 @@ def servo(seed: int = 0, noise: float = 1.0, duration: float = 10.0) -> Setup:
         reference=reference,
     )  # fmt: skip
     resolution = 2.0 * math.pi / 2**20
-    sensor = Sensor(
-        position_resolution=resolution, position_noise=3e-6 * noise, force_noise=5e-3 * noise
-    )
+    sensor = Sensor(position_resolution=resolution, position_noise=3e-6 * noise, force_noise=5e-3 * noise)
     return Setup(machine, loop, sensor, rate=1000.0, duration=duration, seed=seed)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxid.dynamics.dry_friction import set_valued_step
-from jaxid.dynamics.rhs import State, affine_flow, course, step
+from jaxid.dynamics.rhs import State, affine_flow, hold_polynomial, step
 from jaxid.effects import EFFECTS
 from jaxid.model.effect import Action, Effect
 from jaxid.numerics.affine import affine
@@ -67,11 +67,11 @@ def test_matrix_is_the_step(held):
     ends = (jnp.asarray([1.3]),) if held else (jnp.asarray([1.3]), jnp.asarray([-0.4]))
     reaction = jnp.asarray([0.6])
     flow = flow_of(plant, held)
-    stepped = step(plant, x, course(ends), jnp.asarray(5.0), STEP, reaction)
+    stepped = step(plant, x, hold_polynomial(ends), jnp.asarray(5.0), STEP, reaction)
     for a, b in zip(*map(jax.tree.leaves, (flow(x, ends, reaction), stepped)), strict=True):
         np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-13)
     # left out: zero
-    free = step(plant, x, course(ends), jnp.asarray(5.0), STEP, jnp.zeros(1))
+    free = step(plant, x, hold_polynomial(ends), jnp.asarray(5.0), STEP, jnp.zeros(1))
     np.testing.assert_allclose(np.asarray(flow(x, ends).qd), np.asarray(free.qd), rtol=1e-13)
 
 
@@ -81,8 +81,8 @@ def test_set_valued_step_is_the_same_either_way(v):
     x = State(jnp.asarray([0.1]), jnp.asarray([v]), plant.initial_states(jnp.asarray([4.5])))
     u = (jnp.asarray([4.5]),)
     flow = flow_of(plant)
-    fast = set_valued_step(plant, x, course(u), t, STEP, lambda x, *r: flow(x, u, *r))
-    slow = set_valued_step(plant, x, course(u), t, STEP)
+    fast = set_valued_step(plant, x, hold_polynomial(u), t, STEP, lambda x, *r: flow(x, u, *r))
+    slow = set_valued_step(plant, x, hold_polynomial(u), t, STEP)
     for a, b in zip(*map(jax.tree.leaves, (fast, slow)), strict=True):
         np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-12, atol=1e-15)
 

@@ -22,12 +22,15 @@ KP = np.array([3000.0, 3000.0, 800.0, 800.0, 150.0, 80.0, 30.0])
 KD = np.array([150.0, 150.0, 40.0, 40.0, 4.0, 2.5, 1.0])
 AXES, ORIGINS = (np.asarray(x) for x in pa10().frames(np.zeros(7)))
 ARM = Arm(
-    AXES, ORIGINS, bodies(7, np.random.default_rng(0)) * np.linspace(1.0, 0.2, 7)[:, None],
-    np.array([4.0, 5.6, 1.7, 2.7, 1.6, 0.8, 0.25]), np.array([9.6, 16.0, 3.7, 5.9, 3.7, 2.0, 1.0]),
+    AXES,
+    ORIGINS,
+    bodies(7, np.random.default_rng(0)) * np.linspace(1.0, 0.2, 7)[:, None],
+    np.array([4.0, 5.6, 1.7, 2.7, 1.6, 0.8, 0.25]),
+    np.array([9.6, 16.0, 3.7, 5.9, 3.7, 2.0, 1.0]),
 )
 
 
-def course() -> np.ndarray:
+def unknown_reference() -> np.ndarray:
     """Two seconds of sines from rest, each joint turning at a time of its own."""
     t = np.arange(0, 2.0, 1 / RATE)[:, None]
     hz = np.linspace(0.5, 1.1, 7)
@@ -36,7 +39,7 @@ def course() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def truth():
-    return followed(ARM, course(), rate=RATE, kp=KP, kd=KD, step=2e-4)
+    return followed(ARM, unknown_reference(), rate=RATE, kp=KP, kd=KD, step=2e-4)
 
 
 def plant() -> SerialArm:
@@ -51,13 +54,15 @@ def replayed(arm: SerialArm, substeps: int = 1) -> np.ndarray:
     """Positions of the same loop by the package's step."""
     drive = Drive(jnp.ones(7), 1 / RATE, substeps=substeps, set_valued=True)
     law = PD(KP, KD, period=1 / RATE)
-    reference = jnp.asarray(course())
+    reference = jnp.asarray(unknown_reference())
     start = (reference[0], jnp.zeros(7))
     return closed_loop(arm, drive, law, reference, jnp.zeros_like(reference), *start).position
 
 
 def test_the_stepper_settles_as_its_steps_shrink(truth):
-    coarse, middle = (followed(ARM, course(), rate=RATE, kp=KP, kd=KD, step=h)["q"] for h in (1e-3, 5e-4))
+    coarse, middle = (
+        followed(ARM, unknown_reference(), rate=RATE, kp=KP, kd=KD, step=h)["q"] for h in (1e-3, 5e-4)
+    )
     off = [np.abs(q - truth["q"]).max() for q in (coarse, middle)]
     assert off[1] < 0.5 * off[0]
     assert off[1] < 5e-6

@@ -16,8 +16,17 @@ from jaxid.plants import Axis, pa10
 
 # (2.16) of the PA-10 report: no torque depends on them.
 WITHOUT_EFFECT = {
-    "inertia_xx[1]", "inertia_xy[1]", "inertia_xz[1]", "inertia_yy[1]", "inertia_yz[1]", "first_moment_x[1]",
-    "first_moment_y[1]", "first_moment_z[1]", "mass[1]", "first_moment_z[2]", "mass[2]",
+    "inertia_xx[1]",
+    "inertia_xy[1]",
+    "inertia_xz[1]",
+    "inertia_yy[1]",
+    "inertia_yz[1]",
+    "first_moment_x[1]",
+    "first_moment_y[1]",
+    "first_moment_z[1]",
+    "mass[1]",
+    "first_moment_z[2]",
+    "mass[2]",
 }
 
 
@@ -85,8 +94,10 @@ def test_base_parameters_give_all_torques(name):
     found = base_parameters(plant, seed=1)
     states = rng.uniform(-2, 2, (3, 10, len(rows)))
     columns = np.asarray(inertial_regressor(plant, *states))
-    torque = [arm_oracle.inverse_dynamics(rows, _bodies(plant), *x, plant.gravity_vector)
-              for x in states.transpose(1, 0, 2)]
+    torque = [
+        arm_oracle.inverse_dynamics(rows, _bodies(plant), *x, plant.gravity_vector)
+        for x in states.transpose(1, 0, 2)
+    ]
     torque = np.array(torque) + np.asarray(plant.rotor_inertia) * states[2]
     told, near = columns[..., list(found.chosen)] @ found.of(plant), 1e-9 * np.abs(torque).max()
     np.testing.assert_allclose(told, torque, rtol=0, atol=near)
@@ -99,13 +110,19 @@ def _bodies(plant):
 
 def test_scara_in_the_plane_has_five():
     rows = [
-        ("revolute", 0.0, 0.0, 0.2, 0.0), ("revolute", 0.0, 0.4, 0.0, 0.0), ("prismatic", 0.0, 0.3, 0.0, 0.0),
+        ("revolute", 0.0, 0.0, 0.2, 0.0),
+        ("revolute", 0.0, 0.4, 0.0, 0.0),
+        ("prismatic", 0.0, 0.3, 0.0, 0.0),
     ]
     plant = arm(rows, np.ones((3, 10)), (0.0, 0.0, -9.81))
     found = base_parameters(plant)
     # both arms' inertia, the outer one's centre of mass, and what the slide lifts
     assert found.chosen_names == (
-        "inertia_zz[1]", "first_moment_x[2]", "first_moment_y[2]", "inertia_zz[2]", "mass[3]",
+        "inertia_zz[1]",
+        "first_moment_x[2]",
+        "first_moment_y[2]",
+        "inertia_zz[2]",
+        "mass[3]",
     )
 
 
@@ -132,8 +149,13 @@ def random_rows(rng, joints):
     pick = lambda *values: float(rng.choice(values))
     right = np.pi / 2
     return [
-        (str(rng.choice(["revolute", "revolute", "prismatic"])), pick(0, 0, right, -right, np.pi, 0.7),
-         pick(0, 0, 0.3, -0.2), pick(0, 0.25), pick(0, 0.4, right))
+        (
+            str(rng.choice(["revolute", "revolute", "prismatic"])),
+            pick(0, 0, right, -right, np.pi, 0.7),
+            pick(0, 0, 0.3, -0.2),
+            pick(0, 0.25),
+            pick(0, 0.4, right),
+        )
         for _ in range(joints)
     ]
 
@@ -152,7 +174,8 @@ def test_closed_rules_give_the_numerical_mapping_of_the_pa10(rotors):
     # of the rotors, the first two are seen as parts of their links
     assert len(found.chosen) == 43 + 5 * rotors
     assert "inertia_xx[6] -1 inertia_yy[6] +0.16 first_moment_z[7] +0.0064 mass[7] + inertia_yy[7]" in (
-        found.text())
+        found.text()
+    )
 
 
 def test_closed_rules_give_the_numerical_mapping_of_the_tx40():
@@ -176,11 +199,23 @@ def test_closed_rules_give_the_numerical_mapping_of_random_chains(seed):
 # What takes a rule of its own: a slide before, along, across and askew of the only direction of rotation, two
 # joints on one axis, and slides at right angles with rotors and without weight.
 SPECIAL = [
-    "PP", "PRP", "RPaR", "RPxP", "RPoR", "RR0", "RR0P", "RPaR0", "PxP", "RPaP",
+    "PP",
+    "PRP",
+    "RPaR",
+    "RPxP",
+    "RPoR",
+    "RR0",
+    "RR0P",
+    "RPaR0",
+    "PxP",
+    "RPaP",
 ]
 _ROWS = {
-    "P": ("prismatic", 0.3, 0.1, 0.2, 0.1), "R": ("revolute", 0.0, 0.0, 0.2, 0.3), "0": None,
-    "a": ("prismatic", 0.0, 0.3, 0.1, 0.2), "x": ("prismatic", np.pi / 2, 0.2, 0.0, 0.0),
+    "P": ("prismatic", 0.3, 0.1, 0.2, 0.1),
+    "R": ("revolute", 0.0, 0.0, 0.2, 0.3),
+    "0": None,
+    "a": ("prismatic", 0.0, 0.3, 0.1, 0.2),
+    "x": ("prismatic", np.pi / 2, 0.2, 0.0, 0.0),
     "o": ("prismatic", 0.6, 0.2, 0.1, 0.4),
 }
 
@@ -203,12 +238,21 @@ def test_closed_rules_ask_for_weight():
 def test_angles_of_five_digits_are_right_angles_where_asked():
     rows = [(j, np.round(alpha, 4), *rest) for j, alpha, *rest in ROWS["pa10"]]
     plant = arm(rows, np.ones((7, 10)), (0.0, 0.0, -9.81))
-    assert base_parameters_by_rules(plant, 1e-4).chosen_names == base_parameters_by_rules(
-        pa10_arm()[0]).chosen_names
+    assert (
+        base_parameters_by_rules(plant, 1e-4).chosen_names
+        == base_parameters_by_rules(pa10_arm()[0]).chosen_names
+    )
 
 
-KNOWN = ("mass", "first_moment_x", "first_moment_y", "first_moment_z",
-         "inertia_xy", "inertia_xz", "inertia_yz")
+KNOWN = (
+    "mass",
+    "first_moment_x",
+    "first_moment_y",
+    "first_moment_z",
+    "inertia_xy",
+    "inertia_xz",
+    "inertia_yz",
+)
 
 
 def test_symmetric_links_of_known_mass_leave_thirteen():

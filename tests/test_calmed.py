@@ -14,7 +14,7 @@ from jaxid.estimators.within_prior.problem import Problem
 from jaxid.logs.log import Log
 from jaxid.session import open_session
 from jaxid.simulation.replay import make_replay
-from jaxid.simulation.step_size import calmed
+from jaxid.simulation.step_size import with_numerical_damping
 
 REST = jnp.zeros(2)
 
@@ -30,15 +30,15 @@ def test_a_ring_that_no_sample_shows_is_damped(tmp_path):
     truth, motor = stages.TRUTH[1], stages.TRUTH[1]["motor_inertia"] / stages.R**2
     reduced = 1 / (1 / motor + 1 / truth["table_mass"])
     assert np.sqrt(truth["stiffness"] / reduced) / (2 * np.pi) == pytest.approx(990, rel=0.01)
-    *before, more = calmed(plant, REST, 1 / stages.RATE).effects
+    *before, more = with_numerical_damping(plant, REST, 1 / stages.RATE).effects
     assert [(e.kind, e.port) for e in before] == [(e.kind, e.port) for e in plant.effects]
     assert (more.kind, plant.place(more.port)) == ("viscous_friction", ("spring", 1))
     assert float(more.coefficient) == pytest.approx(0.6 * np.sqrt(truth["stiffness"] * reduced), rel=1e-9)
-    assert calmed(plant, REST, 1 / 5000) is plant
+    assert with_numerical_damping(plant, REST, 1 / 5000) is plant
     damped = dataclasses.replace(plant, damping=jnp.asarray(1.01 * more.coefficient))
-    assert calmed(damped, REST, 1 / stages.RATE) is damped
+    assert with_numerical_damping(damped, REST, 1 / stages.RATE) is damped
     half = dataclasses.replace(plant, damping=0.5 * more.coefficient)
-    lacking = calmed(half, REST, 1 / stages.RATE).effects[-1].coefficient
+    lacking = with_numerical_damping(half, REST, 1 / stages.RATE).effects[-1].coefficient
     assert float(lacking) == pytest.approx(0.5 * float(more.coefficient), rel=1e-9)
 
 

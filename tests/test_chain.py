@@ -18,11 +18,11 @@ from jaxid.case.case import load_case
 from jaxid.commands.discover import discover
 from jaxid.commands.identify import identify
 from jaxid.commands.simulate import simulate
-from jaxid.discovery.candidates import Samples as SearchSamples
+from jaxid.discovery.candidates import CandidateSamples as SearchSamples
 from jaxid.discovery.candidates import evaluate, points
-from jaxid.discovery.superset import build_union
+from jaxid.discovery.superset import build_candidate_model
 from jaxid.dynamics.dry_friction import set_valued_step
-from jaxid.dynamics.rhs import State, acceleration, course
+from jaxid.dynamics.rhs import State, acceleration, hold_polynomial
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.gap import force_gap
@@ -114,9 +114,7 @@ SPRING = '[[effects]]\nkind = "cubic_stiffness"\nspring = 2\ncoefficient = { gue
 
 
 def test_eigenfrequencies():
-    at = lambda q: acceleration(
-        plant(), State(q, jnp.zeros(3), ()), jnp.zeros(3), jnp.zeros(())
-    )
+    at = lambda q: acceleration(plant(), State(q, jnp.zeros(3), ()), jnp.zeros(3), jnp.zeros(()))
     values = np.linalg.eigvals(-np.asarray(jax.jacfwd(at)(jnp.zeros(3))))
     expected = np.linalg.eigvals(matrix(STIFFNESS) / MASS[:, None])
     np.testing.assert_allclose(np.sort(values), np.sort(expected), rtol=1e-12)
@@ -202,7 +200,7 @@ def test_diagonal_mass_gives_what_a_full_one_gives():
             p = p.with_effect(EFFECTS["coulomb_friction"](level=level, port=port))
         x = State(*motion, (None,) * 3)
         a = acceleration(p, x, u, jnp.zeros(()))
-        new = set_valued_step(p, x, course((u,)), jnp.zeros(()), jnp.asarray(1e-3))[0]
+        new = set_valued_step(p, x, hold_polynomial((u,)), jnp.zeros(()), jnp.asarray(1e-3))[0]
         found.append((a, new.q, new.qd))
         assert float(new.qd[1]) == 0.0
         assert float(new.qd[0]) != 0.0
@@ -220,9 +218,7 @@ def test_effects_of_one_kind_do_together_what_they_do_apart():
     apart = plant(effects=tuple(made[kind, port] for port in range(3) for kind in kinds))
     motion = [jnp.asarray(x) for x in ([0.1, 0.2, 0.3], [1.0, -2.0, 3.0], [0.3, 0.2, 0.1])]
     u = jnp.asarray([5.0, 6.0, 7.0])
-    one, two = (
-        p.balance(*motion, u, jnp.zeros(()), p.initial_states(2 * u)) for p in (together, apart)
-    )
+    one, two = (p.balance(*motion, u, jnp.zeros(()), p.initial_states(2 * u)) for p in (together, apart))
     np.testing.assert_allclose(one.residual, two.residual, rtol=1e-12)
     np.testing.assert_allclose(one.drive, two.drive, rtol=1e-12)
     assert one.slides == two.slides == (0, 1, 2)
@@ -300,7 +296,9 @@ FAULTS = {
     "one damping": ("[8.0, 7.0, 9.0]", "{ guess = 8.0 }", ["damping", "not a list", "of 3"]),
     "too few springs": (", 1500.0]", "]", ["stiffness", "3 entries", "give 4", "1 more than"]),
     "lists of two lengths": (
-        "[8.0, 7.0, 9.0]", "{ guess = [1.0, 2.0, 3.0], max = [9.0] }", ["damping.max", "1 entry"],
+        "[8.0, 7.0, 9.0]",
+        "{ guess = [1.0, 2.0, 3.0], max = [9.0] }",
+        ["damping.max", "1 entry"],
     ),
     "negative": ("1600.0", "-1600.0", ["stiffness[2]", ">= 0"]),
     "actuated out of range": ('"chain"', '"chain"\nactuated = [4]', ["actuated", "3 joints"]),
@@ -308,7 +306,8 @@ FAULTS = {
     "actuated nothing": ('"chain"', '"chain"\nactuated = []', ["actuated", "is empty"]),
     "actuated number": ('"chain"', '"chain"\nactuated = 2', ["actuated", "not a list"]),
     "gears to two drives": (
-        '"chain"', '"chain"\nactuated = [1, 3]\n[actuator]\ntransmission = [[1.0, 0.0], [1.0, 1.0]]',
+        '"chain"',
+        '"chain"\nactuated = [1, 3]\n[actuator]\ntransmission = [[1.0, 0.0], [1.0, 1.0]]',
         ["transmission", "a drive for each joint, not 2 for 3", "leave it out"],
     ),
     "actuated axis": ('"chain"', '"axis"\nactuated = [1]', ["actuated", "unknown key"]),
@@ -370,7 +369,9 @@ def test_a_log_of_the_wrong_width_is_refused(tmp_path):
 
 
 def test_simulated_logs_hold_a_column_a_joint_and_a_drive(tmp_path):
-    text = BARE.replace('"chain"', '"chain"\nactuated = [3, 1]') + """
+    text = (
+        BARE.replace('"chain"', '"chain"\nactuated = [3, 1]')
+        + """
 [controller]
 kind = "pd"
 kp = [1000.0, 2000.0]
@@ -385,6 +386,7 @@ amplitude = [0.01, 0.02]
 duration = 1.0
 sample_rate = 500.0
 """
+    )
     log = simulate(write(tmp_path, text)).log
     assert (log.position.shape, log.force.shape, log.reference.shape) == ((500, 3), (500, 2), (500, 2))
     assert np.ptp(log.reference[:, 1]) > 1.5 * np.ptp(log.reference[:, 0])
@@ -392,7 +394,7 @@ sample_rate = 500.0
 
 def test_candidates_sit_where_the_plant_has_room(tmp_path):
     session = open_session(write(tmp_path, unknown("2")), recorded((1,)), align_hold=True)
-    union = build_union(session.machine, session.fit.data)
+    union = build_candidate_model(session.machine, session.fit.data)
     labels = {c.label for c in union.candidates}
     assert {"cubic_stiffness[spring 4]", "coulomb_friction[1]", "actuator_lag[2]"} <= labels
     drives = {"actuator_gain", "actuator_lag", "input_delay", "saturation"}
@@ -400,14 +402,14 @@ def test_candidates_sit_where_the_plant_has_room(tmp_path):
     kinds = {c.kind for c in union.candidates}
     # Unknown masses, dampings and springs stand in the plant already.
     assert not {"added_mass", "viscous_friction", "linear_stiffness"} & kinds
-    known = build_union(build_machine(load_case(write(tmp_path, BARE))), session.fit.data)
+    known = build_candidate_model(build_machine(load_case(write(tmp_path, BARE))), session.fit.data)
     assert {"added_mass", "viscous_friction", "linear_stiffness"} <= {c.kind for c in known.candidates}
 
 
 @pytest.mark.slow
 def test_shared_columns_are_those_of_each_unknown(tmp_path):
     session = open_session(write(tmp_path, unknown()), recorded((0, 1, 2)), align_hold=True)
-    union = build_union(session.machine, session.fit.data)
+    union = build_candidate_model(session.machine, session.fit.data)
     samples = SearchSamples(session.fit.data)
     theta = union.neutral.copy()
     for c in union.candidates:
@@ -424,9 +426,7 @@ def test_shared_columns_are_those_of_each_unknown(tmp_path):
     c = next(c for c in union.candidates if c.label == "saturation[2]")
     rivals = [c for c in union.candidates if c.kind == "saturation"]
     (alone,) = (p for p in points(union, [c], samples, theta, e) if p.start == 3)
-    (among,) = (
-        p for p in points(union, rivals, samples, theta, e) if p.start == 3 and p.candidate is c
-    )
+    (among,) = (p for p in points(union, rivals, samples, theta, e) if p.start == 3 and p.candidate is c)
     np.testing.assert_allclose(alone.offset, among.offset, atol=1e-9)
 
 

@@ -182,8 +182,6 @@ def test_a_piped_process_prints_its_result_alone(tmp_path, files):
 def test_a_reader_who_leaves_is_no_accident():
     reading, writing = os.pipe()
     os.close(reading)
-    ended = subprocess.run(
-        [*ENTRY, "plants"], stdout=writing, stderr=subprocess.PIPE, text=True, check=False
-    )
+    ended = subprocess.run([*ENTRY, "plants"], stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)
     assert (ended.returncode, ended.stderr) == (1, "")

@@ -44,7 +44,9 @@ def test_errors_shrink_by_what_is_fed_forward(runs):
 def test_it_learns_from_encoders_alone(runs):
     live = runs["adaptive"].live
     assert live.machine.parameters.names[::2] == [
-        "actuator_gain[1].gain", "viscous_friction[1].coefficient", "coulomb_friction[1].level"
+        "actuator_gain[1].gain",
+        "viscous_friction[1].coefficient",
+        "coulomb_friction[1].level",
     ]
     start = live.machine.parameters.guess
     assert not np.any(np.abs(start - TRUTH) < 0.05 * TRUTH)
@@ -68,8 +70,11 @@ def test_estimates_are_within_their_deviations(tmp_path):
     scores = []
     for seed in range(2):
         ran = driven(
-            written(tmp_path, "half_life = 600.0", 1.5), encoder=1e-6, torque=0.1,
-            inertial=(1e-3, 0.5), seed=seed,
+            written(tmp_path, "half_life = 600.0", 1.5),
+            encoder=1e-6,
+            torque=0.1,
+            inertial=(1e-3, 0.5),
+            seed=seed,
         )
         told = ran.live.estimate
         assert ran.live.switched is not None
@@ -157,7 +162,7 @@ def test_simulation_and_live_are_one_law_and_readings_are_held(tmp_path):
 
 def test_forces_with_and_without_friction(tmp_path):
     """Against Lagrange's equations of two links: accelerations that the forces give are those asked for."""
-    machine = build_machine(load_case(written(tmp_path)), true=True)
+    machine = build_machine(load_case(written(tmp_path)), at_truth=True)
     q, v, a = np.array([0.4, 0.7]), np.array([1.2, -2.0]), np.array([3.0, -5.0])
     smooth, friction = inverse_dynamics(machine.plant, q, v, a, 2)
     arm = TwoLinks(viscous=(0.0, 0.0), coulomb=(0.0, 0.0))
@@ -166,8 +171,10 @@ def test_forces_with_and_without_friction(tmp_path):
     np.testing.assert_allclose(friction, TRUTH[2:4] * v + TRUTH[4:] * np.sign(v), rtol=1e-9)
     # Springs, offsets and drags of an axis: what is left at rest belongs to the first part.
     effects = (
-        EFFECTS["linear_stiffness"](coefficient=300.0), EFFECTS["constant_force"](level=2.0),
-        EFFECTS["quadratic_drag"](coefficient=0.5), EFFECTS["added_mass"](mass=0.5),
+        EFFECTS["linear_stiffness"](coefficient=300.0),
+        EFFECTS["constant_force"](level=2.0),
+        EFFECTS["quadratic_drag"](coefficient=0.5),
+        EFFECTS["added_mass"](mass=0.5),
     )
     motion = (jnp.full(1, x) for x in (0.1, 3.0, 4.0))
     smooth, friction = inverse_dynamics(Axis(2.0, effects=effects), *motion, 1)
@@ -178,7 +185,8 @@ def test_forces_with_and_without_friction(tmp_path):
 def test_switches_of_a_model_that_is_right():
     """All fed forward, over the gain: an axis follows to the hold, at no gains of feedback at all."""
     effects = (
-        EFFECTS["actuator_gain"](gain=0.8), EFFECTS["coulomb_friction"](level=3.0),
+        EFFECTS["actuator_gain"](gain=0.8),
+        EFFECTS["coulomb_friction"](level=3.0),
         EFFECTS["viscous_friction"](coefficient=4.0),
     )
     plant, none = Axis(2.0, effects=effects), jnp.zeros(1)
@@ -187,11 +195,26 @@ def test_switches_of_a_model_that_is_right():
     off = {}
     for switches in ("all", "dynamics", "friction", "gains"):
         law = ComputedTorque(
-            none, none, plant, jnp.asarray([2.0]), period=1e-4, epsilon=jnp.asarray(1e-3), friction=True,
+            none,
+            none,
+            plant,
+            jnp.asarray([2.0]),
+            period=1e-4,
+            epsilon=jnp.asarray(1e-3),
+            friction=True,
         )
-        law = law if switches == "all" else ComputedTorque(
-            none, none, plant, jnp.asarray([2.0]), period=1e-4, epsilon=jnp.asarray(1e-3),
-            **({"friction": True} | {switches: False}),
+        law = (
+            law
+            if switches == "all"
+            else ComputedTorque(
+                none,
+                none,
+                plant,
+                jnp.asarray([2.0]),
+                period=1e-4,
+                epsilon=jnp.asarray(1e-3),
+                **({"friction": True} | {switches: False}),
+            )
         )
         drive = Drive(jnp.asarray([2.0]), 1e-4, "zero_order", 1, True)
         run = closed_loop(plant, drive, law, reference, jnp.zeros((5000, 1)), none, none)
@@ -203,7 +226,12 @@ def test_switches_of_a_model_that_is_right():
 def test_feedback_does_not_see_how_late_a_velocity_is():
     """Velocity is a difference over ten ticks, and so is the reference's: on it, nothing is fed back."""
     law = ComputedTorque(
-        jnp.full(1, 100.0), jnp.full(1, 50.0), Axis(1.0), jnp.ones(1), period=1e-3, velocity_average=10,
+        jnp.full(1, 100.0),
+        jnp.full(1, 50.0),
+        Axis(1.0),
+        jnp.ones(1),
+        period=1e-3,
+        velocity_average=10,
         dynamics=False,
     )
     t = 1e-3 * np.arange(-200, 300)
@@ -249,11 +277,16 @@ def test_half_life_is_of_time_however_far_samples_are_apart(tmp_path, rate, apar
         case.write_text(text)
         live, more = Live(case), {}
     else:
-        case.write_text(TEXT.replace("period = 0.00025", "period = 0.001\nhalf_life = 0.05").replace(
-            "sample_rate = 4000.0", "sample_rate = 1000.0") + "".join(
-            f'[[inertial_sensors]]\nkind = "{kind}"\nlink = {link}\nnoise = 1e-3\nrate = {rate}\n{place}'
-            for link in (1, 2)
-            for kind, place in (("gyroscope", ""), ("accelerometer", "position = [0.2, 0.0, 0.0]\n"))))
+        case.write_text(
+            TEXT.replace("period = 0.00025", "period = 0.001\nhalf_life = 0.05").replace(
+                "sample_rate = 4000.0", "sample_rate = 1000.0"
+            )
+            + "".join(
+                f'[[inertial_sensors]]\nkind = "{kind}"\nlink = {link}\nnoise = 1e-3\nrate = {rate}\n{place}'
+                for link in (1, 2)
+                for kind, place in (("gyroscope", ""), ("accelerometer", "position = [0.2, 0.0, 0.0]\n"))
+            )
+        )
         live, more = Live(case), {"velocity": np.ones(2), "acceleration": np.ones(2)}
     n = live.machine.plant.joints
     for k in range(800):
@@ -303,10 +336,19 @@ def test_refuses_what_it_cannot_find(tmp_path):
     known += [(f"{{ guess = 0.0, true = {x} }}", "0.0") for x in (1.5, 0.8, 4.0, 2.4)]
     for message, swap in (
         ("has nothing to find: all is known; take kind = 'computed_torque'", known),
-        ("the balance is not in proportion to", [('kind = "viscous_friction"\ncoefficient',
-          'kind = "stribeck_friction"\nvelocity = { guess = 0.1 }\nlevel')]),
-        ("has a memory or a delay", [
-            ("[controller]", '[[effects]]\nkind = "actuator_lag"\ntime_constant = 0.01\n[controller]')]),
+        (
+            "the balance is not in proportion to",
+            [
+                (
+                    'kind = "viscous_friction"\ncoefficient',
+                    'kind = "stribeck_friction"\nvelocity = { guess = 0.1 }\nlevel',
+                )
+            ],
+        ),
+        (
+            "has a memory or a delay",
+            [("[controller]", '[[effects]]\nkind = "actuator_lag"\ntime_constant = 0.01\n[controller]')],
+        ),
     ):
         case = written(tmp_path, **dict(swap))
         with pytest.raises(InputError, match=message) as caught:

@@ -19,13 +19,14 @@ from jaxid.estimators.common.consistency import need_bodies
 from jaxid.estimators.common.interior import inner_start
 from jaxid.estimators.common.levenberg_marquardt import eliminated
 from jaxid.logs.log import Log
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 
 RNG = np.random.default_rng(4)
 GRAVITY = np.array([0.0, 0.0, -9.81])
 # A wrist, whose last link is light and short.
 WRIST = [
-    ("revolute", 0.0, 0.0, 0.0, 0.0), ("revolute", np.pi / 2, 0.0, 0.3, 0.0),
+    ("revolute", 0.0, 0.0, 0.0, 0.0),
+    ("revolute", np.pi / 2, 0.0, 0.3, 0.0),
     ("revolute", -np.pi / 2, 0.2, 0.0, 0.0),
 ]
 SHORT = np.array([1.0, 0.3, 0.3, 0.3, *[0.09] * 6])
@@ -179,10 +180,10 @@ def test_results_hold_the_links(fits, tmp_path):
 
 def test_output_error_starts_at_the_bodies_that_inverse_dynamics_finds(fits):
     """Sums that no log tells are no reason to start at the guesses, far from what was told."""
-    start = alone(_start(need_bodies(fits[True].session)))
+    start = run_alone(_start(need_bodies(fits[True].session)))
     np.testing.assert_allclose(start, fits[True].estimate.theta)
     # without, what is untold may be anything
-    assert alone(_start(fits[False].session)) is None
+    assert run_alone(_start(fits[False].session)) is None
 
 
 @pytest.mark.slow
@@ -267,10 +268,18 @@ def test_a_prior_is_in_the_way_of_output_error_only(tmp_path):
         ("mass = { guess = 1.0 }", "mass = 1.0", "power", ["link 1", "mass[1] is known and others are not"]),
         ("mass = { guess = 1.0 }", "mass = { guess = 1.0, max = 2.0 }", "power", ["mass[1] has min or max"]),
         ("mass = { guess = 1.0 }", "mass = { guess = 0.1 }", "power", ["link 1", "its guess is no body"]),
-        ("mass = { guess", "mass = { guess", "recursive",
-         ["does not go with recursive", "inverse_dynamics, power"]),
-        ("[log]", "[output_error]\nprior = 0.5\n[log]", "output_error",
-         ["output_error with a prior", "leave one of them out"]),
+        (
+            "mass = { guess",
+            "mass = { guess",
+            "recursive",
+            ["does not go with recursive", "inverse_dynamics, power"],
+        ),
+        (
+            "[log]",
+            "[output_error]\nprior = 0.5\n[log]",
+            "output_error",
+            ["output_error with a prior", "leave one of them out"],
+        ),
         ("= true", "= 1", "power", ["physically_consistent", "true or false"]),
     ],
 )

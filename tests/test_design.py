@@ -6,7 +6,7 @@ from stepper import Loop, Machine, Sensor, simulate
 
 import jaxid
 from jaxid.cli import main
-from jaxid.experiment_design.in_loop import _Bench
+from jaxid.experiment_design.in_loop import _DesignProblem
 from jaxid.logs.log import Log
 
 CASE = """
@@ -70,13 +70,20 @@ def test_what_it_expects_is_what_a_fit_of_such_a_log_says(found):
     reference = design.values[:, 0]
     loop = Loop("cascade_pd", reference=reference, kp=60.0, kv=3000.0, limit=400.0)
     made = simulate(
-        machine, loop, Sensor(position_noise=1e-7), rate=500.0, duration=len(reference) / 500.0,
+        machine,
+        loop,
+        Sensor(position_noise=1e-7),
+        rate=500.0,
+        duration=len(reference) / 500.0,
         initial_position=reference[0],
     )
     noise = np.random.default_rng(0).normal(0.0, 1e-5, len(reference))
     log = Log(
-        time=made["t"], position=(made["position"] + noise)[:, None], force=made["force"][:, None],
-        reference=reference[:, None], source="designed",
+        time=made["t"],
+        position=(made["position"] + noise)[:, None],
+        force=made["force"][:, None],
+        reference=reference[:, None],
+        source="designed",
     )
     estimate = jaxid.identify(path, log).estimate
     truth = np.array([95.0, 203.0, 20.0])
@@ -108,12 +115,20 @@ def test_what_rounding_takes_is_expected_too(coarse):
     for seed in range(4):
         start = (np.round(reference[0] / COUNT) + np.random.default_rng(seed).uniform(-0.5, 0.5)) * COUNT
         made = simulate(
-            machine, loop, Sensor(position_resolution=COUNT, force_noise=2.0), rate=500.0,
-            duration=len(reference) / 500.0, initial_position=start, seed=seed,
+            machine,
+            loop,
+            Sensor(position_resolution=COUNT, force_noise=2.0),
+            rate=500.0,
+            duration=len(reference) / 500.0,
+            initial_position=start,
+            seed=seed,
         )
         log = Log(
-            time=made["t"], position=made["position"][:, None], force=made["force"][:, None],
-            reference=reference[:, None], source="designed",
+            time=made["t"],
+            position=made["position"][:, None],
+            force=made["force"][:, None],
+            reference=reference[:, None],
+            source="designed",
         )
         estimate = jaxid.identify(path, log).estimate
         ratios.append(estimate.std / np.array([90.0, 150.0, 25.0]) / design.std)
@@ -130,7 +145,7 @@ def test_of_a_loop_that_rounding_tosses_about_nothing_is_expected(coarse):
     for count in (COUNT, 200 * COUNT):
         case = path.with_name("tossed.toml")
         case.write_text(path.read_text().replace(f"resolution = {COUNT}", f"resolution = {count}"))
-        told[count] = _Bench.of(jaxid.load_case(case)).expected(design.values)
+        told[count] = _DesignProblem.of(jaxid.load_case(case)).expected(design.values)
     assert np.all(np.diag(told[COUNT]) < 0.2)
     np.testing.assert_array_equal(told[200 * COUNT], np.eye(3))
 

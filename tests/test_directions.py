@@ -21,7 +21,7 @@ from jaxid.estimators.within_prior.prior import Prior
 from jaxid.estimators.within_prior.problem import criterion_steps
 from jaxid.logs.log import Log
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.results.report.words import within_prior_words
 from jaxid.session import open_session
 from jaxid.simulation.replay import Numerics, make_replay
@@ -83,7 +83,7 @@ def test_all_starts_end_alike_below_the_truth(fitted, folder):
     session = open_session(folder / "case.toml", logged(0))
     truth = np.array([stages.TRUTH[1][n] for n in fitted.estimate.names])
     at_truth, at_guess = (
-        alone(criterion_steps(session.machine, session.fit.log, theta, on="force"))
+        run_alone(criterion_steps(session.machine, session.fit.log, theta, on="force"))
         for theta in (truth, session.machine.parameters.guess)
     )
     assert details["criterion_percent"] < at_truth < 0.2 * at_guess
@@ -95,9 +95,9 @@ def test_what_another_method_finds_is_a_start_too(fitted, folder, tmp_path, meth
     text = (folder / "case.toml").read_text() + f'start = "{method}"\n'
     (tmp_path / "case.toml").write_text(text)
     session = open_session(tmp_path / "case.toml", logged(0))
-    (other,) = alone(_beside_the_guesses(session))
+    (other,) = run_alone(_beside_the_guesses(session))
     assert np.max(other / session.machine.parameters.guess) > 1.3
-    found = alone(steps_of("output_error", session))
+    found = run_alone(steps_of("output_error", session))
     assert found.details["starts"] == {"count": 2, "same_optimum": 2, "flat": 0}
     np.testing.assert_allclose(found.theta, fitted.estimate.theta, rtol=0.02)
 
@@ -136,7 +136,7 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
         found[starts] = jaxid.identify(tmp_path / "case.toml", log).estimate.details
     session = jaxid.open_session(tmp_path / "case.toml", log)
     machine, guessed = session.machine, session.machine.parameters.guess
-    stuck = alone(criterion_steps(machine, session.fit.log, guessed, on="force"))
+    stuck = run_alone(criterion_steps(machine, session.fit.log, guessed, on="force"))
     for details in found.values():
         assert details["directions"]
         assert details["criterion_percent"] < 0.5 * stuck
@@ -158,7 +158,7 @@ def test_guesses_about_which_nothing_moves_are_left_for_likely_ones(tmp_path):
     log = as_log(stages.record(stages.machine(2, rigid=True), reference, noise=0.017, resolution=0.0))
     (tmp_path / "case.toml").write_text(stages.text(2, guess=guess, resolution=0.0, more=STATED))
     session = jaxid.open_session(tmp_path / "case.toml", log)
-    at = lambda theta: alone(criterion_steps(session.machine, session.fit.log, theta, on="force"))
+    at = lambda theta: run_alone(criterion_steps(session.machine, session.fit.log, theta, on="force"))
     names = session.machine.parameters.names
     true = at(np.array([stages.TRUTH[2][n] for n in names]))
     assert at(session.machine.parameters.guess) > 1.4 * true
@@ -188,7 +188,7 @@ def test_a_point_whose_slopes_are_not_finite_is_kept(monkeypatch, unknowns):
     problem = SimpleNamespace(prior=SimpleNamespace(base=np.ones(unknowns)), ladder=(1.0,))
     problem.weighed = lambda found: (problem, found)
     for w in (np.zeros(unknowns), np.arange(1.0, unknowns + 1)):
-        found = alone(directions_rounds.in_rounds(problem, w, unknowns))
+        found = run_alone(directions_rounds.in_rounds(problem, w, unknowns))
         assert found.count == 0
         np.testing.assert_allclose(found.point, w, rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(unknowns), atol=1e-12)
@@ -268,7 +268,7 @@ def test_results_hold_the_directions(fitted, tmp_path):
     assert content["directions"][0].keys() >= {"combination", "value", "std"}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "directions of 11 unknowns fitted" in page
-    told = page[page.index('<section id="directions">'):].partition("</section>")[0]
+    told = page[page.index('<section id="directions">') :].partition("</section>")[0]
     assert told.count("<tr>") == 1 + len(content["directions"])
     assert "rise at −2 σ" in told
     for words in (f"tarts: {content['starts']['same_optimum']} of 16", "riterion: "):
@@ -304,7 +304,7 @@ def test_intervals_hold_what_wrong_guesses_do(tmp_path):
     for case, log, estimate in zip(cases, logs, found, strict=True):
         machine = open_session(case, log).machine
         truth = np.array([stages.TRUTH[1][n] for n in estimate.names])
-        at_truth = alone(criterion_steps(machine, log, truth, on="force"))
+        at_truth = run_alone(criterion_steps(machine, log, truth, on="force"))
         lower.append(estimate.details["criterion_percent"] <= at_truth)
         w = dict(zip(estimate.names, Prior.of(machine, 0.5, np.zeros(0)).inward(truth), strict=True))
         for d in estimate.details["directions"]:
@@ -366,7 +366,7 @@ def test_wrong_priors_are_refused(folder, tmp_path, capsys):
 
 def _without_guess(text: str) -> str:
     head, tail = text.split("phase = { guess = ")
-    return head + "phase = { guess = 0.0" + tail[tail.index(","):]
+    return head + "phase = { guess = 0.0" + tail[tail.index(",") :]
 
 
 @pytest.mark.slow

@@ -19,9 +19,9 @@ from jaxid.estimators.within_prior import (
     rounds as directions_rounds,
 )
 from jaxid.estimators.within_prior.posterior import loss_of, most_probable, past_kinks, spread
-from jaxid.estimators.within_prior.precision import Told, add_profiles
-from jaxid.estimators.within_prior.problem import Found
-from jaxid.numerics.lanes import alone
+from jaxid.estimators.within_prior.precision import DirectionPrecision, add_profiles
+from jaxid.estimators.within_prior.problem import RoundsResult
+from jaxid.numerics.lanes import run_alone
 
 NOISE = 0.3
 
@@ -29,8 +29,13 @@ NOISE = 0.3
 def problem_of(residual, jacobian, size, rows):
     """Stands for a problem: its residual and derivative are functions of the point."""
     return SimpleNamespace(
-        residual=residual, jacobian=jacobian, ladder=(1.0,), prior=SimpleNamespace(base=np.ones(size)),
-        replay=SimpleNamespace(position=np.zeros(1)), measured=np.zeros((rows, 1)), places=(None,) * size,
+        residual=residual,
+        jacobian=jacobian,
+        ladder=(1.0,),
+        prior=SimpleNamespace(base=np.ones(size)),
+        replay=SimpleNamespace(position=np.zeros(1)),
+        measured=np.zeros((rows, 1)),
+        places=(None,) * size,
         encoders=(0,),
     )
 
@@ -58,7 +63,7 @@ def linear(rng, size=4, rows=30):
 
 def test_a_line_ends_where_guesses_and_log_agree():
     problem, a, b = linear(np.random.default_rng(0))
-    w, here, settled = alone(most_probable(problem, NOISE, np.array([3.0, -2.0, 1.0, 1.0])))
+    w, here, settled = run_alone(most_probable(problem, NOISE, np.array([3.0, -2.0, 1.0, 1.0])))
     assert settled
     np.testing.assert_allclose(w, np.linalg.solve(a.T @ a + np.eye(4), a.T @ b), atol=2e-3)
     np.testing.assert_allclose(here.residual / NOISE, a @ w - b)
@@ -68,7 +73,7 @@ def test_a_held_direction_stays():
     problem, a, b = linear(np.random.default_rng(1))
     along = np.array([0.6, 0.8, 0.0, 0.0])
     start = 0.7 * along + np.array([0.0, 0.0, 1.0, -1.0])
-    w, _, settled = alone(most_probable(problem, NOISE, start, held=along))
+    w, _, settled = run_alone(most_probable(problem, NOISE, start, held=along))
     assert settled
     assert along @ w == pytest.approx(0.7, abs=1e-9)
     slope = a.T @ (a @ w - b) + w
@@ -80,7 +85,7 @@ def test_a_cost_with_a_kink_ends_all_the_same():
     """Where the derivative jumps no step keeps what it promises."""
     residual = lambda w: np.array([4.0 * abs(w[0] - 0.4) + 1.0, 3.0 * (w[1] - 0.2)])
     jacobian = lambda w: np.diag([4.0 * np.sign(w[0] - 0.4), 3.0])
-    w, _, _ = alone(most_probable(problem_of(residual, jacobian, 2, 2), NOISE, np.array([0.9, -1.0])))
+    w, _, _ = run_alone(most_probable(problem_of(residual, jacobian, 2, 2), NOISE, np.array([0.9, -1.0])))
     np.testing.assert_allclose(w, [0.4, 0.2], atol=0.1)
 
 
@@ -93,10 +98,10 @@ def test_a_fit_goes_on_along_a_valley_with_a_kink_at_its_floor():
     floor = np.linspace(-3.0, 3.0, 10_001)
     guessed = 0.5 * (floor**2 + floor**4)
     least = np.min(guessed + 0.5 * (1.0 + (1.5 * (floor - 2.0)) ** 2) / NOISE**2)
-    w, here, settled = alone(most_probable(problem, NOISE, start))
+    w, here, settled = run_alone(most_probable(problem, NOISE, start))
     assert not settled
     assert loss_of(NOISE, here, w) > least + 3.0
-    on, there, settled = alone(past_kinks(problem, NOISE, start))
+    on, there, settled = run_alone(past_kinks(problem, NOISE, start))
     assert settled
     # No point drawn about it is half a nat more probable; the least may be a little further.
     assert loss_of(NOISE, there, on) < least + 1.0
@@ -107,13 +112,13 @@ def found_at(problem, w, told):
     jacobian = problem.jacobian(w)
     e = problem.residual(w)
     minimum = Minimum(w, np.asarray(0.5 * e @ e), np.asarray(1), np.asarray(True), e, jacobian)
-    return Found(problem, np.eye(w.size), told, minimum, 1, True)
+    return RoundsResult(problem, np.eye(w.size), told, minimum, 1, True)
 
 
 def test_the_spread_of_a_line_is_the_quadratic_pictures():
     problem, a, b = linear(np.random.default_rng(2))
     whole = np.linalg.inv(a.T @ a + np.eye(4))
-    found = alone(spread(found_at(problem, whole @ (a.T @ b), 2), NOISE))[0]
+    found = run_alone(spread(found_at(problem, whole @ (a.T @ b), 2), NOISE))[0]
     # Directions of the linear problem are not quite the axes: fitted ones and others are correlated.
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(whole)), rtol=0.15)
 
@@ -122,10 +127,12 @@ def test_the_spread_of_what_is_held_wrongly_is_found():
     """x is told well, but only beside the square of y, of which the log says nothing."""
     problem = problem_of(
         lambda w: np.array([10.0 * (w[0] + 0.5 * w[1] ** 2)]),
-        lambda w: np.array([[10.0, 10.0 * w[1]]]), 2, 1,
+        lambda w: np.array([[10.0, 10.0 * w[1]]]),
+        2,
+        1,
     )
     best = np.zeros(2)
-    found, _ = alone(spread(found_at(problem, best, 1), NOISE))
+    found, _ = run_alone(spread(found_at(problem, best, 1), NOISE))
     x, y = np.meshgrid(np.linspace(-8, 3, 2201), np.linspace(-5, 5, 801), indexing="ij")
     nats = -0.5 * (10.0 * (x + 0.5 * y**2) / NOISE) ** 2 - 0.5 * x**2 - 0.5 * y**2
     weight = np.exp(nats - nats.max())
@@ -145,7 +152,7 @@ def test_of_two_valleys_the_spread_has_both_and_knows_the_better():
     weight = np.exp(nats - nats.max())
     for start in (-0.99, 0.99):
         exact = np.sqrt(np.sum(weight * (place - start) ** 2) / weight.sum())
-        whole, best = alone(spread(found_at(problem, np.array([start]), 1), NOISE))
+        whole, best = run_alone(spread(found_at(problem, np.array([start]), 1), NOISE))
         assert np.sqrt(whole[0, 0]) == pytest.approx(exact, rel=0.3)
         assert best[0] == pytest.approx(place[np.argmax(nats)], abs=0.01)
 
@@ -155,12 +162,14 @@ def test_a_fit_in_the_worse_valley_goes_on_from_the_better(monkeypatch):
     residual = lambda w: np.array([2.0 * (w[0] ** 2 - 1.0), 0.7 * (w[0] - 1.0)])
     problem = problem_of(residual, lambda w: np.array([[4.0 * w[0]], [0.7]]), 1, 2)
     problem.noise, problem.on = lambda minimum, count: NOISE, "position"
-    white = lambda found: Told(1e-3 * np.eye(found.count), np.full(found.count, 0.03), np.zeros(0))
-    monkeypatch.setattr(directions, "told_of", white)
+    white = lambda found: DirectionPrecision(
+        1e-3 * np.eye(found.count), np.full(found.count, 0.03), np.zeros(0)
+    )
+    monkeypatch.setattr(directions, "precision_of_directions", white)
     machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=None))
     for drawn, end in ((True, 1.0), (False, -1.0)):
         start = found_at(problem, np.array([-0.9]), 1)
-        found, told = alone(directions._most_probable(machine, start, drawn))
+        found, told = run_alone(directions._most_probable(machine, start, drawn))
         assert found.point[0] == pytest.approx(end, abs=0.1)
         assert told.std[0] == pytest.approx(NOISE / 4.0, rel=0.3)
 
@@ -171,13 +180,13 @@ def test_a_profile_holds_one_direction_and_all_others_give_way():
     whole = np.linalg.inv(a.T @ a + np.eye(4))
     found = found_at(problem, whole @ (a.T @ b), 2)
     stated = [{"std": 0.02}, {"std": 0.1}]
-    assert alone(add_profiles(found, NOISE, stated)) == []
+    assert run_alone(add_profiles(found, NOISE, stated)) == []
     for k, direction in enumerate(stated):
         assert direction["profile"]["at_std"] == [-3, -2, -1, 1, 2, 3]
         places = direction["std"] * np.array([-3, -2, -1, 1, 2, 3])
         np.testing.assert_allclose(direction["profile"]["rise"], places**2 / whole[k, k], rtol=0.02)
     # Beside a point that is not the most probable the profile falls.
-    words = alone(add_profiles(found_at(problem, found.point + [0.3, 0, 0, 0], 2), NOISE, stated))
+    words = run_alone(add_profiles(found_at(problem, found.point + [0.3, 0, 0, 0], 2), NOISE, stated))
     assert [w[:26] for w in words] == ["the profile of direction 1", "the profile of direction 2"]
 
 
@@ -185,11 +194,11 @@ def test_a_fit_begins_in_the_deeper_valley():
     depth = lambda x: np.array([np.where(x < 0.4, 3.0 + abs(x), 5.0 * abs(x - 1.1))])
     problem = problem_of(lambda w: depth(w[0]), None, 3, 1)
     told = np.eye(3)[:, :1]
-    w = alone(directions_rounds._looked(problem, told, np.array([0.0, 0.3, -0.2])))
+    w = run_alone(directions_rounds._looked(problem, told, np.array([0.0, 0.3, -0.2])))
     assert w[0] == pytest.approx(1.1, abs=0.1)
     np.testing.assert_allclose(w[1:], [0.3, -0.2])
     # And stays where nothing is better.
-    w = alone(directions_rounds._looked(problem, told, np.array([1.1, 0.0, 0.0])))
+    w = run_alone(directions_rounds._looked(problem, told, np.array([1.1, 0.0, 0.0])))
     np.testing.assert_allclose(w[0], 1.1)
 
 
@@ -211,9 +220,15 @@ def test_guesses_that_do_not_simulate_are_left_for_points_that_do(monkeypatch, l
 
     monkeypatch.setattr(directions, "likely_points", likely)
     monkeypatch.setattr(directions, "read", directions_posterior.read)
-    gone = Minimum(np.zeros(4), np.asarray(np.nan), np.asarray(1), np.asarray(False), np.full(30, np.nan),
-                   np.full((30, 4), np.nan))
-    found = alone(directions._begun_elsewhere(Found(problem, np.eye(4), 0, gone, 5, False), False))
+    gone = Minimum(
+        np.zeros(4),
+        np.asarray(np.nan),
+        np.asarray(1),
+        np.asarray(False),
+        np.full(30, np.nan),
+        np.full((30, 4), np.nan),
+    )
+    found = run_alone(directions._begun_elsewhere(RoundsResult(problem, np.eye(4), 0, gone, 5, False), False))
     if len(lost) == len(points):
         np.testing.assert_array_equal(found.minimum.jacobian, gone.jacobian)
         return
@@ -224,8 +239,16 @@ def test_guesses_that_do_not_simulate_are_left_for_points_that_do(monkeypatch, l
 
 
 def through(
-    monkeypatch, residual, *, unknowns=2, told=1, best=None, little=None, vectors=None, places=None,
-    course=None,
+    monkeypatch,
+    residual,
+    *,
+    unknowns=2,
+    told=1,
+    best=None,
+    little=None,
+    vectors=None,
+    places=None,
+    unknown_reference=None,
 ):
     """A fit whose loop with rounding leaves another residual: where it ends, and how it is told."""
     problem = problem_of(None, None, unknowns, 8)
@@ -248,11 +271,13 @@ def through(
 
     monkeypatch.setattr(directions_rounding, "at_each", at_each)
     monkeypatch.setattr(directions_rounding, "_rounding", lambda machine, problem: problem)
-    white = lambda found: Told(np.eye(found.count), np.ones(found.count), np.zeros(0))
-    monkeypatch.setattr(directions_rounding, "told_of", white)
-    machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=0.1), course=course)
-    found = Found(problem, np.eye(unknowns) if vectors is None else vectors, told, minimum, 1, True)
-    return alone(directions_rounding.through_rounding(machine, found))
+    white = lambda found: DirectionPrecision(np.eye(found.count), np.ones(found.count), np.zeros(0))
+    monkeypatch.setattr(directions_rounding, "precision_of_directions", white)
+    machine = SimpleNamespace(
+        sensor=SimpleNamespace(position_resolution=0.1), unknown_reference=unknown_reference
+    )
+    found = RoundsResult(problem, np.eye(unknowns) if vectors is None else vectors, told, minimum, 1, True)
+    return run_alone(directions_rounding.through_rounding(machine, found))
 
 
 def test_where_the_machine_stood_counts_once(monkeypatch):
@@ -360,7 +385,7 @@ def test_what_rounding_does_beside_what_is_told_tells_how_it_moved_that(monkeypa
     assert told.std[0] < 0.7 * moved
     # Not where the reference is unknown: logs that it moves in time lie on no line. Starts near the end of
     # the first count move that sample more than was measured, and do not count.
-    _, told = through(monkeypatch, beside, course=SimpleNamespace(names=("onset",)))
+    _, told = through(monkeypatch, beside, unknown_reference=SimpleNamespace(names=("onset",)))
     assert 0.85 * moved < told.std[0] < moved
 
 
@@ -430,6 +455,7 @@ def test_where_all_logs_run_away_nothing_is_told(monkeypatch):
 
 def test_what_rounding_leaves_hardly_told_is_let_go(monkeypatch):
     """The first unknown is told, the second scatters by more than its guess."""
+
     def residual(w, starts):
         return w[:, :2] + np.array([0.1, 60.0]) * starts
 

@@ -14,7 +14,13 @@ from jaxid.plants import Axis
 
 # Symmetric links of known masses and centres of mass leave these.
 KNOWN = (
-    "mass", "first_moment_x", "first_moment_y", "first_moment_z", "inertia_xy", "inertia_xz", "inertia_yz",
+    "mass",
+    "first_moment_x",
+    "first_moment_y",
+    "first_moment_z",
+    "inertia_xy",
+    "inertia_xz",
+    "inertia_yz",
 )
 ARM, BODIES = pa10_arm()
 ANGLES = np.random.default_rng(4).uniform(-2.0, 2.0, (40, 7))

@@ -36,9 +36,7 @@ def loop_with_jacobian(row: Row, *, set_valued: bool, substeps: int):
 
     def position(theta):
         plant_now = scatter(places, plant, theta)
-        run = closed_loop(
-            plant_now, drive, LAW, reference, jnp.zeros((TICKS, 1)), rest, rest
-        ).position[:, 0]
+        run = closed_loop(plant_now, drive, LAW, reference, jnp.zeros((TICKS, 1)), rest, rest).position[:, 0]
         return run, run
 
     return jax.jit(jax.jacfwd(position, has_aux=True))
@@ -94,8 +92,12 @@ def truth(effects: tuple) -> np.ndarray:
 def behind_a_spring(loop: Loop, stiffness: float, damping: float, load_inertia: float) -> np.ndarray:
     """Part of the mass as a second one of the independent chain."""
     machine = ChainMachine(
-        (MASS - load_inertia, load_inertia), (0.0, 0.0), (0.0, stiffness, 0.0), actuated=(1,),
-        actuator_gain=GAIN, coupling=(0.0, damping, 0.0),
+        (MASS - load_inertia, load_inertia),
+        (0.0, 0.0),
+        (0.0, stiffness, 0.0),
+        actuated=(1,),
+        actuator_gain=GAIN,
+        coupling=(0.0, damping, 0.0),
     )
     log = simulate_chain(machine, [loop], Sensor(), rate=1 / PERIOD, duration=TICKS * PERIOD)
     return log["true_position"][:, 0]

@@ -41,8 +41,7 @@ def instants(row: Row, count: int = 12) -> list[Instant]:
     force = random.choice([-400.0, -90.0, 60.0, 300.0], count)
     rest = random.uniform([-0.1, -5, 0], [0.1, 5, 2], (count, 3))
     return [
-        Instant(q, v, a, u, t, row.own or 0.0)
-        for (q, a, t), v, u in zip(rest, speed, force, strict=True)
+        Instant(q, v, a, u, t, row.own or 0.0) for (q, a, t), v, u in zip(rest, speed, force, strict=True)
     ]
 
 

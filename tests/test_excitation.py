@@ -54,16 +54,18 @@ def test_it_keeps_within_its_limits_and_begins_and_ends_at_rest(found, criterion
     step = run.time[1]
     whole = lambda x: np.concatenate([x[-1:], x, x[:1]])
     np.testing.assert_allclose(
-        (whole(run.position)[2:] - whole(run.position)[:-2]) / (2 * step), run.velocity, atol=2e-2)
+        (whole(run.position)[2:] - whole(run.position)[:-2]) / (2 * step), run.velocity, atol=2e-2
+    )
     np.testing.assert_allclose(
-        (whole(run.velocity)[2:] - whole(run.velocity)[:-2]) / (2 * step), run.acceleration, atol=2e-1)
+        (whole(run.velocity)[2:] - whole(run.velocity)[:-2]) / (2 * step), run.acceleration, atol=2e-1
+    )
 
 
 def columns(run) -> np.ndarray:
     """By other physics: torques of unit parameters, viscous friction, and signs smoothed as sharply."""
     names = arm_oracle.NAMES
     out = []
-    for name in run.told:
+    for name in run.identified:
         kind, _, rest = name.partition("[")
         k = int(rest[0]) - 1
         unit = np.zeros((2, 10))
@@ -81,10 +83,11 @@ def columns(run) -> np.ndarray:
 
 def test_its_condition_number_and_deviations_are_those_of_the_regressor(found):
     run = found["condition"]
-    weighted = (columns(run) / np.array(NOISE)[:, None]).reshape(-1, len(run.told))
-    assert len(run.told) == 10
-    np.testing.assert_allclose(run.condition[1], np.linalg.cond(weighted / np.linalg.norm(weighted, axis=0)),
-                               rtol=1e-6)
+    weighted = (columns(run) / np.array(NOISE)[:, None]).reshape(-1, len(run.identified))
+    assert len(run.identified) == 10
+    np.testing.assert_allclose(
+        run.condition[1], np.linalg.cond(weighted / np.linalg.norm(weighted, axis=0)), rtol=1e-6
+    )
     std = np.sqrt(np.diag(np.linalg.inv(weighted.T @ weighted)))
     np.testing.assert_allclose(run.std, std, rtol=1e-6)
 
@@ -100,12 +103,17 @@ def test_each_criterion_is_best_at_its_own(found):
 @pytest.mark.slow
 def test_what_no_motion_tells_apart_is_left_out(tmp_path, found):
     """All twenty inertial parameters unknown: as telling as with the six that stand for sums."""
-    links = (("{ guess = 1.0 }", "[{ guess = 0.0 }, { guess = 0.0 }, { guess = 0.0 }]",
-              "{ guess = [0.1, 0.0, 0.0, 0.1, 0.0, 0.1] }"),) * 2
+    links = (
+        (
+            "{ guess = 1.0 }",
+            "[{ guess = 0.0 }, { guess = 0.0 }, { guess = 0.0 }]",
+            "{ guess = [0.1, 0.0, 0.0, 0.1, 0.0, 0.1] }",
+        ),
+    ) * 2
     path = tmp_path / "case.toml"
     path.write_text(text(links) + DESIGN)
     run = jaxid.design(path)
-    assert len(run.told) == 10
+    assert len(run.identified) == 10
     assert len(run.machine.parameters.names) == 24
 
 
@@ -167,7 +175,7 @@ def test_a_force_noise_of_zero_is_none_that_is_known(tmp_path, inertia, guess):
     path.write_text(text + "[sensor]\nforce_noise = 0.0\n")
     run = jaxid.design(path)
     assert run.std is None
-    assert run.told == ("viscous_friction.coefficient",)
+    assert run.identified == ("viscous_friction.coefficient",)
     assert np.isfinite(run.nats)
 
 
@@ -219,9 +227,17 @@ def test_a_stroke_that_the_plant_cannot_be_in_is_refused(tmp_path):
         ("[design]\n", "[design]\nbase_frequency_hz = 0.1\n", ["has no whole period", "duration to 10.01 s"]),
         ("[design]\n", "[design]\nharmonics = 400\n", ["harmonic 400 is beyond half the sample_rate"]),
         ("speed = [2.0, 3.0]", "", ["[limits] has no speed"]),
-        (text(), text((("{ guess = 1.0 }", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]"),
-                       ("0.0", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]")), viscous=""),
-         ["no force depends on what is unknown"]),
+        (
+            text(),
+            text(
+                (
+                    ("{ guess = 1.0 }", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]"),
+                    ("0.0", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]"),
+                ),
+                viscous="",
+            ),
+            ["no force depends on what is unknown"],
+        ),
         ("[8.0, 20.0]", "[8.0]", ["acceleration", "1 entry"]),
     ],
 )

@@ -21,8 +21,11 @@ from jaxid.simulation.loops import with_diffrax
 
 # Unlike in every entry, so that no two can be exchanged unseen.
 UNEVEN = Robot(
-    length=(0.21, 0.24, 0.27, 0.26, 0.23), center=((0.11, 0.02), (0.14, -0.03)), mass=(2.1, 2.9),
-    inertia=(0.25, 0.33, 0.028, 0.041), tip_mass=1.7,
+    length=(0.21, 0.24, 0.27, 0.26, 0.23),
+    center=((0.11, 0.02), (0.14, -0.03)),
+    mass=(2.1, 2.9),
+    inertia=(0.25, 0.33, 0.028, 0.041),
+    tip_mass=1.7,
 )
 FRICTION = {kind: np.random.default_rng(k).uniform(0.1, 2.0, 5) for k, kind in enumerate(ORDERS)}
 
@@ -209,8 +212,10 @@ def test_energy_stays_without_friction():
     k, tension, q0 = np.array([40.0, 30.0]), 6.0, np.array([2.0, 1.1])
     spring = EFFECTS["linear_stiffness"]
     effects = tuple(spring(float(x), port=i) for i, x in enumerate(k)) + (spring(tension, port=3),)
-    plant = FiveBar(**{f: jnp.asarray(getattr(UNEVEN, f)) for f in (
-        "length", "center", "mass", "inertia", "tip_mass")}, effects=effects)
+    plant = FiveBar(
+        **{f: jnp.asarray(getattr(UNEVEN, f)) for f in ("length", "center", "mass", "inertia", "tip_mass")},
+        effects=effects,
+    )
     hold = jnp.asarray(k * q0)
     times = jnp.linspace(0.0, 2.0, 101)
     start = jnp.asarray(q0), jnp.array([1.0, -1.5])
@@ -254,20 +259,24 @@ def test_payload_is_a_mass_at_the_tool():
         assert ours.rates == (None,)
     assert loaded.place(5) == ("tool", 1)
     assert [bare.place(k) for k in range(5)] == [
-        ("joint", 1), ("joint", 2), ("passive", 1), ("passive", 2), ("passive", 3)
+        ("joint", 1),
+        ("joint", 2),
+        ("passive", 1),
+        ("passive", 2),
+        ("passive", 3),
     ]
 
 
 def test_search_may_name_what_there_can_be():
     plant = righettini_five_bar()
-    offered = {k: {kind for kind, e in EFFECTS.items() if plant.offers(e, k, 2)} for k in range(7)}
+    offered = {k: {kind for kind, e in EFFECTS.items() if plant.accepts(e, k, 2)} for k in range(7)}
     assert offered[5] == {"added_mass"}
     assert offered[6] == set()
     assert {"coulomb_friction", "cubic_friction"} < offered[2] == offered[4]
     assert not {"added_mass", "actuator_gain", "joint_flexibility"} & offered[2]
     assert {"added_mass", "actuator_gain"} < offered[0]
     mass = EFFECTS["added_mass"]
-    twins = [plant.twin(mass, k) for k in range(6)]
+    twins = [plant.equivalent_parameter(mass, k) for k in range(6)]
     assert twins == [("inertia", 0), ("inertia", 1), None, None, None, ("tip_mass", None)]
 
 

@@ -15,8 +15,8 @@ from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.recursive.estimate import recursive_steps
-from jaxid.experiment_design.in_loop import _Bench
-from jaxid.numerics.lanes import alone
+from jaxid.experiment_design.in_loop import _DesignProblem
+from jaxid.numerics.lanes import run_alone
 from jaxid.session import open_session
 
 NAMES = {"actuator_gain": "gain", "coulomb_friction": "level", "viscous_friction": "coefficient"}
@@ -48,12 +48,12 @@ def unknown(guess: float, count: int) -> str:
 
 
 UNKNOWN = effect("actuator_gain", unknown(1.0, 2)) + "".join(
-    effect(kind, unknown(1.0, 2)) + effect(kind, unknown(0.05, 3), "passive = [1, 2, 3]")
-    for kind in FRICTION
+    effect(kind, unknown(1.0, 2)) + effect(kind, unknown(0.05, 3), "passive = [1, 2, 3]") for kind in FRICTION
 )
 TRUTH = {f"actuator_gain[{k + 1}].gain": g for k, g in enumerate(GAINS)} | {
     f"{kind}[{(k + 1) if k < 2 else f'passive {k - 1}'}].{NAMES[kind]}": value
-    for kind, values in FRICTION.items() for k, value in enumerate(values)
+    for kind, values in FRICTION.items()
+    for k, value in enumerate(values)
 }
 
 
@@ -80,7 +80,7 @@ def session(log, tmp_path_factory):
 
 
 def recursive(machine, data):
-    return alone(recursive_steps(machine, data, {}))
+    return run_alone(recursive_steps(machine, data, {}))
 
 
 @pytest.mark.parametrize("method", [inverse_dynamics, recursive])
@@ -102,7 +102,8 @@ def test_payload_is_told_by_the_tip_or_by_an_effect_on_the_tool(robot, tmp_path)
     tool = '[[effects]]\nkind = "added_mass"\ntool = 1\nmass = { guess = 0.0 }\n'
     found = {}
     for text, name, true in (
-        (tip + friction, "tip_mass", 3.4), (PLANT + friction + tool, "added_mass[tool 1].mass", 3.4 - 2.72),
+        (tip + friction, "tip_mass", 3.4),
+        (PLANT + friction + tool, "added_mass[tool 1].mass", 3.4 - 2.72),
     ):
         session = opened(tmp_path, text + LOG, log)
         assert {f.name: f.unit for f in session.machine.parameters.free}[name] == "kg"
@@ -135,24 +136,30 @@ def simulated(tmp_path, capsys, text, name="sim.csv"):
     return run(capsys, "simulate", path, "-o", tmp_path / name, "--force")
 
 
-@pytest.mark.parametrize(("friction", "apart"), [
-    # without dry friction both are smooth: fourth order at 0.25 ms, the stepper's second at 10 us
-    ({"viscous_friction": FRICTION["viscous_friction"]}, 2e-9),
-    # dry friction in all hinges at once: the stepper's turns are of first order, 7e-7 rad at 10 us
-    pytest.param(FRICTION, 2e-6, marks=pytest.mark.slow),
-])
+@pytest.mark.parametrize(
+    ("friction", "apart"),
+    [
+        # without dry friction both are smooth: fourth order at 0.25 ms, the stepper's second at 10 us
+        ({"viscous_friction": FRICTION["viscous_friction"]}, 2e-9),
+        # dry friction in all hinges at once: the stepper's turns are of first order, 7e-7 rad at 10 us
+        pytest.param(FRICTION, 2e-6, marks=pytest.mark.slow),
+    ],
+)
 def test_simulation_is_the_steppers(tmp_path, capsys, friction, apart):
     rows = followed(Robot(friction=friction), duration=2.0, noise=0.0)
     reference = np.stack([rows["r1"], rows["r2"]], axis=1)
     write_csv(tmp_path / "reference.csv", {k: rows[k] for k in ("t", "r1", "r2")})
-    effects = "".join(
-        effect(k, v[:2]) + effect(k, v[2:], "passive = [1, 2, 3]") for k, v in friction.items()
-    )
-    text = PLANT + effects + LOG[: LOG.index("[sensor]")] + (
-        '[reference]\nkind = "csv"\nfile = "reference.csv"\ntime = "t"\ncolumn = ["r1", "r2"]\n'
-        "[simulation]\nduration = 2.0\nsample_rate = 1000.0\n"
-        f"initial_position = {reference[0].tolist()}\n"
-        f"initial_velocity = {((reference[1] - reference[0]) * 1000).tolist()}\n"
+    effects = "".join(effect(k, v[:2]) + effect(k, v[2:], "passive = [1, 2, 3]") for k, v in friction.items())
+    text = (
+        PLANT
+        + effects
+        + LOG[: LOG.index("[sensor]")]
+        + (
+            '[reference]\nkind = "csv"\nfile = "reference.csv"\ntime = "t"\ncolumn = ["r1", "r2"]\n'
+            "[simulation]\nduration = 2.0\nsample_rate = 1000.0\n"
+            f"initial_position = {reference[0].tolist()}\n"
+            f"initial_velocity = {((reference[1] - reference[0]) * 1000).tolist()}\n"
+        )
     )
     ran = simulated(tmp_path, capsys, text)
     assert (ran.status, ran.err) == (0, "")
@@ -208,16 +215,21 @@ def test_columns_are_counted_where_a_case_names_none(tmp_path, capsys):
 @pytest.mark.slow
 def test_an_experiment_is_designed_from_where_the_robot_starts(tmp_path):
     """Lengths with which both joints at zero is no position."""
-    text = PLANT.replace("[0.18,", "[0.6,") + effect("coulomb_friction", unknown(1.0, 2)) + OPEN + (
-        "[sensor]\nposition_noise = 1e-5\n[limits]\nstroke = [0.0, 3.0]\nspeed = 3.0\nforce = 0.5\n"
-        "[simulation]\nduration = 0.2\nsample_rate = 250.0\n"
+    text = (
+        PLANT.replace("[0.18,", "[0.6,")
+        + effect("coulomb_friction", unknown(1.0, 2))
+        + OPEN
+        + (
+            "[sensor]\nposition_noise = 1e-5\n[limits]\nstroke = [0.0, 3.0]\nspeed = 3.0\nforce = 0.5\n"
+            "[simulation]\nduration = 0.2\nsample_rate = 250.0\n"
+        )
     )
     path = tmp_path / "case.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"initial_position: joints at \[0, 0\] rad are out of reach"):
-        _Bench.of(load_case(path))
+        _DesignProblem.of(load_case(path))
     path.write_text(text + "initial_position = [1.1, 2.0]\n")
-    bench = _Bench.of(load_case(path))
+    bench = _DesignProblem.of(load_case(path))
     peaks = bench.peaks(np.zeros((len(bench.shapes.signal(bench.starts[0])), 2)))
     np.testing.assert_allclose([peaks.low, peaks.high], [[1.1, 2.0]] * 2)
 
@@ -251,7 +263,8 @@ FAULTS = {
         ["reduction[1]", "must be a known number", "actuator_gain"],
     ),
     "passive": (
-        ("[1, 2, 3]", "9"), ["passive = 9 is out of range: the plant has 3 passive angles", "from 1 to 3"],
+        ("[1, 2, 3]", "9"),
+        ["passive = 9 is out of range: the plant has 3 passive angles", "from 1 to 3"],
     ),
     "twice": (("[1, 2, 3]", "[1, 2, 2]"), ["passive = [1, 2, 2] names a passive angle twice"]),
     "spring": (("passive = [1, 2, 3]", "spring = 1"), ["spring = 1 does not exist on kind = 'five_bar'"]),
@@ -268,14 +281,16 @@ FAULTS = {
         ["tool = 1 does not go with coulomb_friction", "added_mass"],
     ),
     "second tool": (
-        ("passive = [1, 2, 3]", "tool = 2"), ["tool = 2 is out of range: the plant has 1 tool; name tool 1"],
+        ("passive = [1, 2, 3]", "tool = 2"),
+        ["tool = 2 is out of range: the plant has 1 tool; name tool 1"],
     ),
     "transmission": (
         ("[log]", "[actuator]\ntransmission = [[20.0, 0.0], [0.0, 20.0]]\n[log]"),
         ["[actuator]: transmission and reduction of [plant.parameters] are both given"],
     ),
     "orientation": (
-        ('"five_bar"', '"five_bar"\norientation = "vertical"'), ["does not go with a rotary plant"],
+        ('"five_bar"', '"five_bar"\norientation = "vertical"'),
+        ["does not go with a rotary plant"],
     ),
 }
 
@@ -290,7 +305,8 @@ def test_faults_are_told_in_one_line(tmp_path, fault):
 
 def test_passive_angles_belong_to_plants_that_have_them(tmp_path):
     text = '[plant]\nkind = "axis"\n[plant.parameters]\ninertia = 1.0\n' + effect(
-        "viscous_friction", 1.0, "passive = 1")
+        "viscous_friction", 1.0, "passive = 1"
+    )
     assert "passive = 1 does not exist on kind = 'axis'; leave passive out" in message(tmp_path, text)
 
 

@@ -27,7 +27,9 @@ CASES = {
     "coulomb": (hidden("coulomb_friction", 3, 0.8), ("coulomb_friction", "passive", 2), "level", 0.8),
     "viscous": (hidden("viscous_friction", 2, 0.6), ("viscous_friction", "passive", 1), "coefficient", 0.6),
     "payload": (
-        dataclasses.replace(Robot(friction=DECLARED), tip_mass=2.72 + 0.5), ("added_mass", "tool", 1), "mass",
+        dataclasses.replace(Robot(friction=DECLARED), tip_mass=2.72 + 0.5),
+        ("added_mass", "tool", 1),
+        "mass",
         0.5,
     ),
     "nothing": (Robot(friction=DECLARED), None, "", 0.0),

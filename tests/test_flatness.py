@@ -25,13 +25,23 @@ def in_loop(poles: tuple[float, ...], offset: float, sensor: Sensor | None = Non
     effects = (EFFECTS["viscous_friction"](coefficient=DRAG), EFFECTS["linear_stiffness"](coefficient=STIFF))
     plant = Axis(MASS, effects=effects)
     law = Flatness(
-        poles=poles, epsilon=jnp.asarray(1e-6), model=plant, gain=jnp.asarray([GAIN]), period=PERIOD,
+        poles=poles,
+        epsilon=jnp.asarray(1e-6),
+        model=plant,
+        gain=jnp.asarray([GAIN]),
+        period=PERIOD,
     )
     reference = 0.05 * np.sin(8.0 * PERIOD * np.arange(4000))[:, None]
     slope = 0.05 * 8.0
     run = closed_loop(
-        plant, Drive(jnp.asarray([GAIN]), PERIOD), law, jnp.asarray(reference), jnp.zeros((4000, 1)),
-        jnp.asarray([offset]), jnp.asarray([slope]), sensor,
+        plant,
+        Drive(jnp.asarray([GAIN]), PERIOD),
+        law,
+        jnp.asarray(reference),
+        jnp.zeros((4000, 1)),
+        jnp.asarray([offset]),
+        jnp.asarray([slope]),
+        sensor,
     )
     return run, np.asarray(run.position)[:, 0] - reference[:, 0]
 
@@ -75,8 +85,11 @@ def test_reconstructed_velocity_rests_with_its_joint():
     """Stuck by friction that the model lacks: the command ramps with the error's integral, no more."""
     effects = (EFFECTS["viscous_friction"](coefficient=DRAG), EFFECTS["linear_stiffness"](coefficient=STIFF))
     law = Flatness(
-        poles=(-30.0, -40.0, -50.0), epsilon=jnp.asarray(1e-6), model=Axis(MASS, effects=effects),
-        gain=jnp.asarray([GAIN]), period=PERIOD,
+        poles=(-30.0, -40.0, -50.0),
+        epsilon=jnp.asarray(1e-6),
+        model=Axis(MASS, effects=effects),
+        gain=jnp.asarray([GAIN]),
+        period=PERIOD,
     )
     at, none = 0.01, jnp.zeros(1)
     tick = Tick(jnp.full(1, at), Path(none, none, none), (0,))
@@ -101,9 +114,7 @@ def test_flat_output_gives_all_inputs():
     motion = [size * np.sin(angle), size * rate * np.cos(angle), -size * rate**2 * np.sin(angle)]
     path = Path(*(jnp.asarray(x) for x in motion))
     force = flat_inputs(plant, path, 3)
-    run = open_loop(
-        plant, Drive(jnp.ones(3), 1e-4, "linear"), force, jnp.zeros(3), jnp.asarray(motion[1][0])
-    )
+    run = open_loop(plant, Drive(jnp.ones(3), 1e-4, "linear"), force, jnp.zeros(3), jnp.asarray(motion[1][0]))
     # Forces joined by lines over 0.1 ms: (rate h)^2 / 8 of the motion.
     np.testing.assert_allclose(np.asarray(run.position), motion[0], atol=1e-8)
     np.testing.assert_allclose(np.asarray(run.velocity), motion[1], atol=1e-6)
@@ -120,7 +131,7 @@ def test_live_identifies_switches_and_tracks(tmp_path):
         late[identify] = float(np.sqrt(np.mean(off**2)))
     switched = run.live.switched
     assert 30 < switched <= 100
-    found = errors(list(true_values()), run.live.told.theta)
+    found = errors(list(true_values()), run.live.online_estimate.theta)
     assert all(found[kind] <= aim for kind, aim in KINDS.items())
     assert late[True] < 1e-4 < 2e-4 < late[False]
     told = follow(case, run.log)
@@ -148,7 +159,9 @@ def test_live_refuses(tmp_path):
 @pytest.mark.parametrize(
     ("poles", "words"),
     [
-        ("[-60.0]", "has 1 entry"), ("[-60.0, 60.0]", "is not negative"), ("-60.0", "is not a list"),
+        ("[-60.0]", "has 1 entry"),
+        ("[-60.0, 60.0]", "is not negative"),
+        ("-60.0", "is not a list"),
         ("[-9.0, -9.0, -9.0, -9.0]", "at most 3"),
     ],
 )

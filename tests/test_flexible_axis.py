@@ -18,7 +18,7 @@ from jaxid.errors import InputError
 from jaxid.estimators import METHODS
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.logs.log import Log
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.results.as_json import derived_json
 from jaxid.session import open_session
 from jaxid.simulation.replay import make_replay
@@ -26,8 +26,11 @@ from jaxid.simulation.sensor_noise import position_noise
 
 # Of the paper's aims for the first model: motor inertia 1 %, load inertia 2 %, stiffness 2 %, Coulomb 5 %.
 WITHIN = {
-    "motor_inertia": 0.01, "load_inertia": 0.02, "stiffness": 0.02,
-    "coulomb_friction[1].level": 0.05, "coulomb_friction[2].level": 0.05,
+    "motor_inertia": 0.01,
+    "load_inertia": 0.02,
+    "stiffness": 0.02,
+    "coulomb_friction[1].level": 0.05,
+    "coulomb_friction[2].level": 0.05,
 }
 # Free motor, free load, undamped [Hz].
 FREQUENCY = np.sqrt(8e5 * (1 / 72.3 + 1 / 34.8)) / (2 * np.pi)
@@ -132,10 +135,10 @@ def test_coarse_readings_of_the_motor_alone_are_fitted_from_the_guesses_too(tmp_
     axes.write(axes.record(sensor=sensor, seed=2), tmp_path / "log.csv")
     (tmp_path / "case.toml").write_text(axes.text(load=False, sensor=sensor))
     session = open_session(tmp_path / "case.toml", tmp_path / "log.csv")
-    far = alone(METHODS["inverse_dynamics"](session))
+    far = run_alone(METHODS["inverse_dynamics"](session))
     assert far.told
     assert far.value("stiffness") < 0.1 * axes.TRUTH["stiffness"]
-    found = alone(METHODS["output_error"](session))
+    found = run_alone(METHODS["output_error"](session))
     assert found.converged
     assert found.value("stiffness") == pytest.approx(axes.TRUTH["stiffness"], rel=0.025)
 
@@ -187,8 +190,11 @@ def test_check_says_nothing_of_a_joint_without_encoder(folder, tmp_path):
 
 FAULTS = {
     "load twice": ('position = "q"', 'position = ["q", "q_load"]', ["load_position", "leave it out"]),
-    "no such spring": ("[actuator]", '[[effects]]\nkind = "backlash"\nspring = 2\ngap = 1e-5\n[actuator]',
-                       ["1 spring", "leave spring out"]),
+    "no such spring": (
+        "[actuator]",
+        '[[effects]]\nkind = "backlash"\nspring = 2\ngap = 1e-5\n[actuator]',
+        ["1 spring", "leave spring out"],
+    ),
     "flexibility twice": (
         "[actuator]",
         '[[effects]]\nkind = "joint_flexibility"\nstiffness = 1e5\ndamping = 1.0\nload_inertia = 1.0\n'
@@ -196,11 +202,13 @@ FAULTS = {
         ["springs of its own", "axis"],
     ),
     "friction on the spring": (
-        "[actuator]", '[[effects]]\nkind = "viscous_friction"\nspring = 1\ncoefficient = 1.0\n[actuator]',
+        "[actuator]",
+        '[[effects]]\nkind = "viscous_friction"\nspring = 1\ncoefficient = 1.0\n[actuator]',
         ["viscous_friction", "name a joint"],
     ),
     "gain without a drive": (
-        "[actuator]", '[[effects]]\nkind = "actuator_gain"\njoint = 2\ngain = 1.1\n[actuator]',
+        "[actuator]",
+        '[[effects]]\nkind = "actuator_gain"\njoint = 2\ngain = 1.1\n[actuator]',
         ["no drive", "driven is: 1"],
     ),
 }

@@ -47,9 +47,7 @@ def test_damping_is_left_out(damping):
     modes = natural_frequencies(plant, places, np.array([J2, K, damping, J1 + J2]))
     np.testing.assert_allclose(modes.hz, [two_masses(expected)], rtol=1e-12)
     # The motor's inertia is the whole less the load's.
-    np.testing.assert_allclose(
-        modes.slopes[0], [slopes[1] - slopes[0], slopes[2], 0.0, slopes[0]], rtol=1e-9
-    )
+    np.testing.assert_allclose(modes.slopes[0], [slopes[1] - slopes[0], slopes[2], 0.0, slopes[0]], rtol=1e-9)
 
 
 def test_a_heavily_damped_axis_keeps_its_mode():

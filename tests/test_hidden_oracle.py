@@ -17,9 +17,7 @@ EVERY = [*cases("seen")]
 
 def hiding(*kinds: str, scale: str = "emps_like", noise: float = 1.0, **values) -> HiddenCase:
     """A case with some parameters set."""
-    case = HiddenCase(
-        "effects", " + ".join(kinds), scale, noise, 11, kinds, declared_beside(kinds)
-    )
+    case = HiddenCase("effects", " + ".join(kinds), scale, noise, 11, kinds, declared_beside(kinds))
     for name, value in values.items():
         kind, parameter = name.split("__")
         case.values[kind][parameter] = value
@@ -48,9 +46,7 @@ def test_there_are_enough_of_each():
 @pytest.mark.parametrize("case", EVERY[:180:9], ids=lambda c: c.id)
 def test_the_validation_is_another_tour(case):
     fit, other = (case.setup(validation=v).loop.reference for v in (False, True))
-    stroke, fastest = (
-        [float(np.ptp(f(r))) for r in (fit, other)] for f in (np.asarray, np.gradient)
-    )
+    stroke, fastest = ([float(np.ptp(f(r))) for r in (fit, other)] for f in (np.asarray, np.gradient))
     assert abs(stroke[0] / stroke[1] - 1.0) > 0.05
     assert abs(fastest[0] / fastest[1] - 1.0) > 1e-3
 

@@ -59,7 +59,6 @@ def test_readings_are_mujocos(name):
     assert np.abs(data.sensordata).max() > 5
 
 
-
 def test_fusion_returns_the_motion():
     """Revolute joints' velocities by gyroscopes; all accelerations by accelerometers on every link."""
     rows, parameters, (q, qd, qdd) = case("general")
@@ -112,9 +111,11 @@ def test_redundant_readings_are_weighed():
 def test_what_is_out_of_range_does_not_count():
     q, qd, qdd = MOTION
     gyros = [Inertial("gyroscope", k, 1e-3) for k in (0, 1)]
-    meters = [Inertial("accelerometer", 0, 0.1, position=(0.2, 0.0, 0.0)),
-              Inertial("accelerometer", 1, 0.1, position=(0.2, 0.0, 0.0)),
-              Inertial("accelerometer", 1, 0.1, position=(0.05, 0.0, 0.0), range=4.0)]
+    meters = [
+        Inertial("accelerometer", 0, 0.1, position=(0.2, 0.0, 0.0)),
+        Inertial("accelerometer", 1, 0.1, position=(0.2, 0.0, 0.0)),
+        Inertial("accelerometer", 1, 0.1, position=(0.05, 0.0, 0.0), range=4.0),
+    ]
     held = jnp.asarray([3.0, 4.0])
     plant, suite = planar(*gyros, *meters)
     readings = suite.read(plant, q, qd, qdd)
@@ -221,7 +222,9 @@ def test_refuses(tmp_path, sensor, match):
 
 def test_refuses_a_plant_without_links(tmp_path):
     path = tmp_path / "axis.toml"
-    path.write_text('[plant]\nkind = "axis"\n[plant.parameters]\ninertia = 1.0\n'
-                    '[[inertial_sensors]]\nkind = "gyroscope"\nlink = 1\nnoise = 1.0\n')
+    path.write_text(
+        '[plant]\nkind = "axis"\n[plant.parameters]\ninertia = 1.0\n'
+        '[[inertial_sensors]]\nkind = "gyroscope"\nlink = 1\nnoise = 1.0\n'
+    )
     with pytest.raises(InputError, match="the plant has no links"):
         load_case(path)

@@ -194,8 +194,12 @@ def test_what_only_rounding_moves_rests_at_its_guess():
     linear = Transform(np.zeros(4, bool))
     data = x @ np.array([3.0, -2.0, 0.0, 5.0]) + e
     minimum = levenberg_marquardt(
-        lambda theta: data - x @ theta, np.array([1.0, 1.0, 0.7, 0.0]), linear, np.full(4, -np.inf),
-        np.full(4, np.inf), damping=1e-10,
+        lambda theta: data - x @ theta,
+        np.array([1.0, 1.0, 0.7, 0.0]),
+        linear,
+        np.full(4, -np.inf),
+        np.full(4, np.inf),
+        damping=1e-10,
     )
     assert bool(minimum.converged)
     assert int(minimum.steps) <= 4
@@ -208,8 +212,11 @@ def test_what_shows_only_beside_another_is_found():
     """A rate leaves no trace where its amplitude begins at zero, and has one after a step."""
     t = jnp.linspace(0.0, 3.0, 200)
     minimum = levenberg_marquardt(
-        lambda theta: theta[0] * jnp.exp(-t / theta[1]) - 2.0 * jnp.exp(-t / 0.4), np.array([0.0, 1.0]),
-        Transform(np.array([False, True])), np.array([-np.inf, 0.0]), np.full(2, np.inf),
+        lambda theta: theta[0] * jnp.exp(-t / theta[1]) - 2.0 * jnp.exp(-t / 0.4),
+        np.array([0.0, 1.0]),
+        Transform(np.array([False, True])),
+        np.array([-np.inf, 0.0]),
+        np.full(2, np.inf),
     )
     assert bool(minimum.converged)
     np.testing.assert_allclose(minimum.theta, [2.0, 0.4], rtol=1e-9)

@@ -91,9 +91,7 @@ def test_rows_are_those_of_the_file_and_time_starts_where_they_do(csv_file):
     assert log.rows == (50, 150)
     assert log.time[0] == 0.05
     np.testing.assert_array_equal(log.position[:, 0], signals()["q"][50:150])
-    by_rate = read_log(
-        csv_file, {"sample_rate": 1000.0, "position": "q", "force": "u", "rows": [50, 150]}
-    )
+    by_rate = read_log(csv_file, {"sample_rate": 1000.0, "position": "q", "force": "u", "rows": [50, 150]})
     np.testing.assert_allclose(by_rate.time, log.time, rtol=1e-15)
 
 

@@ -1,4 +1,4 @@
-"""Logs that cannot be read: every fault is one clear line with its mend."""
+"""Logs that cannot be read: every fault is one clear line with its hint."""
 
 import sys
 from pathlib import Path

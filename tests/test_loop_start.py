@@ -9,7 +9,9 @@ from jaxid.simulation.replay import start_shows
 
 RATE = 200.0
 TRUE = {"inertia": 90.0, "viscous_friction.coefficient": 200.0, "coulomb_friction.level": 20.0}
-CASE = RIGID + """[log]
+CASE = (
+    RIGID
+    + """[log]
 time = "t"
 position = "q"
 force = "u"
@@ -22,6 +24,7 @@ period = 0.005
 [sensor]
 position_resolution = 1e-6
 """
+)
 
 
 def test_a_long_log_that_starts_with_a_jerk_is_simulated_from_rest(tmp_path):
@@ -40,9 +43,7 @@ def test_a_long_log_that_starts_with_a_jerk_is_simulated_from_rest(tmp_path):
     stepper.write_csv(log, tmp_path / "log.csv")
     (tmp_path / "case.toml").write_text(CASE)
     found = jaxid.identify(tmp_path / "case.toml", tmp_path / "log.csv", method="output_error")
-    for name, value, std in zip(
-        found.estimate.names, found.estimate.theta, found.estimate.std, strict=True
-    ):
+    for name, value, std in zip(found.estimate.names, found.estimate.theta, found.estimate.std, strict=True):
         assert abs(value - TRUE[name]) < 1e-3 * TRUE[name], name
         assert abs(value - TRUE[name]) < 4 * std, name
     # What is left is the reading's rounding.

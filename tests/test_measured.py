@@ -39,8 +39,10 @@ def test_published_recipe_gives_the_published_parameters(emps):
     result = jaxid.identify(emps / "emps_recipe.toml", emps / "DATA_EMPS.mat", method="inverse_dynamics")
     # Janot, Gautier & Brunot (2019); their offset stands on the side of friction.
     published = {
-        "inertia": (95.109, 0.005), "viscous_friction.coefficient": (203.50, 0.015),
-        "coulomb_friction.level": (20.39, 0.015), "constant_force.level": (3.165, 0.03),
+        "inertia": (95.109, 0.005),
+        "viscous_friction.coefficient": (203.50, 0.015),
+        "coulomb_friction.level": (20.39, 0.015),
+        "constant_force.level": (3.165, 0.03),
     }
     for name, (value, part) in published.items():
         assert result.value(name) == pytest.approx(value, rel=part), name

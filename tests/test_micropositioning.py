@@ -22,7 +22,9 @@ from jaxid.simulation.step_size import needed_steps
 def replayed(case, log: dict, columns: tuple[str, ...], substeps: int):
     """Trajectory of the case's machine at its true values, in the loop of a log."""
     made = Log(
-        time=log["t"], position=np.column_stack([log[c] for c in columns]), force=log["i"][:, None],
+        time=log["t"],
+        position=np.column_stack([log[c] for c in columns]),
+        force=log["i"][:, None],
         reference=log["ref"][:, None],
     )
     machine = build_machine(case, true=True, period=1 / stages.RATE)
@@ -46,7 +48,10 @@ def test_rigid_stage_moves_as_the_exact_one(tmp_path, data):
 def test_elastic_stage_moves_as_the_exact_one(tmp_path):
     """The table swings at 1 kHz behind its screw, and sticks and slips in it: that asks for fine steps."""
     log = stages.record(
-        stages.machine(1), stages.move(0.2, **stages.MOVES[1]), resolution=0.0, step=1e-6,
+        stages.machine(1),
+        stages.move(0.2, **stages.MOVES[1]),
+        resolution=0.0,
+        step=1e-6,
     )
     (tmp_path / "case.toml").write_text(stages.text(1, coupling="elastic", resolution=0.0))
     run = replayed(load_case(tmp_path / "case.toml"), log, ("q", "x"), 2560)
@@ -66,8 +71,10 @@ def test_a_table_without_an_encoder_starts_where_the_screw_does_not_pull(tmp_pat
     path.write_text(stages.text(1, coupling="elastic", resolution=0.0, load=False))
     case = load_case(path)
     log = Log(
-        time=made["t"], position=np.column_stack([made["q"], np.full(made["q"].size, np.nan)]),
-        force=made["i"][:, None], reference=made["ref"][:, None],
+        time=made["t"],
+        position=np.column_stack([made["q"], np.full(made["q"].size, np.nan)]),
+        force=made["i"][:, None],
+        reference=made["ref"][:, None],
     )
     machine = build_machine(case, true=True, period=1 / stages.RATE)
     replay = make_replay(machine, log, Numerics(substeps=320))

@@ -11,7 +11,7 @@ from jaxid.cli import main
 from jaxid.estimators import METHODS
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.minimal.fit import filtering_of
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.results.report.minimal_plots import plot_filtering
 from jaxid.session import open_session
 
@@ -36,7 +36,7 @@ def fitted(log: Path, measured: str, method: str = "minimal_model", extra: str =
     parameters = session.machine.parameters
     away = [abs(g / T[n] - 1) for n, g in zip(parameters.names, parameters.guess, strict=True)]
     assert min(away) > 0.4
-    return alone(METHODS[method](session, **options))
+    return run_alone(METHODS[method](session, **options))
 
 
 def check(estimate: Estimate, within: dict[str, float], sigmas: float = 3.0) -> None:

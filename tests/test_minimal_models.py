@@ -18,7 +18,7 @@ from jaxid.estimators.minimal.models import form_of, structure_of
 from jaxid.estimators.minimal.polynomials import adjugate, determinant, product, scaled
 from jaxid.logs.prepare import Recipe
 from jaxid.numerics import filters as signals
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.session import open_session
 
 T = flexible.TRUTH
@@ -71,9 +71,13 @@ def test_motor_alone_gives_the_coefficients_of_13(tmp_path):
     """By hand: (J1 s^2 + (C1 + d) s + K)((J2 s^2 + (C2 + d) s + K) - (d s + K)^2, over K."""
     chi, of, theta = chi_at_truth(machine_of(tmp_path), hidden=True)
     expected = {
-        "b2": J2 / K, "b1": (D + C2) / K, "a4": J1 * J2 / K,
+        "b2": J2 / K,
+        "b1": (D + C2) / K,
+        "a4": J1 * J2 / K,
         "a3": (J1 * (D + C2) + J2 * (D + C1)) / K,
-        "a2": J1 + J2 + (C1 * C2 + D * (C1 + C2)) / K, "a1": C1 + C2, "Fc": F1 + F2,
+        "a2": J1 + J2 + (C1 * C2 + D * (C1 + C2)) / K,
+        "a1": C1 + C2,
+        "Fc": F1 + F2,
     }
     assert set(chi) == set(expected)
     for name, value in expected.items():
@@ -161,11 +165,11 @@ def test_what_is_not_linear_is_refused(name, still, tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(flexible.case("positions", effects=effects))
     with pytest.raises(InputError, match=words):
-        alone(METHODS["minimal_model"](open_session(path, still)))
+        run_alone(METHODS["minimal_model"](open_session(path, still)))
 
 
 def test_the_printed_model_needs_an_accelerometer(still, tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(flexible.case("motor"))
     with pytest.raises(InputError, match="load_acceleration"):
-        alone(METHODS["minimal_model_printed"](open_session(path, still)))
+        run_alone(METHODS["minimal_model_printed"](open_session(path, still)))

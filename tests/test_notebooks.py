@@ -23,9 +23,7 @@ def test_the_notebook_is_what_jupytext_makes_of_the_script(script):
     written = nbformat.read(script.with_suffix(".ipynb"), as_version=4)
     made = jupytext.read(script)
     assert written.metadata["kernelspec"]["name"] == "python3"
-    assert [(c.cell_type, c.source) for c in written.cells] == [
-        (c.cell_type, c.source) for c in made.cells
-    ]
+    assert [(c.cell_type, c.source) for c in written.cells] == [(c.cell_type, c.source) for c in made.cells]
     for cell in written.cells:
         assert cell.get("outputs", []) == []
         assert cell.get("execution_count") is None

@@ -8,7 +8,7 @@ from search_cases import COULOMB, VISCOUS
 from search_setup import case_text, log_of, write_case
 
 from jaxid.commands.discover import discover
-from jaxid.discovery.superset import build_union
+from jaxid.discovery.superset import build_candidate_model
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.session import open_session
@@ -98,7 +98,7 @@ def test_a_candidate_of_the_case_is_found_and_no_other_case_knows_it(tmp_path, l
 
 def union(path, log):
     session = open_session(path, log)
-    return build_union(session.machine, session.fit.data, session.case.searched)
+    return build_candidate_model(session.machine, session.fit.data, session.case.searched)
 
 
 def test_candidates_stand_beside_the_registered_and_leave_the_model_alone(tmp_path, log):
@@ -138,7 +138,7 @@ def test_some_of_the_registered_are_searched_for_on_request(tmp_path, log):
 
 FAULTS = {
     "Clip": "changes the force by .* at its neutral values; define neutral.*adds_force = False",
-    "Root": "is no number at the values of neutral; change them, or mend act",
+    "Root": "is no number at the values of neutral; change them, or correct act",
     "Unsized": "cannot be started .KeyError.*; let neutral.*give a number for strength",
     "Known": "has no parameters; declare",
     "Misspelt": "cannot be started.*give a number for strength",

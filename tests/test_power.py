@@ -82,9 +82,7 @@ force = ["u1", "u2"]
 
 def test_a_chain_has_a_balance_a_mass(tmp_path):
     t = np.arange(6000) / 1000.0
-    machine = ChainMachine(
-        [2.0, 1.5], [8.0, 8.0], [1500.0] * 3, {("coulomb_friction", 1): {"level": 4.0}}
-    )
+    machine = ChainMachine([2.0, 1.5], [8.0, 8.0], [1500.0] * 3, {("coulomb_friction", 1): {"level": 4.0}})
     speeds = np.array([0.2, 0.3, 0.15])
     loops = [
         Loop("pd", reference=moves(t, tour, speeds, 4.0), kp=2000.0, kd=60.0)

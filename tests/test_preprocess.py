@@ -89,9 +89,7 @@ def test_chosen_band_reaches_the_highest_line_across_gaps():
 def test_chosen_rest_velocity_is_five_deviations_of_the_velocitys_noise():
     recipe = choose_recipe(log_of(multisine(), noise=1e-4))
     noise = 1e-4 * np.random.default_rng(4).standard_normal((8000, 1))
-    _, velocity, _ = differentiate(
-        noise, 1 / RATE, recipe.cutoff_hz, recipe.order, recipe.derivatives
-    )
+    _, velocity, _ = differentiate(noise, 1 / RATE, recipe.cutoff_hz, recipe.order, recipe.derivatives)
     # the roll-off inside the cut-off leaves less than the sharp edge that the choice assumes
     assert 0.5 < 5 * velocity[500:-500].std() / recipe.rest_velocity[0] < 1.0
 

@@ -1,7 +1,5 @@
 """The method `recursive` a sample at a time, on true motion of an exact stepper."""
 
-
-
 import jax
 import numpy as np
 import pytest

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.estimators.recursive.recursion import TOLD, Recursion, instants, run
+from jaxid.estimators.recursive.recursion import IDENTIFIED, Recursion, instants, run
 
 TRUTH = np.array([95.0, 203.0, 20.0, 0.85])
 START = np.array([40.0, 0.0, 0.0, 1.0])
@@ -70,7 +70,7 @@ def test_standard_deviations_are_the_scatter():
     scatter = np.std(told.theta[:, -1], axis=0)
     np.testing.assert_allclose(np.sqrt(np.mean(told.std[:, -1] ** 2, axis=0)), scatter, rtol=0.14)
     np.testing.assert_allclose(np.mean(told.noise[:, -1] ** 2), 0.09, rtol=0.03)
-    assert np.all(told.told[:, -1])
+    assert np.all(told.identifiable[:, -1])
 
 
 def test_it_goes_on_bit_for_bit():
@@ -127,12 +127,12 @@ def test_wind_up_is_bounded_by_the_start():
     _, p = textbook(START, own, beta, y[:, 0], r[:, 0])
     assert p[3, 3] * own[3] > 1e30
     # It is told while it is stirred, then goes back to its start, and says so.
-    assert told.told[0, 3]
+    assert told.identifiable[0, 3]
     np.testing.assert_allclose(told.theta[0, 3], TRUTH[3], rtol=1e-3)
-    assert not told.told[-1, 3]
+    assert not told.identifiable[-1, 3]
     assert np.isnan(told.std[-1, 3])
     np.testing.assert_allclose(told.theta[-1], [*TRUTH[:3], START[3]], rtol=1e-3)
-    assert variance[3] * own[3] > TOLD > variance[0] * own[0]
+    assert variance[3] * own[3] > IDENTIFIED > variance[0] * own[0]
 
 
 def test_a_root_keeps_what_a_covariance_loses():
@@ -222,8 +222,16 @@ def test_instruments_of_summed_rows_are_their_sum():
     options = (np.asarray(1.0), True, (2, 3), True)
     recursion = Recursion(start, own, *options)
     _, told, z = run(recursion, recursion.memory(), both, target, counts, 1)
-    before = np.concatenate([start[None], np.asarray(run(Recursion(
-        start, own, np.asarray(1.0), True), recursion.memory(), both, target, counts, 1)[1].theta)])[:-1]
+    before = np.concatenate(
+        [
+            start[None],
+            np.asarray(
+                run(
+                    Recursion(start, own, np.asarray(1.0), True), recursion.memory(), both, target, counts, 1
+                )[1].theta
+            ),
+        ]
+    )[:-1]
     e = np.einsum("tmp,tp->tm", both, before) - target
     expected = both.copy()
     for k, g in enumerate((2, 3)):

@@ -1,7 +1,5 @@
 """What the method `recursive` refuses, each in one line."""
 
-
-
 import pytest
 from recursive_axis import COULOMB, GAIN, VISCOUS, estimate, slide, with_table, written_axis
 from search_setup import case_text, write_case
@@ -23,7 +21,7 @@ REFUSED = {
     "a half-life of nothing": ("half_life = 0.0", "half_life = 0.0 is not positive"),
     "a start that does not count": ("regularization = 0", "regularization = 0 is not positive"),
     "a negative gate": ("gate_velocity = -1.0", "gate_velocity = -1.0 is negative"),
-    "rows of a third kind": ('rows = "half"', "rows = \"half\" is unknown"),
+    "rows of a third kind": ('rows = "half"', 'rows = "half" is unknown'),
     "an instrument without a gain": ('instrument = "model"', "for gains of drives, and none is unknown"),
     "nothing passes": ("gate_velocity = 1e3", "0 samples pass the gate, for 3 unknowns; lower"),
     "no memory": ('restart = "none.json"', "none.json: no such file"),
@@ -94,5 +92,3 @@ def test_a_restart_about_other_unknowns(axis, tmp_path):
     path = with_table(tmp_path, axis, '\n[recursive]\nrestart = "first/result.json"\nrows = "summed"\n')
     with pytest.raises(InputError, match="restart is of a run with other rows"):
         estimate(path, axis[1])
-
-

@@ -215,9 +215,7 @@ def test_verdicts_are_in_plain_words():
     assert "The force residual on the fit log is 6.10 N (RMS)." in words
     assert "did not converge" in _words(render(_identification(converged=False)))
     place = {"kind": "coulomb_friction", "joint": 2, "parameters": {}}
-    assert "found: coulomb_friction (joint 2)" in _words(
-        render(_discovery(effects=(place,), views=()))
-    )
+    assert "found: coulomb_friction (joint 2)" in _words(render(_discovery(effects=(place,), views=())))
 
 
 def test_gap_of_several_joints_and_logs():

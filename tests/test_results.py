@@ -8,7 +8,9 @@ from cli_setup import COULOMB, TRUTH, VISCOUS, place, recorded, run, text
 from jaxid.effects import EFFECTS
 
 UNITS = {
-    "inertia": "kg", "viscous_friction.coefficient": "N s/m", "coulomb_friction.level": "N",
+    "inertia": "kg",
+    "viscous_friction.coefficient": "N s/m",
+    "coulomb_friction.level": "N",
 }
 METHODS = ("inverse_dynamics", "output_error", "algebraic", "recursive")
 ADDED_MASS = ("added_mass", {"mass": 1.0})
@@ -54,13 +56,23 @@ def judge_gap(gap, *, validated):
     assert promised <= {*gap}
     simulation = gap["simulation"]
     assert (gap["unit"], simulation["unit"]) == ("N", "m")
-    for value in (gap["band_hz"], gap["fit"], gap["noise_floor"], gap["relative"]["fit"],
-                  simulation["fit"], simulation["relative"]["fit"]):
+    for value in (
+        gap["band_hz"],
+        gap["fit"],
+        gap["noise_floor"],
+        gap["relative"]["fit"],
+        simulation["fit"],
+        simulation["relative"]["fit"],
+    ):
         number(value)
     assert gap["relative"]["fit"] < 0.01
     assert simulation["relative"]["fit"] < 1e-4
-    others = (gap["validation"], gap["relative"]["validation"], simulation["validation"],
-              simulation["relative"]["validation"])
+    others = (
+        gap["validation"],
+        gap["relative"]["validation"],
+        simulation["validation"],
+        simulation["relative"]["validation"],
+    )
     if validated:
         [number(other) for other in others]
         assert gap["validation"] == pytest.approx(gap["fit"], rel=1.0)
@@ -142,8 +154,14 @@ def judge_discovery(found, steps):
     promised = {"unit", "band_hz", "before", "after", "noise_floor", "on", "simulation"}
     assert promised <= {*gap}
     assert (gap["unit"], gap["simulation"]["unit"]) == ("N", "m")
-    for value in (gap["band_hz"], gap["before"], gap["after"], gap["noise_floor"],
-                  gap["simulation"]["before"], gap["simulation"]["after"]):
+    for value in (
+        gap["band_hz"],
+        gap["before"],
+        gap["after"],
+        gap["noise_floor"],
+        gap["simulation"]["before"],
+        gap["simulation"]["after"],
+    ):
         number(value)
 
 

@@ -12,19 +12,23 @@ from jaxid.model.parameter import parameters_of
 from jaxid.plants import DenavitHartenberg, SerialArm, pa10
 
 PA10 = [
-    (joint, *numbers) for joint, *numbers in zip(
+    (joint, *numbers)
+    for joint, *numbers in zip(
         pa10().joints, *(np.asarray(getattr(pa10(), k)) for k in ("alpha", "a", "d", "theta")), strict=True
     )
 ]
 ROWS = {
     "pa10": PA10,
     "scara": [
-        ("revolute", 0.0, 0.0, 0.2, 0.3), ("revolute", 0.0, 0.4, 0.0, -0.2),
+        ("revolute", 0.0, 0.0, 0.2, 0.3),
+        ("revolute", 0.0, 0.4, 0.0, -0.2),
         ("prismatic", np.pi, 0.3, 0.1, 0.5),
     ],
     "general": [
-        ("prismatic", 0.4, 0.1, 0.2, -0.3), ("revolute", -1.1, 0.3, -0.2, 0.7),
-        ("revolute", 0.9, -0.2, 0.1, 0.2), ("prismatic", 1.7, 0.25, 0.05, -1.0),
+        ("prismatic", 0.4, 0.1, 0.2, -0.3),
+        ("revolute", -1.1, 0.3, -0.2, 0.7),
+        ("revolute", 0.9, -0.2, 0.1, 0.2),
+        ("prismatic", 1.7, 0.25, 0.05, -1.0),
         ("revolute", -0.6, 0.15, 0.3, 0.1),
     ],
 }
@@ -152,9 +156,9 @@ def test_energy_stays_without_friction():
         centres = np.einsum("imn,in->im", arm_oracle.transforms(rows, np.asarray(x.q)), first)
         return 0.5 * x.qd @ mass @ x.qd - np.sum(centres[:, :3] @ GRAVITY)
 
-    advance = jax.jit(lambda x: jax.lax.fori_loop(
-        0, 500, lambda k, x: step(plant, x, lambda s: none, 0.0, h), x
-    ))
+    advance = jax.jit(
+        lambda x: jax.lax.fori_loop(0, 500, lambda k, x: step(plant, x, lambda s: none, 0.0, h), x)
+    )
     start, end = energy(x), energy(advance(x))
     moved = 0.5 * x.qd @ arm_oracle.mass_matrix(rows, parameters, np.asarray(x.q)) @ x.qd
     # a fourth-order step of 1 ms
@@ -181,7 +185,7 @@ def test_units_of_a_joint_are_those_of_its_motion():
     assert plant.joints == 3
     assert plant.own_inertia() is None
     # a force on a joint stands in no other's balance, so that a search shares its columns
-    assert [plant.reached(k, 3) for k in range(3)] == [(0,), (1,), (2,)]
+    assert [plant.joints_loaded_by(k, 3) for k in range(3)] == [(0,), (1,), (2,)]
     assert set(arm_oracle.NAMES) < set(parameters_of(SerialArm))
 
 

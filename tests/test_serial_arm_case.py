@@ -28,12 +28,11 @@ level = {coulomb}
 LOG = '[log]\ntime = "t"\nposition = ["q1", "q2"]\nforce = ["u1", "u2"]\n'
 UNKNOWN = "[{ guess = 0.1 }, { guess = 0.1 }]"
 # A guess of nothing where something is, and tenfold too little where something must be.
-BASE = (
-    ("0.0", "[{ guess = 0.0 }, { guess = 0.0 }, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, { guess = 0.1 }]"),
-) * 2
+BASE = (("0.0", "[{ guess = 0.0 }, { guess = 0.0 }, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, { guess = 0.1 }]"),) * 2
 WHOLE = (
     (
-        "{ guess = 1.0 }", "[{ guess = 0.0 }, { guess = 0.0 }, { guess = 0.0 }]",
+        "{ guess = 1.0 }",
+        "[{ guess = 0.0 }, { guess = 0.0 }, { guess = 0.0 }]",
         "{ guess = [0.1, 0.0, 0.0, 0.1, 0.0, 0.1] }",
     ),
 ) * 2
@@ -142,7 +141,12 @@ def test_what_a_log_cannot_tell_is_named_and_has_no_sigma(estimates):
     blind = {n for n in estimate.names if np.isnan(std[n])}
     # 20 unknowns, 6 combinations; of those that no torque depends on none is told
     assert blind >= {
-        "mass[1]", "inertia_xx[1]", "inertia_yy[2]", "inertia_yz[2]", "first_moment_z[2]", "mass[2]",
+        "mass[1]",
+        "inertia_xx[1]",
+        "inertia_yy[2]",
+        "inertia_yz[2]",
+        "first_moment_z[2]",
+        "mass[2]",
     }
     # what stands in no sum with another is told
     for name in ("first_moment_x[2]", "first_moment_y[2]", "inertia_zz[2]"):
@@ -162,6 +166,7 @@ def test_what_a_log_cannot_tell_is_named_and_has_no_sigma(estimates):
 
 def true_values(arm: TwoLinks) -> tuple:
     """The links with their own values, in full."""
+
     def link(m, x, y, inertia):
         own = f"[0.01, {-m * x * y}, 0.0, 0.01, 0.0, {inertia + m * (x**2 + y**2)}]"
         return str(m), f"[{m * x}, {m * y}, 0.0]", own
@@ -173,8 +178,11 @@ SHAFT = "[[plant.shafts]]\njoints = [1, 2]\n"
 
 
 def on_shaft(inertia: str, viscous: str, coulomb: str) -> str:
-    values = (("added_mass", "mass", inertia), ("viscous_friction", "coefficient", viscous),
-              ("coulomb_friction", "level", coulomb))
+    values = (
+        ("added_mass", "mass", inertia),
+        ("viscous_friction", "coefficient", viscous),
+        ("coulomb_friction", "level", coulomb),
+    )
     return "".join(f'[[effects]]\nkind = "{k}"\nshaft = 1\n{name} = {v}\n' for k, name, v in values)
 
 
@@ -183,8 +191,12 @@ def test_friction_of_a_shaft_is_told_from_that_of_its_joints(tmp_path):
     log = write_csv(tmp_path / "log.csv", followed(arm))
     rest = SHAFT + on_shaft("0.1", "{ guess = 0.1 }", "{ guess = 0.1 }") + LOG
     path = tmp_path / "case.toml"
-    path.write_text(text().replace(FRICTION.format(viscous=UNKNOWN, coulomb=UNKNOWN) + LOG,
-                                   rest + FRICTION.format(viscous=UNKNOWN, coulomb=UNKNOWN)))
+    path.write_text(
+        text().replace(
+            FRICTION.format(viscous=UNKNOWN, coulomb=UNKNOWN) + LOG,
+            rest + FRICTION.format(viscous=UNKNOWN, coulomb=UNKNOWN),
+        )
+    )
     session = open_session(path, log)
     estimate = inverse_dynamics(session.machine, session.fit.data)
     assert estimate.converged
@@ -245,7 +257,8 @@ def test_command_line_goes_from_simulated_loop_to_result(tmp_path, capsys):
     )
     links = [
         (
-            mass, f"[{{ guess = 0.0, true = {first} }}, 0.0, 0.0]",
+            mass,
+            f"[{{ guess = 0.0, true = {first} }}, 0.0, 0.0]",
             f"[0.0, 0.0, 0.0, 0.0, 0.0, {{ guess = 0.1, true = {second} }}]",
         )
         for mass, first, second in ((0.0, 1.6, 0.7), (1.0, 0.5, 0.2))
@@ -269,7 +282,8 @@ GOOD = text()
 LINK = "[[plant.links]]"
 FAULTS = {
     "joint": (
-        ('joint = "revolute"', 'joint = "helical"'), ["links]] 1", "joint", "helical", "revolute, prismatic"],
+        ('joint = "revolute"', 'joint = "helical"'),
+        ["links]] 1", "joint", "helical", "revolute, prismatic"],
     ),
     "missing row": (("a = 0.5\n", ""), ["[[plant.links]] 2", "'a' is missing", "[m]"]),
     "missing angle": (("alpha_deg = 0.0\n", ""), ["links]] 1", "'alpha' is missing", "alpha_deg"]),
@@ -277,7 +291,8 @@ FAULTS = {
     "missing mass": (("mass = 0.0\n", ""), ["links]] 1", "'mass' is missing", "{ guess = ... }"]),
     "negative mass": (("mass = 0.0", "mass = -1.0"), ["mass = -1.0 is negative"]),
     "columns": (
-        ("[0.0, 0.0, 0.0, 0.0, 0.0, {", "[0.0, 0.0, 0.0, 0.0, {"), ["inertia", "5 entries", "6 in a list"],
+        ("[0.0, 0.0, 0.0, 0.0, 0.0, {", "[0.0, 0.0, 0.0, 0.0, {"),
+        ["inertia", "5 entries", "6 in a list"],
     ),
     "no list": (
         ("first_moment = [{ guess = 0.0 }, { guess = 0.0 }, 0.0]", "first_moment = 0.0"),
@@ -286,11 +301,13 @@ FAULTS = {
     "unknown key": (("mass = 0.0", "mas = 0.0"), ["links]] 1", "'mas'", "'mass'"]),
     "gravity": (("= [0.0, -9.81, 0.0]", "= [0.0, -9.81]"), ["gravity_vector", "3"]),
     "scalar gravity": (
-        ("gravity_vector = [0.0, -9.81, 0.0]", "gravity = 9.81"), ["'gravity'", "gravity_vector"],
+        ("gravity_vector = [0.0, -9.81, 0.0]", "gravity = 9.81"),
+        ["'gravity'", "gravity_vector"],
     ),
     "guessed length": (("a = 0.5", "a = { guess = 0.5 }"), ["a", "must be a known number"]),
     "shafts": (
-        ("[log]", "[[plant.shafts]]\njoints = [2, 3]\n[log]"), ["shafts]] 1", "[2, 3]", "from 1 to 2"],
+        ("[log]", "[[plant.shafts]]\njoints = [2, 3]\n[log]"),
+        ["shafts]] 1", "[2, 3]", "from 1 to 2"],
     ),
     "one joint": (("[log]", "[[plant.shafts]]\njoints = [2]\n[log]"), ["shafts]] 1", "joints", "2"]),
     "ratios": (
@@ -298,7 +315,8 @@ FAULTS = {
         ["ratios = [1.0] does not go with 2 joints; give a ratio other than zero for each"],
     ),
     "sliding shaft": (
-        ('joint = "revolute"', 'joint = "prismatic"'), ["joints that turn and joints that slide"],
+        ('joint = "revolute"', 'joint = "prismatic"'),
+        ["joints that turn and joints that slide"],
     ),
     "no shaft": (
         ('kind = "viscous_friction"', 'kind = "viscous_friction"\nshaft = 1'),
@@ -346,8 +364,10 @@ def test_massless_arm_is_not_simulated(tmp_path, capsys):
 
 
 def test_rotors_and_units_by_joint(tmp_path):
-    slide = GOOD.replace('joint = "revolute"\nalpha_deg = 0.0\na = 0.5', (
-        'joint = "prismatic"\nalpha_deg = 90.0\na = 0.5\nrotor_inertia = { guess = 3.0 }'))
+    slide = GOOD.replace(
+        'joint = "revolute"\nalpha_deg = 0.0\na = 0.5',
+        ('joint = "prismatic"\nalpha_deg = 90.0\na = 0.5\nrotor_inertia = { guess = 3.0 }'),
+    )
     path = tmp_path / "case.toml"
     path.write_text(slide)
     built = build_machine(load_case(path))

@@ -6,7 +6,7 @@ import pytest
 import stepper
 
 from jaxid.dynamics.dry_friction import set_valued_step
-from jaxid.dynamics.rhs import State, course
+from jaxid.dynamics.rhs import State, hold_polynomial
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.plants import Axis, Chain
@@ -24,9 +24,9 @@ COMMAND = 25.0 * np.sin(2 * np.pi * 1.3 * np.arange(round(SECONDS * RATE)) / RAT
 def true_position(effects) -> np.ndarray:
     machine = stepper.Machine(inertia=MASS, effects=effects)
     loop = stepper.Loop(kind="open_loop", input=COMMAND)
-    return stepper.simulate(
-        machine, loop, stepper.Sensor(0.0, 0.0, 0.0), rate=RATE, duration=SECONDS
-    )["true_position"]
+    return stepper.simulate(machine, loop, stepper.Sensor(0.0, 0.0, 0.0), rate=RATE, duration=SECONDS)[
+        "true_position"
+    ]
 
 
 def error(effects, substeps: int) -> float:
@@ -73,7 +73,9 @@ def test_friction_while_speed_grows_beside_friction_in_a_spring_is_refused():
 def stepped(plant, speed: float, force: float) -> tuple[float, float]:
     """Position and velocity after one step from zero under a held force."""
     x = State(jnp.zeros(1), jnp.asarray([speed]), (None,) * len(plant.effects))
-    y, _ = set_valued_step(plant, x, course((jnp.asarray([force]),)), jnp.zeros(()), jnp.asarray(1 / RATE))
+    y, _ = set_valued_step(
+        plant, x, hold_polynomial((jnp.asarray([force]),)), jnp.zeros(()), jnp.asarray(1 / RATE)
+    )
     return float(y.q[0]), float(y.qd[0])
 
 
@@ -96,7 +98,8 @@ def test_a_velocity_stands_just_where_the_force_lies_between_both_frictions():
     """However much damping takes of an impulse within the step: here a fifth."""
     dry, rising, damping, speed = 10.0, 4.0, 0.5 * MASS * RATE, 0.2
     effects = (
-        EFFECTS["coulomb_friction"](level=dry), EFFECTS["viscous_friction"](coefficient=damping),
+        EFFECTS["coulomb_friction"](level=dry),
+        EFFECTS["viscous_friction"](coefficient=damping),
         EFFECTS["velocity_hysteresis"](level=rising, velocity=1e3),
     )
     plant = Axis(MASS, effects=effects, sharpness=1e-6)

@@ -22,7 +22,7 @@ from jaxid.model.unknowns import Free, Parameters
 from jaxid.plants import Axis
 from jaxid.simulation.loops import with_diffrax
 from jaxid.simulation.replay import Numerics, make_replay
-from jaxid.simulation.solvers import SOLVERS, Adaptive
+from jaxid.simulation.solvers import SOLVERS, AdaptiveStep
 
 PERIOD, SAMPLES, GAIN = 5e-3, 300, 3.0
 TIMES = PERIOD * np.arange(SAMPLES)
@@ -63,13 +63,21 @@ def machine(closed: bool, unknown: tuple = tuple(TRUTH)) -> Machine:
 def log(closed: bool, hold: str = "zero_order") -> Log:
     """What the machine does by fine fixed steps."""
     empty = Log(
-        TIMES, np.zeros((SAMPLES, 1)), WAVE[:, None], reference=0.05 * WAVE[:, None], hold=hold,
+        TIMES,
+        np.zeros((SAMPLES, 1)),
+        WAVE[:, None],
+        reference=0.05 * WAVE[:, None],
+        hold=hold,
         source="made.csv",
     )
     run = make_replay(machine(closed), empty, FINE)(plant())
     return Log(
-        TIMES, np.asarray(run.position), np.asarray(run.command), reference=empty.reference,
-        hold=hold, source="made.csv",
+        TIMES,
+        np.asarray(run.position),
+        np.asarray(run.command),
+        reference=empty.reference,
+        hold=hold,
+        source="made.csv",
     )
 
 
@@ -115,7 +123,11 @@ def test_interval_by_interval_is_the_whole_log_at_once():
     held = lambda t: force[jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0)]
     start = make_replay(m, data, FINE)
     whole, _ = with_diffrax(
-        own, held, times, start.position, start.velocity,
+        own,
+        held,
+        times,
+        start.position,
+        start.velocity,
         controller=diffrax.ClipStepSizeController(
             diffrax.PIDController(rtol=1e-10, atol=1e-12), jump_ts=times[1:-1]
         ),
@@ -130,9 +142,7 @@ def test_estimates_through_diffrax_are_those_of_fine_steps(closed):
     m, data = machine(closed, ("inertia", "viscous", "dry", "lag")), log(closed)
     start = np.asarray(m.parameters.guess) * [1.3, 0.7, 1.2, 0.8]
     noise = 1e-4 * np.random.default_rng(1).standard_normal(data.position.shape)
-    data = Log(
-        TIMES, data.position + noise, data.force, reference=data.reference, source="made.csv"
-    )
+    data = Log(TIMES, data.position + noise, data.force, reference=data.reference, source="made.csv")
     fixed, solved = (
         output_error(m, data, start=start, numerics=n)
         for n in (FINE, Numerics(longest_delay=4, solver="tsit5"))
@@ -148,10 +158,10 @@ def test_estimates_through_diffrax_are_those_of_fine_steps(closed):
 def test_what_a_solver_cannot_follow_is_no_number():
     stiff = Axis(1.0, effects=(EFFECTS["viscous_friction"](coefficient=1e9),))
     x = State(jnp.zeros(1), jnp.ones(1), (None,))
-    solver = Adaptive.sized("tsit5", 1.0, 1.0)
+    solver = AdaptiveStep.sized("tsit5", 1.0, 1.0)
     after = solver(stiff, x, (jnp.zeros(1),), jnp.zeros(()), jnp.asarray(1.0))
     assert np.all(np.isnan(np.asarray(after.q)))
-    implicit = Adaptive.sized("kvaerno5", 1.0, 1.0)
+    implicit = AdaptiveStep.sized("kvaerno5", 1.0, 1.0)
     after = implicit(stiff, x, (jnp.zeros(1),), jnp.zeros(()), jnp.asarray(1.0))
     np.testing.assert_allclose(np.asarray(after.q), [1e-9], atol=1e-9)
 

@@ -34,16 +34,14 @@ def axis_log(seed: int = 0, **changes) -> Log:
 
 
 def scaled(log: Log, **factors: float) -> Log:
-    return dataclasses.replace(
-        log, **{name: factor * getattr(log, name) for name, factor in factors.items()}
-    )
+    return dataclasses.replace(log, **{name: factor * getattr(log, name) for name, factor in factors.items()})
 
 
 def found(log: Log, severity: str, match: str, **kwargs) -> Finding:
     """The one finding of this severity whose line holds the words."""
     hits = [f for f in check_log(log, **kwargs) if f.severity == severity and match in str(f)]
     assert len(hits) == 1, [str(f) for f in check_log(log, **kwargs)]
-    assert hits[0].mend
+    assert hits[0].hint
     return hits[0]
 
 
@@ -126,7 +124,7 @@ def test_a_resolution_that_the_case_states_is_not_asked_for(stated):
     log = axis_log()
     coarse = dataclasses.replace(log, position=1e-3 * np.round(log.position / 1e-3))
     told = found(coarse, "warning", "quantised", resolution_stated=stated)
-    assert ("give sensor.position_resolution" in told.mend) == (not stated)
+    assert ("give sensor.position_resolution" in told.hint) == (not stated)
 
 
 # Units
@@ -202,7 +200,11 @@ def test_a_spring_that_a_controller_makes_is_no_inertia():
     friction = {"viscous_friction": {"coefficient": 1.7}, "coulomb_friction": {"level": 3.7}}
     loop = Loop("friction_compensation", kp=235.0, viscous=1.7, reference=np.zeros(900))
     made = simulate(
-        Machine(1.35, friction), loop, Sensor(position_noise=1e-7, force_noise=0.2), rate=1e3, duration=0.9,
+        Machine(1.35, friction),
+        loop,
+        Sensor(position_noise=1e-7, force_noise=0.2),
+        rate=1e3,
+        duration=0.9,
         initial_position=0.1,
     )
     log = Log(made["t"], made["position"], made["force"], source="swing.csv")

@@ -13,22 +13,16 @@ IDEAL = Sensor()
 RATE = 1000.0
 
 
-def free_run(
-    machine: Machine, duration: float, force: Any = 0.0, hold: str = "zero_order", **options: Any
-):
+def free_run(machine: Machine, duration: float, force: Any = 0.0, hold: str = "zero_order", **options: Any):
     """Open loop under a constant force or one given by sample."""
     count = round(duration * RATE)
     given = np.broadcast_to(np.asarray(force, dtype=float), count)
-    return simulate(
-        machine, Loop(input=given, hold=hold), IDEAL, rate=RATE, duration=duration, **options
-    )
+    return simulate(machine, Loop(input=given, hold=hold), IDEAL, rate=RATE, duration=duration, **options)
 
 
 def test_coulomb_stops_after_the_right_time_and_distance():
     mass, level, speed = 2.0, 3.0, 1.0
-    log = free_run(
-        Machine(mass, {"coulomb_friction": {"level": level}}), 1.0, initial_velocity=speed
-    )
+    log = free_run(Machine(mass, {"coulomb_friction": {"level": level}}), 1.0, initial_velocity=speed)
     stop = mass * speed / level
     expected = np.maximum(speed - level / mass * log["t"], 0.0)
     np.testing.assert_allclose(log["true_velocity"], expected, atol=1e-12)
@@ -46,9 +40,7 @@ def test_sticks_exactly_and_leaves_at_level_plus_static():
     assert np.all(log["true_position"][stuck] == 0.1)
     since = np.maximum(log["t"] - 0.45, 0.0)  # net = 10 t - 3 from there on: a jump of 1.5 N
     # it leaves at most one step late: 5 us * 0.75 m/s^2, twice
-    np.testing.assert_allclose(
-        log["true_velocity"], (1.5 * since + 5.0 * since**2) / 2.0, atol=8e-6
-    )
+    np.testing.assert_allclose(log["true_velocity"], (1.5 * since + 5.0 * since**2) / 2.0, atol=8e-6)
 
 
 def test_passes_through_zero_velocity_without_losing_time():
@@ -86,15 +78,11 @@ def test_friction_takes_four_levels_over_stiffness_a_cycle():
     mass, stiffness, level = 1.0, 400.0, 0.5
     effects = {"linear_stiffness": {"coefficient": stiffness}, "coulomb_friction": {"level": level}}
     log = free_run(Machine(mass, effects), 4.0, initial_position=0.0112)
-    turns = 0.0112 - 2.0 * level / stiffness * np.arange(
-        5
-    )  # the fifth turn is inside F / k = 1.25 mm
+    turns = 0.0112 - 2.0 * level / stiffness * np.arange(5)  # the fifth turn is inside F / k = 1.25 mm
     half = np.pi / np.sqrt(stiffness / mass)
     at = np.round(half * np.arange(1, 5) * RATE).astype(int)
     # the nearest sample is within 0.5 ms of the turn: k A (0.5 ms)^2 / 2 m < 0.6 um
-    np.testing.assert_allclose(
-        log["true_position"][at], turns[1:] * np.array([-1, 1, -1, 1]), atol=6e-7
-    )
+    np.testing.assert_allclose(log["true_position"][at], turns[1:] * np.array([-1, 1, -1, 1]), atol=6e-7)
     assert log["true_position"][-1] == pytest.approx(turns[4], abs=1e-9)
     assert np.all(log["true_velocity"][at[3] + 2 :] == 0.0)
 
@@ -106,9 +94,7 @@ def test_dahl_follows_its_exponential_in_each_stroke():
     log = free_run(machine, 0.3, force)
     friction = log["true_force"] - mass * log["true_acceleration"]
     x, v = log["true_position"], log["true_velocity"]
-    np.testing.assert_allclose(
-        friction[:100], level * (1 - np.exp(-stiffness * x[:100] / level)), atol=1e-9
-    )
+    np.testing.assert_allclose(friction[:100], level * (1 - np.exp(-stiffness * x[:100] / level)), atol=1e-9)
     reach = level / stiffness
     turn = int(np.flatnonzero(v < 0.0)[0])
     back = friction[turn:] + level  # falls by e for every `reach` of the way back
@@ -132,9 +118,7 @@ def test_delay_off_the_grid_shifts_the_response_exactly():
         100 * np.arange(50) / RATE,
         "linear",
     )
-    np.testing.assert_allclose(
-        linear["true_force"], 100 * np.maximum(linear["t"] - 1.37e-3, 0.0), atol=1e-12
-    )
+    np.testing.assert_allclose(linear["true_force"], 100 * np.maximum(linear["t"] - 1.37e-3, 0.0), atol=1e-12)
 
 
 def test_a_supply_lets_speed_settle_where_it_says():
@@ -159,18 +143,14 @@ def test_lag_and_saturation_of_a_step():
     log = free_run(Machine(2.0, {"actuator_lag": {"time_constant": tau}}), 0.05, force)
     rise = 1.0 - np.exp(-log["t"] / tau)
     np.testing.assert_allclose(log["true_force"], force * rise, atol=1e-11)
-    np.testing.assert_allclose(
-        log["true_velocity"], force / 2.0 * (log["t"] - tau * rise), atol=1e-8
-    )
+    np.testing.assert_allclose(log["true_velocity"], force / 2.0 * (log["t"] - tau * rise), atol=1e-8)
     effects = {
         "actuator_lag": {"time_constant": tau},
         "saturation": {"limit": 5.0},
         "actuator_gain": {"gain": 1.2},
     }
     clipped = free_run(Machine(2.0, effects), 0.05, force)
-    np.testing.assert_allclose(
-        clipped["true_force"], np.minimum(1.2 * force * rise, 5.0), atol=1e-11
-    )
+    np.testing.assert_allclose(clipped["true_force"], np.minimum(1.2 * force * rise, 5.0), atol=1e-11)
     impulse = np.cumsum(clipped["true_force"]) / RATE  # rectangles: off by 5 N half a tick at most
     np.testing.assert_allclose(clipped["true_velocity"], impulse / 2.0, atol=2.6e-3)
 
@@ -244,9 +224,7 @@ def test_weight_added_mass_bursts_and_clock():
     assert burst["true_velocity"][-1] == pytest.approx((0.08 - 0.1) / 2.0, rel=1e-9)
     clock = free_run(Machine(2.0, clock_force=(4.0, 7.0)), 0.5)
     w = 2.0 * np.pi * 7.0
-    np.testing.assert_allclose(
-        clock["true_velocity"], 2.0 / w * (1.0 - np.cos(w * clock["t"])), atol=1e-9
-    )
+    np.testing.assert_allclose(clock["true_velocity"], 2.0 / w * (1.0 - np.cos(w * clock["t"])), atol=1e-9)
 
 
 SMOOTH: dict[str, tuple[dict, dict[str, Any]]] = {
@@ -276,9 +254,7 @@ def test_error_falls_fourfold_when_the_step_is_halved(case):
         for step in (5e-6, 5e-4, 2.5e-4, 1.25e-4)
     )
     errors = np.abs(np.array(coarse) - fine)
-    np.testing.assert_allclose(
-        errors[:-1] / errors[1:], 4.0, rtol=0.05
-    )  # the next order is about 1 % here
+    np.testing.assert_allclose(errors[:-1] / errors[1:], 4.0, rtol=0.05)  # the next order is about 1 % here
 
 
 @pytest.mark.parametrize(

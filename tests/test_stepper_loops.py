@@ -17,9 +17,7 @@ RATE = 1000.0
 @pytest.mark.parametrize("kind", ["cascade_pd", "pd", "pid", "friction_compensation"])
 def test_command_can_be_recomputed_from_the_log(kind):
     setup = machines.emps_like(duration=2.0)
-    gains = (
-        dict(kp=160.18, kv=243.45) if kind == "cascade_pd" else dict(kp=39000.0, kd=243.45, ki=2e4)
-    )
+    gains = dict(kp=160.18, kv=243.45) if kind == "cascade_pd" else dict(kp=39000.0, kd=243.45, ki=2e4)
     pulses = {"level": 1.5, "on": 0.2, "off": 0.3, "start": 0.1}
     filtered = {"velocity_average": 2, "derivative_filter": 3e-3 * (kind == "pid")}
     fed = dict(coulomb=2.0, viscous=30.0, inertia=0.4) if kind == "friction_compensation" else {}
@@ -50,9 +48,7 @@ def test_command_can_be_recomputed_from_the_log(kind):
 def test_anti_windup_cuts_the_overshoot_and_the_limit_holds():
     loop = Loop(kind="pid", kp=100.0, ki=300.0, kd=20.0, limit=5.0, reference=np.ones(4000))
     plain, clamped = (
-        simulate(
-            Machine(1.0), dataclasses.replace(loop, anti_windup=on), IDEAL, rate=RATE, duration=4.0
-        )
+        simulate(Machine(1.0), dataclasses.replace(loop, anti_windup=on), IDEAL, rate=RATE, duration=4.0)
         for on in (False, True)
     )
     assert np.abs(plain["force"]).max() == 5.0
@@ -95,9 +91,7 @@ def test_presets_follow_their_reference_quickly(preset):
 PUBLISHED = {
     "viscous_friction": {"coefficient": 203.50},
     "coulomb_friction": {"level": 20.39},
-    "constant_force": {
-        "level": 3.165
-    },  # the published offset -3.165 N stands on the side of friction
+    "constant_force": {"level": 3.165},  # the published offset -3.165 N stands on the side of friction
 }
 
 
@@ -120,9 +114,7 @@ def test_closed_loop_replay_of_emps(name, pulses):
     start = {"initial_position": q[0], "initial_velocity": (q[1] - q[0]) * RATE}
     machine = Machine(95.109, PUBLISHED, actuator_gain=35.15065)
     log = simulate(machine, loop, IDEAL, rate=RATE, duration=len(q) / RATE, **start)
-    inner = slice(
-        50, -50
-    )  # the log begins in mid-motion, with a controller's past that is not in it
+    inner = slice(50, -50)  # the log begins in mid-motion, with a controller's past that is not in it
 
     def relative(ours, measured):
         return np.linalg.norm((ours - measured)[inner]) / np.linalg.norm(measured[inner])

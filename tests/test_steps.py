@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from jaxid.numerics.lanes import Parts, Solve, Soon, alone, together
+from jaxid.numerics.lanes import ParallelCalls, Precompile, SolveRequest, run_alone, run_batched
 
 
 def double(x):
@@ -14,7 +14,7 @@ def double(x):
 
 def estimator(x, soon=()):
     yield from soon
-    found = yield Solve(double, (np.asarray(x),))
+    found = yield SolveRequest(double, (np.asarray(x),))
     return float(found)
 
 
@@ -33,13 +33,13 @@ def seen():
 
 def test_what_comes_soon_is_called_beside_once_and_its_error_is_nobodys(seen):
     function, threads, called = seen
-    soon = Soon(function, (1.0,), (function, "a"))
-    assert alone(estimator(3.0, [soon])) == 6.0
+    soon = Precompile(function, (1.0,), (function, "a"))
+    assert run_alone(estimator(3.0, [soon])) == 6.0
     assert called.wait(10)
-    assert alone(estimator(4.0, [soon])) == 8.0
-    other = Soon(function, (2.0,), (function, "b"))
+    assert run_alone(estimator(4.0, [soon])) == 8.0
+    other = Precompile(function, (2.0,), (function, "b"))
     called.clear()
-    assert alone(estimator(5.0), other) == 10.0
+    assert run_alone(estimator(5.0), other) == 10.0
     assert called.wait(10)
     assert len(threads) == 2
     assert all(t is not threading.main_thread() for t in threads)
@@ -55,22 +55,22 @@ def test_parts_run_beside_each_other_after_the_first_of_their_kind():
         return 2.0 * x
 
     def estimator(values):
-        found = yield Parts(function, [(np.array([x]),) for x in values])
+        found = yield ParallelCalls(function, [(np.array([x]),) for x in values])
         return [float(x[0]) for x in found]
 
-    assert alone(estimator([1.0, 2.0, 3.0])) == [2.0, 4.0, 6.0]
+    assert run_alone(estimator([1.0, 2.0, 3.0])) == [2.0, 4.0, 6.0]
     assert threads[0] is threading.current_thread()
     assert all(t is not threads[0] for t in threads[1:])
     threads.clear()
-    assert together([estimator([4.0, 5.0]), estimator([6.0])], 2) == [[8.0, 10.0], [12.0]]
+    assert run_batched([estimator([4.0, 5.0]), estimator([6.0])], 2) == [[8.0, 10.0], [12.0]]
     assert threading.current_thread() not in threads
     with pytest.raises(ValueError, match="negative"):
-        alone(estimator([1.0, -1.0]))
-    assert isinstance(together([estimator([-1.0])], 2)[0], ValueError)
+        run_alone(estimator([1.0, -1.0]))
+    assert isinstance(run_batched([estimator([-1.0])], 2)[0], ValueError)
 
 
 def test_many_together_do_without(seen):
     function, threads, _ = seen
-    many = [estimator(x, [Soon(function, (x,), (function, x))]) for x in (1.0, 2.0, 3.0)]
-    assert together(many, 2) == [2.0, 4.0, 6.0]
+    many = [estimator(x, [Precompile(function, (x,), (function, x))]) for x in (1.0, 2.0, 3.0)]
+    assert run_batched(many, 2) == [2.0, 4.0, 6.0]
     assert not threads

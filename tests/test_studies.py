@@ -16,7 +16,7 @@ from search_setup import write_case
 
 import jaxid
 from jaxid.errors import InputError
-from jaxid.numerics.lanes import Solve, alone, together
+from jaxid.numerics.lanes import SolveRequest, run_alone, run_batched
 from jaxid.studies import plan as planned
 from jaxid.studies.plan import Plan
 from jaxid.studies.result import summarised
@@ -135,12 +135,12 @@ def test_the_loop_stays_where_its_log_is_sampled_otherwise(tmp_path):
 
 
 def test_a_run_is_the_same_whatever_else_is_varied(whole, tmp_path):
-    alone = jaxid.study(whole[0], runs=3, seed=3)
+    run_alone = jaxid.study(whole[0], runs=3, seed=3)
     both = jaxid.study(write_case(tmp_path, AXIS + STUDY.replace(
         "[study]\n", "[study]\nsample_rate = [200.0, 400.0]\n"
     )), runs=3, seed=3)  # fmt: skip
     own = both.table["estimate"].sel(sample_rate=200.0)
-    np.testing.assert_array_equal(own, alone.table["estimate"])
+    np.testing.assert_array_equal(own, run_alone.table["estimate"])
 
 
 def test_resumed_to_the_same_bits(whole, tmp_path):
@@ -376,7 +376,8 @@ def made_up(errors, std, converged=None) -> xr.Dataset:
     converged = np.ones(len(errors)) if converged is None else converged
     return xr.Dataset(
         {
-            "estimate": (each, 5.0 + np.reshape(errors, shape)), "std": (each, np.full(shape, std)),
+            "estimate": (each, 5.0 + np.reshape(errors, shape)),
+            "std": (each, np.full(shape, std)),
             "converged": (each[:3], np.reshape(converged, shape[:3])),
             "identifiable": (each, np.ones(shape, int)),
             "message": (each[:3], np.full(shape[:3], "converged", object)),
@@ -410,18 +411,18 @@ def test_steps_alone_and_together():
         return {"sum": x + y}
 
     def steps(x, fails=False):
-        first = yield Solve(twice, (np.asarray(x), np.ones(2)))
+        first = yield SolveRequest(twice, (np.asarray(x), np.ones(2)))
         if fails:
-            raise InputError("this one ends", mend="let it")
-        second = yield Solve(twice, (np.asarray(first["sum"]), np.asarray(first["sum"])))
+            raise InputError("this one ends", hint="let it")
+        second = yield SolveRequest(twice, (np.asarray(first["sum"]), np.asarray(first["sum"])))
         return np.asarray(second["sum"])
 
     xs = [np.array([k, -k], float) for k in range(5)]
-    found = together([steps(x, fails=k == 3) for k, x in enumerate(xs)], 2)
+    found = run_batched([steps(x, fails=k == 3) for k, x in enumerate(xs)], 2)
     assert isinstance(found[3], InputError)
     for k in (0, 1, 2, 4):
         np.testing.assert_array_equal(found[k], 2 * (xs[k] + 1))
-        np.testing.assert_array_equal(alone(steps(xs[k])), found[k])
+        np.testing.assert_array_equal(run_alone(steps(xs[k])), found[k])
 
 
 FAULTS = {
@@ -432,7 +433,8 @@ FAULTS = {
     "an estimator that keeps no bodies": (
         '[study]\nestimators = ["inverse_dynamics", "algebraic"]',
         '[identification]\nphysically_consistent = true\n[study]\nestimators = ["algebraic", "recursive"]',
-        "does not go with recursive"),
+        "does not go with recursive",
+    ),
     "an estimator that is not there": ('"algebraic"', '"recursion"', "did you mean 'recursive'?"),
 }
 

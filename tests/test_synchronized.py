@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from jaxid.commands.simulate import simulate
 from jaxid.errors import InputError
 from jaxid.references import make_reference
-from jaxid.references.s_curve import Bounds, plan_s_curve
+from jaxid.references.s_curve import MotionBounds, plan_s_curve
 from jaxid.references.synchronized import plan_line
 
 RATE = 4000.0
@@ -39,8 +39,13 @@ def furthest(duration, velocity, acceleration, jerk, way, pieces=120):
             limits += [np.full(pieces, bound[1]), np.full(pieces, -bound[0])]
     j = np.array([sorted(np.array(b) / w) for w, b in zip(way, jerk, strict=True)])
     found = scipy.optimize.linprog(
-        -s, np.vstack(rows), np.concatenate(limits), np.stack([a[-1], v[-1]]), [0.0, 0.0],
-        bounds=(j[:, 0].max(), j[:, 1].min()), method="highs",
+        -s,
+        np.vstack(rows),
+        np.concatenate(limits),
+        np.stack([a[-1], v[-1]]),
+        [0.0, 0.0],
+        bounds=(j[:, 0].max(), j[:, 1].min()),
+        method="highs",
     )
     assert found.status == 0
     return -found.fun
@@ -64,7 +69,7 @@ def test_least_time_against_a_linear_program(seed):
 
 def test_every_case_of_the_limits_is_met():
     """Whether the limits of velocity, and of acceleration both ways, are reached: all that can be."""
-    bounds, met = Bounds(2.0, 3.0, 7.0, 60.0, 40.0), set()
+    bounds, met = MotionBounds(2.0, 3.0, 7.0, 60.0, 40.0), set()
     for distance in np.geomspace(1e-4, 10.0, 200):
         t = plan_s_curve(distance, bounds).durations
         met.add((t[3] > 0, t[1] > 1e-12, t[5] > 1e-12))
@@ -79,11 +84,15 @@ positive = st.floats(0.05, 20.0)
 
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(
-    distance=st.floats(1e-4, 20.0), speed=positive, gain=positive, loss=positive,
-    rise=st.floats(0.5, 1e3), fall=st.floats(0.5, 1e3),
+    distance=st.floats(1e-4, 20.0),
+    speed=positive,
+    gain=positive,
+    loss=positive,
+    rise=st.floats(0.5, 1e3),
+    fall=st.floats(0.5, 1e3),
 )
 def test_curves_keep_their_limits_and_arrive(distance, speed, gain, loss, rise, fall):
-    bounds = Bounds(speed, gain, loss, rise, fall)
+    bounds = MotionBounds(speed, gain, loss, rise, fall)
     curve = plan_s_curve(distance, bounds)
     v = a = s = 0.0
     for h, j in zip(curve.durations, curve.jerks, strict=True):
@@ -110,7 +119,9 @@ def test_joints_go_straight_start_and_end_together():
     assert q.shape == (8000, 2)
     np.testing.assert_allclose(q[:, 1], 0.2 * q[:, 0], atol=1e-15)
     # Joint 1 alone sets the time: 1 rad at 210 deg/s, 1680 deg/s^2, 25200 deg/s^3.
-    way = plan_s_curve(1.0, Bounds(*(TABLE_3[k] for k in ("velocity", *["acceleration"] * 2, *["jerk"] * 2))))
+    way = plan_s_curve(
+        1.0, MotionBounds(*(TABLE_3[k] for k in ("velocity", *["acceleration"] * 2, *["jerk"] * 2)))
+    )
     end = way.duration * RATE
     assert q[int(end), 0] < 1.0 == q[int(end) + 1, 0]
     leaves = int((way.duration + 0.1) * RATE)

@@ -8,7 +8,7 @@ from search_setup import case_text, log_of, write_case
 
 from jaxid.commands import discover as discovery
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.superset import build_union
+from jaxid.discovery.superset import build_candidate_model
 from jaxid.session import open_session
 
 
@@ -21,7 +21,7 @@ def session(tmp_path_factory):
 
 def test_a_large_union_is_differentiated_in_parts_alike(session, monkeypatch):
     """By the same columns as all at once; of those not asked for nothing is said."""
-    union = build_union(session.machine, session.fit.data)
+    union = build_candidate_model(session.machine, session.fit.data)
     samples = cand.Samples(session.fit.data)
     theta = union.neutral.copy()
     for c in union.candidates:

@@ -44,9 +44,7 @@ def test_unknown_dimension_is_refused():
 
 
 DECLARED = {
-    info.dimension
-    for cls in [*EFFECTS.values(), *PLANTS.values()]
-    for info in parameters_of(cls).values()
+    info.dimension for cls in [*EFFECTS.values(), *PLANTS.values()] for info in parameters_of(cls).values()
 }
 
 

@@ -12,7 +12,7 @@ import jaxid
 from jaxid.cli import main
 from jaxid.logs.log import Log
 from jaxid.references import make_reference
-from jaxid.references.unknown import Course
+from jaxid.references.unknown import UnknownReference
 
 TRUE = {"onset": 0.31, "speed": 0.42, "acceleration": 3.1}
 GUESS = {"onset": 0.22, "speed": 0.6, "acceleration": 5.0}
@@ -84,13 +84,16 @@ def case(tmp_path):
 def test_a_course_is_what_its_family_samples_and_has_slopes():
     time = np.arange(2500) / 1000
     stated = {"kind": "trapezoid", "targets": TARGETS, "dwell": 0.2, "repeat": False}
-    course = Course.of(stated, TRUE).at(time)
-    np.testing.assert_allclose(course()[:, 0], moved(), atol=1e-8)
-    np.testing.assert_allclose(course(), make_reference(stated | TRUE, 1000, 2.5), atol=1e-12)
-    slopes = jax.jacfwd(lambda x: replace(course, numbers=x)()[:, 0])(course.numbers)
+    unknown_reference = UnknownReference.of(stated, TRUE).at(time)
+    np.testing.assert_allclose(unknown_reference()[:, 0], moved(), atol=1e-8)
+    np.testing.assert_allclose(unknown_reference(), make_reference(stated | TRUE, 1000, 2.5), atol=1e-12)
+    slopes = jax.jacfwd(lambda x: replace(unknown_reference, numbers=x)()[:, 0])(unknown_reference.numbers)
     for k in range(3):
         h = 1e-6
-        up, down = (replace(course, numbers=course.numbers.at[k].add(s * h))()[:, 0] for s in (1, -1))
+        up, down = (
+            replace(unknown_reference, numbers=unknown_reference.numbers.at[k].add(s * h))()[:, 0]
+            for s in (1, -1)
+        )
         np.testing.assert_allclose(slopes[:, k], (up - down) / (2 * h), atol=1e-5)
         assert np.abs(slopes[:, k]).max() > 0.01
 
@@ -129,9 +132,7 @@ def test_a_hundred_samples_of_a_stage_tell_its_reference_too(case):
     reference = f'[reference]\nkind = "trapezoid"\ntargets = [{way!r}]\nrepeat = false\n'
     reference += "".join(f"{k} = {{ guess = {v * off[k]!r} }}\n" for k, v in true.items())
     stated = '[output_error]\non = "force"\nprior = 0.5\n'
-    path = case(
-        stages.text(1, guess=stages.drawn(3), resolution=0.0, reference="", more=stated + reference)
-    )
+    path = case(stages.text(1, guess=stages.drawn(3), resolution=0.0, reference="", more=stated + reference))
     stage = stages.machine(1, rigid=True)
     made = stages.record(stage, stages.move(0.5, **move), noise=0.0135, resolution=0.0)
     log = Log(time=made["t"], position=made["q"][:, None], force=made["i"][:, None], source="stage")

@@ -77,7 +77,9 @@ def branching() -> str:
     more = "".join(
         urdf_arms.link(name, rng) + urdf_arms.joint(f"to_{name}", kind, parent, name, rng)
         for name, kind, parent in (
-            ("camera", "revolute", "link1"), ("left", "prismatic", "link3"), ("right", "prismatic", "link3"),
+            ("camera", "revolute", "link1"),
+            ("left", "prismatic", "link3"),
+            ("right", "prismatic", "link3"),
         )
     )
     return urdf_arms.arm(["revolute"] * 3, 6).replace("</robot>", more + "</robot>")
@@ -104,11 +106,19 @@ def planar(arm: TwoLinks, joints=("shoulder", "elbow")) -> str:
         '<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/>'
         '<origin xyz="{3} 0 0"/><axis xyz="0 0 1"/></joint>'
     )
-    return urdf_arms.HEAD + '<link name="ground"/>' + "".join([
-        body.format("upper", arm.x1, 0.0, arm.m1, arm.i1),
-        body.format("lower", arm.x2, arm.y2, arm.m2, arm.i2),
-        join.format(joints[0], "ground", "upper", 0.0), join.format(joints[1], "upper", "lower", arm.length),
-    ]) + "</robot>"
+    return (
+        urdf_arms.HEAD
+        + '<link name="ground"/>'
+        + "".join(
+            [
+                body.format("upper", arm.x1, 0.0, arm.m1, arm.i1),
+                body.format("lower", arm.x2, arm.y2, arm.m2, arm.i2),
+                join.format(joints[0], "ground", "upper", 0.0),
+                join.format(joints[1], "upper", "lower", arm.length),
+            ]
+        )
+        + "</robot>"
+    )
 
 
 def case(position='["q1", "q2"]', unknown="base", more="") -> str:
@@ -175,23 +185,28 @@ LOWER = GOOD[_AT : GOOD.index("</link>", _AT)]
 BACK = '<joint name="back" type="fixed"><parent link="ground"/><child link="lower"/></joint></robot>'
 COPY, END = '<mimic joint="shoulder"/>', "</joint></robot>"
 WRONG = {
-    "loop": ("</robot>", BACK,
-             ["link 'lower'", "'elbow' and 'back'", "loop"]),
-    "ring": ('<parent link="ground"/>', '<parent link="lower"/>',
-             ["from link 'upper' on lead back to it: a loop"]),
+    "loop": ("</robot>", BACK, ["link 'lower'", "'elbow' and 'back'", "loop"]),
+    "ring": (
+        '<parent link="ground"/>',
+        '<parent link="lower"/>',
+        ["from link 'upper' on lead back to it: a loop"],
+    ),
     "closed": ('<link name="ground"/>', "", ["no link 'ground', its parent", "upper, lower"]),
     "no inertial": (LOWER, '<link name="lower">', ["link 'lower'", "has no <inertial>", "'elbow'"]),
     "massless": ('<mass value="4.0"/>', '<mass value="0"/>', ["has no mass", "moves it"]),
     "negative": ('<mass value="4.0"/>', '<mass value="-4"/>', ["<mass> is negative: -4 kg"]),
     "half": ('<mass value="4.0"/>', "", ["<inertial> has no <mass>", "add <mass"]),
-    "type": ('name="elbow" type="revolute"', 'name="elbow" type="planar"',
-             ["joint 'elbow'", "type 'planar'", "revolute, continuous, prismatic, fixed"]),
+    "type": (
+        'name="elbow" type="revolute"',
+        'name="elbow" type="planar"',
+        ["joint 'elbow'", "type 'planar'", "revolute, continuous, prismatic, fixed"],
+    ),
     "number": ('izz="', 'izz="${x}', ['<inertia> has izz="${x}', "give a number"]),
     "axis": ('xyz="0 0 1"', 'xyz="0 0 0"', ["<axis> has no length"]),
     "twice": ('name="elbow"', 'name="shoulder"', ["two <joint> are named 'shoulder'"]),
     "mimic": (END, COPY + END, ["joint 'elbow'", "copies joint 'shoulder'"]),
     "held": ('type="revolute"', 'type="fixed"', ["no joint can move"]),
-    "not xml": ("</robot>", "", ["is not XML", "mend that line"]),
+    "not xml": ("</robot>", "", ["is not XML", "correct that line"]),
     "no robot": ("robot", "sdf", ["is no URDF", "<sdf>"]),
     "entities": ("<robot", '<!DOCTYPE r [<!ENTITY a "b">]><robot', ["document type declaration"]),
     "macro": ('<link name="ground"/>', '<link name="ground"/><xacro:arm/>', ["a macro", "xacro arm.urdf"]),
@@ -214,7 +229,8 @@ def test_faults_of_the_file_are_told_in_one_line(folder, capsys, fault):
 def test_a_loop_that_hangs_on_nothing_is_refused(tmp_path):
     rng = np.random.default_rng(0)
     ring = "".join(urdf_arms.link(n, rng) for n in "ab") + "".join(
-        urdf_arms.joint(p + c, "revolute", p, c, rng) for p, c in ("ab", "ba"))
+        urdf_arms.joint(p + c, "revolute", p, c, rng) for p, c in ("ab", "ba")
+    )
     path = tmp_path / "arm.urdf"
     for text in (ring, ring + urdf_arms.link("ground", rng)):
         path.write_text(f"<robot>{text}</robot>")
@@ -239,10 +255,13 @@ def test_branches_ask_for_a_tip(tmp_path):
         (BY_NAME, '["q1", "q2", "q3"]', ["does not fit 2 joints", "shoulder, elbow"]),
         ('urdf = "arm.urdf"', 'urdf = "arms.urdf"', ["no such file", "arm.urdf"]),
         ('urdf = "arm.urdf"', 'links = []\nurdf = "arm.urdf"', ["both urdf and [[plant.links]]"]),
-        ('urdf = "arm.urdf"\n', 'links = []\n', ["unknown", "goes with urdf only"]),
+        ('urdf = "arm.urdf"\n', "links = []\n", ["unknown", "goes with urdf only"]),
         ('unknown = "base"', 'unknown = "some"', ["none, base, all"]),
-        ("[log]", '[[effects]]\nkind = "constant_force"\njoint = "wrist"\nlevel = 1.0\n[log]',
-         ["wrist", "is no joint of the arm", "shoulder, elbow"]),
+        (
+            "[log]",
+            '[[effects]]\nkind = "constant_force"\njoint = "wrist"\nlevel = 1.0\n[log]',
+            ["wrist", "is no joint of the arm", "shoulder, elbow"],
+        ),
     ],
 )
 def test_faults_of_the_case_are_told_in_one_line(folder, old, new, words):

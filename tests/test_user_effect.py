@@ -105,7 +105,7 @@ def test_own_effect_that_does_not_import(tmp_path):
     write(tmp_path, "1 / 0", "broken.py")
     told = message(tmp_path, more('[[effects]]\nkind = "broken.py:Wind"\n'))
     assert "ZeroDivisionError" in told
-    assert "mend broken.py" in told
+    assert "correct broken.py" in told
 
 
 def test_own_effect_with_an_unknown_dimension(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 import stages
 
 import jaxid
-from jaxid.discovery.in_loop.candidates import Fit, Loop
+from jaxid.discovery.in_loop.candidates import Loop, LoopFit
 from jaxid.logs.log import Log
 
 PRIOR = '[output_error]\non = "force"\nprior = 0.5\n'
@@ -71,7 +71,7 @@ def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolu
     # What ends at its bound is no guess that a relative prior says nothing of.
     at = found.after.theta * (np.array(found.after.names) != "viscous_friction[1].coefficient")
     ended = dataclasses.replace(found.after, machine=found.after.machine.with_estimate(at))
-    loop = Loop.of(found.session, Fit.of(found.session, found.session.machine, {}, ended))
+    loop = Loop.of(found.session, LoopFit.of(found.session, found.session.machine, {}, ended))
     assert np.all(np.isfinite(loop.base))
     # What may have either sign is looked for in either.
     looks = loop.looks()

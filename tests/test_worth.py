@@ -12,7 +12,7 @@ from stepper import Sensor
 
 from jaxid.commands.discover import start_search
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.acceptance import Worth
+from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import _felt
@@ -161,7 +161,7 @@ def test_what_takes_the_sensors_own_noise_away_is_turned_down(axis):
 def test_a_joint_with_little_noise_counts_for_little():
     """Weighted sums of squares: what a true model leaves seldom, of a loud joint and a quiet one."""
     floors, counts = np.array([1.0, 0.1]), np.array([20, 20])
-    worth = Worth.__new__(Worth)
+    worth = Acceptance.__new__(Acceptance)
     worth.floor = floors
     worth.data = SimpleNamespace(recipe=SimpleNamespace(independent=0.5))
     worth.samples = SimpleNamespace(moving=np.ones((20, 2), bool))
@@ -192,7 +192,7 @@ def test_few_independent_samples_may_leave_little(axis):
 
 def test_many_starts_are_evaluated_once(axis, monkeypatch):
     _, search = axis
-    cogging = next(c for c in search.union.candidates if c.many)
+    cogging = next(c for c in search.union.candidates if c.has_grid)
     first = search.many(cogging)
     monkeypatch.setattr(cand, "many_points", lambda *a: pytest.fail("evaluated again"))
     assert search.many(cogging) is first

@@ -65,6 +65,7 @@ class TwoLinks:
 
     def advance(self, x, u, h, steps):
         """Classical Runge-Kutta over `steps` of h [s] at constant torque; x is (q1, q2, v1, v2)."""
+
         def rate(x):
             return (x[2], x[3], *self.acceleration(*x, *u))
 
@@ -82,7 +83,7 @@ class TwoLinks:
         return x
 
 
-def course(times, seed):
+def unknown_reference(times, seed):
     """Six sines of 0.1 to 1.5 Hz, about 1 rad: by joint, (time, 2)."""
     rng = np.random.default_rng(seed)
     f, phase = rng.uniform(0.1, 1.5, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6))
@@ -93,7 +94,7 @@ def course(times, seed):
 def followed(arm: TwoLinks, duration=8.0, rate=1000.0, noise=1e-5, seed=0) -> dict[str, np.ndarray]:
     """A log of a PD loop that follows a course: columns t, q1, q2, u1, u2."""
     times = np.arange(round(duration * rate)) / rate
-    reference = course(times, seed)
+    reference = unknown_reference(times, seed)
     speed = np.gradient(reference, 1 / rate, axis=0)
     rng = np.random.default_rng(seed + 1)
     x, rows = (*reference[0], *speed[0]), []

@@ -43,8 +43,14 @@ def arm(kinds, seed: int = 0, axes=None) -> str:
     rng = np.random.default_rng(seed)
     links = [link("base", rng), *(link(f"link{k}", rng) for k in range(1, len(kinds) + 1))]
     joints = [
-        joint(f"joint{k}", kind, "base" if k == 1 else f"link{k - 1}", f"link{k}", rng,
-              None if axes is None else axes[k - 1])
+        joint(
+            f"joint{k}",
+            kind,
+            "base" if k == 1 else f"link{k - 1}",
+            f"link{k}",
+            rng,
+            None if axes is None else axes[k - 1],
+        )
         for k, kind in enumerate(kinds, start=1)
     ]
     return HEAD + "".join([*rng.permutation(joints), *rng.permutation(links)]) + "</robot>\n"

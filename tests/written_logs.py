@@ -36,4 +36,4 @@ def refuse(path, columns=COLUMNS, *, match: str, **kwargs) -> None:
     with pytest.raises(InputError, match=match) as caught:
         read_log(path, columns, **kwargs)
     assert "\n" not in str(caught.value)
-    assert ";" in str(caught.value), "the line ends with its mend"
+    assert ";" in str(caught.value), "the line ends with its hint"

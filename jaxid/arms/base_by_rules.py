@@ -117,9 +117,16 @@ class _Chain:
         weight = np.asarray(plant.gravity_vector)
         direction = np.zeros((n, 3)) if turns is None else np.einsum("kij,i->kj", frames, turns)
         return cls(
-            revolute, axis, turns, first, int(other[0]) if other else n, weight / np.linalg.norm(weight),
+            revolute,
+            axis,
+            turns,
+            first,
+            int(other[0]) if other else n,
+            weight / np.linalg.norm(weight),
             on_axis,
-            [moved(a, o) for a, o in zip(axes, origins, strict=True)], direction, zero,
+            [moved(a, o) for a, o in zip(axes, origins, strict=True)],
+            direction,
+            zero,
         )
 
     def along(self, axis: np.ndarray) -> bool:

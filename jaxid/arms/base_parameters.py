@@ -68,8 +68,11 @@ class BaseParameters:
         """Each base parameter as a sum of standard ones, one line each."""
         lines = []
         for k, row in zip(self.chosen, self.mapping, strict=True):
-            terms = [f"{self.names[j]}" if v == 1 else f"{v:+.{digits}g} {self.names[j]}"
-                     for j, v in enumerate(row) if v != 0 and j != k]
+            terms = [
+                f"{self.names[j]}" if v == 1 else f"{v:+.{digits}g} {self.names[j]}"
+                for j, v in enumerate(row)
+                if v != 0 and j != k
+            ]
             lines.append(" ".join([self.names[k], *(t if t[0] in "+-" else f"+ {t}" for t in terms)]))
         return lines
 
@@ -93,7 +96,8 @@ def _values(plant: Plant, places: Iterable[tuple[str, int | None]]) -> Float[np.
 def standard_places(plant: Plant) -> tuple[tuple[str, int | None], ...]:
     """Field and entry of each such parameter, those to leave out behind the others of their joint."""
     infos = {
-        name: info for name, info in parameters_of(type(plant)).items()
+        name: info
+        for name, info in parameters_of(type(plant)).items()
         if carries_force(info) and getattr(plant, name) is not None
     }
     last = getattr(plant, "regrouped", ())
@@ -101,7 +105,9 @@ def standard_places(plant: Plant) -> tuple[tuple[str, int | None], ...]:
     single = [(name, None) for name in order if infos[name].more is None]
     longest = max((plant.joints + i.more for i in infos.values() if i.more is not None), default=0)
     listed = (
-        (name, k) for k in range(longest) for name in order
+        (name, k)
+        for k in range(longest)
+        for name in order
         if infos[name].more is not None and k < plant.joints + infos[name].more
     )
     return (*single, *listed)
@@ -173,7 +179,8 @@ def base_parameters(
 
 
 def grouped(
-    columns: Float[np.ndarray, "rows standard"], places: tuple[tuple[str, int | None], ...],
+    columns: Float[np.ndarray, "rows standard"],
+    places: tuple[tuple[str, int | None], ...],
     order: Sequence[str] = (),
 ) -> BaseParameters:
     """The sums of parameters that something linear in them tells.

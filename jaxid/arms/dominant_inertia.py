@@ -125,7 +125,7 @@ def from_dominant_inertias(
     if not np.any(columns):
         raise InputError(
             f"the inertia of joint {joint} depends on nothing that is unknown",
-            mend="take a joint before it, or leave names out of known",
+            hint="take a joint before it, or leave names out of known",
         )
     base = grouped(columns, tuple(places[k] for k in left))
     whole = inertia_regressor(plant, joint, q)
@@ -153,18 +153,18 @@ def _check(
     plant: Plant, joint: int, q: np.ndarray, inertia: np.ndarray, known: Sequence[str], names: Sequence[str]
 ) -> None:
     if not 1 <= joint <= plant.joints:
-        raise InputError(f"joint is {joint}", mend=f"the plant has joints 1 to {plant.joints}")
+        raise InputError(f"joint is {joint}", hint=f"the plant has joints 1 to {plant.joints}")
     if q.ndim != 2 or q.shape[1] != plant.joints or not len(q):
-        mend = f"give a row of {plant.joints} positions for each"
-        raise InputError(f"configurations have the shape {q.shape}", mend=mend)
+        hint = f"give a row of {plant.joints} positions for each"
+        raise InputError(f"configurations have the shape {q.shape}", hint=hint)
     if inertia.shape != q.shape[:1]:
-        mend = "give one for each"
-        raise InputError(f"{inertia.size} inertias for {len(q)} configurations", mend=mend)
+        hint = "give one for each"
+        raise InputError(f"{inertia.size} inertias for {len(q)} configurations", hint=hint)
     bad = np.flatnonzero(~(np.isfinite(inertia) & (inertia > 0)))
     if bad.size:
-        mend = "leave its row out of both: a joint that sticks has no period"
-        raise InputError(f"the inertia of configuration {bad[0] + 1} is {inertia[bad[0]]} kg m^2", mend=mend)
+        hint = "leave its row out of both: a joint that sticks has no period"
+        raise InputError(f"the inertia of configuration {bad[0] + 1} is {inertia[bad[0]]} kg m^2", hint=hint)
     plain = {n.partition("[")[0] for n in names}
     wrong = [n for n in known if n not in names and n not in plain]
     if wrong:
-        raise InputError(f"{wrong[0]} is none of the plant's parameters", mend=suggest(wrong[0], names))
+        raise InputError(f"{wrong[0]} is none of the plant's parameters", hint=suggest(wrong[0], names))

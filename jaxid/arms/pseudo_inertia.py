@@ -8,8 +8,16 @@ from jaxtyping import Array, Float
 
 # Fields of an arm in the order of the ten parameters.
 TEN = (
-    "mass", "first_moment_x", "first_moment_y", "first_moment_z",
-    "inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz",
+    "mass",
+    "first_moment_x",
+    "first_moment_y",
+    "first_moment_z",
+    "inertia_xx",
+    "inertia_xy",
+    "inertia_xz",
+    "inertia_yy",
+    "inertia_yz",
+    "inertia_zz",
 )
 
 
@@ -27,7 +35,10 @@ def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
     m, x, y, z, xx, xy, xz, yy, yz, zz = (ten[..., k] for k in range(10))
     half = 0.5 * (xx + yy + zz)
     rows = [
-        [half - xx, -xy, -xz, x], [-xy, half - yy, -yz, y], [-xz, -yz, half - zz, z], [x, y, z, m],
+        [half - xx, -xy, -xz, x],
+        [-xy, half - yy, -yz, y],
+        [-xz, -yz, half - zz, z],
+        [x, y, z, m],
     ]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
@@ -35,10 +46,21 @@ def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
 def ten_parameters(pseudo: Float[Array, "*n 4 4"]) -> Float[Array, "*n 10"]:
     """The inverse of `pseudo_inertia`."""
     s = lambda i, j: pseudo[..., i, j]
-    return jnp.stack([
-        s(3, 3), s(0, 3), s(1, 3), s(2, 3),
-        s(1, 1) + s(2, 2), -s(0, 1), -s(0, 2), s(0, 0) + s(2, 2), -s(1, 2), s(0, 0) + s(1, 1),
-    ], axis=-1)
+    return jnp.stack(
+        [
+            s(3, 3),
+            s(0, 3),
+            s(1, 3),
+            s(2, 3),
+            s(1, 1) + s(2, 2),
+            -s(0, 1),
+            -s(0, 2),
+            s(0, 0) + s(2, 2),
+            -s(1, 2),
+            s(0, 0) + s(1, 1),
+        ],
+        axis=-1,
+    )
 
 
 def moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[np.ndarray, "10 10"]:
@@ -77,9 +99,14 @@ def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
     a22 = jnp.sqrt(s[1, 1] - a23**2)
     a12 = (s[0, 1] - a13 * a23) / a22
     a11 = jnp.sqrt(s[0, 0] - a12**2 - a13**2)
-    return jnp.concatenate([
-        0.5 * jnp.log(m)[None], centre, jnp.log(jnp.stack([a11, a22, a33])), jnp.stack([a12, a13, a23]),
-    ])
+    return jnp.concatenate(
+        [
+            0.5 * jnp.log(m)[None],
+            centre,
+            jnp.log(jnp.stack([a11, a22, a33])),
+            jnp.stack([a12, a13, a23]),
+        ]
+    )
 
 
 def of_log_cholesky(x: Float[Array, " 10"]) -> Float[Array, " 10"]:

@@ -138,8 +138,7 @@ class Case:
         """Effects that `discover` may name."""
         asked = {*self.kinds, *(cls.kind for cls in self.candidates)}
         registered = [
-            cls for kind, cls in EFFECTS.items()
-            if kind in asked or not (self.kinds or cls.on_request)
+            cls for kind, cls in EFFECTS.items() if kind in asked or not (self.kinds or cls.on_request)
         ]
         return (*registered, *self.own_effects)
 
@@ -158,8 +157,8 @@ class Case:
             InputError: If it has none.
         """
         if not self.log:
-            mend = "name the columns: time, position, force"
-            raise InputError("the table [log] is missing", where=str(self.path), mend=mend)
+            hint = "name the columns: time, position, force"
+            raise InputError("the table [log] is missing", where=str(self.path), hint=hint)
         return self.log
 
 
@@ -174,7 +173,7 @@ def load_case(path: str | Path) -> Case:
 
     Raises:
         InputError: If the file cannot be read, or holds an unknown, missing or impossible entry;
-            the text names file, table, key and the mend.
+            the text names file, table, key and the hint.
     """
     path = Path(path)
     tables, file = _tables(path), str(path)
@@ -201,8 +200,11 @@ def load_case(path: str | Path) -> Case:
         algebraic=read("algebraic", ALGEBRAIC),
         output_error=_checked_output_error(read("output_error", OUTPUT_ERROR), file),
         recursive=_apart(
-            read("recursive", recursive_keys(joints)), "restart", ("start", "regularization"),
-            Spot(file, "[recursive]")),
+            read("recursive", recursive_keys(joints)),
+            "restart",
+            ("start", "regularization"),
+            Spot(file, "[recursive]"),
+        ),
         controller=_controller(tables, drives, file),
         sensor=read("sensor", sensor_keys(joints, drives)),
         inertial_sensors=read_inertial_sensors(tables, plant.cls.links(joints), file),
@@ -228,8 +230,11 @@ def _tables(path: Path) -> dict[str, Any]:
     tables = _toml(path)
     for name, value in tables.items():
         if name not in TOP:
-            what = f"unknown table [{name}]" if isinstance(value, dict | list) else (
-                f"key '{name}' stands outside of any table")
+            what = (
+                f"unknown table [{name}]"
+                if isinstance(value, dict | list)
+                else (f"key '{name}' stands outside of any table")
+            )
             raise Spot(file).fault(what, _top_mend(name, value))
         many = isinstance(value, list) and all(isinstance(v, dict) for v in value)
         if TOP[name] and not many:
@@ -244,26 +249,26 @@ def _tables(path: Path) -> dict[str, Any]:
 def _top_mend(name: str, value: Any) -> str:
     if difflib.get_close_matches(name, TOP, n=1):
         return suggest(name, TOP, limit=len(TOP))
-    mend = suggest(name, TOP, limit=len(TOP))
-    return mend if isinstance(value, dict | list) else f"move it below its [table]; {mend}"
+    hint = suggest(name, TOP, limit=len(TOP))
+    return hint if isinstance(value, dict | list) else f"move it below its [table]; {hint}"
 
 
 def _toml(path: Path) -> dict[str, Any]:
     if not path.exists():
         beside = sorted(p.name for p in path.parent.glob("*.toml"))[:8]
-        mend = f"check the path; case files in that folder: {', '.join(beside) or 'none'}"
-        raise InputError("no such file", where=str(path), mend=mend)
+        hint = f"check the path; case files in that folder: {', '.join(beside) or 'none'}"
+        raise InputError("no such file", where=str(path), hint=hint)
     try:
         # Some editors put a byte-order mark first, which TOML does not know.
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise InputError("is not UTF-8 text", where=str(path), mend="save it as UTF-8") from error
+        raise InputError("is not UTF-8 text", where=str(path), hint="save it as UTF-8") from error
     except tomllib.TOMLDecodeError as error:
-        mend = "mend that line (text in quotes, numbers with a point, lists in [ ])"
-        raise InputError(f"is not TOML: {error}", where=str(path), mend=mend) from error
+        hint = "correct that line (text in quotes, numbers with a point, lists in [ ])"
+        raise InputError(f"is not TOML: {error}", where=str(path), hint=hint) from error
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
-        raise InputError(what, where=str(path), mend="name a TOML file that may be read") from error
+        raise InputError(what, where=str(path), hint="name a TOML file that may be read") from error
 
 
 def _checked_transmission(
@@ -274,21 +279,21 @@ def _checked_transmission(
         return actuator
     joints = plant.joints
     if joints == 1:
-        mend = "leave it out; a ratio of gears goes into gain"
-        raise spot.fault("is for plants with several joints", mend)
+        hint = "leave it out; a ratio of gears goes into gain"
+        raise spot.fault("is for plants with several joints", hint)
     if plant.drives < joints:
-        mend = "leave it out, and take a log of the joints"
-        raise spot.fault(f"is for plants with a drive for each joint, not {plant.drives} for {joints}", mend)
+        hint = "leave it out, and take a log of the joints"
+        raise spot.fault(f"is for plants with a drive for each joint, not {plant.drives} for {joints}", hint)
     if {len(rows), *map(len, rows)} != {joints} or np.linalg.matrix_rank(rows) < joints:
-        mend = f"give {joints} rows of {joints} numbers, none a sum of others"
-        raise spot.fault("is not an invertible square matrix", mend)
+        hint = f"give {joints} rows of {joints} numbers, none a sum of others"
+        raise spot.fault("is not an invertible square matrix", hint)
     if looped:
-        mend = "leave [controller] out: what was logged is then identified without the loop"
-        raise spot.fault("does not go with a loop, whose gains are at the motors", mend)
+        hint = "leave [controller] out: what was logged is then identified without the loop"
+        raise spot.fault("does not go with a loop, whose gains are at the motors", hint)
     gears = [n for n, i in parameters_of(plant.cls).items() if i.known and n in plant.parameters]
     if gears:
-        mend = "keep transmission where the log is of the motors' angles, else the other"
-        raise spot.fault(f"and {gears[0]} of [plant.parameters] are both given", mend)
+        hint = "keep transmission where the log is of the motors' angles, else the other"
+        raise spot.fault(f"and {gears[0]} of [plant.parameters] are both given", hint)
     return actuator
 
 
@@ -296,8 +301,8 @@ def _checked_output_error(given: dict[str, Any], file: str) -> dict[str, Any]:
     """Refuse what only a fit within a prior does where there is none."""
     lost = [key for key in given if key not in ("on", "prior", "start")]
     if lost and "prior" not in given:
-        mend = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
-        raise Spot(file, "[output_error]", lost[0]).fault("goes with prior only", mend)
+        hint = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
+        raise Spot(file, "[output_error]", lost[0]).fault("goes with prior only", hint)
     return given
 
 
@@ -305,8 +310,8 @@ def _checked_preprocess(stated: dict[str, Any], file: str) -> dict[str, Any]:
     """Keys of a low-pass and of a parabola do not stand together."""
     parabolic, spot = stated.get("derivatives") == "parabolic", Spot(file, "[preprocess]")
     if "reach" in stated and not parabolic:
-        mend = 'add derivatives = "parabolic", or leave it out'
-        raise spot.at("reach").fault("is that of a parabola", mend)
+        hint = 'add derivatives = "parabolic", or leave it out'
+        raise spot.at("reach").fault("is that of a parabola", hint)
     for key in ("cutoff_hz", "order"):
         if key in stated and parabolic:
             what = 'is of a low-pass, which derivatives = "parabolic" does without'
@@ -335,8 +340,8 @@ def _check_time(table: dict[str, Any], spot: Spot) -> dict[str, Any]:
     if ("time" in table) == ("sample_rate" in table):
         if "time" in table:
             raise spot.fault("both time and sample_rate are given", "keep one of them")
-        mend = 'add time = "<name of the column>", or sample_rate = <Hz>'
-        raise spot.fault("neither time nor sample_rate is given", mend)
+        hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
+        raise spot.fault("neither time nor sample_rate is given", hint)
     return table
 
 
@@ -360,8 +365,8 @@ def _validations(tables: Mapping[str, Any], plant: PlantEntry, path: Path) -> tu
             raise spot.at("name").refuse(given["name"], "is taken", "give each its own name")
         columns = {key: value for key, value in given.items() if key in LOG_KEYS}
         if "log" not in given and "rows" not in columns:
-            mend = "add log = <its file>, or rows that the fit does not use"
-            raise spot.fault("it would be the log of the fit itself", mend)
+            hint = "add log = <its file>, or rows that the fit does not use"
+            raise spot.fault("it would be the log of the fit itself", hint)
         log = path.parent / given["log"] if "log" in given else None
         merged = _merged(base, columns, same_file=log is None)
         _check_time(merged, spot)
@@ -384,12 +389,12 @@ def _check_loop(case: Case) -> None:
     file = str(case.path)
     if case.controller is None:
         if case.reference is not None:
-            mend = "add [controller], or call it [input] for open loop"
-            raise Spot(file, "[reference]").fault("there is no loop to follow it", mend)
+            hint = "add [controller], or call it [input] for open loop"
+            raise Spot(file, "[reference]").fault("there is no loop to follow it", hint)
         for k, validation in enumerate(case.validations, start=1):
             if validation.disturbance is not None:
                 spot = Spot(file, f"[[validation]] {k}", "disturbance")
                 raise spot.fault("belongs to a controller", "add [controller], or leave it out")
     if case.reference is not None and case.input is not None:
-        mend = "keep [reference] for closed loop, or [input] for open loop"
-        raise Spot(file).fault("both [reference] and [input] are given", mend)
+        hint = "keep [reference] for closed loop, or [input] for open loop"
+        raise Spot(file).fault("both [reference] and [input] are given", hint)

@@ -74,11 +74,16 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
     motion = given.get("motion", cls.usual_motion or "linear")
     vertical = given.get("orientation") == "vertical"
     if vertical and motion == "rotary":
-        mend = 'leave orientation out, or set motion = "linear"; an unbalanced load is an effect'
-        raise spot.at("orientation").refuse("vertical", "does not go with a rotary plant", mend)
+        hint = 'leave orientation out, or set motion = "linear"; an unbalanced load is an effect'
+        raise spot.at("orientation").refuse("vertical", "does not go with a rotary plant", hint)
     units = Units(motion, **given.get("units", {}))
     return PlantEntry(
-        cls, given["parameters"], units, vertical, given.get("gravity"), joints,
+        cls,
+        given["parameters"],
+        units,
+        vertical,
+        given.get("gravity"),
+        joints,
         given.get("actuated", cls.actuated),
     )
 
@@ -103,8 +108,15 @@ def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot:
         options["shafts"] = read_shafts(table["shafts"], geometry, spot)
     units = Units(given.get("motion", cls.usual_motion), **given.get("units", {}))
     return PlantEntry(
-        cls, parameters, units, False, None, len(geometry.joints), cls.actuated,
-        {"geometry": geometry, **options}, names,
+        cls,
+        parameters,
+        units,
+        False,
+        None,
+        len(geometry.joints),
+        cls.actuated,
+        {"geometry": geometry, **options},
+        names,
     )
 
 
@@ -127,8 +139,8 @@ def _count_joints(table: Any, cls: type[Plant], spot: Spot) -> int:
     if not isinstance(given, list):
         raise spot.refuse(given, "is not a list", f"give a list, even of one: {name} = [...]")
     if not 1 <= len(given) <= _MOST_JOINTS:
-        mend = f"a {cls.kind} has 1 to {_MOST_JOINTS}"
-        raise spot.fault(f"has {count(len(given), 'entry', 'entries')}", mend)
+        hint = f"a {cls.kind} has 1 to {_MOST_JOINTS}"
+        raise spot.fault(f"has {count(len(given), 'entry', 'entries')}", hint)
     return len(given)
 
 
@@ -175,12 +187,12 @@ def _plant_list(
     beside = "" if info.more == 0 else f": {info.more} more than joints"
     beside = f": {info.doc}" if fixed else beside
     if whole_list is None:
-        mend = f"give a list of {entries}{beside}"
-        raise spot.refuse(value, "is not a list", mend)
+        hint = f"give a list of {entries}{beside}"
+        raise spot.refuse(value, "is not a list", hint)
     if len(whole_list) != entries:
-        mend = f"give {count(entries, 'entry', 'entries')}{beside}"
-        mend = mend if fixed else f"the plant has {count(joints, 'joint')}: {mend}"
-        raise spot.fault(f"has {count(len(whole_list), 'entry', 'entries')}", mend)
+        hint = f"give {count(entries, 'entry', 'entries')}{beside}"
+        hint = hint if fixed else f"the plant has {count(joints, 'joint')}: {hint}"
+        raise spot.fault(f"has {count(len(whole_list), 'entry', 'entries')}", hint)
     if info.width is not None:
         return tuple(_row(row, info, spot.entry(k)) for k, row in enumerate(whole_list, start=1))
     return read_values(value, info, entries, spot, "entry")
@@ -213,8 +225,8 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
     _check_keys(table, list(infos), spot)
     ports, what = read_ports(table, cls, plant, spot)
     if "shared" in table and flag(table["shared"], spot.at("shared")) and len(ports) > 1:
-        mend = "leave it out: each joint then has a value of its own"
-        raise spot.at("shared").refuse(True, "is not available in this version", mend)
+        hint = "leave it out: each joint then has a value of its own"
+        raise spot.at("shared").refuse(True, "is not available in this version", hint)
     for name, info in infos.items():
         if not info.optional and name not in table:
             raise spot.fault(f"'{name}' is missing", f"add {name}: {info.doc}; {_takes(cls)}")
@@ -233,6 +245,7 @@ def read_search(table: Any, path: Path) -> dict[str, tuple]:
     Raises:
         InputError: If a kind is unknown, or a candidate no class of a file, or in every search as it is.
     """
+
     def own(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
         if kind in EFFECTS and EFFECTS[kind].on_request:
@@ -257,8 +270,8 @@ def check_kinds(classes: Iterable[type[Effect]], file: str) -> None:
     known: dict[str, type[Effect]] = {}
     for cls in classes:
         if known.setdefault(cls.kind, cls) is not cls:
-            mend = "give one of them another kind"
-            raise Spot(file).fault(f"two effects of your own are of kind '{cls.kind}'", mend)
+            hint = "give one of them another kind"
+            raise Spot(file).fault(f"two effects of your own are of kind '{cls.kind}'", hint)
 
 
 def _check_keys(table: dict[str, Any], names: list[str], spot: Spot) -> None:
@@ -273,9 +286,7 @@ def _takes(cls: type[Effect]) -> str:
     return f"it takes {', '.join(names)}"
 
 
-def _check_together(
-    cls: type[Effect], parameters: dict[str, tuple[Value, ...]], spot: Spot
-) -> None:
+def _check_together(cls: type[Effect], parameters: dict[str, tuple[Value, ...]], spot: Spot) -> None:
     """Let the class judge which optional parameters go together."""
     try:
         cls(**{name: values[0].guess for name, values in parameters.items()})

@@ -54,8 +54,8 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
     """
     links = table.get("links")
     if links is None:
-        mend = 'add a table [[plant.links]] for each, from the base to the tip, or urdf = "<its file>"'
-        raise spot.fault("'links' is missing", mend)
+        hint = 'add a table [[plant.links]] for each, from the base to the tip, or urdf = "<its file>"'
+        raise spot.fault("'links' is missing", hint)
     if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
         raise spot.at("links").fault("is not a list of tables", "write [[plant.links]], in double brackets")
     if not 1 <= len(links) <= _MOST_LINKS:
@@ -106,8 +106,8 @@ def read_links_of_urdf(
         weight = {name: given[name] for name in ("gravity_vector",) if name in given}
         plant = cls(**values, geometry=arm.geometry, **weight)
         if not np.any(np.asarray(plant.gravity_vector)):
-            mend = 'state a gravity_vector other than zero, or unknown = "all"'
-            raise spot.at("unknown").refuse("base", "needs weight", mend)
+            hint = 'state a gravity_vector other than zero, or unknown = "all"'
+            raise spot.at("unknown").refuse("base", "needs weight", hint)
         base = base_parameters_by_rules(plant, _ANGLE)
         values = {name: np.zeros(len(arm.names)) for name in TEN}
         for (name, k), value in zip(base.places, base.of(plant), strict=True):
@@ -118,9 +118,7 @@ def read_links_of_urdf(
     }, arm
 
 
-def read_shafts(
-    shafts: Any, geometry: Geometry, spot: Spot
-) -> tuple[tuple[float, ...], ...]:
+def read_shafts(shafts: Any, geometry: Geometry, spot: Spot) -> tuple[tuple[float, ...], ...]:
     """[[plant.shafts]]: by how much each turns with every joint.
 
     Raises:
@@ -135,12 +133,18 @@ def read_shafts(
         named = given["joints"]
         check_places(shaft["joints"], named, joints, "joint", own.at("joints"))
         if len({geometry.joints[j - 1] for j in named}) > 1:
-            raise own.at("joints").refuse(shaft["joints"], "names joints that turn and joints that slide",
-                                          "a shaft goes with joints of one kind")
+            raise own.at("joints").refuse(
+                shaft["joints"],
+                "names joints that turn and joints that slide",
+                "a shaft goes with joints of one kind",
+            )
         ratios = given.get("ratios", (1.0,) * len(named))
         if len(ratios) != len(named) or 0.0 in ratios:
-            raise own.at("ratios").refuse(shaft["ratios"], f"does not go with {len(named)} joints",
-                                          "give a ratio other than zero for each")
+            raise own.at("ratios").refuse(
+                shaft["ratios"],
+                f"does not go with {len(named)} joints",
+                "give a ratio other than zero for each",
+            )
         row = dict(zip(named, ratios, strict=True))
         out.append(tuple(float(row.get(j + 1, 0.0)) for j in range(joints)))
     return tuple(out)

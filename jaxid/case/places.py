@@ -28,38 +28,43 @@ def read_ports(
     places = [name for name in PLACES if name in table]
     if len(places) > 1:
         raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
-    parts, springs = plant.cls.parts(plant.joints), plant.cls.springs(plant.joints)
+    parts, springs = plant.cls.bodies(plant.joints), plant.cls.springs(plant.joints)
     if cls.with_springs not in (None, springs > 0):
-        has, mend = ("no springs", "chain or flexible_axis") if cls.with_springs else (
-            "springs of its own", "axis, or state the spring there",
+        has, hint = (
+            ("no springs", "chain or flexible_axis")
+            if cls.with_springs
+            else (
+                "springs of its own",
+                "axis, or state the spring there",
+            )
         )
-        raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {mend}")
+        raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {hint}")
     shafts = len(plant.options.get("shafts", ()))
     passives, tools = plant.cls.passives, plant.cls.tools
     there = {"spring": springs, "shaft": shafts, "passive": passives, "tool": tools}
     for name in (name for name in places if name in there):
         if not there[name]:
-            mend = f"leave {name} out: the effect then acts on the joint"
+            hint = f"leave {name} out: the effect then acts on the joint"
             if name == "shaft" and plant.cls.linked:
-                mend = "add [[plant.shafts]] with the joints that it turns with, or name joints"
+                hint = "add [[plant.shafts]] with the joints that it turns with, or name joints"
             what = f"does not exist on kind = '{plant.cls.kind}'"
-            raise spot.at(name).refuse(table[name], what, mend)
+            raise spot.at(name).refuse(table[name], what, hint)
     if "spring" in table:
         if not cls.of_spring:
-            mend = "name a joint; on springs act the stiffness effects"
-            raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", mend)
+            hint = "name a joint; on springs act the stiffness effects"
+            raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", hint)
         chosen = _places(table, "spring", springs, spot)
         return tuple(parts + k for k in chosen), "spring"
     for name, before in (("shaft", parts), ("passive", parts), ("tool", parts + passives)):
         if name not in table:
             continue
         if cls.in_drive:
-            what, mend = f"has no command for {cls.kind} to act on", "name the joint of the drive"
-            raise spot.at(name).refuse(table[name], what, mend)
+            what, hint = f"has no command for {cls.kind} to act on", "name the joint of the drive"
+            raise spot.at(name).refuse(table[name], what, hint)
         if name == "tool" and not cls.any_direction:
             alike = "what is the same in all directions (added_mass, viscous_friction)"
-            mend = f"name a joint; on a tool acts {alike}"
-            raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", mend)
+            hint = f"name a joint; on a tool acts {alike}"
+            raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", hint)
         return tuple(before + k for k in _places(table, name, there[name], spot)), name
     if "joint" in table:
         chosen = _places(_numbered(table, plant.names, spot), "joint", parts, spot)
@@ -111,7 +116,7 @@ def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot
         fault = f"is out of range: the plant has {count(there, noun)}"
         # Without its place an effect is on the joints, not on the only shaft.
         alone = f"leave {what} out" if what in ("joint", "spring") else f"name {what} 1"
-        mend = f"{noun}s count from 1 to {there}" if there > 1 else alone
-        raise spot.refuse(given, fault, mend)
+        hint = f"{noun}s count from 1 to {there}" if there > 1 else alone
+        raise spot.refuse(given, fault, hint)
     if len(set(named)) < len(named):
         raise spot.refuse(given, f"names a {noun} twice", f"name each {noun} once")

@@ -14,9 +14,7 @@ from jaxid.references import REFERENCES
 from jaxid.references import Key as ReferenceKey
 
 
-def read_signal(
-    name: str, tables: Mapping[str, Any], drives: int, file: str
-) -> dict[str, Any] | None:
+def read_signal(name: str, tables: Mapping[str, Any], drives: int, file: str) -> dict[str, Any] | None:
     """[reference] or [input], checked by the family that it names; None where it says nothing."""
     if not tables.get(name):
         return None
@@ -42,16 +40,16 @@ def read_unknown_reference(
     family = REFERENCES[read_kind(table, REFERENCES, spot)]
     for name in given:
         if name not in family.unknown:
-            mend = f"of {family.kind} may be: {', '.join(family.unknown) or 'nothing'}"
-            raise spot.at(name).fault("cannot be unknown", f"give a number; unknown {mend}")
+            hint = f"of {family.kind} may be: {', '.join(family.unknown) or 'nothing'}"
+            raise spot.at(name).fault("cannot be unknown", f"give a number; unknown {hint}")
     if drives > 1:
-        mend = "log it, and name its columns in [log]"
-        raise spot.fault("is unknown, of a plant with several drives", mend)
+        hint = "log it, and name its columns in [log]"
+        raise spot.fault("is unknown, of a plant with several drives", hint)
     if table.get("repeat", True):
         raise spot.fault("is unknown, and has no end", "add repeat = false")
     if "reference" in tables.get("log", {}):
-        mend = "leave reference out of [log], or give numbers in [reference]"
-        raise spot.fault("has unknowns, and [log] names a column for it", mend)
+        hint = "leave reference out of [log], or give numbers in [reference]"
+        raise spot.fault("has unknowns, and [log] names a column for it", hint)
     unknown = {k: read_value(v, info_of(family.keys[k]), spot.at(k)) for k, v in given.items()}
     return {"reference": {**table, **{k: v.guess for k, v in unknown.items()}}}, unknown
 

@@ -31,14 +31,14 @@ class Spot:
     table: str = ""
     key: str = ""
 
-    def fault(self, what: str, mend: str) -> InputError:
+    def fault(self, what: str, hint: str) -> InputError:
         """An error that names file, table and key."""
         where = f"{self.file}, {self.table}" if self.table else self.file
-        return InputError(f"{self.key} {what}".strip(), where=where, mend=mend)
+        return InputError(f"{self.key} {what}".strip(), where=where, hint=hint)
 
-    def refuse(self, value: Any, what: str, mend: str) -> InputError:
+    def refuse(self, value: Any, what: str, hint: str) -> InputError:
         """An error that also shows the value."""
-        return self.fault(f"= {shown(value)} {what}", mend)
+        return self.fault(f"= {shown(value)} {what}", hint)
 
     def at(self, key: str) -> Spot:
         """A key of the same table."""
@@ -62,7 +62,7 @@ class Key:
 
     Args:
         read: Checks the value and returns it, or raises `InputError`.
-        doc: What it means, with unit or example; for the mend where it is missing.
+        doc: What it means, with unit or example; for the hint where it is missing.
         required: Whether it must be there.
     """
 
@@ -90,8 +90,8 @@ def read_table(table: Any, keys: Keys, spot: Spot) -> dict[str, Any]:
     """
     at = spot.inside if spot.key else spot.at
     if not isinstance(table, dict):
-        mend = f"write {{ {', '.join(keys)} }}" if spot.key else "write it as one table"
-        raise spot.fault(f"{'= ' if spot.key else ''}{shown(table)} is not a table", mend)
+        hint = f"write {{ {', '.join(keys)} }}" if spot.key else "write it as one table"
+        raise spot.fault(f"{'= ' if spot.key else ''}{shown(table)} is not a table", hint)
     for name in table:
         if name not in keys:
             has = "has an " if spot.key else ""
@@ -151,8 +151,8 @@ def number(sign: str = "free") -> Reader:
         if abs(value) > 1e300 or not math.isfinite(value):
             raise spot.refuse(value, "is not a finite number", "give a finite one, in SI units")
         if not holds(value):
-            what, mend = demand.split("; ")
-            raise spot.refuse(value, what, mend)
+            what, hint = demand.split("; ")
+            raise spot.refuse(value, what, hint)
         return float(value)
 
     return read
@@ -163,8 +163,8 @@ def whole(minimum: int) -> Reader:
 
     def read(value: Any, spot: Spot) -> int:
         if isinstance(value, bool) or not isinstance(value, int):
-            mend = f"give a whole number, e.g. {spot.key} = {max(minimum, 1)}"
-            raise spot.refuse(value, "is not a whole number", mend)
+            hint = f"give a whole number, e.g. {spot.key} = {max(minimum, 1)}"
+            raise spot.refuse(value, "is not a whole number", hint)
         if value < minimum:
             raise spot.refuse(value, "is too small", f"it must be at least {minimum}")
         return value
@@ -217,10 +217,10 @@ def several(read: Reader, *, shortest: int = 1, longest: int | None = None) -> R
 
     def read_list(value: Any, spot: Spot) -> tuple:
         if not isinstance(value, list) or len(value) < shortest:
-            mend = f"give a list of at least {shortest} in [ ]"
+            hint = f"give a list of at least {shortest} in [ ]"
             short = isinstance(value, list)
             what = f"has {count(len(value), 'entry', 'entries')}" if short else "is not a list"
-            raise spot.refuse(value, what if value != [] else "is empty", mend)
+            raise spot.refuse(value, what if value != [] else "is empty", hint)
         if longest is not None and len(value) > longest:
             raise spot.refuse(value, f"has {len(value)} entries", f"give at most {longest}")
         return tuple(read(v, spot.entry(k)) for k, v in enumerate(value, start=1))
@@ -235,8 +235,8 @@ def by_joint(read: Reader, joints: int, what: str = "joint") -> Reader:
         if not isinstance(value, list):
             return read(value, spot)
         if len(value) != joints:
-            mend = f"give {count(joints, 'value')}, one a {what}"
-            raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", mend)
+            hint = f"give {count(joints, 'value')}, one a {what}"
+            raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", hint)
         return several(read)(value, spot)
 
     return read_either
@@ -249,8 +249,8 @@ def span() -> Reader:
     def read(value: Any, spot: Spot) -> tuple[float, float]:
         pair = ends(value, spot)
         if len(pair) != 2 or not pair[0] < pair[1]:
-            mend = f"give the lower end and the upper, e.g. {spot.key} = [0.0, 0.2]"
-            raise spot.refuse(value, "is not a range", mend)
+            hint = f"give the lower end and the upper, e.g. {spot.key} = [0.0, 0.2]"
+            raise spot.refuse(value, "is not a range", hint)
         return pair
 
     return read
@@ -278,8 +278,8 @@ def columns(joints: int, what: str = "joint", names: tuple[str, ...] = ()) -> Re
         if names and isinstance(value, dict):
             lost = [name for name in names if name not in value]
             if lost:
-                mend = f"add {lost[0]} = <its column>; the joints are {', '.join(names)}"
-                raise spot.fault(f"names no column for joint '{lost[0]}'", mend)
+                hint = f"add {lost[0]} = <its column>; the joints are {', '.join(names)}"
+                raise spot.fault(f"names no column for joint '{lost[0]}'", hint)
             other = [name for name in value if name not in names]
             if other:
                 raise spot.fault(f"names a joint '{other[0]}', which there is not", suggest(other[0], names))
@@ -288,12 +288,12 @@ def columns(joints: int, what: str = "joint", names: tuple[str, ...] = ()) -> Re
             given = several(text)(value, spot)
             if len(given) not in (1, joints) or len(set(given)) < len(given):
                 listed = f" ({', '.join(names)})" if names else ""
-                mend = f"name {count(joints, 'column')}, one a {what}{listed}, each once"
-                raise spot.refuse(value, f"does not fit {count(joints, what)}", mend)
+                hint = f"name {count(joints, 'column')}, one a {what}{listed}, each once"
+                raise spot.refuse(value, f"does not fit {count(joints, what)}", hint)
             return list(given)
         if not isinstance(value, str) or not value:
-            mend = f'give the name of a column: {spot.key} = "..."'
-            raise spot.refuse(value, "names no column", mend)
+            hint = f'give the name of a column: {spot.key} = "..."'
+            raise spot.refuse(value, "names no column", hint)
         return value
 
     return read
@@ -301,14 +301,14 @@ def columns(joints: int, what: str = "joint", names: tuple[str, ...] = ()) -> Re
 
 def rows(value: Any, spot: Spot) -> list[int]:
     """First row and end: 0-based, half open."""
-    mend = "give two whole numbers, first and end (0-based, half open), e.g. rows = [0, 25000]"
+    hint = "give two whole numbers, first and end (0-based, half open), e.g. rows = [0, 25000]"
     if (
         not isinstance(value, list)
         or len(value) != 2
         or not all(isinstance(v, int) and not isinstance(v, bool) for v in value)
         or not 0 <= value[0] < value[1]
     ):
-        raise spot.refuse(value, "is not a range of rows", mend)
+        raise spot.refuse(value, "is not a range of rows", hint)
     return value
 
 

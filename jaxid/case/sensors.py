@@ -64,11 +64,11 @@ def read_inertial_sensors(tables: Mapping[str, Any], links: int, file: str) -> t
         if len(set(names)) < len(names):
             raise spot.at("axes").refuse(list(names), "names an axis twice", "name each once")
         if "position" in given and given["kind"] == "gyroscope":
-            mend = "leave it out: a link turns alike everywhere"
-            raise spot.at("position").fault("is of an accelerometer", mend)
+            hint = "leave it out: a link turns alike everywhere"
+            raise spot.at("position").fault("is of an accelerometer", hint)
         out.append({**given, "axes": tuple(AXES.index(a) for a in names)})
     kinds = {s["kind"] for s in out}
     if kinds == {"accelerometer"}:
-        mend = "add gyroscopes: what turns also accelerates towards its axis"
-        raise Spot(file, "[[inertial_sensors]]").fault("there are accelerometers only", mend)
+        hint = "add gyroscopes: what turns also accelerates towards its axis"
+        raise Spot(file, "[[inertial_sensors]]").fault("there are accelerometers only", hint)
     return tuple(out)

@@ -99,11 +99,12 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
     for k, (body, carrier) in enumerate(zip(bodies, carriers, strict=True)):
         if k and not body[0] > 0:
             what = "has no mass" if weighed[k] else "has no <inertial>"
-            mend = "give it, or a link fixed to it, <inertial> with <mass> and <inertia>"
+            hint = "give it, or a link fixed to it, <inertial> with <mass> and <inertia>"
             where = f"{file}, link '{carrier}'"
-            raise InputError(f"{what}, and joint '{names[k - 1]}' moves it", where=where, mend=mend)
+            raise InputError(f"{what}, and joint '{names[k - 1]}' moves it", where=where, hint=hint)
     geometry = JointFrames(
-        tuple(m for m, _ in places), np.array([p[:3, :3] for _, p in places]),
+        tuple(m for m, _ in places),
+        np.array([p[:3, :3] for _, p in places]),
         np.array([p[:3, 3] for _, p in places]),
     )
     return Urdf(tuple(names), geometry, np.array(bodies[1:]))
@@ -114,8 +115,8 @@ def _tree(path: Path) -> Element:
     where = str(path)
 
     def refuse(*args: object) -> None:
-        mend = "take the line <!DOCTYPE ...> out"
-        raise InputError("has a document type declaration", where=where, mend=mend)
+        hint = "take the line <!DOCTYPE ...> out"
+        raise InputError("has a document type declaration", where=where, hint=hint)
 
     tree, parser = TreeBuilder(), expat.ParserCreate()
     parser.StartDoctypeDeclHandler = refuse
@@ -124,23 +125,23 @@ def _tree(path: Path) -> Element:
         parser.Parse(path.read_bytes(), True)
     except FileNotFoundError as error:
         beside = ", ".join(sorted(p.name for p in path.parent.glob("*.urdf"))[:8]) or "none"
-        mend = f"check the path, which starts at the case; URDF files in that folder: {beside}"
-        raise InputError("no such file", where=where, mend=mend) from error
+        hint = f"check the path, which starts at the case; URDF files in that folder: {beside}"
+        raise InputError("no such file", where=where, hint=hint) from error
     except OSError as error:
-        mend = "name a URDF file that may be read"
-        raise InputError(f"cannot be read ({error.strerror})", where=where, mend=mend) from error
+        hint = "name a URDF file that may be read"
+        raise InputError(f"cannot be read ({error.strerror})", where=where, hint=hint) from error
     except (expat.ExpatError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"is not XML: {error}", where=where, mend="mend that line") from error
+        raise InputError(f"is not XML: {error}", where=where, hint="correct that line") from error
     root = tree.close()
     if root.tag != "robot":
-        mend = "name a URDF file, whose first element is <robot>"
-        raise InputError(f"is no URDF: its first element is <{root.tag}>", where=where, mend=mend)
+        hint = "name a URDF file, whose first element is <robot>"
+        raise InputError(f"is no URDF: its first element is <{root.tag}>", where=where, hint=hint)
     expand = [e.tag for e in root.iter() if "xacro" in e.tag]
     if expand:
-        mend = "expand it first: xacro arm.urdf.xacro > arm.urdf"
-        raise InputError(f"holds <{expand[0]}>, a macro", where=where, mend=mend)
+        hint = "expand it first: xacro arm.urdf.xacro > arm.urdf"
+        raise InputError(f"holds <{expand[0]}>, a macro", where=where, hint=hint)
     return root
 
 
@@ -155,7 +156,7 @@ def _named(robot: Element, tag: str, file: str) -> Iterator[tuple[str, Element]]
         name = element.get("name", "")
         if not name or name in taken:
             what = f"<{tag}> {k} has no name" if not name else f"two <{tag}> are named '{name}'"
-            raise InputError(what, where=file, mend="give each a name of its own")
+            raise InputError(what, where=file, hint="give each a name of its own")
         taken.add(name)
         yield name, element
 
@@ -169,23 +170,27 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
     where = f"{file}, joint '{name}'"
     kind = joint.get("type", "")
     if kind not in _TYPES:
-        raise InputError(f"type '{kind}' is none of an arm's joints", where=where, mend=suggest(kind, _TYPES))
+        raise InputError(f"type '{kind}' is none of an arm's joints", where=where, hint=suggest(kind, _TYPES))
     ends = []
     for end in ("parent", "child"):
         element = joint.find(end)
         link = "" if element is None else element.get("link", "")
         if link not in links:
             what = f"<{end}> names no link" if not link else f"there is no link '{link}', its {end}"
-            raise InputError(what, where=where, mend=suggest(link, links))
+            raise InputError(what, where=where, hint=suggest(link, links))
         ends.append(link)
     given = joint.find("axis")
     axis = np.array([1.0, 0.0, 0.0]) if given is None else _numbers(given, "xyz", 3, where)
     length = np.linalg.norm(axis)
     if _TYPES[kind] and not length > 0:
-        raise InputError("<axis> has no length", where=where, mend='write a direction such as xyz="0 0 1"')
+        raise InputError("<axis> has no length", where=where, hint='write a direction such as xyz="0 0 1"')
     copied = joint.find("mimic")
     return _Joint(
-        name, _TYPES[kind], *ends, _place(joint.find("origin"), where), axis / (length or 1.0),
+        name,
+        _TYPES[kind],
+        *ends,
+        _place(joint.find("origin"), where),
+        axis / (length or 1.0),
         None if copied is None else copied.get("joint", ""),
     )
 
@@ -197,19 +202,22 @@ def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
         InputError: If there is none, or more than one, or a loop.
     """
     if not links:
-        raise InputError("has no <link>", where=file, mend="name a file that describes an arm")
+        raise InputError("has no <link>", where=file, hint="name a file that describes an arm")
     into: dict[str, str] = {}
     for joint in joints:
         if joint.child in into:
             both = f"joints '{into[joint.child]}' and '{joint.name}' both carry it"
-            mend = "take one of them out; an arm is an open chain"
+            hint = "take one of them out; an arm is an open chain"
             where = f"{file}, link '{joint.child}'"
-            raise InputError(f"{both}: the chain closes to a loop", where=where, mend=mend)
+            raise InputError(f"{both}: the chain closes to a loop", where=where, hint=hint)
         into[joint.child] = joint.name
     roots = [name for name in links if name not in into]
     if len(roots) > 1:
-        raise InputError(f"no joint joins '{roots[0]}' and '{roots[1]}'", where=file,
-                         mend="join them, or take out what is not part of the arm")
+        raise InputError(
+            f"no joint joins '{roots[0]}' and '{roots[1]}'",
+            where=file,
+            hint="join them, or take out what is not part of the arm",
+        )
     reached, ahead = set(), list(roots)
     while ahead:
         link = ahead.pop()
@@ -218,7 +226,7 @@ def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
     lost = [name for name in links if name not in reached]
     if lost:
         what = f"the joints from link '{lost[0]}' on lead back to it: a loop"
-        raise InputError(what, where=file, mend="take one of them out; an arm is an open chain")
+        raise InputError(what, where=file, hint="take one of them out; an arm is an open chain")
     return roots[0]
 
 
@@ -232,7 +240,7 @@ def _chain(
     """
     of_child = {j.child: j for j in joints}
     if tip is not None and tip not in links:
-        raise InputError(f"there is no link '{tip}', the tip", where=file, mend=suggest(tip, links))
+        raise InputError(f"there is no link '{tip}', the tip", where=file, hint=suggest(tip, links))
     ways = []
     for end in [tip] if tip is not None else links:
         way, link = [], end
@@ -245,16 +253,20 @@ def _chain(
         for one, other in zip(way, longest, strict=False):
             if one is not other:
                 what = f"joints '{other.name}' and '{one.name}' branch: an arm is one chain"
-                mend = 'say which by tip = "<name of its last link>"; what branches off is then held at zero'
-                raise InputError(what, where=file, mend=mend)
+                hint = 'say which by tip = "<name of its last link>"; what branches off is then held at zero'
+                raise InputError(what, where=file, hint=hint)
     if not longest:
-        raise InputError("no joint can move" + (f" up to link '{tip}'" if tip else ""), where=file,
-                         mend="give it a revolute, continuous or prismatic one, or name another tip")
+        raise InputError(
+            "no joint can move" + (f" up to link '{tip}'" if tip else ""),
+            where=file,
+            hint="give it a revolute, continuous or prismatic one, or name another tip",
+        )
     for joint in longest:
         if joint.mimics is not None:
             what = f"it copies joint '{joint.mimics}' (<mimic>), and would not be free"
-            raise InputError(what, where=f"{file}, joint '{joint.name}'",
-                             mend="take <mimic> out, or name a tip before it")
+            raise InputError(
+                what, where=f"{file}, joint '{joint.name}'", hint="take <mimic> out, or name a tip before it"
+            )
     return {j.name for j in longest}
 
 
@@ -270,9 +282,9 @@ def _numbers(element: Element, name: str, count: int, where: str) -> np.ndarray:
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        shown = f"has no {name}" if text is None else f"has {name}=\"{text[:40]}\""
-        mend = f"give {'a number' if count == 1 else f'{count} numbers'}"
-        raise InputError(f"<{element.tag}> {shown}", where=where, mend=mend)
+        shown = f"has no {name}" if text is None else f'has {name}="{text[:40]}"'
+        hint = f"give {'a number' if count == 1 else f'{count} numbers'}"
+        raise InputError(f"<{element.tag}> {shown}", where=where, hint=hint)
     return np.array(values)
 
 
@@ -304,10 +316,10 @@ def _inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndar
     for tag in ("mass", "inertia"):
         parts[tag] = inertial.find(tag)
         if parts[tag] is None:
-            raise InputError(f"<inertial> has no <{tag}>", where=where, mend=f"add <{tag} .../>")
+            raise InputError(f"<inertial> has no <{tag}>", where=where, hint=f"add <{tag} .../>")
     (mass,) = _numbers(parts["mass"], "value", 1, where)
     if mass < 0:
-        raise InputError(f"<mass> is negative: {mass:g} kg", where=where, mend="give the mass of a body")
+        raise InputError(f"<mass> is negative: {mass:g} kg", where=where, hint="give the mass of a body")
     xx, xy, xz, yy, yz, zz = (float(_numbers(parts["inertia"], name, 1, where)[0]) for name in _TENSOR)
     place = frame @ _place(inertial.find("origin"), where)
     turn, c = place[:3, :3], place[:3, 3]
@@ -322,6 +334,10 @@ def _towards(axis: np.ndarray) -> Float[np.ndarray, "3 3"]:
     half = np.diag([1.0, -1.0, -1.0]) if axis[2] < 0 else np.eye(3)
     x, y, z = half @ axis
     # About the cross product of both, by Rodrigues' formula.
-    return half @ np.array([
-        [1 - x * x / (1 + z), -x * y / (1 + z), x], [-x * y / (1 + z), 1 - y * y / (1 + z), y], [-x, -y, z],
-    ])
+    return half @ np.array(
+        [
+            [1 - x * x / (1 + z), -x * y / (1 + z), x],
+            [-x * y / (1 + z), 1 - y * y / (1 + z), y],
+            [-x, -y, z],
+        ]
+    )

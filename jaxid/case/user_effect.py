@@ -44,8 +44,8 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
         raise spot.refuse(kind, "names no class in a file", "write it as my_effects.py:MyEffect")
     if not path.is_file():
         beside = sorted(p.name for p in folder.glob("*.py"))[:8]
-        mend = f"paths start at the case's folder; there is: {', '.join(beside) or 'none'}"
-        raise spot.refuse(kind, "names a file that does not exist", mend)
+        hint = f"paths start at the case's folder; there is: {', '.join(beside) or 'none'}"
+        raise spot.refuse(kind, "names a file that does not exist", hint)
     module = _import(path, kind, spot)
     cls = getattr(module, name, None)
     if not (isinstance(cls, type) and issubclass(cls, Effect) and cls is not Effect):
@@ -60,11 +60,7 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
 
 
 def _is_effect_of(thing: object, module: ModuleType) -> bool:
-    return (
-        isinstance(thing, type)
-        and issubclass(thing, Effect)
-        and thing.__module__ == module.__name__
-    )
+    return isinstance(thing, type) and issubclass(thing, Effect) and thing.__module__ == module.__name__
 
 
 def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
@@ -81,7 +77,7 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
     except Exception as error:
         sys.modules.pop(name, None)
         raise spot.refuse(
-            kind, f"cannot be imported ({type(error).__name__}: {error})", f"mend {path.name}"
+            kind, f"cannot be imported ({type(error).__name__}: {error})", f"correct {path.name}"
         ) from error
     finally:
         # What it registers is its case's, not every case's.
@@ -102,9 +98,9 @@ def _check_class(cls: type[Effect], kind: str, spot: Spot) -> None:
         try:
             Units().label(info.dimension)
         except (ValueError, KeyError) as error:
-            mend = "use force, position, time, inertia with *, / and powers: force*time/position"
+            hint = "use force, position, time, inertia with *, / and powers: force*time/position"
             what = f": {name} has dimension {info.dimension!r}"
-            raise spot.refuse(kind, what, mend) from error
+            raise spot.refuse(kind, what, hint) from error
 
 
 def _check_kind(cls: type[Effect], module: ModuleType, kind: str, spot: Spot) -> None:
@@ -114,5 +110,5 @@ def _check_kind(cls: type[Effect], module: ModuleType, kind: str, spot: Spot) ->
         what = f": another class of that file has its kind, {cls.kind}"
         raise spot.refuse(kind, what, "each class has a kind of its own")
     if EFFECTS.get(cls.kind, cls) is not cls:
-        mend = "give the class another kind"
-        raise spot.refuse(kind, f"takes the name of an effect there is: {cls.kind}", mend)
+        hint = "give the class another kind"
+        raise spot.refuse(kind, f"takes the name of an effect there is: {cls.kind}", hint)

@@ -27,9 +27,9 @@ class Value:
     upper: float = math.inf
     true: float | None = None
 
-    def start(self, true: bool) -> float:
-        """Value for a fit, or (`true`) for a simulation."""
-        return self.true if true and self.true is not None else self.guess
+    def start(self, at_truth: bool) -> float:
+        """Return the guess, or the true value where there is one and it is asked for."""
+        return self.true if at_truth and self.true is not None else self.guess
 
 
 def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
@@ -47,12 +47,12 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
     if isinstance(value, list):
         raise spot.refuse(value, "is a list", "this parameter takes one value")
     if isinstance(value, dict) and info.known:
-        mend = f"give the number, and let an effect in the drive (actuator_gain) be unknown: {info.doc}"
-        raise spot.refuse(value, "must be a known number", mend)
+        hint = f"give the number, and let an effect in the drive (actuator_gain) be unknown: {info.doc}"
+        raise spot.refuse(value, "must be a known number", hint)
     if not isinstance(value, dict):
         if isinstance(value, bool) or not isinstance(value, int | float):
-            mend = "give a number where it is known, { guess = ... } where it is not"
-            raise spot.refuse(value, "is not a number", mend)
+            hint = "give a number where it is known, { guess = ... } where it is not"
+            raise spot.refuse(value, "is not a number", hint)
         return Value(signed(value, spot))
     keys = {
         "guess": Key(signed, "where the fit starts", required=True),
@@ -65,11 +65,11 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
     if lower > upper:
         raise spot.refuse(value, f"has min {lower:g} above max {upper:g}", "exchange min and max")
     if lower == upper:
-        mend = f"give the number itself: {spot.key} = {shown(lower)}"
-        raise spot.refuse(value, "has min equal to max, which leaves nothing to identify", mend)
+        hint = f"give the number itself: {spot.key} = {shown(lower)}"
+        raise spot.refuse(value, "has min equal to max, which leaves nothing to identify", hint)
     if not lower <= given["guess"] <= upper:
-        mend = f"move guess into [{lower:g}, {upper:g}], or widen min and max"
-        raise spot.refuse(value, f"has its guess {given['guess']:g} outside of min and max", mend)
+        hint = f"move guess into [{lower:g}, {upper:g}], or widen min and max"
+        raise spot.refuse(value, f"has its guess {given['guess']:g} outside of min and max", hint)
     return Value(given["guess"], True, lower, upper, given.get("true"))
 
 
@@ -106,5 +106,5 @@ def read_values(
 
 def _check_length(value: list, places: int, spot: Spot, what: str) -> None:
     if len(value) != places:
-        mend = f"give one value, or {places} in a list: one a {what}"
-        raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", mend)
+        hint = f"give one value, or {places} in a list: one a {what}"
+        raise spot.refuse(value, f"has {count(len(value), 'entry', 'entries')}", hint)

@@ -42,7 +42,7 @@ class Check:
     @property
     def warnings(self) -> list[str]:
         """What is doubtful about the logs."""
-        return [f"{f.where}: {f.what}; {f.mend}" for f in self.session.findings]
+        return [f"{f.where}: {f.what}; {f.hint}" for f in self.session.findings]
 
     def json(self) -> dict[str, Any]:
         """Content of check.json."""
@@ -56,7 +56,8 @@ class Check:
             "sound": True,
             "warnings": self.warnings,
             "log": {
-                "samples": log.samples, "rate_hz": log.rate_hz,
+                "samples": log.samples,
+                "rate_hz": log.rate_hz,
                 "duration_s": log.period * log.samples,
                 "stroke": np.ptp(log.position, axis=0),
                 "peak_velocity": np.abs(seen(session.fit.data.qd)).max(axis=0),
@@ -68,15 +69,15 @@ class Check:
             "noise_floor": self.noise_floor,
             "parameters": {
                 f.name: {
-                    "guess": f.guess, "expected_std": s if ok else None, "unit": f.unit,
+                    "guess": f.guess,
+                    "expected_std": s if ok else None,
+                    "unit": f.unit,
                     "identifiable": bool(ok),
                 }
                 for f, s, ok in zip(free, self.precision.std, told, strict=True)
             },
             "unidentifiable": [{"combination": c} for c in self.precision.unidentifiable],
-            "condition": float(np.sqrt(1 / max(self.precision.information[0], 1e-30)))
-            if len(free)
-            else None,
+            "condition": float(np.sqrt(1 / max(self.precision.information[0], 1e-30))) if len(free) else None,
         }
 
     def __str__(self) -> str:
@@ -84,13 +85,13 @@ class Check:
 
         return check_table(self)
 
-    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write `check.json` to a folder.
 
         Raises:
-            InputError: If the folder holds what jaxid did not make and `force` is not given.
+            InputError: If the folder holds what jaxid did not make and `overwrite` is not given.
         """
-        folder = ready_folder(Path(folder), ["check.json"], force=force)
+        folder = ready_folder(Path(folder), ["check.json"], overwrite=overwrite)
         write_json(folder / "check.json", self.json())
         return folder
 
@@ -116,8 +117,12 @@ def check(
     jacobian = _jacobian(sharpened(machine.plant, data), machine.parameters.places, arrays, theta)
     noise = np.random.default_rng(0).standard_normal(data.fitted.shape) * floor
     precision = force_precision(
-        machine, force_size(machine.plant, arrays), np.asarray(theta), noise,
-        np.asarray(jacobian), data.fitted,
+        machine,
+        force_size(machine.plant, arrays),
+        np.asarray(theta),
+        noise,
+        np.asarray(jacobian),
+        data.fitted,
     )
     return Check(session, precision, floor)
 

@@ -45,9 +45,13 @@ def design(
 def _check(case: Case) -> None:
     """Refuse a case without what any design needs."""
     where = str(case.path)
-    for table, key in (("simulation", "duration"), ("simulation", "sample_rate"), ("limits", "stroke"),
-                       ("limits", "speed")):
+    for table, key in (
+        ("simulation", "duration"),
+        ("simulation", "sample_rate"),
+        ("limits", "stroke"),
+        ("limits", "speed"),
+    ):
         if key not in getattr(case, table):
-            raise InputError(f"[{table}] has no {key}", where=where, mend=f"add {key} = ... to [{table}]")
+            raise InputError(f"[{table}] has no {key}", where=where, hint=f"add {key} = ... to [{table}]")
     if not build_machine(case, period=1 / float(case.simulation["sample_rate"])).parameters.free:
-        raise InputError("nothing is unknown", where=where, mend="give a parameter as { guess = ... }")
+        raise InputError("nothing is unknown", where=where, hint="give a parameter as { guess = ... }")

@@ -14,11 +14,11 @@ from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
 from jaxid.discovery.noise import sensor_colour
-from jaxid.discovery.result import Discovery, Found, Round
+from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import proposals
-from jaxid.discovery.superset import build_union
+from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where, locate
 from jaxid.effects.friction import StaticFriction
 from jaxid.estimators import need_known_reference
@@ -68,13 +68,15 @@ def discover(
         InputError: If case or log are unsound.
     """
     session = open_session(case, log, validate, align_hold=True, method="discover")
-    return explore(
-        session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress
-    )
+    return explore(session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress)
 
 
 def explore(
-    session: Session, *, max_effects: int = 5, refit: bool = True, experiments: bool | None = None,
+    session: Session,
+    *,
+    max_effects: int = 5,
+    refit: bool = True,
+    experiments: bool | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
     """`discover` on what is open already.
@@ -131,8 +133,17 @@ def explore(
     old = gaps(before.machine, session.runs)
     new = gaps(after.machine, session.runs) if effects else old
     return Discovery(
-        session, verdict, None if verdict == "nothing_missing" else where, effects,
-        tuple(_round(search, s) for s in steps), before, after, old, new, search.floor, separating,
+        session,
+        verdict,
+        None if verdict == "nothing_missing" else where,
+        effects,
+        tuple(_round(search, s) for s in steps),
+        before,
+        after,
+        old,
+        new,
+        search.floor,
+        separating,
         unseen,
     )
 
@@ -145,14 +156,14 @@ def start_search(
     baseline = inverse_dynamics(machine, data)
     floor = noise_floor(baseline.machine, log, data)
     colour = sensor_colour(baseline.machine, log, data)
-    union = build_union(baseline.machine, data, session.case.searched)
+    union = build_candidate_model(baseline.machine, data, session.case.searched)
     others = tuple(v.data for v in session.validations)
     return baseline, Search(union, data, floor, colour, others, progress)
 
 
 def _with_break_away(
     estimate: Estimate, search: Search, c: cand.Candidate, b: BreakAway
-) -> tuple[Estimate, Found, Step]:
+) -> tuple[Estimate, NamedEffect, Step]:
     """An estimate with break-away friction beside it, as the starts from rest tell it."""
     machine = estimate.machine
     effect = StaticFriction(level=b.level, port=c.port)
@@ -161,7 +172,7 @@ def _with_break_away(
     machine = machine.with_plant(plant, machine.parameters.extended(free)).with_estimate(theta)
     new = replace(estimate, machine=machine, theta=theta, precision=estimate.precision.beside(b.std))
     score = Score(c, 0, np.array([b.level]), b.evidence)
-    found = Found(c.kind, c.label, plant.place(c.port), (free[0].name,), score, ())
+    found = NamedEffect(c.kind, c.label, plant.place(c.port), (free[0].name,), score, ())
     return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
 
 
@@ -172,8 +183,18 @@ def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
     region = (float(b.times.min()), float(b.times.max())) if len(b.times) else where.region
     none = np.zeros(0)
     return replace(
-        where, joint=c.port + 1, variable="time", region=region, intervals=spans, text=text,
-        evidence=b.evidence, threshold=b.threshold, x=none, mean=none, low=none, high=none,
+        where,
+        joint=c.port + 1,
+        variable="time",
+        region=region,
+        intervals=spans,
+        text=text,
+        evidence=b.evidence,
+        threshold=b.threshold,
+        x=none,
+        mean=none,
+        low=none,
+        high=none,
         frequency_hz=None,
     )
 
@@ -194,9 +215,7 @@ def where_of(search: Search, baseline: Step, log: Log) -> Where:
     return locate(-e, own, search.data, search.colour, wanted, search.union.machine.plant)
 
 
-def _verdict(
-    effects: tuple[Found, ...], where: Where, steps: list[Step], search: Search
-) -> str:
+def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], search: Search) -> str:
     if effects:
         return "found"
     baseline = steps[0].theta
@@ -207,7 +226,7 @@ def _verdict(
 
 def _final_machine(
     machine: Machine, search: Search, alternatives: dict[int, tuple[Score, ...]], steps: list[Step]
-) -> tuple[Machine, tuple[Found, ...]]:
+) -> tuple[Machine, tuple[NamedEffect, ...]]:
     """The case's machine with only the effects that were added, at their refitted values."""
     plant, parameters = machine.plant, machine.parameters
     theta = [*search.theta[search.union.base]]
@@ -220,7 +239,7 @@ def _final_machine(
         score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
         names = tuple(f.name for f in free)
         place = plant.place(c.port)
-        effects.append(Found(c.kind, c.label, place, names, score, alternatives.get(k, ())))
+        effects.append(NamedEffect(c.kind, c.label, place, names, score, alternatives.get(k, ())))
     final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
     return final, tuple(effects)
 
@@ -251,14 +270,10 @@ def _length(gap: Gap) -> float:
 
 
 def _round(search: Search, step: Step) -> Round:
-    fit, *others = (
-        _rms(search, samples, step.theta)
-        for samples in [search.samples, *search.worth.others]
-    )
+    fit, *others = (_rms(search, samples, step.theta) for samples in [search.samples, *search.worth.others])
     return Round(step, fit, np.max(others, axis=0) if others else None)
 
 
 def _rms(search: Search, samples: cand.Samples, theta: np.ndarray) -> np.ndarray:
     e, _ = cand.evaluate(search.union, samples, theta, ())
     return np.sqrt(np.nanmean(np.where(samples.moving, e, np.nan) ** 2, axis=0))
-

@@ -16,7 +16,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import OUTPUTS
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.log import Log
-from jaxid.numerics.lanes import Soon, Steps, alone, together
+from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.session import Session, open_session
 from jaxid.simulation.solvers import SOLVERS
 
@@ -51,15 +51,15 @@ class Identification:
 
         return identification_table(self)
 
-    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write `result.json` and `report.html` to a folder.
 
         Raises:
-            InputError: If the folder holds what jaxid did not make and `force` is not given.
+            InputError: If the folder holds what jaxid did not make and `overwrite` is not given.
         """
         from jaxid.results.as_json import save_identification
 
-        return save_identification(self, Path(folder), force=force)
+        return save_identification(self, Path(folder), overwrite=overwrite)
 
 
 def identify(
@@ -90,9 +90,7 @@ def identify(
         InputError: If case, log, method, solver or `on` are unsound.
     """
     if method not in METHODS:
-        raise InputError(
-            f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}"
-        )
+        raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     options = {}
     if solver is not None:
         options["solver"] = _checked("solver", solver, SOLVERS, method)
@@ -101,21 +99,27 @@ def identify(
     session = open_session(case, log, validate, method=method)
     if not session.machine.parameters.free:
         raise InputError(
-            "nothing is unknown", where=str(session.case.path),
-            mend="give at least one parameter as { guess = ... }",
+            "nothing is unknown",
+            where=str(session.case.path),
+            hint="give at least one parameter as { guess = ... }",
         )
     progress(f"fitting by {method}")
-    estimate = alone(steps_of(method, session, **options), _gaps_of(session))
+    estimate = run_alone(steps_of(method, session, **options), _gaps_of(session))
     progress("simulating")
     return Identification(
-        session, estimate, gaps(estimate.machine, session.runs),
+        session,
+        estimate,
+        gaps(estimate.machine, session.runs),
         noise_floor(estimate.machine, session.fit.log, session.fit.data),
     )
 
 
 def identify_many(
-    case: Case | str | Path | Sequence[Case | str | Path], logs: Sequence[Log | str | Path], *,
-    method: str = "output_error", lanes: int = 16,
+    case: Case | str | Path | Sequence[Case | str | Path],
+    logs: Sequence[Log | str | Path],
+    *,
+    method: str = "output_error",
+    lanes: int = 16,
 ) -> list[Estimate | Exception]:
     """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
 
@@ -132,29 +136,29 @@ def identify_many(
         InputError: If a case or the method is unsound, or cases are not as many as logs.
     """
     if method not in METHODS:
-        raise InputError(f"method {method!r} is not known", mend=f"choose one of {', '.join(METHODS)}")
+        raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     loaded = lambda c: c if isinstance(c, Case) else load_case(c)
     if isinstance(case, Case | str | Path):
         cases = [loaded(case)] * len(logs)
     elif len(case) == len(logs):
         cases = [loaded(c) for c in case]
     else:
-        raise InputError(f"{len(case)} cases for {len(logs)} logs", mend="give one case, or one for each log")
+        raise InputError(f"{len(case)} cases for {len(logs)} logs", hint="give one case, or one for each log")
 
     def steps(case: Case, log: Log | str | Path) -> Steps[Estimate]:
         return (yield from steps_of(method, open_session(case, log, method=method)))
 
-    return together([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
+    return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
 
 def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
     if method != "output_error":
         raise InputError(
             f"{option} {value!r} goes only with output_error",
-            mend=f"leave out {option}, or method {method!r}",
+            hint=f"leave out {option}, or method {method!r}",
         )
     if value not in known:
-        raise InputError(f"{option} {value!r} is not known", mend=suggest(value, known))
+        raise InputError(f"{option} {value!r} is not known", hint=suggest(value, known))
     return value
 
 
@@ -162,12 +166,10 @@ def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
 _COMPILED_BESIDE = 100_000
 
 
-def _gaps_of(session: Session) -> Soon | None:
+def _gaps_of(session: Session) -> Precompile | None:
     """What a fit is followed by."""
     machine, samples = session.machine, tuple(r.log.samples for r in session.runs)
     if sum(samples) > _COMPILED_BESIDE:
         return None
     key = (gaps, jax.tree.structure((machine.plant, machine.controller)), samples)
-    return Soon(gaps, (machine, session.runs), key)
-
-
+    return Precompile(gaps, (machine, session.runs), key)

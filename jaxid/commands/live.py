@@ -21,8 +21,8 @@ from jaxid.build import build_machine
 from jaxid.case.case import Case, load_case
 from jaxid.controllers import Controller, Tick, base
 from jaxid.errors import InputError
-from jaxid.estimators.algebraic.online import Memory, Online, Told
-from jaxid.estimators.recursive.recursion import Told as Estimate
+from jaxid.estimators.algebraic.online import Online, OnlineEstimate, OnlineMemory
+from jaxid.estimators.recursive.recursion import RecursiveEstimate
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.scene import Scene
@@ -42,10 +42,10 @@ class Live:
         case: The case, or its file; it needs [controller], [reference] and [simulation].
         identify: Identify the unknowns on-line and, once all may be trusted, put what was found into
             the model of a controller that has one.
-        tolerance: Of that trust (see `jaxid.estimators.algebraic.online.Told`).
+        tolerance: Of that trust (see `jaxid.estimators.algebraic.online.OnlineEstimate`).
 
     Attributes:
-        told: What the rows so far say; None without `identify`, and before the second tick.
+        online_estimate: Estimate from the rows so far; None without `identify`, and before the second tick.
         adapts: Whether the controller identifies by itself.
         switched: Tick from which on the controller knows what was found; None: not yet.
 
@@ -58,11 +58,11 @@ class Live:
         case = case if isinstance(case, Case) else load_case(case)
         scene = Scene.of(case)
         if scene.machine.controller is None:
-            raise InputError("there is no loop", where=str(case.path), mend="add a [controller]")
+            raise InputError("there is no loop", where=str(case.path), hint="add a [controller]")
         self.machine = build_machine(case, period=scene.drive.period)
         self.reference: Float[np.ndarray, "ticks m"] = scene.signal
         self.period: float = scene.drive.period
-        self.told: Told | None = None
+        self.online_estimate: OnlineEstimate | None = None
         self.switched: int | None = None
         self._controller = scene.machine.controller
         path = self._controller.path(jnp.asarray(self.reference))
@@ -84,13 +84,16 @@ class Live:
                 raise InputError(
                     f"a controller of kind {kind!r} {what}",
                     where=str(case.path),
-                    mend="leave identify out" if self.adapts else "take kind = 'flatness'",
+                    hint="leave identify out" if self.adapts else "take kind = 'flatness'",
                 )
             self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
 
     def command(
-        self, position: Float[np.ndarray, " n"], velocity: Float[np.ndarray, " n"] | None = None,
-        acceleration: Float[np.ndarray, " n"] | None = None, measured: Float[np.ndarray, " m"] | None = None,
+        self,
+        position: Float[np.ndarray, " n"],
+        velocity: Float[np.ndarray, " n"] | None = None,
+        acceleration: Float[np.ndarray, " n"] | None = None,
+        measured: Float[np.ndarray, " m"] | None = None,
     ) -> Float[np.ndarray, " m"]:
         """The command to hold until the next tick.
 
@@ -107,13 +110,13 @@ class Live:
         if self._tick >= len(self.reference):
             raise InputError(
                 f"the reference ends after {len(self.reference)} ticks",
-                mend="let [simulation] duration be longer",
+                hint="let [simulation] duration be longer",
             )
         position = np.asarray(position, dtype=np.float64)
         joints = self.machine.plant.joints
         if position.shape != (joints,):
             what = f"position has shape {position.shape}"
-            raise InputError(what, where="Live.command", mend=f"give one reading of each of {joints} joints")
+            raise InputError(what, where="Live.command", hint=f"give one reading of each of {joints} joints")
         if measured is None and self.adapts:
             measured = self._as_given
         others = [None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured)]
@@ -121,7 +124,7 @@ class Live:
         for name, x, like in zip(_OTHERS, others, (position, position, self._as_given), strict=True):
             if x is not None and x.shape != like.shape:
                 what = f"{name} has shape {x.shape}"
-                raise InputError(what, where="Live.command", mend=f"give {like.size} numbers")
+                raise InputError(what, where="Live.command", hint=f"give {like.size} numbers")
         fresh = tuple(self._tick % hold == 0 for hold in self._holds)
         if self._tick == 0:
             path = jax.tree.map(lambda x: x[0], self._path)
@@ -150,7 +153,7 @@ class Live:
         self._memory = self._law.remembers(memory)
 
     @property
-    def estimate(self) -> Estimate:
+    def estimate(self) -> RecursiveEstimate:
         """What a controller that identifies says of the unknowns, in the order of `machine.parameters`.
 
         Raises:
@@ -158,7 +161,7 @@ class Live:
         """
         if not self.adapts or self.memory is None:
             what = "no reading yet" if self.adapts else "the controller does not identify"
-            raise InputError(what, where="Live", mend="take kind = 'adaptive', and give it readings")
+            raise InputError(what, where="Live", hint="take kind = 'adaptive', and give it readings")
         return self._controller.estimate(self.memory)
 
     def _identify(self, position: np.ndarray) -> None:
@@ -166,21 +169,21 @@ class Live:
             self._rows = self._online.start(jnp.asarray(position))
             return
         self._rows, told = _learned(self._online, self._rows, position, self._last)
-        self.told = jax.tree.map(np.asarray, told)
-        if self.told.trusted.all():
-            model = self.machine.with_estimate(self.told.theta).plant
+        self.online_estimate = jax.tree.map(np.asarray, told)
+        if self.online_estimate.trusted.all():
+            model = self.machine.with_estimate(self.online_estimate.theta).plant
             self._controller = eqx.tree_at(lambda c: c.model, self._controller, model)
             self._law.take(self._controller)
             self.switched = self._tick
 
 
-def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> Told:
+def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> OnlineEstimate:
     """What the on-line estimator tells at every sample of a log but the first, (time, p) each.
 
     Args:
         case: The case, or its file.
         log: The log; its command is held between samples.
-        tolerance: Of trust (see `jaxid.estimators.algebraic.online.Told`).
+        tolerance: Of trust (see `jaxid.estimators.algebraic.online.OnlineEstimate`).
 
     Raises:
         InputError: If the case asks for what cannot be identified on-line.
@@ -195,8 +198,8 @@ def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> Tol
 
 
 @eqx.filter_jit
-def _followed(online: Online, position: Array, command: Array) -> Told:
-    def step(memory: Memory, now: tuple) -> tuple[Memory, Told]:
+def _followed(online: Online, position: Array, command: Array) -> OnlineEstimate:
+    def step(memory: OnlineMemory, now: tuple) -> tuple[OnlineMemory, OnlineEstimate]:
         return _learn(online, memory, *now)
 
     return jax.lax.scan(step, online.start(position[0]), (position[1:], command[:-1]))[1]
@@ -236,7 +239,11 @@ class _Law:
         return self.memory.packed(memory)
 
     def __call__(
-        self, k: int, position: np.ndarray, fresh: tuple[bool, bool], others: Sequence[np.ndarray | None],
+        self,
+        k: int,
+        position: np.ndarray,
+        fresh: tuple[bool, bool],
+        others: Sequence[np.ndarray | None],
         memory: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
         """The command, the new memory, and whether what the law found takes part in the command.
@@ -273,7 +280,7 @@ class _Law:
             tick = Tick(position, path, self._driven, fresh[0], *others, fresh[1])
             controller = eqx.combine(self._own.unpacked(own), self._static)
             u, memory = controller.command(tick, self.memory.unpacked(memory), jnp.zeros(1))
-            told = controller.told(memory)
+            told = controller.learned(memory)
             closed = jnp.zeros(1) if told is None else told.closed.astype(float)[None]
             memory = self.memory.packed(memory, jnp)
             return jnp.concatenate([own, memory, before[ends[1] : ends[-1]], closed, u])
@@ -312,9 +319,11 @@ class _Packed:
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def _learn(online: Online, memory: Memory, position: Array, command: Array) -> tuple[Memory, Told]:
+def _learn(
+    online: Online, memory: OnlineMemory, position: Array, command: Array
+) -> tuple[OnlineMemory, OnlineEstimate]:
     memory, _ = online.update(memory, position, command)
-    return memory, online.told(memory)
+    return memory, online.estimate(memory)
 
 
 _learned = eqx.filter_jit(_learn)

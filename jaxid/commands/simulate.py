@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.case.case import Case, load_case
-from jaxid.numerics.lanes import alone
-from jaxid.scene import Scene, Virtual
+from jaxid.numerics.lanes import run_alone
+from jaxid.scene import Scene, SimulatedLog
 
 
-def simulate(case: Case | str | Path, *, seed: int = 0) -> Virtual:
+def simulate(case: Case | str | Path, *, seed: int = 0) -> SimulatedLog:
     """Simulate the log that a case would give, at its true values where it has any.
 
     Args:
@@ -23,4 +23,4 @@ def simulate(case: Case | str | Path, *, seed: int = 0) -> Virtual:
         InputError: If the case does not say what to simulate.
     """
     scene = Scene.of(case if isinstance(case, Case) else load_case(case))
-    return alone(scene.virtual(scene.machine, np.random.default_rng(seed)))
+    return run_alone(scene.simulated_log(scene.machine, np.random.default_rng(seed)))

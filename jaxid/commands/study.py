@@ -19,7 +19,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
 from jaxid.files import check_folder, mark_folder, write_json, write_whole
 from jaxid.logs.log import Log
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError
 from jaxid.studies.levels import Level
@@ -42,7 +42,7 @@ def study(
     seed: int = 0,
     folder: str | Path | None = None,
     resume: bool = False,
-    force: bool = False,
+    overwrite: bool = False,
     scheduler: str | None = None,
     progress: Told = lambda done, runs: None,
 ) -> Study:
@@ -56,7 +56,7 @@ def study(
         folder: Where each chunk is kept as soon as it ends, and the results at the end; absent: in
             memory only.
         resume: Go on where an interrupted study in that folder stopped: to the same bits.
-        force: Write into a folder that jaxid did not make.
+        overwrite: Write into a folder that jaxid did not make.
         scheduler: Address of a Dask scheduler whose workers run the chunks; absent: this machine, all
             cores.
         progress: Called with the number of runs done, and of all.
@@ -67,13 +67,14 @@ def study(
     case = case if isinstance(case, Case) else load_case(case)
     where = None if folder is None else Path(folder)
     if resume and where is None:
-        raise InputError("there is nothing to resume from", mend="give the folder of the study: -o DIR")
+        raise InputError("there is nothing to resume from", hint="give the folder of the study: -o DIR")
     if where is not None and not resume:
-        check_folder(where, FILES, force=force)
+        check_folder(where, FILES, overwrite=overwrite)
         if (where / _MANIFEST).exists():
             raise InputError(
-                "holds a study already", where=str(where),
-                mend="go on with it with --resume, or choose another -o",
+                "holds a study already",
+                where=str(where),
+                hint="go on with it with --resume, or choose another -o",
             )
     begun = _begun(where) if resume else {}
     with contextlib.ExitStack() as stack:
@@ -84,8 +85,9 @@ def study(
         differs = same(plan.manifest, begun) if resume else ""
         if differs:
             raise InputError(
-                f"the study there is another one: {differs} differ", where=str(where),
-                mend="give what it was begun with, or choose another -o",
+                f"the study there is another one: {differs} differ",
+                where=str(where),
+                hint="give what it was begun with, or choose another -o",
             )
         # All that can be refused is refused before anything is written.
         runner = Runner(plan)
@@ -108,7 +110,7 @@ def study(
             progress(done, total)
     result = gathered(plan, [kept[k] for k in range(len(plan.chunks))], bound)
     if where is not None:
-        result.save(where, force=force)
+        result.save(where, overwrite=overwrite)
     return result
 
 
@@ -142,13 +144,13 @@ def _begun(folder: Path) -> dict:
     path = folder / _MANIFEST
     if not path.exists():
         raise InputError(
-            "holds no study", where=str(folder), mend="leave out --resume, or give the study's folder"
+            "holds no study", where=str(folder), hint="leave out --resume, or give the study's folder"
         )
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise InputError(
-            f"cannot be read: {error}", where=str(path), mend="begin anew in another folder"
+            f"cannot be read: {error}", where=str(path), hint="begin anew in another folder"
         ) from error
 
 
@@ -177,11 +179,11 @@ def _unpacked(path: Path, identity: str) -> Arrays:
         own = str(found.pop("study"))
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(
-            f"cannot be read: {error}", where=str(path), mend="remove this file, and resume again"
+            f"cannot be read: {error}", where=str(path), hint="remove this file, and resume again"
         ) from error
     if own != identity:
         raise InputError(
-            "belongs to another study", where=str(path), mend="remove this file, and resume again"
+            "belongs to another study", where=str(path), hint="remove this file, and resume again"
         )
     return found
 
@@ -199,11 +201,11 @@ def _bound(plan: Plan, level: Level) -> np.ndarray:
     if machine.sensor.position_std is None or not plan.fits:
         return none
     silent = replace(machine, sensor=replace(machine.sensor, position_noise=None, force_noise=None))
-    virtual = alone(scene.virtual(silent, np.random.default_rng(0)))
+    simulated_log = run_alone(scene.simulated_log(silent, np.random.default_rng(0)))
     # The command of every tick, of which the log may have but some.
-    run = virtual.trajectory
+    run = simulated_log.trajectory
     ticks = scene.drive.period * np.arange(len(run.command))
-    log = Log(ticks, np.asarray(run.reading), np.asarray(run.command), hold=virtual.log.hold)
+    log = Log(ticks, np.asarray(run.reading), np.asarray(run.command), hold=simulated_log.log.hold)
     driven = replace(machine, controller=None)
     try:
         numerics = choose_numerics(driven, log, segments=False)

@@ -13,6 +13,11 @@ from jaxid.controllers.flatness import flat_inputs as flat_inputs
 from jaxid.controllers.linear import PD, PID, CascadePD, FrictionCompensation
 
 CONTROLLERS: dict[str, type[Controller]] = {
-    "cascade_pd": CascadePD, "pd": PD, "pid": PID, "flatness": Flatness,
-    "friction_compensation": FrictionCompensation, "computed_torque": ComputedTorque, "adaptive": Adaptive,
+    "cascade_pd": CascadePD,
+    "pd": PD,
+    "pid": PID,
+    "flatness": Flatness,
+    "friction_compensation": FrictionCompensation,
+    "computed_torque": ComputedTorque,
+    "adaptive": Adaptive,
 }

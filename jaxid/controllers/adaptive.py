@@ -16,13 +16,13 @@ from jaxid.model.unknowns import scatter
 
 # A law is given its estimator, and imports none: `RealTime` of `jaxid.estimators.recursive.real_time`, with
 # the memory and what it tells of `jaxid.estimators.recursive.recursion`.
-RealTime = Memory = Told = Any
+RealTime = RecursiveMemory = RecursiveEstimate = Any
 
 # Instants of the reference at which columns are looked at, at most.
 _LOOKS = 500
 
 
-class Found(eqx.Module):
+class LearnedUnknowns(eqx.Module):
     """What the law has found.
 
     Args:
@@ -50,10 +50,10 @@ class Learning(eqx.Module):
     """
 
     feedback: tuple
-    recursion: Memory
+    recursion: RecursiveMemory
     information: Float[Array, " p"]
     share: Float[Array, " p"]
-    found: Found
+    found: LearnedUnknowns
     positions: Float[Array, "past n"]
     commands: Float[Array, "past m"]
     ticks: Array
@@ -104,9 +104,14 @@ class Adaptive(FeedForward):
         start = jnp.asarray(self.estimator.recursion.start)
         information = self.regularization * square
         return Learning(
-            self.start_feedback(tick), self._recursion(information).memory(), information,
-            jnp.sqrt(square) / force, Found(start, jnp.zeros((), bool)),
-            tick.joints - back * velocity, jnp.zeros((2 * self.stride, len(tick.driven))), jnp.zeros((), int),
+            self.start_feedback(tick),
+            self._recursion(information).memory(),
+            information,
+            jnp.sqrt(square) / force,
+            LearnedUnknowns(start, jnp.zeros((), bool)),
+            tick.joints - back * velocity,
+            jnp.zeros((2 * self.stride, len(tick.driven))),
+            jnp.zeros((), int),
         )
 
     def law(self, tick: Tick, velocity: Array, memory: Learning, disturbance: Array) -> tuple:
@@ -127,14 +132,14 @@ class Adaptive(FeedForward):
         kept = lambda memory: (memory[1].recursion, memory[1].information, memory[1].found)
         return eqx.tree_at(kept, start, kept(saved))
 
-    def told(self, memory: Any) -> Found:
+    def learned(self, memory: Any) -> LearnedUnknowns:
         """What has been found, of the memory that `command` returns."""
         return memory[1].found
 
     @eqx.filter_jit
-    def estimate(self, memory: Any) -> Told:
+    def estimate(self, memory: Any) -> RecursiveEstimate:
         """What the estimator says, of the memory that `command` returns."""
-        return self._recursion(memory[1].information).told(memory[1].recursion)
+        return self._recursion(memory[1].information).estimate(memory[1].recursion)
 
     def _recursion(self, information: Array, ticks: int = 1) -> Any:
         """The recursion with its start, of samples so many ticks apart: what it forgets is by time."""
@@ -157,18 +162,24 @@ class Adaptive(FeedForward):
         closed = jax.lax.cond(
             done, lambda: jnp.ones((), bool), lambda: self._converged(recursion, new, share)
         )
-        theta = recursion.told(new).theta if recursion.instrument else new.theta
+        theta = recursion.estimate(new).theta if recursion.instrument else new.theta
         positions = jnp.concatenate([tick.joints[None], memory.positions[:-1]])
         return Learning(
-            memory.feedback, new, memory.information, memory.share, Found(theta, closed), positions,
-            memory.commands, memory.ticks + 1,
+            memory.feedback,
+            new,
+            memory.information,
+            memory.share,
+            LearnedUnknowns(theta, closed),
+            positions,
+            memory.commands,
+            memory.ticks + 1,
         )
 
-    def _converged(self, recursion: Any, memory: Memory, share: Array) -> Array:
-        told = recursion.told(memory)
+    def _converged(self, recursion: Any, memory: RecursiveMemory, share: Array) -> Array:
+        told = recursion.estimate(memory)
         # Rows enough that the residual tells the noise.
         enough = told.effective > 10 * share.size
-        return enough & jnp.all(told.told & (told.std * share < self.tolerance))
+        return enough & jnp.all(told.identifiable & (told.std * share < self.tolerance))
 
     def _sample(self, tick: Tick, memory: Learning) -> tuple[tuple, Array]:
         """Position, velocity, acceleration and command at one instant, and whether there is a new one."""

@@ -120,7 +120,7 @@ class Controller(eqx.Module):
         """A memory at the start of a new run with what was identified in an earlier one."""
         return start
 
-    def told(self, memory: Any) -> Any:
+    def learned(self, memory: Any) -> Any:
         """What a law that identifies has found so far; None of one that does not."""
         return None
 

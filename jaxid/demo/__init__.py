@@ -20,13 +20,13 @@ _FILES = ("case.toml", "log.csv", "validation.csv")
 
 
 def run_demo(
-    folder: Path, *, force: bool = False, progress: Callable[[str], None] = lambda text: None
+    folder: Path, *, overwrite: bool = False, progress: Callable[[str], None] = lambda text: None
 ) -> tuple[str, bool]:
     """Run the whole way in a folder.
 
     Args:
         folder: Where case, logs and results go.
-        force: Overwrite what jaxid did not make.
+        overwrite: Overwrite what jaxid did not make.
         progress: Called with a line at every stage.
 
     Returns:
@@ -36,24 +36,30 @@ def run_demo(
         InputError: If the folder cannot be written to.
     """
     results = ("check.json", "result.json", "discovery.json", "report.html")
-    ready_folder(folder, [*_FILES, *results], force=force)
+    ready_folder(folder, [*_FILES, *results], overwrite=overwrite)
     for name in _FILES:
         with resources.as_file(resources.files("jaxid.demo") / name) as source:
             shutil.copyfile(source, folder / name)
     case, log = folder / "case.toml", folder / "log.csv"
     progress("checking the log")
     checked = check(case, log)
-    checked.save(folder, force=force)
+    checked.save(folder, overwrite=overwrite)
     identified = identify(case, log, progress=progress)
-    identified.save(folder, force=force)
+    identified.save(folder, overwrite=overwrite)
     discovered = discover(case, log, progress=progress)
-    discovered.save(folder, force=force)
+    discovered.save(folder, overwrite=overwrite)
     shown = f"{folder}/case.toml {folder}/log.csv"
     text = "\n".join(
         [
-            f"$ jaxid check {shown}", str(checked), "",
-            f"$ jaxid identify {shown}", str(identified), "",
-            f"$ jaxid discover {shown}", str(discovered), "",
+            f"$ jaxid check {shown}",
+            str(checked),
+            "",
+            f"$ jaxid identify {shown}",
+            str(identified),
+            "",
+            f"$ jaxid discover {shown}",
+            str(discovered),
+            "",
             f"report: {folder / 'report.html'}",
         ]
     )

@@ -29,7 +29,7 @@ _CONFIRMED = 0.1
 
 
 @dataclass
-class Worth:
+class Acceptance:
     """Logs and their noise, against which models are judged.
 
     Args:
@@ -40,7 +40,7 @@ class Worth:
         colour: Of that noise, by joint.
     """
 
-    union: cand.Union
+    union: cand.CandidateModel
     data: Prepared
     validation: tuple[Prepared, ...]
     floor: np.ndarray
@@ -84,9 +84,7 @@ class Worth:
         """Whether a residual is more than filtering and integrating leave wrong."""
         return self._sum(self.residual(theta)) - self._noise > self._numerics
 
-    def closed(
-        self, old: Float[np.ndarray, "kept n"], new: Float[np.ndarray, "kept n"]
-    ) -> float:
+    def closed(self, old: Float[np.ndarray, "kept n"], new: Float[np.ndarray, "kept n"]) -> float:
         """Part by which the gap above the noise floor closes, in sum of squares."""
         before, after = self._sum(old), self._sum(new)
         if before - after < self._numerics:
@@ -150,8 +148,13 @@ class Worth:
         return total
 
     def objection(
-        self, index: np.ndarray, old: np.ndarray, new: np.ndarray, validation: float | None,
-        confirmed: float | None, fitted: int,
+        self,
+        index: np.ndarray,
+        old: np.ndarray,
+        new: np.ndarray,
+        validation: float | None,
+        confirmed: float | None,
+        fitted: int,
     ) -> str:
         """Why what a model adds to another may not be named; empty where it may.
 

@@ -62,7 +62,7 @@ class Candidate:
     amplitude: np.ndarray
 
     @property
-    def many(self) -> bool:
+    def has_grid(self) -> bool:
         """Whether its starts are evaluated on a plant of their own."""
         return len(self.starts) > _FEW
 
@@ -97,7 +97,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Union:
+class CandidateModel:
     """Machine with all candidates.
 
     Args:
@@ -120,7 +120,7 @@ class Union:
         return self.machine.parameters.guess
 
 
-class Samples:
+class CandidateSamples:
     """What a search looks at of a log: all of it, or pieces spread over a long one.
 
     Args:
@@ -128,9 +128,7 @@ class Samples:
         force_noise: Standard deviation of the declared force, (m,); None: not known.
     """
 
-    def __init__(
-        self, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None
-    ) -> None:
+    def __init__(self, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None) -> None:
         self.parts = data.parts(_MOST // data.q.shape[1], _PIECES)
         self.arrays = [ForceData.of(p) for p in self.parts]
         self.noisier = [] if force_noise is None else [_noisier(a, force_noise) for a in self.arrays]
@@ -148,14 +146,20 @@ def _noisier(arrays: ForceData, force_noise: np.ndarray) -> ForceData:
 
 
 def evaluate(
-    union: Union, samples: Samples, theta: Float[np.ndarray, " p"], wanted: Sequence[int] | None = None
+    union: CandidateModel,
+    samples: CandidateSamples,
+    theta: Float[np.ndarray, " p"],
+    wanted: Sequence[int] | None = None,
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """Residual of the union and its Jacobian in all unknowns, or at least in those wanted."""
     return evaluate_on(union, samples.arrays, theta, wanted)
 
 
 def evaluate_on(
-    union: Union, logs: list[ForceData], theta: Float[np.ndarray, " p"], wanted: Sequence[int] | None = None
+    union: CandidateModel,
+    logs: list[ForceData],
+    theta: Float[np.ndarray, " p"],
+    wanted: Sequence[int] | None = None,
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """The same on several logs or pieces, their rows in that order."""
     colours = np.asarray(union.colours, int)
@@ -174,7 +178,7 @@ def evaluate_on(
 
 
 def _asked(
-    union: Union, log: ForceData, theta: np.ndarray, directions: np.ndarray, part: np.ndarray
+    union: CandidateModel, log: ForceData, theta: np.ndarray, directions: np.ndarray, part: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residual and derivatives in some directions, filled up to one number of them."""
     own = np.zeros((len(theta), _COLUMNS))
@@ -185,7 +189,7 @@ def _asked(
 
 
 def refine(
-    union: Union, data: Samples, theta: Float[np.ndarray, " p"], moving: np.ndarray
+    union: CandidateModel, data: CandidateSamples, theta: Float[np.ndarray, " p"], moving: np.ndarray
 ) -> tuple[Float[np.ndarray, " p"], bool]:
     """Fit some unknowns of the union in the force domain, the rest held.
 
@@ -224,8 +228,15 @@ def refine(
 
     start = np.clip(np.asarray(transform.inward(jnp.asarray(theta[moving]))), lower, upper)
     fit = scipy.optimize.least_squares(
-        lambda x: both(x)[0], start, lambda x: both(x)[1], (lower, upper), x_scale="jac",
-        ftol=1e-7, xtol=1e-7, gtol=1e-10, max_nfev=25,
+        lambda x: both(x)[0],
+        start,
+        lambda x: both(x)[1],
+        (lower, upper),
+        x_scale="jac",
+        ftol=1e-7,
+        xtol=1e-7,
+        gtol=1e-10,
+        max_nfev=25,
     )
     out = theta.copy()
     out[moving] = np.asarray(transform.outward(jnp.asarray(fit.x)))
@@ -238,7 +249,10 @@ def _finite(x: np.ndarray) -> np.ndarray:
 
 
 def points(
-    union: Union, rest: list[Candidate], data: Samples, theta: Float[np.ndarray, " p"],
+    union: CandidateModel,
+    rest: list[Candidate],
+    data: CandidateSamples,
+    theta: Float[np.ndarray, " p"],
     residual: Float[np.ndarray, "kept n"],
 ) -> list[Point]:
     """Every candidate that has few starts at each of them, all together through the union.
@@ -251,7 +265,7 @@ def points(
         residual: Its residual.
     """
     found = []
-    few = [c for c in rest if not c.many]
+    few = [c for c in rest if not c.has_grid]
     for k in range(max((len(c.starts) for c in few), default=0)):
         now = [c for c in few if k < len(c.starts)]
         # Added forces are faint and can share an evaluation. A drive effect shifts the residual of
@@ -275,11 +289,11 @@ def points(
     return found
 
 
-def many_points(union: Union, candidate: Candidate, data: Samples) -> list[Point]:
+def grid_points(union: CandidateModel, candidate: Candidate, data: CandidateSamples) -> list[Point]:
     """A candidate with many starts at each of them, on a plant that has nothing else."""
     effect: Effect = union.machine.plant.effects[position(union, candidate)]
     alone = eqx.tree_at(lambda p: p.effects, union.machine.plant, (effect,))
-    names = own_names(effect)
+    names = user_effect_names(effect)
     places = tuple((("effects", 0, n), None) for n in names)
     probes = np.stack([candidate.probe(k) for k in range(len(candidate.starts))])
     found = []
@@ -307,24 +321,24 @@ def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array) -> Arr
     return jax.lax.map(columns, starts)
 
 
-def position(union: Union, candidate: Candidate) -> int:
+def position(union: CandidateModel, candidate: Candidate) -> int:
     """Index of a candidate among the effects of the union's plant."""
     path = union.machine.parameters.free[candidate.index[0]].path
     return int(path[1])
 
 
-def effect_at(union: Union, candidate: Candidate, values: Float[np.ndarray, " k"]) -> Effect:
+def effect_at(union: CandidateModel, candidate: Candidate, values: Float[np.ndarray, " k"]) -> Effect:
     """A candidate as an effect of its own, at some values of its unknowns."""
     effect: Effect = union.machine.plant.effects[position(union, candidate)]
-    return type(effect)(**dict(zip(own_names(effect), values, strict=True)), port=candidate.port)
+    return type(effect)(**dict(zip(user_effect_names(effect), values, strict=True)), port=candidate.port)
 
 
-def own_names(effect: Effect) -> list[str]:
+def user_effect_names(effect: Effect) -> list[str]:
     """Parameters that an effect has, those that it leaves out apart."""
     return [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
 
 
-def free_of(union: Union, index: np.ndarray) -> Parameters:
+def free_of(union: CandidateModel, index: np.ndarray) -> Parameters:
     """Some unknowns of the union."""
     free: list[Free] = [union.machine.parameters.free[i] for i in index]
     return Parameters(tuple(free))

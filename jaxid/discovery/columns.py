@@ -41,9 +41,7 @@ def independent(
     return rest[:, np.linalg.norm(rest, axis=0) > NOTHING_NEW]
 
 
-def span(
-    base: Float[np.ndarray, "row k"], extra: Float[np.ndarray, "row j"]
-) -> Float[np.ndarray, "row i"]:
+def span(base: Float[np.ndarray, "row k"], extra: Float[np.ndarray, "row j"]) -> Float[np.ndarray, "row i"]:
     """Orthonormal columns that span the base and what is new in the rest."""
     q = orthonormal(base)
     rest = unit(independent(q, extra))
@@ -56,8 +54,6 @@ def span(
     return np.concatenate([q, rest @ (vectors[:, kept] / np.sqrt(squares[kept]))], axis=1)
 
 
-def left_over(
-    span: Float[np.ndarray, "row i"], e: Float[np.ndarray, " row"]
-) -> Float[np.ndarray, " row"]:
+def left_over(span: Float[np.ndarray, "row i"], e: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
     """What orthonormal columns do not explain."""
     return e - span @ (span.T @ e)

@@ -44,7 +44,9 @@ class Whitener:
 
     @classmethod
     def of(
-        cls, e: Float[np.ndarray, "kept n"], counts: Bool[np.ndarray, "kept n"],
+        cls,
+        e: Float[np.ndarray, "kept n"],
+        counts: Bool[np.ndarray, "kept n"],
         colour: tuple[NoiseModel, ...] = (),
     ) -> Whitener:
         """Whitener for noise such as `e`; from an expected colour, what of it is not so is fitted."""
@@ -97,9 +99,7 @@ def _predictor(model: NoiseModel, counts: Bool[np.ndarray, " kept"]) -> scipy.sp
     size = scipy.fft.next_fast_len(max(4096, 64 * order), real=True)
     covariance = np.fft.irfft(model.density(size), size)[: order + 1]
     index = np.flatnonzero(counts)
-    since = np.arange(len(counts)) - np.maximum.accumulate(
-        np.where(counts, -1, np.arange(len(counts)))
-    )
+    since = np.arange(len(counts)) - np.maximum.accumulate(np.where(counts, -1, np.arange(len(counts))))
     past = np.minimum(since[index] - 1, order)
     rows, columns, values = [], [], []
     a, variance = np.zeros(0), covariance[0]
@@ -115,9 +115,7 @@ def _predictor(model: NoiseModel, counts: Bool[np.ndarray, " kept"]) -> scipy.sp
     return scipy.sparse.csr_array(entries, shape=(len(index), len(counts)))
 
 
-def grams(
-    columns: Float[np.ndarray, "row k"], blocks: np.ndarray
-) -> Float[np.ndarray, "block k k"]:
+def grams(columns: Float[np.ndarray, "row k"], blocks: np.ndarray) -> Float[np.ndarray, "block k k"]:
     """Products of columns, block by block."""
     return np.stack([columns[b].T @ columns[b] for b in _slices(blocks)])
 
@@ -146,8 +144,10 @@ def held_out(
 
 
 def _left(
-    trained: Float[np.ndarray, "block k k"], held: Float[np.ndarray, "block k k"],
-    trained_e: Float[np.ndarray, "block k r"], held_e: Float[np.ndarray, "block k r"],
+    trained: Float[np.ndarray, "block k k"],
+    held: Float[np.ndarray, "block k k"],
+    trained_e: Float[np.ndarray, "block k r"],
+    held_e: Float[np.ndarray, "block k r"],
     squares: Float[np.ndarray, "block r"],
 ) -> Float[np.ndarray, " r"]:
     """What is left on the blocks: products over the others, with residuals too, and on each itself."""
@@ -185,8 +185,10 @@ def swept(
 
 
 def left_beside(
-    trained: Float[np.ndarray, "block m m"], held: Float[np.ndarray, "block m m"],
-    columns: Int[np.ndarray, " j"], target: Int[np.ndarray, " t"],
+    trained: Float[np.ndarray, "block m m"],
+    held: Float[np.ndarray, "block m m"],
+    columns: Int[np.ndarray, " j"],
+    target: Int[np.ndarray, " t"],
 ) -> float:
     """What is left of a sum of columns once some others, and the base, are fitted; by `swept`."""
     own, mixed = (columns[:, None], columns), (columns[:, None], target)
@@ -231,7 +233,8 @@ class Beside:
         return with_base, np.stack([extra[b].T @ self.e[b] for b in slices])
 
     def held_out(
-        self, extra: Float[np.ndarray, "row j"],
+        self,
+        extra: Float[np.ndarray, "row j"],
         crossed: tuple[Float[np.ndarray, "block k j"], Float[np.ndarray, "block j r"]],
         offset: Float[np.ndarray, "row 1"] | None = None,
     ) -> Float[np.ndarray, " r"]:

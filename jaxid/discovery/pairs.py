@@ -50,9 +50,7 @@ class Pairs:
 
     def with_partner(self, kind: str, port: int) -> float:
         """Evidence of an effect with the best partner."""
-        rows = [
-            k for k, p in enumerate(self.points) if (p.candidate.kind, p.candidate.port) == (kind, port)
-        ]
+        rows = [k for k, p in enumerate(self.points) if (p.candidate.kind, p.candidate.port) == (kind, port)]
         return float(self.evidence[rows].max()) if rows else 0.0
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Found:
+class NamedEffect:
     """An effect that was added.
 
     Args:
@@ -77,7 +77,7 @@ class Discovery:
     session: Session
     verdict: str
     where: Where | None
-    effects: tuple[Found, ...]
+    effects: tuple[NamedEffect, ...]
     rounds: tuple[Round, ...]
     before: Estimate
     after: Estimate
@@ -102,12 +102,12 @@ class Discovery:
 
         return discovery_table(self)
 
-    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write `discovery.json`, `report.html` and the proposed experiments to a folder.
 
         Raises:
-            InputError: If the folder holds what jaxid did not make and `force` is not given.
+            InputError: If the folder holds what jaxid did not make and `overwrite` is not given.
         """
         from jaxid.results.as_json import save_discovery
 
-        return save_discovery(self, Path(folder), force=force)
+        return save_discovery(self, Path(folder), overwrite=overwrite)

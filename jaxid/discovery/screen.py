@@ -80,7 +80,7 @@ def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
     points = cand.points(search.union, rest, search.samples, search.theta, e)
     base = jacobian[..., search.active]
     for c in rest:
-        if c.many:
+        if c.has_grid:
             points.extend(search.many(c))
     counts = search.samples.moving
     scale = np.array([c.innovation for c in search.colour])
@@ -117,7 +117,7 @@ def _few_points(out: Screen, points: list[cand.Point], base: np.ndarray) -> list
     best = {(s.candidate.kind, s.candidate.port): s.start for s in out.scores}
     found, q = [], orthonormal(base)
     for p in points:
-        if p.candidate.many and best.get((p.candidate.kind, p.candidate.port)) != p.start:
+        if p.candidate.has_grid and best.get((p.candidate.kind, p.candidate.port)) != p.start:
             continue
         columns = independent(q, out.whitener(p.columns))
         if columns.shape[1]:
@@ -155,7 +155,11 @@ def _allowed(c: cand.Candidate, amount: float, search: Search) -> bool:
 
 
 def _score(
-    out: Screen, search: Search, white: np.ndarray, base: np.ndarray, surrogates: np.ndarray,
+    out: Screen,
+    search: Search,
+    white: np.ndarray,
+    base: np.ndarray,
+    surrogates: np.ndarray,
     points: list[cand.Point],
 ) -> None:
     beside = ev.Beside(base, np.concatenate([white, surrogates], axis=1), out.blocks)
@@ -219,8 +223,8 @@ def _all_columns(
     e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
     """Columns of every candidate with few starts, and of a clear one with many."""
-    columns = np.concatenate([p.columns for p in points if not p.candidate.many], axis=2)
-    many = [p for p in points if p.candidate.many]
+    columns = np.concatenate([p.columns for p in points if not p.candidate.has_grid], axis=2)
+    many = [p for p in points if p.candidate.has_grid]
     if not many:
         return columns
     own = span(*(stacked(x, counts, scale) for x in (base, columns)))

@@ -10,10 +10,10 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
-from jaxid.discovery.acceptance import RELEVANT, Worth
+from jaxid.discovery.acceptance import RELEVANT, Acceptance
 from jaxid.discovery.score import Score
 from jaxid.discovery.screen import Screen, guess_pair, screen_candidates
-from jaxid.discovery.selection import MODEST, few, margin, modest, simplest
+from jaxid.discovery.selection import MODEST, margin, next_effect, shortlist, simplest_equivalent
 from jaxid.logs.prepare import Prepared
 from jaxid.numerics.precision import NoiseModel
 
@@ -69,7 +69,7 @@ class Search:
         barred: Effects taken out for good.
     """
 
-    union: cand.Union
+    union: cand.CandidateModel
     data: Prepared
     floor: np.ndarray
     colour: tuple[NoiseModel, ...]
@@ -79,7 +79,7 @@ class Search:
     barred: list[cand.Candidate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.worth = Worth(self.union, self.data, self.validation, self.floor, self.colour)
+        self.worth = Acceptance(self.union, self.data, self.validation, self.floor, self.colour)
         self.samples = self.worth.samples
         self.theta = self.union.neutral
         self._many: dict[tuple[str, int], list[cand.Point]] = {}
@@ -104,7 +104,7 @@ class Search:
         """A candidate at its many starts, computed once."""
         key = (candidate.kind, candidate.port)
         if key not in self._many:
-            self._many[key] = cand.many_points(self.union, candidate, self.samples)
+            self._many[key] = cand.grid_points(self.union, candidate, self.samples)
         return self._many[key]
 
     def run(self, most: int) -> list[Step]:
@@ -176,7 +176,7 @@ class Search:
         least = max(0.5 * screened.threshold, near * top)
         promising = [s for s in screened.scores if s.evidence > least]
         refitted = []
-        for score in few(promising):
+        for score in shortlist(promising):
             self.progress(f"refitting with {score.candidate.label}")
             refitted.append(self._refit(score, screened))
         refitted.sort(key=lambda s: -s.total)
@@ -184,16 +184,14 @@ class Search:
         promised = {id(s.candidate): s.evidence for s in promising}
         # The threshold's surrogates are not refitted. Few starts need the refit; what has a start
         # everywhere must pass as they do.
-        passed = lambda s: min(s.evidence, promised[id(s.candidate)] if s.candidate.many else np.inf)
+        passed = lambda s: min(s.evidence, promised[id(s.candidate)] if s.candidate.has_grid else np.inf)
         good = [s for s in refitted if not s.reason and passed(s) > screened.threshold]
-        one = modest(good)
+        one = next_effect(good)
         broken = [s.candidate for s in refitted if s.evidence < _KEPT * promised[id(s.candidate)]]
         two = self._two(screened, one, broken) if ahead else ()
         return two or ((one,) if one else ()), (*refitted, *rest), screened.threshold
 
-    def _two(
-        self, screened: Screen, one: Score | None, broken: list[cand.Candidate]
-    ) -> tuple[Score, ...]:
+    def _two(self, screened: Screen, one: Score | None, broken: list[cand.Candidate]) -> tuple[Score, ...]:
         """Two effects to add at once, where they explain far more than one with any partner."""
         c = one.candidate if one else None
         reached = screened.pairs.with_partner(c.kind, c.port) if c else screened.threshold
@@ -205,9 +203,7 @@ class Search:
             if guess is None:
                 continue
             self.progress("refitting with " + " and ".join(p.candidate.label for p in pair))
-            first, second = (
-                Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True)
-            )
+            first, second = (Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True))
             both = self._refit(second, screened, beside=first)
             old, new = (self.worth.residual(t) for t in (self.theta, both.theta))
             enough = self.worth.closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
@@ -242,7 +238,7 @@ class Search:
                 continue
             if mine.theta is None:  # others promised more, and it was not refitted: it stands where it stood
                 mine = replace(mine, theta=theta)
-            best, ties = simplest(good, self._undecided)
+            best, ties = simplest_equivalent(good, self._undecided)
             if best.candidate is not own and self._takes_over(best, mine, own):
                 self.added = [best.candidate if c is own else c for c in kept]
                 self.theta = self._fit(best.theta, self.active)

@@ -19,11 +19,11 @@ TIE_PART = 0.01
 MODEST = 0.7
 
 
-def few(promising: list[Score]) -> list[Score]:
+def shortlist(promising: list[Score]) -> list[Score]:
     """The best candidates, and the best of those with a single parameter."""
-    few = promising[:REFITTED]
+    best = promising[:REFITTED]
     single = [s for s in promising[REFITTED:] if len(s.candidate.index) == 1]
-    return [*few, *single[:1]]
+    return [*best, *single[:1]]
 
 
 def margin(score: Score) -> float:
@@ -31,7 +31,7 @@ def margin(score: Score) -> float:
     return max(TIE_NATS, TIE_PART * abs(score.total))
 
 
-def modest(good: list[Score]) -> Score | None:
+def next_effect(good: list[Score]) -> Score | None:
     """The effect to add next: of those that gain most of what the best gains, the simplest."""
     if not good:
         return None
@@ -39,7 +39,7 @@ def modest(good: list[Score]) -> Score | None:
     return min(enough, key=lambda s: (len(s.candidate.index), -s.total))
 
 
-def simplest(
+def simplest_equivalent(
     good: list[Score], undecided: Callable[[Score, Score], float]
 ) -> tuple[Score, tuple[Score, ...]]:
     """Of those that explain the log equally well, the simplest; and the others.
@@ -50,7 +50,8 @@ def simplest(
     """
     first = good[0]
     equal = [
-        s for s in good
+        s
+        for s in good
         if s.total >= first.total - max(margin(first), undecided(first, s) if s is not first else 0.0)
     ]
     best = min(equal, key=lambda s: (len(s.candidate.index), -s.total))

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxid.discovery.candidates import Candidate, Union
-from jaxid.discovery.user_effects import check_foreign, is_foreign
+from jaxid.discovery.candidates import Candidate, CandidateModel
+from jaxid.discovery.user_effects import check_user_effect, is_user_effect
 from jaxid.effects import EFFECTS
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -37,16 +37,18 @@ def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
         v, a = data.at_kept(yd)[rows, port], data.at_kept(ydd)[rows, port]
         drive = plant.drive_of(port, drives) if len(v) else None
         own = slice(None) if drive is None else slice(drive, drive + 1)
-        found.append(Scales(
-            position=float(np.ptp(y[:, port]) / 2),
-            velocity=rms(v) if len(v) else 0.0,
-            acceleration=rms(a) if len(v) else 0.0,
-            force=rms(force[:, own]),
-            peak_velocity=float(np.abs(v).max(initial=0.0)),
-            peak_force=float(np.abs(data.force[:, own]).max()),
-            period=data.period,
-            duration=data.period * len(data.q),
-        ))
+        found.append(
+            Scales(
+                position=float(np.ptp(y[:, port]) / 2),
+                velocity=rms(v) if len(v) else 0.0,
+                acceleration=rms(a) if len(v) else 0.0,
+                force=rms(force[:, own]),
+                peak_velocity=float(np.abs(v).max(initial=0.0)),
+                peak_force=float(np.abs(data.force[:, own]).max()),
+                period=data.period,
+                duration=data.period * len(data.q),
+            )
+        )
     return tuple(found)
 
 
@@ -56,9 +58,9 @@ def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
     return jax.vmap(lambda *now: port_motion(plant, *now))(*motion)
 
 
-def build_union(
+def build_candidate_model(
     machine: Machine, data: Prepared, effects: Sequence[type[Effect]] | None = None
-) -> Union:
+) -> CandidateModel:
     """Add every effect that the plant does not have yet, at every joint and spring that suits it.
 
     Args:
@@ -78,8 +80,8 @@ def build_union(
     # Kind by kind, so that the effects of one kind are traced as one.
     for cls in effects:
         ports = [i for i, s in enumerate(scales) if s.velocity > 0.0 and _missing(machine, cls, i, data)]
-        if ports and is_foreign(cls):
-            check_foreign(cls, machine, data, scales[ports[0]], ports[0])
+        if ports and is_user_effect(cls):
+            check_user_effect(cls, machine, data, scales[ports[0]], ports[0])
         for port in ports:
             plant, free = free_effect(plant, cls(**cls.neutral(scales[port]), port=port), machine.units)
             free = _limited(free, cls.limits(scales[port]))
@@ -90,12 +92,10 @@ def build_union(
             candidates.append(_candidate(cls, where, port, index, scales[port]))
     union = machine.with_plant(sharpened(plant, data), parameters)
     enters = _enters(plant, parameters, data.q.shape[1], data.force.shape[1])
-    return Union(union, base, tuple(candidates), enters, colours(enters))
+    return CandidateModel(union, base, tuple(candidates), enters, colours(enters))
 
 
-def _enters(
-    plant: Plant, parameters: Parameters, joints: int, drives: int
-) -> Bool[np.ndarray, "n p"]:
+def _enters(plant: Plant, parameters: Parameters, joints: int, drives: int) -> Bool[np.ndarray, "n p"]:
     """Which unknowns stand in the balance of which joints, as far as the plant says."""
     enters = np.ones((joints, len(parameters.free)), bool)
     undriven = [i for i in range(joints) if plant.drive_of(i, drives) is None]
@@ -103,10 +103,10 @@ def _enters(
         if f.path[0] != "effects":
             continue
         effect = plant.effects[f.path[1]]
-        if is_foreign(type(effect)):  # it may act on the drive without saying so
+        if is_user_effect(type(effect)):  # it may act on the drive without saying so
             continue
         # The scale of forces where no drive is follows all drives.
-        rows = [*plant.reached(effect.port, joints), *(undriven if effect.in_drive else [])]
+        rows = [*plant.joints_loaded_by(effect.port, joints), *(undriven if effect.in_drive else [])]
         enters[:, k] = np.isin(np.arange(joints), rows)
     return enters
 
@@ -114,9 +114,9 @@ def _enters(
 def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> bool:
     """Whether a port may lack an effect: one that it does not have yet, nor by another name."""
     plant = machine.plant
-    if not plant.offers(cls, port, data.force.shape[1]):
+    if not plant.accepts(cls, port, data.force.shape[1]):
         return False
-    twin = plant.twin(cls, port)
+    twin = plant.equivalent_parameter(cls, port)
     fitted = twin is not None and any(
         f.path == (twin[0],) and f.index == twin[1] for f in machine.parameters.free
     )
@@ -132,13 +132,14 @@ def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[F
     return out
 
 
-def _candidate(
-    cls: type[Effect], where: str, port: int, index: np.ndarray, scales: Scales
-) -> Candidate:
+def _candidate(cls: type[Effect], where: str, port: int, index: np.ndarray, scales: Scales) -> Candidate:
     neutral, infos = cls.neutral(scales), parameters_of(cls)
     names = [n for n in infos if n in neutral]
     return Candidate(
-        cls.kind, where, port, index,
+        cls.kind,
+        where,
+        port,
+        index,
         np.asarray([neutral[n] for n in names], float),
         np.asarray([[s[n] for n in names] for s in cls.starts(scales)], float),
         np.asarray([cls.adds_force and carries_force(infos[n]) for n in names]),

@@ -25,12 +25,12 @@ _ROWS = 400
 _NOTHING = 1e-3
 
 
-def is_foreign(cls: type[Effect]) -> bool:
+def is_user_effect(cls: type[Effect]) -> bool:
     """Whether a class is not part of jaxid."""
     return not cls.__module__.startswith("jaxid.")
 
 
-def check_foreign(
+def check_user_effect(
     cls: type[Effect], machine: Machine, data: Prepared, scales: Scales, port: int = 0
 ) -> None:
     """Refuse an effect that a search could not handle.
@@ -49,18 +49,18 @@ def check_foreign(
     where = f"effect {cls.kind}"
     names = [n for n, i in parameters_of(cls).items() if not i.optional]
     if not parameters_of(cls):
-        mend = "declare with parameter(...) what a search is to find"
-        raise InputError("has no parameters", where=where, mend=mend)
+        hint = "declare with parameter(...) what a search is to find"
+        raise InputError("has no parameters", where=where, hint=hint)
     try:
         starts, neutral = cls.starts(scales), cls.neutral(scales)
         cls.limits(scales)
         effects = [cls(**values, port=port) for values in (neutral, *starts)]
     except Exception as error:
         what = f"cannot be started ({type(error).__name__}: {error})"
-        mend = f"let neutral(scales) and each of starts(scales) give a number for {', '.join(names)}"
-        raise InputError(what, where=where, mend=mend) from error
+        hint = f"let neutral(scales) and each of starts(scales) give a number for {', '.join(names)}"
+        raise InputError(what, where=where, hint=hint) from error
     if not starts:
-        raise InputError("starts(scales) is empty", where=where, mend="give at least one start")
+        raise InputError("starts(scales) is empty", where=where, hint="give at least one start")
     pieces = data.parts(3 * _ROWS, 3)
     part, plant = ForceData.of(pieces[len(pieces) // 2]), sharpened(machine.plant, data)
     models = [_with(plant, e, machine) for e in effects[:2]]
@@ -68,18 +68,18 @@ def check_foreign(
     for which, arrays in zip(("neutral", "starts"), found, strict=True):
         if not all(np.all(np.isfinite(a)) for a in arrays):
             what = f"its force or a derivative of it is no number at the values of {which}"
-            mend = "change them, or mend act: a root or a power at zero has no derivative"
-            raise InputError(what, where=where, mend=mend)
+            hint = "change them, or correct act: a root or a power at zero has no derivative"
+            raise InputError(what, where=where, hint=hint)
     added = np.asarray(found[0][0] - _force(plant, part))
     share = float(np.sqrt(np.mean(np.square(added)))) / scales.force
     if share > _NOTHING:
         size = f"{100 * share:.2g} %" if share < 1 else "more than all"
         what = f"changes the force by {size} of its RMS at its neutral values"
-        mend = (
+        hint = (
             "define neutral(cls, scales), values at which it does nothing; what acts in the drive "
             "also sets adds_force = False"
         )
-        raise InputError(what, where=where, mend=mend)
+        raise InputError(what, where=where, hint=hint)
 
 
 def _with(plant: Plant, effect: Effect, machine: Machine) -> tuple[Plant, tuple, Array]:

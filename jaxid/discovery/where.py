@@ -120,8 +120,11 @@ def _elongations(
 
 
 def locate(
-    residual: Float[np.ndarray, "kept n"], jacobian: Float[np.ndarray, "kept n p"], data: Prepared,
-    colour: tuple[NoiseModel, ...], wanted: Float[np.ndarray, "kept n"] | None = None,
+    residual: Float[np.ndarray, "kept n"],
+    jacobian: Float[np.ndarray, "kept n p"],
+    data: Prepared,
+    colour: tuple[NoiseModel, ...],
+    wanted: Float[np.ndarray, "kept n"] | None = None,
     plant: Plant | None = None,
 ) -> Where:
     """Find the joint and variable that explain most of a residual.
@@ -143,16 +146,19 @@ def locate(
 
 
 def _locate(
-    e: np.ndarray, jacobian: np.ndarray, data: Prepared, colour: NoiseModel, wanted: np.ndarray,
-    joint: int, plant: Plant | None,
+    e: np.ndarray,
+    jacobian: np.ndarray,
+    data: Prepared,
+    colour: NoiseModel,
+    wanted: np.ndarray,
+    joint: int,
+    plant: Plant | None,
 ) -> Where:
     counts = data.moving[:, joint]
     named = variables(data, joint, plant)
     hats = {name: _hats(x, counts) for name, x in named.items()}
     every = np.concatenate(list(hats.values()), axis=1)
-    whitener, _ = fit_whitener(
-        e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,)
-    )
+    whitener, _ = fit_whitener(e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,))
     blocks = whitener.blocks()
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])
@@ -197,8 +203,16 @@ def _best(gains: dict[str, float], clean: str) -> str:
 
 
 def _describe(
-    e: np.ndarray, counts: np.ndarray, x: np.ndarray, name: str, joint: int, gain: float,
-    limit: float, clear: bool, intervals: tuple, line: float | None,
+    e: np.ndarray,
+    counts: np.ndarray,
+    x: np.ndarray,
+    name: str,
+    joint: int,
+    gain: float,
+    limit: float,
+    clear: bool,
+    intervals: tuple,
+    line: float | None,
 ) -> Where:
     centre, mean, error, ends = _binned(e, counts, x)
     peak = int(np.argmax(np.abs(mean) - error))
@@ -217,8 +231,20 @@ def _describe(
     elif name == "time" and intervals:
         text = f"joint {joint + 1}: the residual is loud in {len(intervals)} interval(s) of time"
     return Where(
-        joint + 1, name, region, intervals, text, explained, gain, limit, clear, centre, mean,
-        mean - 1.96 * error, mean + 1.96 * error, line,
+        joint + 1,
+        name,
+        region,
+        intervals,
+        text,
+        explained,
+        gain,
+        limit,
+        clear,
+        centre,
+        mean,
+        mean - 1.96 * error,
+        mean + 1.96 * error,
+        line,
     )
 
 

@@ -154,9 +154,7 @@ class _Sliding:
         dry = picked(levels.dry, self.ports)
         held = picked(at_rest.dry, self.ports) + picked(at_rest.stick, self.ports)
         if levels.rises:
-            rising = [
-                jnp.stack([picked(r, self.ports) for r in b.rising]) for b in (levels, at_rest)
-            ]
+            rising = [jnp.stack([picked(r, self.ports) for r in b.rising]) for b in (levels, at_rest)]
             return _own_reaction(self.own, self.speed, self.before, dry, held, *rising, self.corner)
         drag = -jnp.sign(self.before) * dry
         if self.mobility is None:
@@ -216,8 +214,14 @@ def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> A
 
 
 def _own_reaction(
-    own: Array, speed: Array, before: Array, dry: Array, hold: Array, rising: Array | None = None,
-    rising_at_rest: Array | None = None, corner: Array | float = 0.0,
+    own: Array,
+    speed: Array,
+    before: Array,
+    dry: Array,
+    hold: Array,
+    rising: Array | None = None,
+    rising_at_rest: Array | None = None,
+    corner: Array | float = 0.0,
 ) -> _Answer:
     """Mean reaction over a step of ports that do not push each other.
 
@@ -275,9 +279,7 @@ def _overshot(before: Array, after: Array, part: Array, h: Array) -> Array:
     return jnp.where(part < 1.0, 0.5 * h * ((1.0 - part) * before + part * after), 0.0)
 
 
-def _shared_reaction(
-    mobility: Array, speed: Array, before: Array, dry: Array, hold: Array
-) -> _Answer:
+def _shared_reaction(mobility: Array, speed: Array, before: Array, dry: Array, hold: Array) -> _Answer:
     """Mean reaction over a step of ports that push each other: each answers what the others leave it.
 
     Its slope in the speed that is left lies between 0 and -1 over the port's own mobility, as that of a

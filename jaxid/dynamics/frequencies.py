@@ -103,8 +103,10 @@ def _state_matrix(plant: Plant, held: tuple[int, ...]) -> Float[Array, "s s"]:
     by_q, _, mass, by_own = forces
     # Without the column of the velocities, which is the damping.
     a_q, a_own = (-jnp.linalg.solve(mass, x) for x in (by_q, by_own))
-    return jnp.block([
-        [jnp.zeros((n, n)), jnp.eye(n), jnp.zeros((n, own.size))],
-        [a_q, jnp.zeros((n, n)), a_own],
-        [rates[0] + rates[2] @ a_q, rates[1], rates[3] + rates[2] @ a_own],
-    ])
+    return jnp.block(
+        [
+            [jnp.zeros((n, n)), jnp.eye(n), jnp.zeros((n, own.size))],
+            [a_q, jnp.zeros((n, n)), a_own],
+            [rates[0] + rates[2] @ a_q, rates[1], rates[3] + rates[2] @ a_own],
+        ]
+    )

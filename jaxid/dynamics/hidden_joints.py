@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.dynamics.dry_friction import set_valued_step
-from jaxid.dynamics.rhs import State, acceleration, affine_flow, course, picked, small_solve, spread
+from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, picked, small_solve, spread
 from jaxid.model.plant import Balance, Plant
 
 Motion = tuple[Array, Array, Array]
@@ -26,7 +26,7 @@ Motion = tuple[Array, Array, Array]
 _RELAXING = 4
 
 
-class Carried(Plant):
+class HiddenJoints(Plant):
     """The joints without an encoder as a plant of their own, which the others' motion drives.
 
     Its force is the declared one and, behind that, position, velocity and acceleration of the others.
@@ -46,7 +46,13 @@ class Carried(Plant):
     diagonal: ClassVar[property] = property(lambda self: self.plant.diagonal)
 
     def balance(
-        self, q: Array, qd: Array, qdd: Array, u: Array, t: Array, states: tuple,
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        u: Array,
+        t: Array,
+        states: tuple,
         reaction: Array | None = None,
     ) -> Balance:
         n = len(self.seen) + q.size
@@ -65,8 +71,14 @@ class Carried(Plant):
 
 
 def complete_motion(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, times: Float[Array, " time"],
-    measured: tuple[bool, ...], steps: int,
+    plant: Plant,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    u: Array,
+    times: Float[Array, " time"],
+    measured: tuple[bool, ...],
+    steps: int,
 ) -> Motion:
     """Fill in the motion of joints without an encoder.
 
@@ -85,15 +97,15 @@ def complete_motion(
     if all(measured):
         return q, qd, qdd
     seen, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
-    carried = Carried(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
+    carried = HiddenJoints(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
     known = tuple(a[:, seen] for a in (q, qd, qdd))
     period = times[1] - times[0]
     h = period / steps
     # Force of the carried plant at the start, in the middle and at the end of every step.
     parts = (np.arange(steps)[:, None] + np.array([0.0, 0.5, 1.0])) / steps
-    force = jax.vmap(
-        lambda s: jnp.concatenate([u[:-1], *_between(known, s, period)], axis=1), out_axes=1
-    )(parts.ravel()).reshape((len(u) - 1) * steps, 3, -1)
+    force = jax.vmap(lambda s: jnp.concatenate([u[:-1], *_between(known, s, period)], axis=1), out_axes=1)(
+        parts.ravel()
+    ).reshape((len(u) - 1) * steps, 3, -1)
     starts = (times[:-1, None] + h * np.arange(steps)).ravel()
 
     together = [jnp.broadcast_to(jnp.mean(a[0]), hidden.shape) for a in known]
@@ -108,7 +120,7 @@ def complete_motion(
     def advance(x: State, now: tuple) -> tuple[State, tuple]:
         values, t = tuple(now[0]), now[1]
         bound = None if flow is None else lambda x, *reaction: flow(x, values, *reaction)
-        x, reaction = set_valued_step(carried, x, course(values), t, h, bound)
+        x, reaction = set_valued_step(carried, x, hold_polynomial(values), t, h, bound)
         return x, (x, reaction)
 
     _, later = jax.lax.scan(advance, x0, (force, starts))
@@ -138,12 +150,12 @@ def resting(
     if all(measured):
         return q, np.eye(q.size)
     seen, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
-    carried = Carried(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
+    carried = HiddenJoints(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
     return tuple(np.asarray(a) for a in _resting(carried, q[seen], drives))
 
 
 @eqx.filter_jit
-def _resting(carried: Carried, known: Array, drives: int) -> tuple[Array, Array]:
+def _resting(carried: HiddenJoints, known: Array, drives: int) -> tuple[Array, Array]:
     n, u = len(carried.seen) + len(carried.hidden), jnp.zeros(drives)
     still, memory = jnp.zeros(len(carried.hidden)), carried.plant.initial_states(u)
 

@@ -13,7 +13,7 @@ from jaxid.dynamics.rhs import balance_of, phi
 from jaxid.model.plant import Plant
 
 
-def drive_own_states(
+def integrate_internal_states(
     plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
 ) -> tuple:
     """Drive the effects' own states along a measured motion.
@@ -48,9 +48,9 @@ def drive_own_states(
         push = rate(jnp.zeros_like(z))
         if z.ndim:
             here = jax.tree.map(lambda a: a[0], (*motion, own))
-            slope = jax.jacfwd(lambda v, i=i, at=here: balance_of(plant,
-                *at[:5], (*at[5][:i], v, *at[5][i + 1 :])
-            ).rates[i])(z)
+            slope = jax.jacfwd(
+                lambda v, i=i, at=here: balance_of(plant, *at[:5], (*at[5][:i], v, *at[5][i + 1 :])).rates[i]
+            )(z)
             own = (*own[:i], _vector_recurrence(z, slope, push, period), *own[i + 1 :])
             continue
         decay = rate(jnp.ones_like(z)) - push
@@ -138,7 +138,7 @@ def balance_along(
         period: Sampling time [s].
         start: Time of the first sample [s].
     """
-    own = drive_own_states(plant, q, qd, qdd, u, period, start)
+    own = integrate_internal_states(plant, q, qd, qdd, u, period, start)
     times = start + period * jnp.arange(q.shape[0])
 
     def at(q: Array, qd: Array, qdd: Array, u: Array, t: Array, own: tuple) -> tuple:

@@ -115,7 +115,7 @@ def need_apart(plant: Plant, mass: Array, ports: tuple[int, ...]) -> Array:
     raise InputError(
         f"velocity_hysteresis cannot be simulated here: on kind = {plant.kind!r} "
         + ("it, or other dry friction beside it, acts in a spring" if apart else "joints push each other"),
-        mend="put it on a joint of a machine whose joints do not push each other, "
+        hint="put it on a joint of a machine whose joints do not push each other, "
         "and leave dry friction out of the springs",
     )
 
@@ -133,9 +133,7 @@ def solved(mass: Array, force: Float[Array, " n"]) -> Float[Array, " n"]:
     return force / mass if mass.ndim == 1 else small_solve(mass, force)
 
 
-def derivative(
-    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None
-) -> State:
+def derivative(plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None) -> State:
     """Time derivative of the state: the right-hand side."""
     qdd = acceleration(plant, x, u, t, reaction)
     rates = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction).rates
@@ -249,9 +247,7 @@ def _sum(*terms: Split) -> Split:
     return jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *terms)
 
 
-def _own_push(
-    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None
-) -> Float[Array, "n own"]:
+def _own_push(plant: Plant, x: State, u: Array, t: Array, reaction: Array | None) -> Float[Array, "n own"]:
     """Derivative of the accelerations with respect to the own states."""
     flat, back = ravel_pytree(x.own)
 
@@ -311,7 +307,7 @@ def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array
     Args:
         plant: The plant.
         x: Any state, for its shape.
-        u: Declared force at the ends of the step, as `course` takes it; for its shape.
+        u: Declared force at the ends of the step, as `hold_polynomial` takes it; for its shape.
         t: Any time: a force that depends on it is not affine.
         h: Step [s].
 
@@ -320,12 +316,12 @@ def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array
     """
 
     def flow(x: State, u: tuple[Array, ...], reaction: Array, t: Array) -> State:
-        return step(plant, x, course(u), t, h, reaction)
+        return step(plant, x, hold_polynomial(u), t, h, reaction)
 
     return affine(flow, (x, u, jnp.zeros_like(plant.ports(x.q))), (t,))
 
 
-def course(values: tuple[Array, ...]) -> Callable[[Array], Array]:
+def hold_polynomial(values: tuple[Array, ...]) -> Callable[[Array], Array]:
     """Held at one value, a line through two, a parabola through three; of the fraction in [0, 1]."""
     if len(values) == 3:
         start, middle, end = values

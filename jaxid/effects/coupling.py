@@ -80,7 +80,5 @@ class JointFlexibility(Effect):
         found = []
         for samples in 3.0 * 2.0 ** (np.arange(16) / 3.0):
             w = 2 * np.pi / (samples * scales.period)
-            found.append(
-                {"stiffness": inertia * w**2, "damping": 0.4 * inertia * w, "load_inertia": inertia}
-            )
+            found.append({"stiffness": inertia * w**2, "damping": 0.4 * inertia * w, "load_inertia": inertia})
         return found

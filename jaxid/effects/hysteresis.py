@@ -37,10 +37,7 @@ class Hysteresis(Effect):
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         # The presliding distance level / stiffness runs from a thousandth of the stroke to half.
         slips = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
-        return [
-            {"stiffness": scales.force / (scales.position * s), "level": scales.force}
-            for s in slips
-        ]
+        return [{"stiffness": scales.force / (scales.position * s), "level": scales.force} for s in slips]
 
 
 @register("velocity_hysteresis")

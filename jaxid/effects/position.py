@@ -66,9 +66,7 @@ class Cogging(Effect):
     phase: Array = parameter("1", "free", "rad, at q = 0")
 
     def act(self, x: Signals, state: None) -> Action:
-        return Action(
-            force=-self.amplitude * jnp.cos(2 * jnp.pi * x.y / self.period + self.phase)
-        )
+        return Action(force=-self.amplitude * jnp.cos(2 * jnp.pi * x.y / self.period + self.phase))
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:

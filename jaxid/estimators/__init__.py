@@ -31,7 +31,10 @@ def _inverse_dynamics(session: Session) -> Steps[Estimate]:
 
 
 def _output_error(
-    session: Session, *, solver: str | None = None, on: str | None = None,
+    session: Session,
+    *,
+    solver: str | None = None,
+    on: str | None = None,
     numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
     from jaxid.estimators.output_error import choose_numerics, need_loop, output_error_steps
@@ -42,15 +45,14 @@ def _output_error(
 
         if solver is not None:
             raise InputError(
-                f"solver {solver!r} does not go with [output_error] prior", where=str(session.case.path),
-                mend="leave one of them out: a fit within a prior takes fixed steps",
+                f"solver {solver!r} does not go with [output_error] prior",
+                where=str(session.case.path),
+                hint="leave one of them out: a fit within a prior takes fixed steps",
             )
         need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
         stated = {k: v for k, v in session.case.output_error.items() if k not in ("on", "start")}
         others = yield from _beside_the_guesses(session)
-        asked = directions_steps(
-            session.machine, log, on=on, numerics=numerics, others=others, **stated
-        )
+        asked = directions_steps(session.machine, log, on=on, numerics=numerics, others=others, **stated)
         return (yield from asked)
     start = yield from _start(session)
     if solver is not None:
@@ -114,9 +116,7 @@ def _recursive(session: Session) -> Steps[Estimate]:
     return recursive_steps(session.machine, run.data, case.recursive, saved)
 
 
-def _instrumental_variable(
-    session: Session, *, numerics: Numerics | None = None
-) -> Steps[Estimate]:
+def _instrumental_variable(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
     from jaxid.estimators.instrumental_variable import instrumental_variable_steps
 
     run = session.fit
@@ -181,7 +181,12 @@ SIMULATING = ("output_error", "instrumental_variable", "didim")
 
 # Methods that can keep links to what bodies can be: they minimise, step by step at least.
 CONSISTENT = (
-    "inverse_dynamics", "power", "algebraic", "instrumental_variable", "didim", "output_error",
+    "inverse_dynamics",
+    "power",
+    "algebraic",
+    "instrumental_variable",
+    "didim",
+    "output_error",
 )
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
@@ -228,12 +233,12 @@ def need_consistent(method: str, case: Case) -> None:
     """
     if not case.identification.get("physically_consistent"):
         return
-    mend = "" if method in CONSISTENT else f"use {', '.join(CONSISTENT)}, or leave it out"
+    hint = "" if method in CONSISTENT else f"use {', '.join(CONSISTENT)}, or leave it out"
     if method == "output_error" and "prior" in case.output_error:
-        method, mend = "output_error with a prior", "leave one of them out"
-    if mend:
+        method, hint = "output_error with a prior", "leave one of them out"
+    if hint:
         what, where = f"physically_consistent does not go with {method}", f"{case.path}, [identification]"
-        raise InputError(what, where=where, mend=mend)
+        raise InputError(what, where=where, hint=hint)
 
 
 def need_known_reference(session: Session, why: str) -> None:
@@ -242,8 +247,9 @@ def need_known_reference(session: Session, why: str) -> None:
     Raises:
         InputError: If it has any.
     """
-    if session.machine.course is not None:
+    if session.machine.unknown_reference is not None:
         raise InputError(
-            f"the reference has unknowns, and {why}", where=f"{session.case.path}, [reference]",
-            mend="fit them by output_error, and give the numbers found",
+            f"the reference has unknowns, and {why}",
+            where=f"{session.case.path}, [reference]",
+            hint="fit them by output_error, and give the numbers found",
         )

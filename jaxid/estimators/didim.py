@@ -32,7 +32,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
-from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import Precision
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics, Replay
@@ -71,7 +71,7 @@ def didim(machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | No
     Source:
         Gautier, Janot & Vandanjon (2013), IEEE Trans. Control Syst. Technol. 21: DIDIM.
     """
-    return alone(didim_steps(machine, log, data, numerics=numerics))
+    return run_alone(didim_steps(machine, log, data, numerics=numerics))
 
 
 class _Look(NamedTuple):
@@ -110,14 +110,15 @@ def didim_steps(
     """`didim`, one solve at a time."""
     if machine.controller is None:
         raise InputError(
-            "didim simulates the loop, and the controller is not known", where=log.source,
-            mend="name it in [controller] and the reference's column in [log], or use inverse_dynamics",
+            "didim simulates the loop, and the controller is not known",
+            where=log.source,
+            hint="name it in [controller] and the reference's column in [log], or use inverse_dynamics",
         )
     plant, theta = sharpened(machine.plant, data), machine.parameters.guess
     held = len(plant.driven(log.position.shape[1])) == log.position.shape[1]
     if not held:
         first = yield from inverse_dynamics_steps(machine, data)
-        theta = first.theta if first.told else theta
+        theta = first.theta if first.all_identified else theta
     rerun = Rerun.of(machine.with_estimate(theta), log, data, numerics)
     look = yield from _look(rerun, plant, theta)
     if look is None:
@@ -146,10 +147,15 @@ def didim_steps(
     used = "the start is used" if held else "the start, and inverse dynamics for a first guess, is used"
     columns = look.seen if held else look.slope
     return Estimate(
-        method="didim", machine=machine.with_estimate(theta), theta=theta,
+        method="didim",
+        machine=machine.with_estimate(theta),
+        theta=theta,
         precision=force_precision(machine, look.size, theta, look.e, columns, look.rows),
-        converged=message == "converged", message=message,
-        residual=np.where(look.rows, look.e, np.nan), samples=int(look.rows.sum()), steps=step,
+        converged=message == "converged",
+        message=message,
+        residual=np.where(look.rows, look.e, np.nan),
+        samples=int(look.rows.sum()),
+        steps=step,
         notes=(f"the motion is that of the simulated loop; of the measured position only {used}",),
     )
 
@@ -168,9 +174,9 @@ def _look(
     if rows is None:
         rows = run.fitted & np.isin(np.arange(joints), plant.driven(joints))
     arrays = ForceData.of(run, rows)
-    e, regressor = yield Solve(force_and_columns, (plant, places, arrays, theta))
-    slope = yield Solve(_slope, (rerun.replay, places, rerun.machine.plant, arrays, theta))
-    size = yield Solve(force_size, (plant, arrays))
+    e, regressor = yield SolveRequest(force_and_columns, (plant, places, arrays, theta))
+    slope = yield SolveRequest(_slope, (rerun.replay, places, rerun.machine.plant, arrays, theta))
+    size = yield SolveRequest(force_size, (plant, arrays))
     regressor, slope = np.asarray(regressor), np.asarray(slope)
     slope = slope if np.all(np.isfinite(slope)) else regressor
     return _Look(np.asarray(e), regressor, slope, rows, float(size))
@@ -196,7 +202,12 @@ def _nothing(machine: Machine, log: Log) -> Estimate:
     p = len(machine.parameters.free)
     blank = Precision(np.full((p, p), np.nan), np.zeros(p, bool), [], np.zeros(p))
     return Estimate(
-        method="didim", machine=machine, theta=machine.parameters.guess, precision=blank,
-        converged=False, message="the simulation diverged from these starting values, or does not move",
-        residual=np.full(log.position.shape, np.nan), samples=0,
+        method="didim",
+        machine=machine,
+        theta=machine.parameters.guess,
+        precision=blank,
+        converged=False,
+        message="the simulation diverged from these starting values, or does not move",
+        residual=np.full(log.position.shape, np.nan),
+        samples=0,
     )

@@ -59,7 +59,7 @@ class Estimate:
         return self.precision.identifiable
 
     @property
-    def told(self) -> bool:
+    def all_identified(self) -> bool:
         """Whether the solver converged and the log tells all parameters."""
         return self.converged and bool(np.all(self.identifiable))
 

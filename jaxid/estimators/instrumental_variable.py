@@ -21,7 +21,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters
-from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics
 
@@ -56,7 +56,7 @@ def instrumental_variable(
         Janot, Vandanjon & Gautier (2014), IEEE Trans. Control Syst. Technol. 22: IDIM-IV. What
         enters nonlinearly is linearised anew at every step.
     """
-    return alone(instrumental_variable_steps(machine, log, data, numerics=numerics))
+    return run_alone(instrumental_variable_steps(machine, log, data, numerics=numerics))
 
 
 def instrumental_variable_steps(
@@ -66,13 +66,13 @@ def instrumental_variable_steps(
     first = yield from inverse_dynamics_steps(machine, data)
     # Of bodies what no log tells is that of a body, and moves nothing.
     within = bool(machine.parameters.bodies) and first.converged
-    theta = first.theta if first.told or within else machine.parameters.guess
+    theta = first.theta if first.all_identified or within else machine.parameters.guess
     if log.reference is None:
         machine = replace(machine, controller=None)
     rerun = Rerun.of(machine.with_estimate(theta), log, data, numerics)
     plant, rows, places = sharpened(machine.plant, data), data.fitted, machine.parameters.places
     arrays = ForceData.of(data, rows)
-    size = yield Solve(force_size, (plant, arrays))
+    size = yield SolveRequest(force_size, (plant, arrays))
     found = yield from _search(rerun, plant, arrays, rows, machine.parameters, theta, float(size))
     theta, e, columns, basis = found.theta, found.e, found.columns, found.basis
     # Seen through the instruments: with it the formulas of least squares are those of instruments.
@@ -81,9 +81,15 @@ def instrumental_variable_steps(
     precision = force_precision(machine, size, theta, e, seen, rows)
     how = "in its loop" if rerun.looped else "in open loop from the measured force"
     return Estimate(
-        method="instrumental_variable", machine=machine.with_estimate(theta), theta=theta,
-        precision=precision, converged=found.message == "converged", message=found.message,
-        residual=np.where(rows, e, np.nan), samples=int(rows.sum()), steps=found.steps,
+        method="instrumental_variable",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=found.message == "converged",
+        message=found.message,
+        residual=np.where(rows, e, np.nan),
+        samples=int(rows.sum()),
+        steps=found.steps,
         notes=(f"instruments: the regressor along the motion simulated {how}",),
     )
 
@@ -109,14 +115,19 @@ class _Found:
 
 
 def _search(
-    rerun: Rerun, plant: Plant, arrays: ForceData, rows: np.ndarray, unknown: Parameters, theta: np.ndarray,
+    rerun: Rerun,
+    plant: Plant,
+    arrays: ForceData,
+    rows: np.ndarray,
+    unknown: Parameters,
+    theta: np.ndarray,
     size: float,
 ) -> Steps[_Found]:
     """Instruments at the estimate, the estimate by the instruments, until it stays where it is."""
     places = unknown.places
 
     def along(data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
-        e, columns = yield Solve(force_and_columns, (plant, places, data, theta))
+        e, columns = yield SolveRequest(force_and_columns, (plant, places, data, theta))
         return np.asarray(e), np.asarray(columns)
 
     e, columns = yield from along(arrays, theta)
@@ -126,7 +137,8 @@ def _search(
         if not rerun.looped and (run is None or _lost(run, rerun.log)) and step == 1:
             raise InputError(
                 "the simulation from the measured force loses the log, and makes no instruments",
-                where=rerun.log.source, mend="name the controller in [controller] and the reference's "
+                where=rerun.log.source,
+                hint="name the controller in [controller] and the reference's "
                 "column in [log], or use inverse_dynamics",
             )
         # Those of the step before still are instruments where the simulation runs away.

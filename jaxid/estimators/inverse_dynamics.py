@@ -20,7 +20,7 @@ from jaxid.model.effect import Effect, carries_force
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, scatter
-from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.force_balance import ForceData, _size, force_residual, sharpened
 
@@ -34,8 +34,13 @@ _SHARES = (0.2, 0.5, 0.8)
 
 @eqx.filter_jit
 def _solve(
-    plant: Plant, places: tuple, data: ForceData, theta: Array, transform: Transform,
-    bounds: tuple[Array, Array], damping: float,
+    plant: Plant,
+    places: tuple,
+    data: ForceData,
+    theta: Array,
+    transform: Transform,
+    bounds: tuple[Array, Array],
+    damping: float,
 ) -> tuple[Minimum, Array]:
     """The fit, and the size of the force that it explains."""
 
@@ -65,7 +70,7 @@ def inverse_dynamics(
         Gautier (1986) and Janot, Vandanjon & Gautier (2014) for filtered inverse dynamics; Tukey's
         bisquare with constant 4.685 for the weights. Gautier (1997), ICRA, for those of the joints.
     """
-    return alone(inverse_dynamics_steps(machine, data, reweighted=reweighted, start=start))
+    return run_alone(inverse_dynamics_steps(machine, data, reweighted=reweighted, start=start))
 
 
 def inverse_dynamics_steps(
@@ -82,11 +87,11 @@ def inverse_dynamics_steps(
     options = (transform, parameters.bounds, damping)
     fits = []
     for at in _starts(machine, theta):
-        fit, size = yield Solve(_solve, (plant, places, arrays, at, *options))
+        fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
     # What a joint without an encoder sticks at is told by jumps of the others: full of local minima.
     for at in [] if whole else _splits(machine, np.asarray(fits[0].theta), data.measured):
-        fit, size = yield Solve(_solve, (plant, places, arrays, at, *options))
+        fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
     # Of those that reach the lowest cost, to rounding, one that converged.
@@ -98,7 +103,7 @@ def inverse_dynamics_steps(
         # What has no weight left has none again.
         e = np.where(was > 0, e / np.where(was > 0, was, 1.0), np.inf)
         arrays = eqx.tree_at(lambda a: a.weight, arrays, _robust(e, rows))
-        fit, _ = yield Solve(_solve, (plant, places, arrays, fit.theta, *options))
+        fit, _ = yield SolveRequest(_solve, (plant, places, arrays, fit.theta, *options))
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)
@@ -172,7 +177,8 @@ def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> 
     """The same with the dry friction of all joints shared otherwise between those with an encoder and not."""
     effects = machine.plant.effects
     levels = [
-        (k, effects[f.path[1]].port) for k, f in enumerate(machine.parameters.free)
+        (k, effects[f.path[1]].port)
+        for k, f in enumerate(machine.parameters.free)
         if f.path[0] == "effects" and effects[f.path[1]].kind == "coulomb_friction" and f.path[2] == "level"
     ]
     seen = [k for k, port in levels if port < len(measured) and measured[port]]
@@ -187,7 +193,11 @@ def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> 
 
 
 def force_precision(
-    machine: Machine, size: Array, theta: np.ndarray, e: np.ndarray, jacobian: np.ndarray,
+    machine: Machine,
+    size: Array,
+    theta: np.ndarray,
+    e: np.ndarray,
+    jacobian: np.ndarray,
     rows: np.ndarray,
 ) -> Precision:
     """Precision of a fit in the force domain; `size` is what `force_size` says."""

@@ -23,7 +23,7 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, scatter
-from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import assess, full_hessian
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
@@ -89,8 +89,9 @@ def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
     """
     if machine.controller is None:
         raise InputError(
-            f"{what} needs a loop whose simulation makes a force", where=log.source,
-            mend=f"name the controller in [controller] and the reference's column in [log], {other}",
+            f"{what} needs a loop whose simulation makes a force",
+            where=log.source,
+            hint=f"name the controller in [controller] and the reference's column in [log], {other}",
         )
 
 
@@ -105,8 +106,16 @@ def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np
 
 @eqx.filter_jit
 def _fit(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array,
-    transform: Transform, bounds: tuple[Array, Array], on: str, active: Array,
+    replay: Replay,
+    places: tuple,
+    plant: Plant,
+    measured: Array,
+    weight: Array,
+    theta: Array,
+    transform: Transform,
+    bounds: tuple[Array, Array],
+    on: str,
+    active: Array,
 ) -> Minimum:
     residual = output_residual(replay, places, plant, measured, weight, on)
     return levenberg_marquardt(residual, theta, transform, *bounds, active)
@@ -141,9 +150,7 @@ def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndar
 
 
 @eqx.filter_jit
-def _jacobian(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, theta: Array
-) -> Array:
+def _jacobian(replay: Replay, places: tuple, plant: Plant, measured: Array, theta: Array) -> Array:
     residual = output_residual(replay, places, plant, measured, jnp.ones(measured.shape))
     return jax.jacfwd(residual)(theta)
 
@@ -174,14 +181,17 @@ def output_error(
     Raises:
         InputError: If the force is to be met and there is no loop that makes one.
     """
-    return alone(
-        output_error_steps(machine, log, start=start, numerics=numerics, hessian=hessian, on=on)
-    )
+    return run_alone(output_error_steps(machine, log, start=start, numerics=numerics, hessian=hessian, on=on))
 
 
 def output_error_steps(
-    machine: Machine, log: Log, *, start: np.ndarray | None = None, numerics: Numerics | None = None,
-    hessian: bool = False, on: str = "position",
+    machine: Machine,
+    log: Log,
+    *,
+    start: np.ndarray | None = None,
+    numerics: Numerics | None = None,
+    hessian: bool = False,
+    on: str = "position",
 ) -> Steps[Estimate]:
     """`output_error`, one solve at a time."""
     if on != "position":
@@ -196,46 +206,50 @@ def output_error_steps(
     p = len(machine.parameters.free)
     active = np.arange(p + nuisance) < p
     problem = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
-    if machine.course is not None:
+    if machine.unknown_reference is not None:
         # A machine bent to follow another reference ends nowhere: first what is unknown of that alone.
-        minimum = yield Solve(_fit, (*problem, _of_course(machine, active)))
+        minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active)))
         problem = (*problem[:5], minimum.theta, *problem[6:])
-    minimum = yield Solve(_fit, (*problem, active))
+    minimum = yield SolveRequest(_fit, (*problem, active))
     if on == "both":
         problem = _problem(machine.with_estimate(np.asarray(minimum.theta)[:p]), replay, log, nuisance, on)
-        e = yield Solve(_residual, (*problem[:6], on))
+        e = yield SolveRequest(_residual, (*problem[:6], on))
         spread = np.maximum(np.std(np.asarray(e), axis=0), 1e-12 * np.std(problem[3], axis=0))
         problem = (*problem[:4], problem[4] / spread, *problem[5:])
-        minimum = yield Solve(_fit, (*problem, active))
+        minimum = yield SolveRequest(_fit, (*problem, active))
     if looped and not nuisance and not numerics.segment:
         left = np.asarray(minimum.residual).reshape(problem[3].shape)
         if start_shows(left[:, problem[4][0] > 0]):
             # A log that begins with a jerk from rest: its first readings are no velocity.
             rested = (from_rest(problem[0]), *problem[1:5], minimum.theta, *problem[6:])
-            other = yield Solve(_fit, (*rested, active))
+            other = yield SolveRequest(_fit, (*rested, active))
             if bool(other.converged) and float(other.cost) < float(minimum.cost):
                 problem, minimum = rested, other
     if nuisance and looped:
         every = np.ones(p + nuisance, bool)
-        freed = yield Solve(_fit, (*problem, every))
+        freed = yield SolveRequest(_fit, (*problem, every))
         spare = _CLEARLY * nuisance / max(problem[3].size - p - nuisance, 1)
         if bool(freed.converged) and float(freed.cost) * (1 + spare) < float(minimum.cost):
             minimum, active = freed, every
     elif nuisance:
         problem, active = _with_start(machine, log, problem, minimum)
-        minimum = yield Solve(_fit, (*problem, active))
+        minimum = yield SolveRequest(_fit, (*problem, active))
     measured, weight = problem[3], problem[4]
     e = np.asarray(minimum.residual).reshape(measured.shape)
     counts = np.broadcast_to(weight[0] > 0, e.shape)
     jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
     theta = np.asarray(minimum.theta)
     names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
-    full = np.asarray((yield Solve(_hessian, (*problem[:5], minimum.theta, on)))) if hessian else None
+    full = np.asarray((yield SolveRequest(_hessian, (*problem[:5], minimum.theta, on)))) if hessian else None
     precision = assess(
-        names, jacobian[..., active], e, counts,
+        names,
+        jacobian[..., active],
+        e,
+        counts,
         float(np.linalg.norm(weight * (measured - measured.mean(axis=0)))),
         np.where(theta != 0, theta, 1.0)[active],
-        None if full is None else full[np.ix_(active, active)], crossed=on == "both",
+        None if full is None else full[np.ix_(active, active)],
+        crossed=on == "both",
     ).first(machine.parameters.names)
     converged = bool(minimum.converged)
     return Estimate(
@@ -259,9 +273,7 @@ def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
     return own
 
 
-def _with_start(
-    machine: Machine, log: Log, problem: tuple, minimum: Minimum
-) -> tuple[tuple, np.ndarray]:
+def _with_start(machine: Machine, log: Log, problem: tuple, minimum: Minimum) -> tuple[tuple, np.ndarray]:
     """A fit from a start that suits the fitted plant; of the start too where noise is all that is left."""
     p = len(machine.parameters.free)
     fitted = machine.with_estimate(np.asarray(minimum.theta)[:p])
@@ -281,9 +293,15 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str)
     transform = Transform.of(parameters)
     transform = replace(transform, log=np.concatenate([transform.log, np.zeros(nuisance, bool)]))
     return (
-        replay, parameters.places, machine.plant, measured, np.tile(counts.astype(float), (len(measured), 1)),
-        np.concatenate([parameters.guess, np.zeros(nuisance)]), transform,
-        (np.concatenate([lower, -free]), np.concatenate([upper, free])), on,
+        replay,
+        parameters.places,
+        machine.plant,
+        measured,
+        np.tile(counts.astype(float), (len(measured), 1)),
+        np.concatenate([parameters.guess, np.zeros(nuisance)]),
+        transform,
+        (np.concatenate([lower, -free]), np.concatenate([upper, free])),
+        on,
     )
 
 
@@ -304,8 +322,10 @@ def choose_numerics(
     kinds = {e.kind for e in machine.plant.effects}
     exact = exact_numerics(machine, log, 1 if solver else None)
     numerics = replace(
-        exact, substeps=1 if solver else max(exact.substeps, turning_steps(machine, log)),
-        set_valued="static_friction" not in kinds and solver is None, solver=solver,
+        exact,
+        substeps=1 if solver else max(exact.substeps, turning_steps(machine, log)),
+        set_valued="static_friction" not in kinds and solver is None,
+        solver=solver,
     )
     if not numerics.set_valued and solver is None:
         numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))

@@ -26,7 +26,7 @@ import scipy.signal
 from jaxtyping import Array, Bool, Float
 
 from jaxid.arms.base_parameters import base_parameters
-from jaxid.dynamics.residuals import drive_own_states, drive_ratio
+from jaxid.dynamics.residuals import drive_ratio, integrate_internal_states
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.estimate import Estimate
@@ -36,7 +36,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Balance, Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
-from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import assess
 from jaxid.simulation.force_balance import ForceData, sharpened
 
@@ -108,9 +108,7 @@ def window_slope(s: np.ndarray) -> np.ndarray:
     return 2 * np.pi * np.sin(0.5 * np.pi * s) ** 3 * np.cos(0.5 * np.pi * s)
 
 
-def _energies(
-    plant: Plant, data: ForceData
-) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
+def _energies(plant: Plant, data: ForceData) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
     """Kinetic energy [J], and the power of all else less half the rate of the mass [W].
 
     In declared units: over the ratio of the force at the load to the declared one.
@@ -119,7 +117,7 @@ def _energies(
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     # Accelerations reach own states only, of effects that look at them.
-    own = drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
+    own = integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
     times = data.start + data.period * jnp.arange(data.q.shape[0])
     apart = plant.diagonal or joints == 1
 
@@ -146,8 +144,13 @@ def _energies(
 
 @eqx.filter_jit
 def _solve(
-    plant: Plant, places: tuple, windows: PowerData, theta: Array, transform: Transform,
-    bounds: tuple[Array, Array], damping: float,
+    plant: Plant,
+    places: tuple,
+    windows: PowerData,
+    theta: Array,
+    transform: Transform,
+    bounds: tuple[Array, Array],
+    damping: float,
 ) -> Minimum:
     def residual(theta: Array) -> Array:
         return power_residual(scatter(places, plant, theta), windows)
@@ -168,7 +171,7 @@ def power(machine: Machine, data: Prepared) -> Estimate:
     Raises:
         InputError: If the log is too short for as many windows as the unknowns ask for.
     """
-    return alone(power_steps(machine, data))
+    return run_alone(power_steps(machine, data))
 
 
 def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
@@ -176,9 +179,18 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
     windows, unit = _windows(machine, data)
     plant, parameters = sharpened(machine.plant, data), machine.parameters
     transform, damping = linear_scale(machine)
-    fit = yield Solve(_solve, (
-        plant, parameters.places, windows, parameters.guess, transform, parameters.bounds, damping,
-    ))
+    fit = yield SolveRequest(
+        _solve,
+        (
+            plant,
+            parameters.places,
+            windows,
+            parameters.guess,
+            transform,
+            parameters.bounds,
+            damping,
+        ),
+    )
     rows = windows.weight > 0
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
@@ -188,10 +200,15 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
     converged = bool(fit.converged) and bool(np.all(np.isfinite(theta)))
     length = 2 * windows.half * data.period
     return Estimate(
-        method="power", machine=machine.with_estimate(theta), theta=theta, precision=precision,
+        method="power",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
         converged=converged,
         message="converged" if converged else f"no convergence within {int(fit.steps)} steps",
-        residual=np.where(rows, e, np.nan), samples=int(rows.sum()), steps=int(fit.steps),
+        residual=np.where(rows, e, np.nan),
+        samples=int(rows.sum()),
+        steps=int(fit.steps),
         notes=(f"{int(rows.sum())} windows of {length:.3g} s, half overlapping: four on a rise of speed",),
     )
 
@@ -211,7 +228,7 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     if count * (joints if apart else 1) < fewest:
         raise InputError(
             f"only {max(count, 0)} windows of {2 * half * period:.3g} s fit into the log",
-            mend="take a longer log, or use inverse_dynamics",
+            hint="take a longer log, or use inverse_dynamics",
         )
     slowest, halts = np.asarray(data.recipe.rest_velocity), _halts(machine.plant, data)
     speed = data.qd
@@ -266,7 +283,7 @@ def _halts(plant: Plant, data: Prepared) -> Bool[np.ndarray, "time n"]:
 
     # Traced: a number that no compiled code sees counts as nothing there.
     slides = eqx.filter_eval_shape(at_start, plant).slides
-    dry = {i for port in slides for i in plant.reached(port, joints)}
+    dry = {i for port in slides for i in plant.joints_loaded_by(port, joints)}
     halts = np.abs(data.qd) < np.asarray(data.recipe.rest_velocity)
     if data.recipe.keeps_reversals:
         halts = lasting(halts, 2 * data.recipe.decimation)

@@ -50,7 +50,7 @@ class Excitation:
         condition: Condition number of the regressor, its columns normed: of the best of the trajectories that
             were drawn, and of this one.
         nats: Logarithm of the root of the information's determinant above that of the same one.
-        told: Names of the unknowns that it counts; any others are sums of these in every motion.
+        identified: Names of the unknowns that it counts; any others are sums of these in every motion.
         std: Standard deviations to expect of these, (told,); None where the noise of the force is not known,
             or zero.
     """
@@ -64,7 +64,7 @@ class Excitation:
     criterion: str
     condition: tuple[float, float]
     nats: float
-    told: tuple[str, ...]
+    identified: tuple[str, ...]
     std: Float[np.ndarray, " told"] | None
 
     signal = "reference"
@@ -86,17 +86,19 @@ class Excitation:
     def __str__(self) -> str:
         lines = []
         if self.std is not None:
-            width = max(map(len, self.told))
+            width = max(map(len, self.identified))
             lines.append(f"{'parameter':<{width}}  expected standard deviation")
-            lines += [f"{n:<{width}}  {s:.3g}" for n, s in zip(self.told, self.std, strict=True)]
+            lines += [f"{n:<{width}}  {s:.3g}" for n, s in zip(self.identified, self.std, strict=True)]
         peaks = lambda x: ", ".join(f"{v:.3g}" for v in np.abs(x).max(axis=0))
         lines.append(
             f"condition number {self.condition[1]:.4g}, of the best that was drawn {self.condition[0]:.4g}; "
-            f"{self.nats:.1f} nats more than that one; {len(self.told)} of "
+            f"{self.nats:.1f} nats more than that one; {len(self.identified)} of "
             f"{len(self.machine.parameters.names)} unknowns counted"
         )
-        lines.append(f"{self.time[-1]:.3g} s, speed up to {peaks(self.velocity)}, acceleration up to "
-                     f"{peaks(self.acceleration)}, force up to {peaks(self.force)}")
+        lines.append(
+            f"{self.time[-1]:.3g} s, speed up to {peaks(self.velocity)}, acceleration up to "
+            f"{peaks(self.acceleration)}, force up to {peaks(self.force)}"
+        )
         return "\n".join(lines)
 
 
@@ -151,8 +153,14 @@ class _Series(eqx.Module):
         x, v, a = self.fine @ weights
         half = 0.5 * (self.high - self.low)
         centre = self.low + half * (1 + 0.8 * jnp.tanh(p[n * k :]))
-        parts = (x / (self.high - centre), x / (self.low - centre), v / self.speed, -v / self.speed,
-                 a / self.acceleration, -a / self.acceleration)
+        parts = (
+            x / (self.high - centre),
+            x / (self.low - centre),
+            v / self.speed,
+            -v / self.speed,
+            a / self.acceleration,
+            -a / self.acceleration,
+        )
         scale = (1 - _ROOM) / largest(jnp.concatenate(parts))
         x, v, a = self.basis @ weights
         return centre + scale * x, scale * v, scale * a
@@ -163,7 +171,7 @@ def _instants(base_hz: float, harmonics: int) -> np.ndarray:
     return np.arange(_FINE * harmonics) / (_FINE * harmonics * base_hz)
 
 
-class _Bench(eqx.Module):
+class _ReferenceProblem(eqx.Module):
     """What a trajectory is tried on."""
 
     plant: Plant
@@ -204,12 +212,15 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     rate, duration = float(case.simulation["sample_rate"]), float(case.simulation["duration"])
     base_hz, harmonics = setting.get("base_frequency_hz", 1 / duration), setting.get("harmonics", HARMONICS)
     if base_hz * duration < 1 - 1e-9:
-        mend = f"leave it out, or lengthen [simulation] duration to {1.001 / base_hz:.4g} s"
+        hint = f"leave it out, or lengthen [simulation] duration to {1.001 / base_hz:.4g} s"
         what = "base_frequency_hz has no whole period in the experiment"
-        raise InputError(what, where=f"{where}, [design]", mend=mend)
+        raise InputError(what, where=f"{where}, [design]", hint=hint)
     if 2 * base_hz * harmonics >= rate:
-        raise InputError(f"harmonic {harmonics} is beyond half the sample_rate", where=f"{where}, [design]",
-                         mend="lower harmonics or base_frequency_hz")
+        raise InputError(
+            f"harmonic {harmonics} is beyond half the sample_rate",
+            where=f"{where}, [design]",
+            hint="lower harmonics or base_frequency_hz",
+        )
     n = case.plant.joints
     spread = lambda x, k=(): np.broadcast_to(np.asarray(x, float), (n, *k))
     low, high = spread(case.limits["stroke"], (2,)).T
@@ -223,11 +234,18 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     noise = machine.sensor.force_noise
     known = noise is not None and bool(np.all(np.asarray(noise) > 0)) and plant.actuated is None
     p = len(machine.parameters.free)
-    bench = _Bench(
-        plant, jnp.asarray(machine.parameters.guess), series,
-        jnp.asarray(1.0 / (np.abs(machine.gain) * np.asarray(noise)) if known else np.ones(n)), jnp.ones(p),
-        jnp.arange(p), jnp.asarray(force), time[1], machine.parameters.places,
-        any(e.in_drive for e in plant.effects), setting.get("criterion", CRITERIA[0]),
+    bench = _ReferenceProblem(
+        plant,
+        jnp.asarray(machine.parameters.guess),
+        series,
+        jnp.asarray(1.0 / (np.abs(machine.gain) * np.asarray(noise)) if known else np.ones(n)),
+        jnp.ones(p),
+        jnp.arange(p),
+        jnp.asarray(force),
+        time[1],
+        machine.parameters.places,
+        any(e.in_drive for e in plant.effects),
+        setting.get("criterion", CRITERIA[0]),
     )
     progress("drawing trajectories")
     draws = np.random.default_rng(0).normal(size=(_DRAWN, series.size))
@@ -242,12 +260,13 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
         found.append(improved(both, draws[k], valued[k], _EVALUATIONS))
     best = min(found, key=lambda f: f[0])[1]
     ticks = np.arange(round(duration * rate)) / rate
-    whole = eqx.tree_at(lambda b: (b.series, b.period), bench,
-                        (_Series.within(ticks, base_hz, harmonics, bounds), 1 / rate))
+    whole = eqx.tree_at(
+        lambda b: (b.series, b.period), bench, (_Series.within(ticks, base_hz, harmonics, bounds), 1 / rate)
+    )
     return _judged(whole, machine, ticks, (draws[ranked[0]], best), known, where)
 
 
-def _scaled(bench: _Bench, draws: np.ndarray, known: bool, where: str) -> _Bench:
+def _scaled(bench: _ReferenceProblem, draws: np.ndarray, known: bool, where: str) -> _ReferenceProblem:
     """With columns of norm one, none that depends on others, and rows of like size if no noise is known.
 
     On the first of some trajectories that the plant can follow.
@@ -267,19 +286,19 @@ def _scaled(bench: _Bench, draws: np.ndarray, known: bool, where: str) -> _Bench
     norm = np.linalg.norm(j, axis=0)
     chosen = independent(j / np.where(norm > 1e-9 * norm.max(), norm, np.inf), range(j.shape[1]))
     if not chosen:
-        mend = "let one be unknown that moves or resists, as [plant] stands"
-        raise InputError("no force depends on what is unknown", where=where, mend=mend)
+        hint = "let one be unknown that moves or resists, as [plant] stands"
+        raise InputError("no force depends on what is unknown", where=where, hint=hint)
     values = (jnp.asarray(norm[chosen]), jnp.asarray(chosen))
     return eqx.tree_at(lambda b: (b.scale, b.columns), bench, values)
 
 
 def _out_of_reach(where: str) -> InputError:
     what = "trajectories meet positions that the plant cannot be in"
-    return InputError(what, where=f"{where}, [limits]", mend="narrow stroke")
+    return InputError(what, where=f"{where}, [limits]", hint="narrow stroke")
 
 
 @eqx.filter_jit
-def _along(bench: _Bench, p: Array) -> tuple[Array, Array, tuple]:
+def _along(bench: _ReferenceProblem, p: Array) -> tuple[Array, Array, tuple]:
     """Regressor over the noise, (time n, unknowns), force (time, n), and motion of some numbers."""
     motion = bench.series(p)
 
@@ -295,7 +314,7 @@ def _along(bench: _Bench, p: Array) -> tuple[Array, Array, tuple]:
 
 
 @eqx.filter_jit
-def _loss(p: Array, bench: _Bench) -> tuple[Array, Array]:
+def _loss(p: Array, bench: _ReferenceProblem) -> tuple[Array, Array]:
     """The criterion and what it costs to come near the limit of the force, with the slope."""
 
     def of(p: Array) -> Array:
@@ -322,7 +341,11 @@ def _sound(value: np.ndarray, slope: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _judged(
-    bench: _Bench, machine: Machine, ticks: np.ndarray, numbers: tuple[np.ndarray, np.ndarray], known: bool,
+    bench: _ReferenceProblem,
+    machine: Machine,
+    ticks: np.ndarray,
+    numbers: tuple[np.ndarray, np.ndarray],
+    known: bool,
     where: str,
 ) -> Excitation:
     """The trajectory at the rate of the log, beside the one that it began from.
@@ -344,11 +367,18 @@ def _judged(
     over = np.abs(np.asarray(bench.plant.at_drives(force))).max(axis=0) > np.asarray(bench.force)
     if np.any(over):
         what = f"every trajectory takes more than the force of drive {int(np.argmax(over)) + 1}"
-        mend = "raise force, or lower speed and acceleration"
-        raise InputError(what, where=f"{where}, [limits]", mend=mend)
+        hint = "raise force, or lower speed and acceleration"
+        raise InputError(what, where=f"{where}, [limits]", hint=hint)
     names = machine.parameters.names
     std = np.sqrt(np.diag(np.linalg.inv(told[1].T @ told[1]))) if known else None
     return Excitation(
-        machine, ticks, *(np.asarray(x) for x in motion), force, bench.criterion, tuple(condition),
-        0.5 * (logdets[1] - logdets[0]), tuple(names[int(k)] for k in bench.columns), std,
+        machine,
+        ticks,
+        *(np.asarray(x) for x in motion),
+        force,
+        bench.criterion,
+        tuple(condition),
+        0.5 * (logdets[1] - logdets[0]),
+        tuple(names[int(k)] for k in bench.columns),
+        std,
     )

@@ -10,8 +10,10 @@ import scipy.optimize
 
 
 def improved(
-    both: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray,
-    first: tuple[float, np.ndarray], evaluations: int,
+    both: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    start: np.ndarray,
+    first: tuple[float, np.ndarray],
+    evaluations: int,
 ) -> tuple[float, np.ndarray]:
     """The least value that so many evaluations beside the first find, and where."""
     seen = [(first[0], start.copy())]

@@ -21,13 +21,13 @@ from jaxid.estimators.within_prior.prior import Prior
 from jaxid.estimators.within_prior.problem import Problem, residual_of, with_sensor
 from jaxid.estimators.within_prior.rounding import rounds
 from jaxid.experiment_design.improve import improved
-from jaxid.experiment_design.limits import Bounds, Limits, Peaks, kept_within
+from jaxid.experiment_design.limits import LimitCost, Limits, Peaks, kept_within
 from jaxid.experiment_design.shapes import Shapes, basis
 from jaxid.files import signal_csv, write_whole
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.scene import refuse_impossible
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive, needed_substeps
@@ -114,15 +114,16 @@ def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
     Raises:
         InputError: If no experiment keeps within the limits.
     """
-    bench = _Bench.of(case)
+    bench = _DesignProblem.of(case)
     progress("looking at sines and tours")
     both = lambda p: _valued(bench, p)
     # Within the limits from the beginning: what breaks them is led back to them, not to what tells most.
     starts = [p for p in map(bench.within, bench.starts) if p is not None]
     if not starts:
         raise InputError(
-            "no experiment within the limits was found", where=f"{case.path}, [limits]",
-            mend="widen them, or check the loop's gains: the machine went beyond whatever it was asked",
+            "no experiment within the limits was found",
+            where=f"{case.path}, [limits]",
+            hint="widen them, or check the loop's gains: the machine went beyond whatever it was asked",
         )
     known = [both(p) for p in starts]
     ranked = sorted(range(len(starts)), key=lambda k: known[k][0])[:_IMPROVED]
@@ -136,7 +137,7 @@ def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
 
 
 @dataclass(frozen=True)
-class _Bench:
+class _DesignProblem:
     """What a design is tried on."""
 
     machine: Machine
@@ -150,7 +151,7 @@ class _Bench:
     starts: list[np.ndarray]
 
     @classmethod
-    def of(cls, case: Case) -> _Bench:
+    def of(cls, case: Case) -> _DesignProblem:
         setting = case.simulation
         rate, duration = float(setting["sample_rate"]), float(setting["duration"])
         machine = build_machine(case, period=1 / rate)
@@ -205,14 +206,20 @@ class _Bench:
         Where readings round, that which is found of a log simulated at the guesses: see `through_rounding`.
         """
         problem = Problem(
-            _under(self.replay, self.machine.plant, jnp.asarray(signal)), self.machine.parameters.places,
-            self.machine.plant, np.zeros(self.weight.shape), self.weight, self.prior, self.on,
-            (np.asarray(self.machine.plant.sharpness),), tuple(range(self.replay.position.size)),
+            _under(self.replay, self.machine.plant, jnp.asarray(signal)),
+            self.machine.parameters.places,
+            self.machine.plant,
+            np.zeros(self.weight.shape),
+            self.weight,
+            self.prior,
+            self.on,
+            (np.asarray(self.machine.plant.sharpness),),
+            tuple(range(self.replay.position.size)),
         )
         if not rounds(self.machine, problem):
             information = np.asarray(_information(*self.args(), jnp.asarray(signal)))
             return np.linalg.inv(np.eye(len(information)) + information)
-        return alone(expected_steps(self.machine, problem, self.own))
+        return run_alone(expected_steps(self.machine, problem, self.own))
 
     def args(self) -> tuple:
         """For the compiled functions."""
@@ -244,16 +251,17 @@ def _limits(case: Case, machine: Machine) -> Limits:
     own = None if machine.controller is None else machine.controller.limit
     force = stated.get("force", np.inf if own is None else _UNSATURATED * np.asarray(own))
     if machine.controller is None and "force" not in stated:
-        raise InputError("[limits] has no force", where=str(case.path), mend="add force = ... to [limits]")
+        raise InputError("[limits] has no force", where=str(case.path), hint="add force = ... to [limits]")
     return Limits(
-        np.array(low), np.array(high), np.broadcast_to(stated["speed"], n).astype(float),
-        np.broadcast_to(force, m).astype(float), tuple(stated),
+        np.array(low),
+        np.array(high),
+        np.broadcast_to(stated["speed"], n).astype(float),
+        np.broadcast_to(force, m).astype(float),
+        tuple(stated),
     )
 
 
-def _family(
-    machine: Machine, limits: Limits, ticks: int, period: float
-) -> tuple[Shapes, list[np.ndarray]]:
+def _family(machine: Machine, limits: Limits, ticks: int, period: float) -> tuple[Shapes, list[np.ndarray]]:
     """Signals within the limits, and where to start: the tour first."""
     speed, looped = float(limits.speed.max()), machine.controller is not None
     if looped:
@@ -270,7 +278,7 @@ def _family(
     return shapes, [shapes.numbers(w) for w in weights]
 
 
-def _noises(case: Case, bench: _Bench) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def _noises(case: Case, bench: _DesignProblem) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Of what is compared: that of its own, and with what rounding does in the loop to the command."""
     sensor, n, m = bench.machine.sensor, case.plant.joints, bench.machine.gain.size
     std: list[np.ndarray] = []
@@ -296,8 +304,9 @@ def _noises(case: Case, bench: _Bench) -> tuple[Float[np.ndarray, " k"], Float[n
 
 def _no_noise(case: Case, what: str, key: str) -> InputError:
     return InputError(
-        f"the noise of the {what} is not known", where=f"{case.path}, [sensor]",
-        mend=f"add {key}: without it no experiment is better than another",
+        f"the noise of the {what} is not known",
+        where=f"{case.path}, [sensor]",
+        hint=f"add {key}: without it no experiment is better than another",
     )
 
 
@@ -318,9 +327,7 @@ def _sensitivity(
 ) -> Array:
     """Derivative of what is compared over its noise, in units of the prior, (rows, p)."""
     p, none = len(places), jnp.zeros(weight.shape)
-    run = residual_of(
-        _under(replay, plant, signal), places, plant, none, weight, prior, on, jnp.eye(p)
-    )
+    run = residual_of(_under(replay, plant, signal), places, plant, none, weight, prior, on, jnp.eye(p))
     return jax.jacfwd(run)(jnp.zeros(p)).reshape(-1, p)
 
 
@@ -331,7 +338,7 @@ def _information(*args: Any) -> Array:
 
 
 @eqx.filter_jit
-def _loss(p: Array, args: tuple, shapes: Shapes, bounds: Bounds) -> tuple[Array, Array]:
+def _loss(p: Array, args: tuple, shapes: Shapes, bounds: LimitCost) -> tuple[Array, Array]:
     """Minus the information gained [nats] and what limits cost, with the slope."""
     replay, places, plant, _, prior, _ = args
 
@@ -347,7 +354,7 @@ def _loss(p: Array, args: tuple, shapes: Shapes, bounds: Bounds) -> tuple[Array,
     return value, slope
 
 
-def _valued(bench: _Bench, p: np.ndarray) -> tuple[float, np.ndarray]:
-    value, slope = _loss(jnp.asarray(p), bench.args(), bench.shapes, Bounds.of(bench.limits))
+def _valued(bench: _DesignProblem, p: np.ndarray) -> tuple[float, np.ndarray]:
+    value, slope = _loss(jnp.asarray(p), bench.args(), bench.shapes, LimitCost.of(bench.limits))
     good = np.isfinite(value) & np.all(np.isfinite(slope))
     return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))

@@ -68,15 +68,20 @@ class Limits:
         used = np.abs(log.force).max(axis=0) if own is None else np.asarray(own)
         force = stated.get("force", used)
         return cls(
-            np.array(low, float), np.array(high, float), np.broadcast_to(speed, n).astype(float),
-            np.broadcast_to(force, m).astype(float), tuple(stated),
+            np.array(low, float),
+            np.array(high, float),
+            np.broadcast_to(speed, n).astype(float),
+            np.broadcast_to(force, m).astype(float),
+            tuple(stated),
         )
 
     def broken(self, peaks: Peaks) -> bool:
         """Whether a run goes beyond them."""
         return bool(
-            np.any(peaks.low < self.low) or np.any(peaks.high > self.high)
-            or np.any(peaks.speed > self.speed) or np.any(peaks.force > self.force)
+            np.any(peaks.low < self.low)
+            or np.any(peaks.high > self.high)
+            or np.any(peaks.speed > self.speed)
+            or np.any(peaks.force > self.force)
             or not np.all(np.isfinite(peaks.speed))
         )
 
@@ -115,13 +120,14 @@ class Peaks:
     @classmethod
     def of(cls, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> Peaks:
         """Of runs whose time is the axis before the last."""
+
         def most(x: np.ndarray) -> np.ndarray:
             return np.max(x.reshape(-1, x.shape[-1]), axis=0)
 
         return cls(-most(-position), most(position), most(np.abs(velocity)), most(np.abs(command)))
 
 
-class Bounds(eqx.Module):
+class LimitCost(eqx.Module):
     """`Limits` as arrays."""
 
     low: Array
@@ -130,7 +136,7 @@ class Bounds(eqx.Module):
     force: Array
 
     @classmethod
-    def of(cls, limits: Limits) -> Bounds:
+    def of(cls, limits: Limits) -> LimitCost:
         """The limits' arrays."""
         return cls(*(jnp.asarray(x) for x in (limits.low, limits.high, limits.speed, limits.force)))
 
@@ -139,6 +145,4 @@ class Bounds(eqx.Module):
         half = 0.5 * (self.high - self.low)
         off = jnp.abs(run.position - 0.5 * (self.low + self.high)) / half
         parts = (off, jnp.abs(run.velocity) / self.speed, jnp.abs(run.command) / self.force)
-        return sum(
-            jnp.sum(jnp.square(jax.nn.relu(largest(x) - _FROM) / (1 - _FROM))) for x in parts
-        )
+        return sum(jnp.sum(jnp.square(jax.nn.relu(largest(x) - _FROM) / (1 - _FROM))) for x in parts)

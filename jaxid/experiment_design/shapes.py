@@ -88,7 +88,10 @@ def largest(x: Float[Array, "time *n"]) -> Float[Array, "*n"]:
 
 
 def basis(
-    samples: int, period: float, fastest_hz: float, ways: tuple[float, float, float],
+    samples: int,
+    period: float,
+    fastest_hz: float,
+    ways: tuple[float, float, float],
     own: np.ndarray | None,
 ) -> tuple[Float[np.ndarray, "time k"], list[np.ndarray]]:
     """Basis functions, and weights to start a search from.

@@ -12,14 +12,14 @@ class Finding:
         severity: "error" stops the work, "warning" is told.
         what: The fault, with its size and unit.
         where: File and quantity.
-        mend: What the user can do about it.
+        hint: What the user can do about it.
     """
 
     severity: Literal["error", "warning"]
     what: str
     where: str
-    mend: str
+    hint: str
 
     def __str__(self) -> str:
         """One line for a terminal."""
-        return f"{self.severity}: {self.where}: {self.what}; {self.mend}"
+        return f"{self.severity}: {self.where}: {self.what}; {self.hint}"

@@ -77,11 +77,11 @@ class Log:
             values = _frozen(values[:, None] if values.ndim == 1 else values)
             if len(values) != time.size:
                 what = f"unequal lengths: time {time.size}, {name} {len(values)}"
-                raise InputError(what, where=self.source, mend="cut them to the same samples")
+                raise InputError(what, where=self.source, hint="cut them to the same samples")
             object.__setattr__(self, name, values)
         if self.hold not in HOLDS:
-            what, mend = f"hold = '{self.hold}' is unknown", suggest(self.hold, HOLDS)
-            raise InputError(what, where=self.source, mend=mend)
+            what, hint = f"hold = '{self.hold}' is unknown", suggest(self.hold, HOLDS)
+            raise InputError(what, where=self.source, hint=hint)
         if self.rows == (0, 0):
             object.__setattr__(self, "rows", (0, time.size))
 
@@ -104,7 +104,8 @@ class Log:
         if not all(self.measured):
             raise InputError(
                 f"joint {self.measured.index(False) + 1} has no position, which {method} needs",
-                where=self.source, mend="name its column (load_position), or use output_error",
+                where=self.source,
+                hint="name its column (load_position), or use output_error",
             )
 
     @property
@@ -148,14 +149,16 @@ def with_load(log: Log, load: int | None, joints: int) -> Log:
     if width == joints:
         if log.load_position is not None:
             raise InputError(
-                "load_position is given beside the positions of all joints", where=log.source,
-                mend="leave it out, or let position name the motor's column alone",
+                "load_position is given beside the positions of all joints",
+                where=log.source,
+                hint="leave it out, or let position name the motor's column alone",
             )
         return log
     if width != joints - 1:
         raise InputError(
-            f"position has {width} columns where {joints - 1} or {joints} belong", where=log.source,
-            mend="name the motor's column, and the load's as load_position where it has one",
+            f"position has {width} columns where {joints - 1} or {joints} belong",
+            where=log.source,
+            hint="name the motor's column, and the load's as load_position where it has one",
         )
     column = np.full(log.samples, np.nan) if log.load_position is None else log.load_position[:, 0]
     return replace(log, position=np.insert(log.position, load, column, axis=1), load_position=None)
@@ -192,14 +195,12 @@ def read_log(
     rows = _rows(columns)
     data, rows = read_columns(path, [name for group in names.values() for name in group], rows)
     _check_finite(data, rows[0], path)
-    groups = {
-        key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()
-    }
+    groups = {key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()}
     _check_widths(groups, names, joints, drives, path)
     samples = rows[1] - rows[0]
     if samples < MINIMUM_SAMPLES:
-        mend = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
-        raise InputError(f"is too short: {samples} samples", where=str(path), mend=mend)
+        hint = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
+        raise InputError(f"is too short: {samples} samples", where=str(path), hint=hint)
     time = _time(groups.pop("time", None), columns, rows, path)
     hold = columns.get("hold", "zero_order")
     return Log(time=time, hold=hold, rows=rows, source=str(path), **groups)
@@ -208,23 +209,21 @@ def read_log(
 def _check_keys(columns: dict[str, Any]) -> None:
     for key in columns:
         if key not in LOG_KEYS:
-            raise InputError(f"unknown key '{key}'", where="[log]", mend=suggest(key, LOG_KEYS))
+            raise InputError(f"unknown key '{key}'", where="[log]", hint=suggest(key, LOG_KEYS))
     for key in ("position", "force"):
         if not columns.get(key):
-            mend = f'add {key} = "<name of the column>"'
-            raise InputError(f"'{key}' is missing", where="[log]", mend=mend)
+            hint = f'add {key} = "<name of the column>"'
+            raise InputError(f"'{key}' is missing", where="[log]", hint=hint)
     hold = columns.get("hold", "zero_order")
     if hold not in HOLDS:
-        raise InputError(
-            f"hold = {hold!r} is unknown", where="[log]", mend=suggest(str(hold), HOLDS)
-        )
+        raise InputError(f"hold = {hold!r} is unknown", where="[log]", hint=suggest(str(hold), HOLDS))
     rate = columns.get("sample_rate")
     if rate is None and not columns.get("time"):
-        mend = 'add time = "<name of the column>", or sample_rate = <Hz>'
-        raise InputError("neither time nor sample_rate is given", where="[log]", mend=mend)
+        hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
+        raise InputError("neither time nor sample_rate is given", where="[log]", hint=hint)
     if rate is not None and not (_is_number(rate) and 0 < rate < np.inf):
-        mend = "give the samples per second, e.g. sample_rate = 1000.0"
-        raise InputError(f"sample_rate = {rate!r} is not a rate in Hz", where="[log]", mend=mend)
+        hint = "give the samples per second, e.g. sample_rate = 1000.0"
+        raise InputError(f"sample_rate = {rate!r} is not a rate in Hz", where="[log]", hint=hint)
 
 
 def _is_number(value: Any) -> bool:
@@ -240,11 +239,11 @@ def _names(columns: dict[str, Any], key: str) -> list[str]:
     given = columns[key]
     names = given if isinstance(given, list | tuple) else [given]
     if not names or not all(isinstance(name, str) for name in names):
-        mend = "give the name of a column, or a list of names"
-        raise InputError(f"{key} = {given!r} names no column", where="[log]", mend=mend)
+        hint = "give the name of a column, or a list of names"
+        raise InputError(f"{key} = {given!r} names no column", where="[log]", hint=hint)
     if len(set(names)) < len(names):
-        mend = "name one column a joint"
-        raise InputError(f"{key} names a column twice: {names}", where="[log]", mend=mend)
+        hint = "name one column a joint"
+        raise InputError(f"{key} names a column twice: {names}", where="[log]", hint=hint)
     return list(names)
 
 
@@ -252,8 +251,8 @@ def _check_distinct(names: dict[str, list[str]]) -> None:
     """Refuse one column for two quantities; a reference may be what was measured elsewhere."""
     for one, other in (("time", "position"), ("time", "force"), ("force", "position")):
         if set(names.get(one, ())) & set(names.get(other, ())):
-            mend = "each quantity has a column of its own"
-            raise InputError(f"{one} and {other} are the same column", where="[log]", mend=mend)
+            hint = "each quantity has a column of its own"
+            raise InputError(f"{one} and {other} are the same column", where="[log]", hint=hint)
 
 
 def _rows(columns: dict[str, Any]) -> tuple[int, int] | None:
@@ -265,8 +264,8 @@ def _rows(columns: dict[str, Any]) -> tuple[int, int] | None:
         or len(rows) != 2
         or not all(isinstance(row, int) and not isinstance(row, bool) for row in rows)
     ):
-        mend = "give two whole numbers, first and end (0-based, half open): rows = [0, 25000]"
-        raise InputError(f"rows = {rows!r} is no range", where="[log]", mend=mend)
+        hint = "give two whole numbers, first and end (0-based, half open): rows = [0, 25000]"
+        raise InputError(f"rows = {rows!r} is no range", where="[log]", hint=hint)
     return (rows[0], rows[1])
 
 
@@ -276,15 +275,18 @@ def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
         if not bad.size:
             continue
         kind = "NaN" if np.isnan(values[bad[0]]).any() else "infinite"
-        mend = "cut these rows out with rows = [first, end], or interpolate before"
+        hint = "cut these rows out with rows = [first, end], or interpolate before"
         where = f"{path}, column '{name}'"
         what = f"{bad.size} row(s) are NaN or infinite, the first is row {first + bad[0]} ({kind})"
-        raise InputError(what, where=where, mend=mend)
+        raise InputError(what, where=where, hint=hint)
 
 
 def _check_widths(
-    groups: dict[str, np.ndarray], names: dict[str, list[str]], joints: int | None,
-    drives: int | None, path: Path,
+    groups: dict[str, np.ndarray],
+    names: dict[str, list[str]],
+    joints: int | None,
+    drives: int | None,
+    path: Path,
 ) -> None:
     """One time, as many positions as joints, and as many forces as drives, or no more than those."""
     expected = groups["position"].shape[1] if joints is None else joints
@@ -301,9 +303,9 @@ def _check_widths(
             continue
         if width != needed:
             where = f"{path}, [log] {key} = {names[key]}"
-            mend = f"name one column a {what}, in the order of the {what}s"
+            hint = f"name one column a {what}, in the order of the {what}s"
             belongs = most if what == "drive" else needed
-            raise InputError(f"{width} column(s) where {belongs} belong", where=where, mend=mend)
+            raise InputError(f"{width} column(s) where {belongs} belong", where=where, hint=hint)
 
 
 def _time(
@@ -317,6 +319,6 @@ def _time(
     logged = (time.size - 1) / (time[-1] - time[0])
     if rate is not None and abs(logged / rate - 1) > 0.01:
         what = f"the time column says {logged:.6g} Hz, sample_rate says {rate:.6g} Hz"
-        mend = "leave one of them out; is time in seconds?"
-        raise InputError(what, where=where, mend=mend)
+        hint = "leave one of them out; is time in seconds?"
+        raise InputError(what, where=where, hint=hint)
     return time

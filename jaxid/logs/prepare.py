@@ -198,8 +198,14 @@ class Prepared:
         at = first // self.recipe.decimation
         rows = slice(at, at + len(kept))
         return replace(
-            self, q=self.q[part], qd=self.qd[part], qdd=self.qdd[part], force=self.force[part],
-            moving=self.moving[rows], fitted=self.fitted[rows], kept=kept,
+            self,
+            q=self.q[part],
+            qd=self.qd[part],
+            qdd=self.qdd[part],
+            force=self.force[part],
+            moving=self.moving[rows],
+            fitted=self.fitted[rows],
+            kept=kept,
             start=self.start + first * self.period,
         )
 
@@ -233,7 +239,9 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     if stated.get("cutoff_hz", 0.0) >= 0.5 * rate:
         raise InputError(
             f"[preprocess] cutoff_hz = {stated['cutoff_hz']:g} is not below half the sampling rate of "
-            f"{rate:.6g} Hz", where=log.source, mend="lower it, or leave it out: it is then chosen",
+            f"{rate:.6g} Hz",
+            where=log.source,
+            hint="lower it, or leave it out: it is then chosen",
         )
     parabolic, reach = stated.get("derivatives") == "parabolic", int(stated.get("reach", 2))
     _require_length(log, stated.get("median"), reach if parabolic else None)
@@ -278,7 +286,8 @@ def _require_length(log: Log, median: int | None, reach: int | None) -> None:
         if value is not None and width >= log.samples:
             raise InputError(
                 f"[preprocess] {key} = {value} takes {width} samples, and the log has {log.samples}",
-                where=log.source, mend="lower it, or take a longer log",
+                where=log.source,
+                hint="lower it, or take a longer log",
             )
 
 
@@ -316,9 +325,7 @@ def _noise_cutoff(log: Log) -> float:
     # Two seconds a segment: friction's corners recur over seconds, noise everywhere.
     position = log.position[:, list(log.measured)]
     length = int(min(len(position), max(256, 2 * rate)))
-    f, p = scipy.signal.welch(
-        position, rate, window="hann", nperseg=length, detrend="linear", axis=0
-    )
+    f, p = scipy.signal.welch(position, rate, window="hann", nperseg=length, detrend="linear", axis=0)
     floor = 2 * signals.high_band_std(position) ** 2 / rate
     above = np.all(p > 4 * floor, axis=1) & (f < 0.3 * rate)
     first_lost = np.argmax(~above[1:]) + 1 if np.any(~above[1:]) else len(f) - 1
@@ -329,7 +336,12 @@ def _noise_cutoff(log: Log) -> float:
 
 
 def differentiate(
-    x: Float[np.ndarray, "time n"], period: float, cutoff_hz: float, order: int, how: str, orders: int = 2,
+    x: Float[np.ndarray, "time n"],
+    period: float,
+    cutoff_hz: float,
+    order: int,
+    how: str,
+    orders: int = 2,
     reach: int = 2,
 ) -> tuple[np.ndarray, ...]:
     """Signal and its derivatives up to an order; filtered unless `how` is "parabolic", see `Recipe`."""
@@ -345,9 +357,7 @@ def differentiate(
     return tuple(out)
 
 
-def prepare(
-    log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | None = None
-) -> Prepared:
+def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | None = None) -> Prepared:
     """Filter a log and mark the samples that count.
 
     Args:
@@ -369,9 +379,17 @@ def prepare(
     moving = ~smeared(at_rest, reach)[kept] & log.measured
     fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
     return Prepared(
-        q, qd, qdd, log.force * gain, log.period,
-        recipe.hold(log, hold_period), recipe, moving,
-        fitted if recipe.keeps_reversals else moving, kept, measured=log.measured,
+        q,
+        qd,
+        qdd,
+        log.force * gain,
+        log.period,
+        recipe.hold(log, hold_period),
+        recipe,
+        moving,
+        fitted if recipe.keeps_reversals else moving,
+        kept,
+        measured=log.measured,
     )
 
 

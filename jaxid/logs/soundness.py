@@ -75,8 +75,8 @@ def raise_on_error(findings: Iterable[Finding]) -> None:
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
         first, others = errors[0], len(errors) - 1
-        mend = first.mend + (f" (and {others} more error(s))" if others else "")
-        raise InputError(first.what, where=first.where, mend=mend)
+        hint = first.hint + (f" (and {others} more error(s))" if others else "")
+        raise InputError(first.what, where=first.where, hint=hint)
 
 
 def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
@@ -84,20 +84,20 @@ def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
     seen = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
     reasons = [_stillness(q, fewest) for _, q in seen]
     if all(reasons):
-        mend = "check that position names the right column and that the machine moved"
-        return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, position", mend)]
+        hint = "check that position names the right column and that the machine moved"
+        return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, position", hint)]
     findings = []
     for (joint, q), reason in zip(seen, reasons, strict=True):
         where = f"{path}, position of joint {joint}"
         levels, step = _levels(q)
         if reason:
-            mend = "its parameters cannot be told from this log; check the column"
-            findings.append(Finding("warning", f"the joint does not move: {reason}", where, mend))
+            hint = "its parameters cannot be told from this log; check the column"
+            findings.append(Finding("warning", f"the joint does not move: {reason}", where, hint))
         elif step and levels < _COARSE_LEVELS:
             what = f"the position is quantised in steps of {step:.3g}: {levels} levels in all"
-            mend = "log a longer stroke or more digits"
-            mend += "" if stated else ", and give sensor.position_resolution"
-            findings.append(Finding("warning", what, where, mend))
+            hint = "log a longer stroke or more digits"
+            hint += "" if stated else ", and give sensor.position_resolution"
+            findings.append(Finding("warning", what, where, hint))
     return findings
 
 
@@ -136,15 +136,15 @@ def _force(log: Log, limit: ByJoint | None, path: str) -> list[Finding]:
     constant = np.ptp(log.force, axis=0) == 0
     if constant.all():
         level = "zero" if not log.force.any() else f"constant ({channels[0][0]:.6g})"
-        mend = "check that force names the right column; nothing can be learned without a change"
-        return [Finding("error", f"the force is {level} throughout", f"{path}, force", mend)]
+        hint = "check that force names the right column; nothing can be learned without a change"
+        return [Finding("error", f"the force is {level} throughout", f"{path}, force", hint)]
     limits = [None] * len(channels) if limit is None else np.broadcast_to(limit, len(channels))
     findings = []
     for k, (u, bound) in enumerate(zip(channels, limits, strict=True), start=1):
         where = f"{path}, force {k}"
         if constant[k - 1]:
-            mend = "check the column; this joint is driven by the others alone"
-            findings.append(Finding("warning", f"constant at {u[0]:.6g}", where, mend))
+            hint = "check the column; this joint is driven by the others alone"
+            findings.append(Finding("warning", f"constant at {u[0]:.6g}", where, hint))
         else:
             findings += _saturation(u, bound, where)
     return findings
@@ -157,8 +157,8 @@ def _saturation(u: np.ndarray, bound: float | None, where: str) -> list[Finding]
     if share <= (_OFTEN_SATURATED if bound is not None else _SATURATED):
         return []
     what = f"the command is saturated: |u| = {extreme:.6g} in {100 * share:.0f} % of the rows"
-    mend = "log a gentler motion, or take other rows"
+    hint = "log a gentler motion, or take other rows"
     # A random binary excitation has two levels of both signs and is a sound experiment.
     binary = bound is None and share > 0.98 and np.ptp(np.sign(u[at_limit])) == 2
     severity = "error" if share > _SATURATED and not binary else "warning"
-    return [Finding(severity, what, where, mend)]
+    return [Finding(severity, what, where, hint)]

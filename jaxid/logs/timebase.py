@@ -12,9 +12,7 @@ _FEW_ROWS = 5
 _GAP = 1.5
 
 
-def sound_time(
-    time: Float[np.ndarray, " samples"], first: int, where: str
-) -> Float[np.ndarray, " samples"]:
+def sound_time(time: Float[np.ndarray, " samples"], first: int, where: str) -> Float[np.ndarray, " samples"]:
     """Check that time runs forward at one rate.
 
     Time stamps that were only rounded when they were written (1.638 ms logged as
@@ -48,13 +46,13 @@ def _check_forward(time: np.ndarray, step: np.ndarray, first: int, where: str) -
         return
     k = int(wrong[0])
     if wrong.size > 0.2 * step.size and not np.any(step < 0):
-        mend = "write it with more digits, or give sample_rate in place of time"
+        hint = "write it with more digits, or give sample_rate in place of time"
         what = f"time repeats in {wrong.size} rows, first in row {first + k + 1}"
-        raise InputError(what, where=where, mend=mend)
+        raise InputError(what, where=where, hint=hint)
     verb = "repeats" if step[k] == 0 else "runs backwards"
-    mend = "remove the doubled rows, or keep to one run with rows = [first, end]"
+    hint = "remove the doubled rows, or keep to one run with rows = [first, end]"
     what = f"time {verb} in row {first + k + 1} ({time[k]:.9g} s, then {time[k + 1]:.9g} s)"
-    raise InputError(what, where=where, mend=mend)
+    raise InputError(what, where=where, hint=hint)
 
 
 def _decimal_unit(time: np.ndarray) -> float:
@@ -77,12 +75,12 @@ def _check_gaps(time: np.ndarray, step: np.ndarray, period: float, first: int, w
     if not gaps.size or gaps.size > 0.05 * step.size:
         return
     k = int(gaps[np.argmax(step[gaps])])
-    mend = _widest(gaps, step.size + 1, first)
+    hint = _widest(gaps, step.size + 1, first)
     what = (
         f"{gaps.size} gap(s) in time, the longest of {step[k]:.4g} s after row {first + k} "
         f"(t = {time[k]:.6g} s; the period is {period:.4g} s)"
     )
-    raise InputError(what, where=where, mend=mend)
+    raise InputError(what, where=where, hint=hint)
 
 
 def _widest(gaps: np.ndarray, count: int, first: int) -> str:
@@ -103,5 +101,5 @@ def _check_jitter(step: np.ndarray, period: float, first: int, where: str) -> No
         f"median {period:.4g} s by more than 1 %, the worst by {100 * off[k]:.3g} % "
         f"after row {first + k}"
     )
-    mend = "resample the log to a constant rate, or take an even stretch with rows = [first, end]"
-    raise InputError(what, where=where, mend=mend)
+    hint = "resample the log to a constant rate, or take an even stretch with rows = [first, end]"
+    raise InputError(what, where=where, hint=hint)

@@ -109,8 +109,8 @@ def _compare_velocity(
     alike = correlation(measured, derived)
     if abs(alike) < _ALIKE:
         what = f"velocity is not the derivative of position (correlation {alike:.2f})"
-        mend = "check that velocity names the right column, or leave it out"
-        return [Finding("warning", what, where, mend)]
+        hint = "check that velocity names the right column, or leave it out"
+        return [Finding("warning", what, where, hint)]
     if alike < 0:
         what = "velocity has the opposite sign of the derivative of position"
         return [Finding("error", what, where, "turn the sign of one of them, or leave it out")]
@@ -126,19 +126,17 @@ def _compare_reference(r: np.ndarray, q: np.ndarray, motion: str, where: str) ->
     return _judge(ratio, _REFERENCE, motion, "the reference is {:.4g} times the position", where)
 
 
-def _judge(
-    ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: str
-) -> list[Finding]:
+def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: str) -> list[Finding]:
     """An error where a usual slip explains the factor, a warning where none does."""
     if 0.67 < ratio < 1.5:
         return []
     told = text.format(ratio)
     for slip in slips:
         if slip.matches(ratio, motion, 1.2):
-            mend = "bring all columns to SI units"
-            return [Finding("error", f"{told}: {slip.text}", where, mend)]
-    mend = "check the units of both columns"
-    return [Finding("warning", f"{told}, which should be 1", where, mend)]
+            hint = "bring all columns to SI units"
+            return [Finding("error", f"{told}: {slip.text}", where, hint)]
+    hint = "check the units of both columns"
+    return [Finding("warning", f"{told}, which should be 1", where, hint)]
 
 
 def magnitude_findings(log: Log, motion: str, path: str) -> list[Finding]:
@@ -161,8 +159,8 @@ def magnitude_findings(log: Log, motion: str, path: str) -> list[Finding]:
         span = float(np.ptp(q))
         if span >= 100 and np.all(q == np.round(q)):
             what = f"position holds whole numbers only, {span:.0f} in all: encoder counts?"
-            mend = "convert position to " + ("m" if motion == "linear" else "rad")
-            findings.append(Finding("error", what, where, mend))
+            hint = "convert position to " + ("m" if motion == "linear" else "rad")
+            findings.append(Finding("error", what, where, hint))
         elif finding := _magnitude(q, log.period, motion, where):
             findings.append(finding)
     return findings
@@ -177,15 +175,15 @@ def _magnitude(q: np.ndarray, period: float, motion: str, where: str) -> Finding
         # Chosen: no axis travels 50 m or runs at 100 m/s; metres written as mm do at once.
         seen, limit, absurd = (span, 50.0, 1e4) if span > 50.0 else (speed, 100.0, 1e5)
         told = f"a stroke of {span:.4g} m" if span > 50.0 else f"a speed of {speed:.4g} m/s"
-        unit, mend = "millimetres" if span < 1e4 else "micrometres", "convert position to m"
+        unit, hint = "millimetres" if span < 1e4 else "micrometres", "convert position to m"
     else:
         # Chosen: 1e4 rad/s is 95 000 rpm.
         seen, limit, absurd = speed, 1e4, 1e6
-        told, unit, mend = f"a speed of {speed:.4g} rad/s", "degrees", "convert position to rad"
+        told, unit, hint = f"a speed of {speed:.4g} rad/s", "degrees", "convert position to rad"
     if seen <= limit:
         return None
     severity = "error" if seen > absurd else "warning"
-    return Finding(severity, f"{told}: position looks like {unit}", where, mend)
+    return Finding(severity, f"{told}: position looks like {unit}", where, hint)
 
 
 def plausible_inertia(
@@ -229,17 +227,15 @@ def plausible_inertia(
     return None
 
 
-def _judge_inertia(
-    rough: float | None, guess: float, span: float, motion: str, where: str
-) -> Finding | None:
+def _judge_inertia(rough: float | None, guess: float, span: float, motion: str, where: str) -> Finding | None:
     if rough is None or guess <= 0:
         return None
     for slip in _INERTIA:
         spread = 2.0 if slip.severity == "warning" else 5.0
         if slip.matches(rough / guess, motion, spread):
             what = f"the log implies an inertia of about {rough:.2g}, the guess is {guess:.3g}"
-            mend = "bring the log to SI units, check actuator.gain, or mend the guess"
+            hint = "bring the log to SI units, check actuator.gain, or correct the guess"
             # A guess may be 57 times off; an angle of more than 20 makes it degrees.
             sure = slip.severity == "error" or (slip.motion == "rotary" and span > 20.0)
-            return Finding("error" if sure else "warning", f"{what}: {slip.text}", where, mend)
+            return Finding("error" if sure else "warning", f"{what}: {slip.text}", where, hint)
     return None

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jaxid.model.effect import Action, Effect, Signals
 
 
-def alike(effects: Sequence[Effect], drives: Sequence[int | None]) -> list[list[int]]:
+def group_by_kind(effects: Sequence[Effect], drives: Sequence[int | None]) -> list[list[int]]:
     """Indices of effects in runs of one kind, no two of a run on one port or one drive.
 
     Args:
@@ -48,7 +48,7 @@ def _same(one: Effect, two: Effect) -> bool:
     return True
 
 
-def acted(effects: list[Effect], signals: list[Signals], states: list) -> list[Action]:
+def act_batched(effects: list[Effect], signals: list[Signals], states: list) -> list[Action]:
     """What the effects of a run do; several are traced as one.
 
     Args:
@@ -71,7 +71,4 @@ def acted(effects: list[Effect], signals: list[Signals], states: list) -> list[A
     leaves = [jnp.stack(column) for column in zip(*map(jax.tree.leaves, effects), strict=True)]
     together = [jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (signals, states)]
     found = jax.vmap(act)(leaves, *together)
-    return [
-        eqx.combine(jax.tree.map(lambda a, k=k: a[k], found), left_out[-1])
-        for k in range(len(effects))
-    ]
+    return [eqx.combine(jax.tree.map(lambda a, k=k: a[k], found), left_out[-1]) for k in range(len(effects))]

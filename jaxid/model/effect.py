@@ -86,7 +86,9 @@ class Scales:
     def natural(self, dimension: str) -> float:
         """Size at which a parameter of this dimension would explain all of the force."""
         base = {
-            "force": self.force, "position": self.position, "time": self.position / self.velocity,
+            "force": self.force,
+            "position": self.position,
+            "time": self.position / self.velocity,
         }
         if "inertia" in dimension:
             base["inertia"] = self.force / self.acceleration

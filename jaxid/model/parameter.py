@@ -37,8 +37,15 @@ class ParameterInfo:
 
 
 def parameter(
-    dimension: str, sign: str, doc: str, *, optional: bool = False, more: int | None = None,
-    motion: str | None = None, width: int | None = None, known: bool = False,
+    dimension: str,
+    sign: str,
+    doc: str,
+    *,
+    optional: bool = False,
+    more: int | None = None,
+    motion: str | None = None,
+    width: int | None = None,
+    known: bool = False,
 ) -> Any:
     """Declare a field of a plant or effect as a physical parameter, a float64 array leaf.
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.errors import InputError
-from jaxid.model.batching import acted, alike
+from jaxid.model.batching import act_batched, group_by_kind
 from jaxid.model.effect import Effect, Signals
 from jaxid.numerics import smooth
 
@@ -99,7 +99,7 @@ class Plant(eqx.Module):
         return None
 
     @classmethod
-    def parts(cls, joints: int) -> int:
+    def bodies(cls, joints: int) -> int:
         """How many ports are called joints: a part that another moves rigidly has a port without a motion."""
         return joints
 
@@ -143,9 +143,9 @@ class Plant(eqx.Module):
             if self.impossible(motion[:1]) is None:
                 return motion
             motion[0] = random.uniform(-np.pi, np.pi, self.joints)
-        raise InputError(f"kind = '{self.kind}' cannot take any position", mend="check its lengths")
+        raise InputError(f"kind = '{self.kind}' cannot take any position", hint="check its lengths")
 
-    def along(self, port: int) -> tuple[int, ...]:
+    def directions(self, port: int) -> tuple[int, ...]:
         """Coordinates, as entries of `ports`, along which an effect on a port acts, each for itself."""
         return (port,)
 
@@ -165,7 +165,7 @@ class Plant(eqx.Module):
             InputError: If the plant has no links that move in space.
         """
         what = f"kind = '{self.kind}' has no links that move in space"
-        raise InputError(what, mend="put sensors on the links of a serial_arm or five_bar")
+        raise InputError(what, hint="put sensors on the links of a serial_arm or five_bar")
 
     @property
     def base_gravity(self) -> Float[Array, "3"]:
@@ -174,10 +174,10 @@ class Plant(eqx.Module):
 
     def place(self, port: int) -> tuple[str, int]:
         """What a port is called: one of `PLACES`, and which, counted from 1."""
-        parts = self.parts(self.joints)
+        parts = self.bodies(self.joints)
         return ("joint", port + 1) if port < parts else ("spring", port - parts + 1)
 
-    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+    def joints_loaded_by(self, port: int, joints: int) -> tuple[int, ...]:
         """Joints in whose balance a force on a port stands; all by default."""
         return tuple(range(joints))
 
@@ -202,16 +202,16 @@ class Plant(eqx.Module):
         drives = [self.drive_of(i, u.size) for i in range(coordinates)]
         return jnp.stack([jnp.zeros((), u.dtype) if j is None else u[j] for j in drives])
 
-    def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
+    def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
         """Whether a search may name such an effect on a port."""
         springs = self.springs(self.joints) > 0
         if effect.with_springs not in (None, springs) or (effect.of_stages and not self.stage):
             return False
-        if springs and effect.of_spring != (port >= self.parts(self.joints)):
+        if springs and effect.of_spring != (port >= self.bodies(self.joints)):
             return False
         return not effect.in_drive or self.drive_of(port, drives) is not None
 
-    def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         """Parameter of the plant, and its entry, that an effect on a port is by another name."""
         return None
 
@@ -251,8 +251,7 @@ class Plant(eqx.Module):
         drives = [self.drive_of(e.port, u.size) for e in self.effects]
         zero = jnp.zeros((), u.dtype)
         return tuple(
-            e.initial_state(zero if j is None else u[j])
-            for e, j in zip(self.effects, drives, strict=True)
+            e.initial_state(zero if j is None else u[j]) for e, j in zip(self.effects, drives, strict=True)
         )
 
     def with_effect(self, effect: Effect) -> Plant:
@@ -294,17 +293,26 @@ class Plant(eqx.Module):
         drive, rates = [u[j] for j in range(u.size)], []
         ports = [e.port for e in self.effects]
         drives = [self.drive_of(i, u.size) for i in ports]
-        for run in alike(self.effects, drives):
-            spots = [(k, i, drives[k]) for k in run for i in self.along(ports[k])]
+        for run in group_by_kind(self.effects, drives):
+            spots = [(k, i, drives[k]) for k in run for i in self.directions(ports[k])]
             signals = [
                 Signals(
-                    y[i], yd[i], ydd[i], jnp.zeros(()) if j is None else drive[j], t, width[i],
-                    jnp.asarray(dry_scale[i]), gravity[i], normal[i], stiffness[i], damping[i],
+                    y[i],
+                    yd[i],
+                    ydd[i],
+                    jnp.zeros(()) if j is None else drive[j],
+                    t,
+                    width[i],
+                    jnp.asarray(dry_scale[i]),
+                    gravity[i],
+                    normal[i],
+                    stiffness[i],
+                    damping[i],
                 )
                 for _, i, j in spots
             ]
             each = [k for k, _, _ in spots]
-            actions = acted([self.effects[k] for k in each], signals, [states[k] for k in each])
+            actions = act_batched([self.effects[k] for k in each], signals, [states[k] for k in each])
             for (k, i, j), action in zip(spots, actions, strict=True):
                 force[i], dry[i] = force[i] + action.force, dry[i] + action.dry
                 stick[i] = stick[i] + action.stick
@@ -349,9 +357,7 @@ def _while_rising(rising: Float[Array, "2 ports"], way: Array, ydd: Array) -> Ar
     return forth - jnp.where(ydd < 0, 0.5 * (1 - way) * rising[1], 0.0)
 
 
-def port_motion(
-    plant: Plant, q: Array, qd: Array, qdd: Array
-) -> tuple[Array, Array, Array]:
+def port_motion(plant: Plant, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array]:
     """Coordinate, velocity and acceleration of the ports by forward-mode differentiation."""
     if plant.ports_are_joints:
         return q, qd, qdd

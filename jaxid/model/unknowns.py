@@ -218,4 +218,4 @@ def label(plant: Plant, kind: str, port: int) -> str:
 
 def several_places(plant: Plant) -> bool:
     """Whether effects need a place to be told apart."""
-    return plant.parts(plant.joints) + plant.springs(plant.joints) > 1
+    return plant.bodies(plant.joints) + plant.springs(plant.joints) > 1

@@ -15,8 +15,22 @@ from jaxtyping import Array
 _CONSTANT, _AFFINE, _OTHER = range(3)
 # Affine in all operands together; in the first alone; in any one of them.
 _SUMS = {
-    "add", "sub", "neg", "add_any", "broadcast_in_dim", "concatenate", "copy", "pad", "reduce_sum",
-    "reshape", "slice", "split", "squeeze", "stack", "transpose", "unstack",
+    "add",
+    "sub",
+    "neg",
+    "add_any",
+    "broadcast_in_dim",
+    "concatenate",
+    "copy",
+    "pad",
+    "reduce_sum",
+    "reshape",
+    "slice",
+    "split",
+    "squeeze",
+    "stack",
+    "transpose",
+    "unstack",
 }
 _FIRST = {"div", "dynamic_slice", "gather"}
 _PRODUCTS = {"mul", "dot_general"}

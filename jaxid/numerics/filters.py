@@ -31,8 +31,7 @@ def butterworth_zero_phase(
     """
     if not 0 < cutoff_hz < rate_hz / 2:
         raise ValueError(
-            f"cutoff_hz = {cutoff_hz:g} must lie between 0 and half the sampling rate, "
-            f"{rate_hz / 2:g} Hz."
+            f"cutoff_hz = {cutoff_hz:g} must lie between 0 and half the sampling rate, {rate_hz / 2:g} Hz."
         )
     sos = scipy.signal.butter(order, cutoff_hz, fs=rate_hz, output="sos")
     # Odd extension over three periods of the cut-off: shorter ones leave a transient at the ends.
@@ -40,9 +39,7 @@ def butterworth_zero_phase(
     return scipy.signal.sosfiltfilt(sos, x, axis=0, padlen=pad)
 
 
-def central_difference(
-    x: Float[np.ndarray, "time k"], period: float
-) -> Float[np.ndarray, "time k"]:
+def central_difference(x: Float[np.ndarray, "time k"], period: float) -> Float[np.ndarray, "time k"]:
     """Second-order central difference, one-sided at the two ends."""
     return np.gradient(x, period, axis=0, edge_order=2)
 
@@ -256,9 +253,7 @@ class Decimator:
         return _through(x, int(32 / self.pass_band), lambda f: jnp.asarray(gain(f)), self.factor)
 
 
-def _through(
-    x: Array, pad: int, response: Callable[[np.ndarray], Array], every: int = 1
-) -> Array:
+def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every: int = 1) -> Array:
     """Pass the columns of x through a response over frequency (cycles a sample), without ends.
 
     Odd extension at both ends keeps value and slope; a half cosine joins them over the rest of
@@ -289,9 +284,7 @@ def _through(
     return jnp.fft.irfft(spectrum, few, axis=0)[first : first - (-n // every)]
 
 
-def delayed(
-    u: Float[Array, "time m"], delay: Array, period: float, *, hold: float
-) -> Float[Array, "time m"]:
+def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: float) -> Float[Array, "time m"]:
     """Mean force around each sample of a command that acts `delay` later.
 
     A command that is held acts from its sample on: seen at the samples it lags by half the time

@@ -1,6 +1,6 @@
 """Estimators as steps: what is to be solved goes out, what was found comes back.
 
-An estimator that is written as a generator of `Solve` can be run alone, or many of them together:
+An estimator that is written as a generator of `SolveRequest` can be run alone, or many of them together:
 those that ask for the same solver at the same shapes are stacked and solved in one compiled call.
 """
 
@@ -20,7 +20,7 @@ from jaxtyping import Array
 T = TypeVar("T")
 
 
-class Solve(NamedTuple):
+class SolveRequest(NamedTuple):
     """A compiled function and its arguments.
 
     Args:
@@ -32,7 +32,7 @@ class Solve(NamedTuple):
     args: tuple
 
 
-class Soon(NamedTuple):
+class Precompile(NamedTuple):
     """What will be asked for later, with other values: it may be compiled beside what runs until then.
 
     Args:
@@ -46,11 +46,11 @@ class Soon(NamedTuple):
     key: Any
 
 
-class Parts(NamedTuple):
+class ParallelCalls(NamedTuple):
     """A compiled function and the arguments of many calls of it, one to a core at a time.
 
     Args:
-        function: As of `Solve`.
+        function: As of `SolveRequest`.
         args: Of each call.
     """
 
@@ -58,10 +58,10 @@ class Parts(NamedTuple):
     args: Sequence[tuple]
 
 
-Steps = Generator[Solve | Soon | Parts, Any, T]
+Steps = Generator[SolveRequest | Precompile | ParallelCalls, Any, T]
 
 
-def alone(steps: Steps[T], behind: Soon | None = None) -> T:
+def run_alone(steps: Steps[T], behind: Precompile | None = None) -> T:
     """Run steps one after the other.
 
     Args:
@@ -74,11 +74,11 @@ def alone(steps: Steps[T], behind: Soon | None = None) -> T:
             asked = steps.send(answer)
         except StopIteration as end:
             return end.value
-        if isinstance(asked, Soon):
+        if isinstance(asked, Precompile):
             _prepare(asked)
             answer = None
             continue
-        if isinstance(asked, Parts):
+        if isinstance(asked, ParallelCalls):
             answer = in_threads(*asked)
             continue
         if behind is not None:
@@ -90,7 +90,7 @@ def alone(steps: Steps[T], behind: Soon | None = None) -> T:
 _PREPARED: set = set()
 
 
-def _prepare(soon: Soon) -> None:
+def _prepare(soon: Precompile) -> None:
     """Call it in a thread of its own: compiling leaves Python's lock alone."""
     if soon.key not in _PREPARED:
         _PREPARED.add(soon.key)
@@ -102,7 +102,7 @@ def _beside() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, thread_name_prefix="jaxid-compile")
 
 
-def _called(soon: Soon) -> None:
+def _called(soon: Precompile) -> None:
     # Who asks for it in earnest gets the error.
     with contextlib.suppress(Exception):
         soon.function(*soon.args)
@@ -134,7 +134,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
+def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     """Run the steps of several runs side by side, what is alike in one compiled call.
 
     Args:
@@ -152,8 +152,8 @@ def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     def advance(k: int, answer: Any) -> None:
         try:
             asked = many[k].send(answer)
-            while not isinstance(asked, Solve):
-                asked = many[k].send(in_threads(*asked) if isinstance(asked, Parts) else None)
+            while not isinstance(asked, SolveRequest):
+                asked = many[k].send(in_threads(*asked) if isinstance(asked, ParallelCalls) else None)
             key, arrays = _parted(asked)
         except StopIteration as end:
             ended[k] = end.value
@@ -175,7 +175,7 @@ def together(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     return [ended[k] for k in range(len(many))]
 
 
-def _parted(asked: Solve) -> tuple[Any, list[np.ndarray]]:
+def _parted(asked: SolveRequest) -> tuple[Any, list[np.ndarray]]:
     """What two runs must share to be solved together, and the arrays of one."""
     leaves, structure = jax.tree.flatten(asked.args)
     arrays = [np.asarray(x) for x in leaves if isinstance(x, _ARRAYS)]

@@ -120,9 +120,7 @@ def _lagged(x: np.ndarray, largest: int) -> np.ndarray:
     return scipy.fft.irfft(np.abs(scipy.fft.rfft(x, size)) ** 2, size)[: largest + 1]
 
 
-def sandwich(
-    jacobian: Float[np.ndarray, "time p"], noise: NoiseModel
-) -> Float[np.ndarray, "p p"]:
+def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[np.ndarray, "p p"]:
     """J' R J with R the covariance of the residual: its colour seen through the regressor."""
     size = scipy.fft.next_fast_len(len(jacobian) + min(len(jacobian), _REMEMBERED), real=True)
     weight = noise.density(size)
@@ -262,9 +260,7 @@ def held(directions: Float[np.ndarray, "p k"]) -> Bool[np.ndarray, " p"]:
     return np.linalg.norm(directions, axis=1) > _NEGLIGIBLE
 
 
-def named_directions(
-    names: Sequence[str], directions: Float[np.ndarray, "p k"]
-) -> list[dict[str, float]]:
+def named_directions(names: Sequence[str], directions: Float[np.ndarray, "p k"]) -> list[dict[str, float]]:
     """Orthonormal directions that nothing tells, as combinations of the unknowns by name."""
     untold = _sparse(directions)
     weight = np.abs(untold)

@@ -37,12 +37,8 @@ class Chain(Plant):
     diagonal = True
 
     mass: Array = parameter("inertia", "positive", "masses, one each", more=0)
-    damping: Array = parameter(
-        "force*time/position", "nonnegative", "damping to ground, one a mass", more=0
-    )
-    stiffness: Array = parameter(
-        "force/position", "nonnegative", "springs, one more than masses", more=1
-    )
+    damping: Array = parameter("force*time/position", "nonnegative", "damping to ground, one a mass", more=0)
+    stiffness: Array = parameter("force/position", "nonnegative", "springs, one more than masses", more=1)
     effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
     actuated: tuple[int, ...] | None = eqx.field(static=True, default=None, kw_only=True)
     gravity: Array = eqx.field(converter=as_array, default=9.81, kw_only=True)
@@ -81,11 +77,11 @@ class Chain(Plant):
         stiffness = jnp.concatenate([jnp.zeros_like(q), self.stiffness])
         return stiffness, jnp.zeros_like(stiffness)
 
-    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+    def joints_loaded_by(self, port: int, joints: int) -> tuple[int, ...]:
         spring = port - joints
         return (port,) if spring < 0 else tuple(i for i in (spring - 1, spring) if 0 <= i < joints)
 
-    def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         what, k = self.place(port)
         name = (_OF_JOINTS if what == "joint" else _OF_SPRINGS).get(effect.kind)
         return None if name is None else (name, k - 1)

@@ -91,8 +91,11 @@ class FiveBar(Plant):
     )
     mass: Array = parameter("inertia", "nonnegative", "of the distal links", more=0, motion="linear")
     inertia: Array = parameter(
-        "inertia", "nonnegative", "I_p1, I_p2 about their fixed joints, I_d1, I_d2 about their centres",
-        more=2, motion="rotary",
+        "inertia",
+        "nonnegative",
+        "I_p1, I_p2 about their fixed joints, I_d1, I_d2 about their centres",
+        more=2,
+        motion="rotary",
     )
     tip_mass: Array = parameter("inertia", "nonnegative", "at the tool", motion="linear")
     reduction: Array | None = parameter(
@@ -214,7 +217,7 @@ class FiveBar(Plant):
     def gearing(self) -> Array | float:
         return 1.0 if self.reduction is None else self.reduction
 
-    def along(self, port: int) -> tuple[int, ...]:
+    def directions(self, port: int) -> tuple[int, ...]:
         return (port, port + 1) if port == _TOOL else (port,)
 
     def place(self, port: int) -> tuple[str, int]:
@@ -224,14 +227,14 @@ class FiveBar(Plant):
     def motion(self, port: int) -> str:
         return "linear" if port >= _TOOL else "rotary"
 
-    def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
+    def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
         if port >= _TOOL:  # a payload
             return effect.kind == "added_mass" and port == _TOOL
         # Nothing that has inertia turns with a passive angle alone.
         alone = port < self.joints or effect.kind not in ("added_mass", "joint_flexibility")
-        return alone and super().offers(effect, port, drives)
+        return alone and super().accepts(effect, port, drives)
 
-    def twin(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
         if effect.kind != "added_mass":
             return None
         return ("tip_mass", None) if port == _TOOL else ("inertia", port) if port < self.joints else None

@@ -89,13 +89,14 @@ class FlexibleAxis(Plant):
     def port_spring(self, q: Array) -> tuple[Array, Array]:
         none = jnp.zeros(2)
         return (
-            jnp.concatenate([none, self.stiffness[None]]), jnp.concatenate([none, self.damping[None]]),
+            jnp.concatenate([none, self.stiffness[None]]),
+            jnp.concatenate([none, self.damping[None]]),
         )
 
-    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+    def joints_loaded_by(self, port: int, joints: int) -> tuple[int, ...]:
         return (port,) if port < joints else (0, 1)
 
-    def twin(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
         if effect.kind == "added_mass" and port < self.joints:
             return _INERTIAS[port], None
         if effect.kind == "linear_stiffness" and port == self.joints:

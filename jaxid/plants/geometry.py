@@ -41,7 +41,7 @@ class Geometry(eqx.Module):
         """Refuse a field that has not an entry of shape `one` for each joint."""
         value, wanted = getattr(self, name), (len(self.joints), *one)
         # Trees that JAX fills with markers of its own pass; arrays count, with axes of a batch before.
-        if isinstance(value, (np.ndarray, Array)) and np.shape(value)[-len(wanted):] != wanted:
+        if isinstance(value, (np.ndarray, Array)) and np.shape(value)[-len(wanted) :] != wanted:
             told = " x ".join(map(str, one)) + " each, " if one else ""
             shape = np.shape(value)
             raise ValueError(f"{name} has shape {shape}; give {told}{len(self.joints)}, one a joint.")

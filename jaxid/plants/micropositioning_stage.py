@@ -62,7 +62,7 @@ class Stage(Plant):
         along = jnp.broadcast_to(self.ratio, (self.ports(q).size - 1,))
         return self.width * jnp.concatenate([jnp.ones(1), along])
 
-    def twin(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
         return (_INERTIAS[port], None) if effect.kind == "added_mass" and port < 2 else None
 
 
@@ -115,12 +115,12 @@ class MicropositioningStage(Stage):
         damping = jnp.zeros(()) if self.damping is None else self.damping
         return jnp.concatenate([none, self.stiffness[None]]), jnp.concatenate([none, damping[None]])
 
-    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+    def joints_loaded_by(self, port: int, joints: int) -> tuple[int, ...]:
         return (port,) if port < joints else (0, 1)
 
-    def twin(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
         of_screw = effect.kind == "linear_stiffness" and port == self.joints
-        return ("stiffness", None) if of_screw else super().twin(effect, port)
+        return ("stiffness", None) if of_screw else super().equivalent_parameter(effect, port)
 
 
 class RigidMicropositioningStage(Stage):
@@ -140,7 +140,7 @@ class RigidMicropositioningStage(Stage):
         return (self.turning + self.ratio**2 * self.table_mass)[None]
 
     @classmethod
-    def parts(cls, joints: int) -> int:
+    def bodies(cls, joints: int) -> int:
         return 2
 
     @property
@@ -153,10 +153,10 @@ class RigidMicropositioningStage(Stage):
     def ports(self, q: Array) -> Array:
         return jnp.stack([q[0], self.ratio * q[0]])
 
-    def offers(self, effect: type[Effect], port: int, drives: int) -> bool:
+    def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
         # Of what one coordinate cannot tell apart: the table's, but for what sits in the drive or at rest.
         at_motor = effect.in_drive or effect.kind == "static_friction"
-        return super().offers(effect, port, drives) and port == (0 if at_motor else 1)
+        return super().accepts(effect, port, drives) and port == (0 if at_motor else 1)
 
 
 # By the coupling that a case states.

@@ -90,13 +90,13 @@ class SerialArm(Plant):
         return ("joint", port + 1) if port < self.joints else ("shaft", port - self.joints + 1)
 
     def motion(self, port: int) -> str:
-        first = self.reached(port, self.joints)[0]
+        first = self.joints_loaded_by(port, self.joints)[0]
         return "rotary" if self.geometry.joints[first] == "revolute" else "linear"
 
-    def reached(self, port: int, joints: int) -> tuple[int, ...]:
+    def joints_loaded_by(self, port: int, joints: int) -> tuple[int, ...]:
         return (port,) if port < joints else tuple(np.flatnonzero(self.shafts[port - joints]).tolist())
 
-    def twin(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         return ("rotor_inertia", port) if effect.kind == "added_mass" and port < self.joints else None
 
     @classmethod

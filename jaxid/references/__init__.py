@@ -27,9 +27,7 @@ __all__ = ["REFERENCES", "Family", "Key", "make_reference"]
 
 REFERENCES: dict[str, Family] = {
     family.kind: family
-    for family in (
-        CSV, TRAPEZOID, BEZIER, QUARTER_SINE, FOURIER, MULTISINE, POINT_TO_POINT, SYNCHRONIZED
-    )
+    for family in (CSV, TRAPEZOID, BEZIER, QUARTER_SINE, FOURIER, MULTISINE, POINT_TO_POINT, SYNCHRONIZED)
 }
 
 
@@ -60,27 +58,25 @@ def make_reference(
     """
     kind = table.get("kind")
     if kind not in REFERENCES:
-        mend = suggest(str(kind), REFERENCES)
+        hint = suggest(str(kind), REFERENCES)
         what = "kind is missing" if kind is None else f"kind = {kind!r} is unknown"
-        raise InputError(what, where=where, mend=mend)
+        raise InputError(what, where=where, hint=hint)
     samples = _samples(rate_hz, duration)
     family = REFERENCES[kind]
     grids = lambda joint: Grid(rate_hz, samples, Path(base_dir), joint, where, plant)
     if family.together:
         return family.sample(family.read(table, where), grids(0))
-    columns = [
-        family.sample(values, grids(joint)) for joint, values in enumerate(family.read(table, where))
-    ]
+    columns = [family.sample(values, grids(joint)) for joint, values in enumerate(family.read(table, where))]
     return np.stack(columns, axis=1)
 
 
 def _samples(rate_hz: float | int, duration: float | int) -> int:
     for name, value, unit in (("sample_rate", rate_hz, "Hz"), ("duration", duration, "s")):
         if not 0 < value < math.inf:
-            mend = f"give a positive number of {unit}"
-            raise InputError(f"{name} = {value} {unit}", where="[simulation]", mend=mend)
+            hint = f"give a positive number of {unit}"
+            raise InputError(f"{name} = {value} {unit}", where="[simulation]", hint=hint)
     samples = round(duration * rate_hz)
     if samples < 2:
-        mend = "raise duration or sample_rate"
-        raise InputError(f"only {samples} sample(s)", where="[simulation]", mend=mend)
+        hint = "raise duration or sample_rate"
+        raise InputError(f"only {samples} sample(s)", where="[simulation]", hint=hint)
     return samples

@@ -27,9 +27,7 @@ def bezier_curve(
     """
     levels = [np.full_like(z, point) for point in points]
     while len(levels) > 1:
-        levels = [
-            (1.0 - z) * one + z * other for one, other in zip(levels[:-1], levels[1:], strict=True)
-        ]
+        levels = [(1.0 - z) * one + z * other for one, other in zip(levels[:-1], levels[1:], strict=True)]
     return levels[0]
 
 
@@ -44,8 +42,8 @@ def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
         points = rest_to_rest(*points)
     rest = grid.duration - values["start_time"]
     if rest <= 0:
-        mend = f"start before {grid.duration:g} s"
-        raise grid.fault(f"start_time = {values['start_time']:g} s is past the end", mend)
+        hint = f"start before {grid.duration:g} s"
+        raise grid.fault(f"start_time = {values['start_time']:g} s is past the end", hint)
     duration = values["duration"] or rest
     z = (grid.time - values["start_time"]) / duration
     if values["repeat"]:

@@ -15,11 +15,11 @@ def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
     for name in names:
         bad = np.flatnonzero(~np.isfinite(data[name]).all(axis=1))
         if bad.size:
-            raise grid.fault(f"{path}, column '{name}', row {bad[0]} is no number", "mend the row")
+            raise grid.fault(f"{path}, column '{name}', row {bad[0]} is no number", "correct the row")
     position = data[values["column"]]
     if position.shape[1] > 1:
-        mend = f"name one of its columns: '{values['column']}[1]'"
-        raise grid.fault(f"{path}: '{values['column']}' is a matrix", mend)
+        hint = f"name one of its columns: '{values['column']}[1]'"
+        raise grid.fault(f"{path}: '{values['column']}' is a matrix", hint)
     if not values["time"]:
         rate = values["sample_rate"] or grid.rate_hz
         return _resample(np.arange(len(position)) / rate, position[:, 0], grid)

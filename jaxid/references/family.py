@@ -76,9 +76,9 @@ class Grid:
         """Time that the samples stand for [s], the last period included."""
         return self.samples / self.rate_hz
 
-    def fault(self, what: str, mend: str) -> InputError:
+    def fault(self, what: str, hint: str) -> InputError:
         """An error that names the table."""
-        return InputError(what, where=self.where, mend=mend)
+        return InputError(what, where=self.where, hint=hint)
 
 
 @dataclass(frozen=True)
@@ -121,15 +121,15 @@ class Family:
         place = f"{where} kind = '{self.kind}'"
         for name in given:
             if name not in self.keys:
-                mend = suggest(name, self.keys)
-                raise InputError(f"unknown key '{name}'", where=place, mend=mend)
+                hint = suggest(name, self.keys)
+                raise InputError(f"unknown key '{name}'", where=place, hint=hint)
         spread = {}
         for name, key in self.keys.items():
             if name in given:
                 spread[name] = _by_joint(name, key, given[name], place)
             elif key.default is REQUIRED:
-                mend = f"add {name}" + (f" [{key.unit}]" if key.unit else "") + f": {key.doc}"
-                raise InputError(f"'{name}' is missing", where=place, mend=mend)
+                hint = f"add {name}" + (f" [{key.unit}]" if key.unit else "") + f": {key.doc}"
+                raise InputError(f"'{name}' is missing", where=place, hint=hint)
             else:
                 spread[name] = [key.default]
         joints = max(len(values) for values in spread.values())
@@ -140,11 +140,10 @@ class Family:
             points = self.keys[name].shape == "points" and values[0] is not None
             count = values[0].shape[1] if points else len(values)
             if count != joints and (points or count != 1):
-                mend = f"{'' if points else 'one value for all, or '}{joints} as in the longest list"
-                raise InputError(f"'{name}' has {count} joints", where=place, mend=mend)
+                hint = f"{'' if points else 'one value for all, or '}{joints} as in the longest list"
+                raise InputError(f"'{name}' has {count} joints", where=place, hint=hint)
         return [
-            {name: values[joint % len(values)] for name, values in spread.items()}
-            for joint in range(joints)
+            {name: values[joint % len(values)] for name, values in spread.items()} for joint in range(joints)
         ]
 
 
@@ -164,8 +163,8 @@ def _by_joint(name: str, key: Key, value: Any, place: str) -> list[Any]:
 def _checked(name: str, key: Key, value: Any, place: str) -> Any:
     if key.shape == "list":
         if not isinstance(value, list | tuple) or len(value) < key.shortest:
-            mend = f"give a list of at least {key.shortest}, or a list of such lists by joint"
-            raise InputError(f"{name} = {value!r} is too short", where=place, mend=mend)
+            hint = f"give a list of at least {key.shortest}, or a list of such lists by joint"
+            raise InputError(f"{name} = {value!r} is too short", where=place, hint=hint)
         return np.array([_number(name, key, one, place) for one in value])
     if key.shape == "range":
         pair = value if isinstance(value, list | tuple) else (value, value)
@@ -173,20 +172,20 @@ def _checked(name: str, key: Key, value: Any, place: str) -> Any:
             low, high = pair if isinstance(value, list | tuple) else (-value, value)
             if low < 0 < high:
                 return np.array([low, high], dtype=float)
-        mend = f"give [lower, upper], the lower negative, or one positive number for both [{key.unit}]"
-        raise InputError(f"{name} = {value!r} is no range about zero", where=place, mend=mend)
+        hint = f"give [lower, upper], the lower negative, or one positive number for both [{key.unit}]"
+        raise InputError(f"{name} = {value!r} is no range about zero", where=place, hint=hint)
     if key.shape == "points":
         return _points(name, key, value, place)
     if key.shape == "flag":
         if not isinstance(value, bool):
-            raise InputError(f"{name} = {value!r} is no flag", where=place, mend="true or false")
+            raise InputError(f"{name} = {value!r} is no flag", where=place, hint="true or false")
         return value
     if key.shape == "text":
         if not isinstance(value, str) or not value:
-            raise InputError(f"{name} = {value!r} is no text", where=place, mend=key.doc)
+            raise InputError(f"{name} = {value!r} is no text", where=place, hint=key.doc)
         if key.choices and value not in key.choices:
-            mend = suggest(value, key.choices)
-            raise InputError(f"{name} = '{value}' is unknown", where=place, mend=mend)
+            hint = suggest(value, key.choices)
+            raise InputError(f"{name} = '{value}' is unknown", where=place, hint=hint)
         return value
     return _number(name, key, value, place)
 
@@ -195,11 +194,11 @@ def _points(name: str, key: Key, value: Any, place: str) -> np.ndarray:
     """A list of points, one number a joint."""
     rows = value if isinstance(value, list | tuple) else ()
     if len(rows) < key.shortest or not all(isinstance(row, list | tuple) and len(row) for row in rows):
-        mend = f"give a list of at least {key.shortest} points, e.g. {name} = [[0.1, 0.2], [0.3, 0.1]]"
-        raise InputError(f"{name} = {value!r} is no list of points", where=place, mend=mend)
+        hint = f"give a list of at least {key.shortest} points, e.g. {name} = [[0.1, 0.2], [0.3, 0.1]]"
+        raise InputError(f"{name} = {value!r} is no list of points", where=place, hint=hint)
     if len({len(row) for row in rows}) > 1:
-        mend = "give each one number a joint"
-        raise InputError(f"the points of {name} are of unlike lengths", where=place, mend=mend)
+        hint = "give each one number a joint"
+        raise InputError(f"the points of {name} are of unlike lengths", where=place, hint=hint)
     return np.array([[_number(name, key, one, place) for one in row] for row in rows], dtype=float)
 
 
@@ -210,11 +209,11 @@ def _is_number(value: Any) -> bool:
 def _number(name: str, key: Key, value: Any, place: str) -> float | int:
     unit = f" {key.unit}" if key.unit else ""
     if not _is_number(value):
-        mend = f"give a finite number [{key.unit or '1'}]"
-        raise InputError(f"{name} = {value!r} is not a number", where=place, mend=mend)
+        hint = f"give a finite number [{key.unit or '1'}]"
+        raise InputError(f"{name} = {value!r} is not a number", where=place, hint=hint)
     if key.shape == "whole" and value != int(value):
-        raise InputError(f"{name} = {value!r} is not whole", where=place, mend="round it")
+        raise InputError(f"{name} = {value!r} is not whole", where=place, hint="round it")
     if value < key.minimum or (key.positive and value <= 0):
         bound = "positive" if key.positive else f"at least {key.minimum:g}{unit}"
-        raise InputError(f"{name} = {value:g}{unit}", where=place, mend=f"it must be {bound}")
+        raise InputError(f"{name} = {value:g}{unit}", where=place, hint=f"it must be {bound}")
     return int(value) if key.shape == "whole" else float(value)

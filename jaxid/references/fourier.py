@@ -14,9 +14,9 @@ def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
         raise grid.fault("neither sine nor cosine is given", "give the coefficients of one of them")
     highest = harmonics * values["base_frequency_hz"]
     if highest >= grid.rate_hz / 2.0:
-        mend = "lower base_frequency_hz, give fewer coefficients or raise the sampling rate"
+        hint = "lower base_frequency_hz, give fewer coefficients or raise the sampling rate"
         what = f"harmonic {harmonics} at {highest:g} Hz is beyond half the sampling rate"
-        raise grid.fault(what, mend)
+        raise grid.fault(what, hint)
     angle = 2.0 * np.pi * values["base_frequency_hz"] * grid.time
     position = np.full(grid.samples, values["offset"])
     for k, coefficient in enumerate(sine, start=1):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, Key
-from jaxid.references.s_curve import Bounds, SCurve, plan_s_curve
+from jaxid.references.s_curve import MotionBounds, SCurve, plan_s_curve
 
 _NO_TIME = 1e-300
 
@@ -48,9 +48,7 @@ class Move:
         return xp.where(clipped <= self.duration / 2.0, covered, self.distance - covered)
 
 
-def plan_move(
-    distance: float, speed: float, acceleration: float, jerk: float = math.inf
-) -> Move | SCurve:
+def plan_move(distance: float, speed: float, acceleration: float, jerk: float = math.inf) -> Move | SCurve:
     """Find the fastest move from rest to rest within limits that are the same in both directions.
 
     Args:
@@ -61,7 +59,7 @@ def plan_move(
     """
     if math.isinf(jerk):
         return plan_trapezoid(distance, speed, acceleration)
-    curve = plan_s_curve(abs(distance), Bounds(speed, acceleration, acceleration, jerk, jerk))
+    curve = plan_s_curve(abs(distance), MotionBounds(speed, acceleration, acceleration, jerk, jerk))
     return curve if distance >= 0 else replace(curve, distance=distance, jerks=-curve.jerks)
 
 
@@ -105,8 +103,8 @@ def string_moves(
             if now == round_start:
                 break  # Nowhere to go: it stands at its only target.
             if now - round_start < 2.0 / grid.rate_hz:
-                mend = "move further, more slowly, or raise the sampling rate"
-                raise grid.fault("a round of the targets takes less than two samples", mend)
+                hint = "move further, more slowly, or raise the sampling rate"
+                raise grid.fault("a round of the targets takes less than two samples", hint)
             round_start = now
     return position
 

@@ -14,16 +14,16 @@ def _lines(values: dict[str, Any], samples: int, grid: Grid) -> np.ndarray:
         raise grid.fault("band_hz must hold two frequencies", "band_hz = [lowest, highest]")
     low, high = values["band_hz"]
     if not 0 <= low < high < grid.rate_hz / 2.0:
-        mend = f"0 <= lowest < highest < {grid.rate_hz / 2.0:g} Hz, half the sampling rate"
-        raise grid.fault(f"band_hz = [{low:g}, {high:g}] Hz is no band", mend)
+        hint = f"0 <= lowest < highest < {grid.rate_hz / 2.0:g} Hz, half the sampling rate"
+        raise grid.fault(f"band_hz = [{low:g}, {high:g}] Hz is no band", hint)
     spacing = grid.rate_hz / samples
     # A bound that is meant to be a line stays one despite its rounding.
     first = max(1, int(np.ceil(low / spacing - 1e-9)))
     harmonics = np.arange(first, int(np.floor(high / spacing + 1e-9)) + 1)
     harmonics = harmonics[harmonics % 2 == 1] if values["odd"] else harmonics
     if not harmonics.size:
-        mend = "widen band_hz or lengthen period"
-        raise grid.fault(f"no line in the band: they are {spacing:g} Hz apart", mend)
+        hint = "widen band_hz or lengthen period"
+        raise grid.fault(f"no line in the band: they are {spacing:g} Hz apart", hint)
     return harmonics
 
 

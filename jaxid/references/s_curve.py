@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-class Bounds(NamedTuple):
+class MotionBounds(NamedTuple):
     """What a motion forwards may do; each positive.
 
     Args:
@@ -62,7 +62,7 @@ class SCurve:
         return np.where(time >= ends[-1], self.distance, way)
 
 
-def plan_s_curve(distance: float, bounds: Bounds) -> SCurve:
+def plan_s_curve(distance: float, bounds: MotionBounds) -> SCurve:
     """Find the fastest motion from rest to rest.
 
     Velocity rises to a peak and falls back to zero. Rise and fall each take three segments, of which the
@@ -106,7 +106,7 @@ def _way(peak: float, limit: float, rise: float, fall: float) -> float:
     return a * (t1**2 / 6 + t1 * t2 / 2 + t2**2 / 2 + (t1 / 2 + t2) * t3 + t3**2 / 3)
 
 
-def _peak(distance: float, bounds: Bounds) -> float:
+def _peak(distance: float, bounds: MotionBounds) -> float:
     """Velocity whose rise and fall cover the way, whatever the limit of velocity."""
     _, gain, loss, rise, fall = bounds
     both, mean = 1 / rise + 1 / fall, 1 / (6 * rise) + 1 / (3 * fall)

@@ -15,11 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, Key
-from jaxid.references.s_curve import Bounds, SCurve, plan_s_curve
+from jaxid.references.s_curve import MotionBounds, SCurve, plan_s_curve
 
 
 def plan_line(
-    way: Float[np.ndarray, " n"], velocity: Float[np.ndarray, "n 2"], acceleration: Float[np.ndarray, "n 2"],
+    way: Float[np.ndarray, " n"],
+    velocity: Float[np.ndarray, "n 2"],
+    acceleration: Float[np.ndarray, "n 2"],
     jerk: Float[np.ndarray, "n 2"],
 ) -> SCurve:
     """The path parameter, from 0 to 1, of the fastest motion along a straight line.
@@ -29,7 +31,7 @@ def plan_line(
         velocity, acceleration, jerk: Lowest (negative) and highest of each joint [position/s and so on].
     """
     lowest, highest = zip(*(_tightest(way, b) for b in (velocity, acceleration, jerk)), strict=True)
-    return plan_s_curve(1.0, Bounds(highest[0], highest[1], lowest[1], highest[2], lowest[2]))
+    return plan_s_curve(1.0, MotionBounds(highest[0], highest[1], lowest[1], highest[2], lowest[2]))
 
 
 def _tightest(way: np.ndarray, bounds: np.ndarray) -> tuple[float, float]:
@@ -54,8 +56,8 @@ def _sample(joints: list[dict[str, Any]], grid: Grid) -> Float[np.ndarray, "samp
             out[first:last] = here + np.outer(curve.position(time[first:last] - now), target - here)
             out[last:] = target
             if curve.duration + own["dwell"] < 2.0 / grid.rate_hz:
-                mend = "move further, more slowly, or raise the sampling rate"
-                raise grid.fault("a motion takes less than two samples", mend)
+                hint = "move further, more slowly, or raise the sampling rate"
+                raise grid.fault("a motion takes less than two samples", hint)
             now, here, still = now + curve.duration, target, 0
         elif own["dwell"] == 0:
             # A round of nowhere to go would last for ever.
@@ -141,7 +143,9 @@ SYNCHRONIZED = Family(
             "corners of a convex region; targets are drawn from it", "position", default=None, shape="points"
         ),
         "coordinates": Key(
-            "what points and corners are of: the joints, or the tool", shape="text", default="joint",
+            "what points and corners are of: the joints, or the tool",
+            shape="text",
+            default="joint",
             choices=("joint", "task"),
         ),
         "velocity": Key("lowest and highest", "position/s", shape="range"),

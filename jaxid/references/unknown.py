@@ -14,7 +14,7 @@ from jaxid.model.unknowns import REFERENCE
 from jaxid.references import REFERENCES
 
 
-class Course(eqx.Module):
+class UnknownReference(eqx.Module):
     """A family of references at its numbers, some of them unknown.
 
     Args:
@@ -32,7 +32,7 @@ class Course(eqx.Module):
     known: tuple[tuple[str, Any], ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, table: Mapping[str, Any], unknown: Mapping[str, float]) -> Course:
+    def of(cls, table: Mapping[str, Any], unknown: Mapping[str, float]) -> UnknownReference:
         """Of a table of a case, and values for what it leaves unknown."""
         family = REFERENCES[table["kind"]]
         (values,) = family.read({**table, **unknown}, f"[{REFERENCE}]")
@@ -41,11 +41,11 @@ class Course(eqx.Module):
         rest = tuple((k, v) for k, v in (values | lists).items() if k not in unknown)
         return cls(numbers, jnp.zeros(1), tuple(unknown), family.kind, rest)
 
-    def at(self, time: Float[Array, " ticks"]) -> Course:
+    def at(self, time: Float[Array, " ticks"]) -> UnknownReference:
         """The same reference at other instants."""
         return replace(self, time=jnp.asarray(time))
 
-    def with_unknowns(self, places: tuple, theta: Float[Array, " p"]) -> Course:
+    def with_unknowns(self, places: tuple, theta: Float[Array, " p"]) -> UnknownReference:
         """The same reference with theta[k] where places[k] is one of its unknowns."""
         own = [k for k, (path, _) in enumerate(places) if path[0] == REFERENCE]
         return replace(self, numbers=jnp.stack([jnp.asarray(theta[k]) for k in own])) if own else self

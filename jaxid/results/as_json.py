@@ -15,7 +15,7 @@ from jaxid.results.proposals import proposal_json
 if TYPE_CHECKING:
     from jaxid.commands.identify import Identification
     from jaxid.discovery.candidates import Candidate
-    from jaxid.discovery.result import Discovery, Found
+    from jaxid.discovery.result import Discovery, NamedEffect
     from jaxid.discovery.score import Score
     from jaxid.estimators.common.derived import Derived
     from jaxid.estimators.estimate import Estimate
@@ -29,15 +29,20 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
     out: dict[str, Any] = {}
     plant = estimate.machine.plant
     rows = zip(
-        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        estimate.machine.parameters.free,
+        estimate.theta,
+        estimate.std,
+        estimate.identifiable,
         strict=True,
     )
     for f, value, std, told in rows:
         if names is not None and f.name not in names:
             continue
         entry = {
-            "value": float(value) if told else None, "std": float(std) if told else None,
-            "unit": f.unit, "identifiable": bool(told),
+            "value": float(value) if told else None,
+            "std": float(std) if told else None,
+            "unit": f.unit,
+            "identifiable": bool(told),
         }
         if f.index is None:
             out[f.name] = entry
@@ -86,9 +91,7 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
         "fit": _one(fit.force.rms),
         "validation": _worst(others, "force.rms"),
         "noise_floor": _one(floor),
-        "relative": {
-            "fit": _one(fit.force.relative), "validation": _worst(others, "force.relative")
-        },
+        "relative": {"fit": _one(fit.force.relative), "validation": _worst(others, "force.relative")},
         "simulation": {
             "unit": units.label("position"),
             "fit": _one(_pick(fit, "simulation.rms")),
@@ -106,7 +109,8 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     if len(others) > 1:
         out["validations"] = {
             g.name: {
-                "force": _one(g.force.rms), "relative": _one(g.force.relative),
+                "force": _one(g.force.rms),
+                "relative": _one(g.force.relative),
                 "simulation": _one(_pick(g, "simulation.rms")),
                 "simulation_relative": _one(_pick(g, "simulation.relative")),
             }
@@ -155,19 +159,24 @@ def recipe_json(session: Session) -> dict[str, Any]:
     if r.derivatives == "parabolic":
         stated["reach"] = r.reach
     return {
-        "cutoff_hz": r.cutoff_hz, "order": r.order, "decimation": r.decimation, "trim": r.trim,
-        "rest_velocity": list(r.rest_velocity), "align_hold": r.align_hold,
-        "derivatives": r.derivatives, **stated,
+        "cutoff_hz": r.cutoff_hz,
+        "order": r.order,
+        "decimation": r.decimation,
+        "trim": r.trim,
+        "rest_velocity": list(r.rest_velocity),
+        "align_hold": r.align_hold,
+        "derivatives": r.derivatives,
+        **stated,
     }
 
 
 def notes(session: Session, estimate: Estimate) -> list[str]:
     """What a reader should know: warnings on the logs, and how the fit was done."""
-    warnings = [f"{f.where}: {f.what}; {f.mend}" for f in session.findings]
+    warnings = [f"{f.where}: {f.what}; {f.hint}" for f in session.findings]
     return [*warnings, *estimate.notes]
 
 
-def effect_json(found: Found, estimate: Estimate) -> dict[str, Any]:
+def effect_json(found: NamedEffect, estimate: Estimate) -> dict[str, Any]:
     """One entry of `effects` in discovery.json."""
     own = parameters_json(estimate, found.names)
     return {
@@ -195,8 +204,11 @@ def where_json(result: Discovery) -> dict[str, Any] | None:
     if w is None:
         return None
     return {
-        "joint": w.joint, "variable": w.variable, "region": list(w.region),
-        "intervals": [list(i) for i in w.intervals], "text": w.text,
+        "joint": w.joint,
+        "variable": w.variable,
+        "region": list(w.region),
+        "intervals": [list(i) for i in w.intervals],
+        "text": w.text,
         "frequency_hz": w.frequency_hz,
     }
 
@@ -215,7 +227,8 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "effects": [effect_json(e, result.after) for e in result.effects],
         "experiments": [proposal_json(p, units) for p in result.proposals],
         "steps": [
-            step_json(r, result.session.machine.plant) for k, r in enumerate(result.rounds)
+            step_json(r, result.session.machine.plant)
+            for k, r in enumerate(result.rounds)
             # The baseline, and what changed it; the last round mostly adds nothing.
             if k == 0 or r.step.added or r.step.dropped
         ],
@@ -237,7 +250,8 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
             },
         },
         "parameters": {
-            k: v for k, v in parameters_json(result.after).items()
+            k: v
+            for k, v in parameters_json(result.after).items()
             if any(n == k or n.startswith(f"{k}[") for n in own)
         },
         **derived_json(result.session, result.after),
@@ -285,18 +299,19 @@ def step_json(r: Any, plant: Plant) -> dict[str, Any]:
     out = {
         "added": step.added.candidate.kind if step.added else None,
         **(_place(changed, plant) if changed else {}),
-        "fit": _one(r.fit), "validation": _one(r.validation),
+        "fit": _one(r.fit),
+        "validation": _one(r.validation),
     }
     if step.dropped is not None:
         out["dropped"] = step.dropped.kind
     return out
 
 
-def save_identification(result: Identification, folder: Path, *, force: bool = False) -> Path:
+def save_identification(result: Identification, folder: Path, *, overwrite: bool = False) -> Path:
     """Write result.json and report.html."""
     from jaxid.results.report.build import identification_report
 
-    ready_folder(folder, ["result.json", "report.html"], force=force)
+    ready_folder(folder, ["result.json", "report.html"], overwrite=overwrite)
     write_whole(folder / "report.html", identification_report(result))
     write_json(folder / "result.json", identification_json(result))
     return folder
@@ -307,11 +322,11 @@ def discovery_files(result: Discovery) -> list[str]:
     return ["discovery.json", "report.html", *[p.file for p in result.proposals if p.separates]]
 
 
-def save_discovery(result: Discovery, folder: Path, *, force: bool = False) -> Path:
+def save_discovery(result: Discovery, folder: Path, *, overwrite: bool = False) -> Path:
     """Write discovery.json, report.html and a CSV for every experiment that is proposed."""
     from jaxid.results.report.build import discovery_report
 
-    ready_folder(folder, discovery_files(result), force=force)
+    ready_folder(folder, discovery_files(result), overwrite=overwrite)
     for proposal in result.proposals:
         if proposal.separates:
             write_whole(folder / proposal.file, signal_csv(proposal.signal, proposal.time, proposal.values))

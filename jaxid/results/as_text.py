@@ -30,7 +30,10 @@ def parameter_lines(estimate: Estimate, derived: Sequence[Derived] = ()) -> str:
     """Value, standard deviation and unit of every parameter, and of what follows from them."""
     rows = [["parameter", "value", "std", "unit"]]
     for f, value, std, told in zip(
-        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        estimate.machine.parameters.free,
+        estimate.theta,
+        estimate.std,
+        estimate.identifiable,
         strict=True,
     ):
         shown = with_std(value, std) if told else ("-", "this log cannot tell it")
@@ -56,8 +59,12 @@ def identification_table(result: Identification) -> str:
         ["force", _number(gap["fit"]), _number(gap["validation"]), gap["unit"]],
         ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
         ["noise floor", _number(gap["noise_floor"]), "", gap["unit"]],
-        ["simulated position", _number(simulation["fit"]), _number(simulation["validation"]),
-         simulation["unit"]],
+        [
+            "simulated position",
+            _number(simulation["fit"]),
+            _number(simulation["validation"]),
+            simulation["unit"],
+        ],
     ]
     told = parameter_lines(estimate, results.derived(result.session, result.estimate))
     notes = _notes(results.notes(result.session, estimate))

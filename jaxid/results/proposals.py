@@ -62,7 +62,8 @@ def _bounds(b: Limits | Peaks) -> dict[str, Any]:
     stroke = np.stack([b.low, b.high], axis=1)
     return {
         "stroke": stroke[0].tolist() if len(stroke) == 1 else stroke.tolist(),
-        "speed": _one(b.speed), "force": _one(b.force),
+        "speed": _one(b.speed),
+        "force": _one(b.force),
     }
 
 
@@ -70,5 +71,3 @@ def _one(x: np.ndarray) -> float | list[float]:
     """A number where there is one joint, a list where there are several."""
     values = [float(v) for v in np.ravel(x)]
     return values[0] if len(values) == 1 else values
-
-

@@ -102,8 +102,12 @@ class InertialSensors(eqx.Module):
         return jnp.concatenate(out)
 
     def fused(
-        self, plant: Plant, q: Float[Array, " n"], readings: Float[Array, " count"],
-        velocity: Float[Array, " n"], acceleration: Float[Array, " n"],
+        self,
+        plant: Plant,
+        q: Float[Array, " n"],
+        readings: Float[Array, " count"],
+        velocity: Float[Array, " n"],
+        acceleration: Float[Array, " n"],
     ) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, ""]]:
         """Velocity and acceleration of all joints, and whether the readings tell them.
 

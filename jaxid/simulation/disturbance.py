@@ -52,13 +52,13 @@ def disturbance_at(
 def _column(name: str, times: np.ndarray, log: Log | None) -> np.ndarray:
     where = f"disturbance = '{name}'"
     if log is None:
-        mend = "give { level, on, off, start } in its place"
-        raise InputError("a column needs a log to stand in", where=where, mend=mend)
+        hint = "give { level, on, off, start } in its place"
+        raise InputError("a column needs a log to stand in", where=where, hint=hint)
     values = read_columns(log.source, [name], log.rows)[0][name]
     if not np.isfinite(values).all():
         row = log.rows[0] + int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-        mend = "mend that row, or cut it out with rows"
-        raise InputError(f"row {row} is not a number", where=f"{log.source}, {where}", mend=mend)
+        hint = "correct that row, or cut it out with rows"
+        raise InputError(f"row {row} is not a number", where=f"{log.source}, {where}", hint=hint)
     # A tick belongs to the sample at its own instant, however that is rounded.
     held = np.searchsorted(log.time, times + 1e-3 * log.period, side="right") - 1
     return values[np.clip(held, 0, len(values) - 1)]

@@ -42,8 +42,16 @@ class ForceData(eqx.Module):
         """Arrays of a prepared log; weight one for `rows`, by default every moving sample."""
         rows = data.moving if rows is None else rows
         return cls(
-            data.q, data.qd, data.qdd, data.force, rows.astype(np.float64),
-            np.asarray(data.start), data.period, data.hold, data.recipe.decimator, data.measured,
+            data.q,
+            data.qd,
+            data.qdd,
+            data.force,
+            rows.astype(np.float64),
+            np.asarray(data.start),
+            data.period,
+            data.hold,
+            data.recipe.decimator,
+            data.measured,
             data.steps,
         )
 
@@ -59,9 +67,7 @@ def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
 def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array, Array]:
     """Position, velocity and acceleration of all joints, also of those without an encoder, (time, n)."""
     times = data.start + data.period * jnp.arange(data.q.shape[0])
-    return complete_motion(
-        plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps
-    )
+    return complete_motion(plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps)
 
 
 @eqx.filter_jit

@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 
 from jaxid.controllers import Controller, Tick
 from jaxid.dynamics.dry_friction import set_valued_step
-from jaxid.dynamics.rhs import State, acceleration, affine_flow, course, step, vector_field
+from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, step, vector_field
 from jaxid.model.plant import Plant
 from jaxid.sensors.encoder import Sensor
-from jaxid.simulation.solvers import RELATIVE, Adaptive
+from jaxid.simulation.solvers import RELATIVE, AdaptiveStep
 
 if TYPE_CHECKING:
     import diffrax
@@ -40,7 +40,7 @@ class Trajectory(eqx.Module):
         velocity: (time, n).
         command: Logged command, (time, m), before the declared gain.
         reading: Position as the sensor reports it, (time, n).
-        found: What a law that identifies had found, see `Controller.told`; else None.
+        found: What a law that identifies had found, see `Controller.learned`; else None.
     """
 
     position: Float[Array, "time n"]
@@ -69,7 +69,7 @@ class Drive(eqx.Module):
     substeps: int = eqx.field(static=True, default=1)
     set_valued: bool = eqx.field(static=True, default=False)
     longest_delay: int = eqx.field(static=True, default=0)
-    solver: Adaptive | None = None
+    solver: AdaptiveStep | None = None
 
     def stepper(
         self, plant: Plant, x: State, ends: tuple[Array, ...]
@@ -92,13 +92,13 @@ class Drive(eqx.Module):
 
         def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
             if not self.set_valued:
-                return step(plant, x, course(ends), t, h)
+                return step(plant, x, hold_polynomial(ends), t, h)
             bound = None if flow is None else lambda x, *reaction: flow(x, ends, *reaction)
-            return set_valued_step(plant, x, course(ends), t, h, bound)[0]
+            return set_valued_step(plant, x, hold_polynomial(ends), t, h, bound)[0]
 
         def several(x: State, ends: tuple[Array, ...], t: Array) -> State:
             def inner(x: State, k: Array) -> tuple[State, None]:
-                part = [course(ends)((k + i) / self.substeps) for i in range(len(ends))]
+                part = [hold_polynomial(ends)((k + i) / self.substeps) for i in range(len(ends))]
                 return one(x, tuple(part), t + k * h), None
 
             return jax.lax.scan(inner, x, jnp.arange(self.substeps, dtype=jnp.float64))[0]
@@ -156,9 +156,7 @@ def open_loop(
     return Trajectory(q, v, command, reading)
 
 
-def interval_forces(
-    plant: Plant, drive: Drive, command: Float[Array, "time m"]
-) -> tuple[Array, Array]:
+def interval_forces(plant: Plant, drive: Drive, command: Float[Array, "time m"]) -> tuple[Array, Array]:
     """Declared force at the start and the end of every interval, delay applied.
 
     A delay that is no whole number of samples is averaged over the interval: taken literally, a
@@ -245,7 +243,7 @@ def closed_loop(
         force, past = _delayed_force(plant, drive, u, past)
         new = advance(x, (force,), t)
         last = None if last is None else sensor.read_command(u, noise[n : n + m])
-        return (new, memory, past, last, held, moved), (x.q, x.qd, u, reading, controller.told(memory))
+        return (new, memory, past, last, held, moved), (x.q, x.qd, u, reading, controller.learned(memory))
 
     fresh = None if sensor.hold == 1 else jnp.arange(len(times)) % sensor.hold == 0
     measures = noise is not None and noise.shape[1] > n and sensor.force_noise is not None

@@ -19,11 +19,11 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
-from jaxid.references.unknown import Course
+from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
-from jaxid.simulation.solvers import Adaptive
+from jaxid.simulation.solvers import AdaptiveStep
 from jaxid.simulation.step_size import needed_steps
 
 # Ticks of past command that a delay in a loop may reach back.
@@ -66,7 +66,7 @@ class Replay(eqx.Module):
         drive: How the command acts.
         controller: The law; None: open loop.
         sensor: What the controller reads.
-        reference, disturbance: By drive, at every tick (closed loop); a `Course` where it has unknowns.
+        reference, disturbance: By drive, at every tick (closed loop); an `UnknownReference` has unknowns.
         command: Logged command (open loop), refined where it is band-limited.
         position, velocity: At the start.
         restart: Flags, positions and velocities of segments (open loop).
@@ -77,7 +77,7 @@ class Replay(eqx.Module):
     drive: Drive
     controller: Controller | None
     sensor: Sensor
-    reference: Array | Course | None
+    reference: Array | UnknownReference | None
     disturbance: Array | None
     command: Array | None
     position: Float[Array, " n"]
@@ -97,9 +97,15 @@ class Replay(eqx.Module):
         if nudge is not None:
             q, v = q + nudge[: q.size], v + nudge[q.size :]
         if self.controller is not None:
-            reference = self.reference() if isinstance(self.reference, Course) else self.reference
+            reference = self.reference() if isinstance(self.reference, UnknownReference) else self.reference
             run = closed_loop(
-                plant, self.drive, self.controller, reference, self.disturbance, q, v,
+                plant,
+                self.drive,
+                self.controller,
+                reference,
+                self.disturbance,
+                q,
+                v,
                 self.sensor,
             )
         else:
@@ -112,7 +118,7 @@ class Replay(eqx.Module):
 
     def following(self, places: tuple, theta: Float[Array, " p"]) -> Replay:
         """The same run with what is unknown of its reference at theta."""
-        if not isinstance(self.reference, Course):
+        if not isinstance(self.reference, UnknownReference):
             return self
         return replace(self, reference=self.reference.with_unknowns(places, theta))
 
@@ -142,7 +148,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
             f"{log.source}: one sample every {log.period:g} s is no whole multiple of the "
             f"controller's period {period:g} s; resample the log or correct [controller] period."
         )
-    if log.reference is None and machine.course is None:
+    if log.reference is None and machine.unknown_reference is None:
         raise InputError(
             f"{log.source}: the loop cannot be simulated without a reference; name its column "
             "as reference in [log], or leave out [controller] to simulate from the measured force."
@@ -155,7 +161,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         )
     ticks = log.time[0] + period * np.arange((log.samples - 1) * every + 1)
     if log.reference is None:
-        reference, times = machine.course.at(ticks - log.time[0]), ticks
+        reference, times = machine.unknown_reference.at(ticks - log.time[0]), ticks
     elif every == 1:
         reference, times = log.reference, log.time
     else:
@@ -165,8 +171,16 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         reference, times = curve(np.minimum(ticks, log.time[-1])), ticks
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
-        _drive(machine, log, numerics, period, "zero_order"), machine.controller,
-        machine.sensor.mean, reference, disturbance, None, *start, None, every, follow,
+        _drive(machine, log, numerics, period, "zero_order"),
+        machine.controller,
+        machine.sensor.mean,
+        reference,
+        disturbance,
+        None,
+        *start,
+        None,
+        every,
+        follow,
     )
 
 
@@ -174,10 +188,15 @@ def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: 
     solver = None
     if numerics.solver is not None:
         sizes = float(np.std(log.filled, axis=0).max()), float(machine.plant.velocity_scale)
-        solver = Adaptive.sized(numerics.solver, *sizes)
+        solver = AdaptiveStep.sized(numerics.solver, *sizes)
     return Drive(
-        machine.gain, period, hold, numerics.substeps,
-        numerics.sticks, numerics.longest_delay, solver,
+        machine.gain,
+        period,
+        hold,
+        numerics.substeps,
+        numerics.sticks,
+        numerics.longest_delay,
+        solver,
     )
 
 
@@ -216,9 +235,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     if replay.controller is not None or replay.restart is not None:
         return replay
     count = min(samples, log.samples)
-    short = eqx.tree_at(
-        lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1]
-    )
+    short = eqx.tree_at(lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1])
     nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
     n = replay.position.size
     moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
@@ -257,7 +274,16 @@ def _open(
         seen = list(log.measured)
         restart = flags, start[0] + (q - start[0])[:, seen] @ follow.T, v[:, seen] @ follow.T
     return Replay(
-        drive, None, machine.sensor.mean, None, None, command, *start, restart, every, follow,
+        drive,
+        None,
+        machine.sensor.mean,
+        None,
+        None,
+        command,
+        *start,
+        restart,
+        every,
+        follow,
     )
 
 

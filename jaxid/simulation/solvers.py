@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxid.dynamics.rhs import State, course, derivative
+from jaxid.dynamics.rhs import State, derivative, hold_polynomial
 from jaxid.errors import InputError, suggest
 from jaxid.model.plant import Plant
 
@@ -33,7 +33,7 @@ _NEAR_ZERO = 0.1
 _MOST_STEPS = 4096
 
 
-class Adaptive(eqx.Module):
+class AdaptiveStep(eqx.Module):
     """A diffrax solver under step-size control, differentiable forward.
 
     Args:
@@ -45,19 +45,17 @@ class Adaptive(eqx.Module):
     absolute: Float[Array, ""]
 
     @classmethod
-    def sized(cls, name: str, *sizes: float) -> Adaptive:
+    def sized(cls, name: str, *sizes: float) -> AdaptiveStep:
         """The solver of that name for a motion of such position and velocity.
 
         Raises:
             InputError: If there is no such solver.
         """
         if name not in SOLVERS:
-            raise InputError(f"solver {name!r} is not known", mend=suggest(name, SOLVERS))
+            raise InputError(f"solver {name!r} is not known", hint=suggest(name, SOLVERS))
         return cls(name, jnp.asarray(_NEAR_ZERO * RELATIVE * min(sizes), dtype=jnp.float64))
 
-    def __call__(
-        self, plant: Plant, x: State, ends: tuple[Array, ...], t: Array, h: Array
-    ) -> State:
+    def __call__(self, plant: Plant, x: State, ends: tuple[Array, ...], t: Array, h: Array) -> State:
         """State at t + h.
 
         Args:
@@ -73,10 +71,18 @@ class Adaptive(eqx.Module):
 
         solver = getattr(diffrax, SOLVERS[self.name])()
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(_rate), solver, 0.0, h, h, x, (plant, ends, t, h),
+            diffrax.ODETerm(_rate),
+            solver,
+            0.0,
+            h,
+            h,
+            x,
+            (plant, ends, t, h),
             saveat=diffrax.SaveAt(t1=True),
             stepsize_controller=diffrax.PIDController(rtol=RELATIVE, atol=self.absolute),
-            adjoint=diffrax.ForwardMode(), max_steps=_MOST_STEPS, throw=False,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=_MOST_STEPS,
+            throw=False,
         )
         good = solution.result == diffrax.RESULTS.successful
         return jax.tree.map(lambda y: jnp.where(good, y[0], jnp.nan), solution.ys)
@@ -84,4 +90,4 @@ class Adaptive(eqx.Module):
 
 def _rate(since: Array, x: State, args: tuple) -> State:
     plant, ends, t, h = args
-    return derivative(plant, x, course(ends)(since / h), t + since)
+    return derivative(plant, x, hold_polynomial(ends)(since / h), t + since)

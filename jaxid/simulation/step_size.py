@@ -47,13 +47,15 @@ def needed_steps(machine: Machine, log: Log) -> int:
     steps = float(_fastest(machine.plant, q, u)) * period / _FINE
     if not np.isfinite(steps):
         raise TooStiffError(
-            "the plant's forces have no finite slope where the log begins to move", where=log.source,
-            mend="check the guesses, and effects of your own at velocity zero",
+            "the plant's forces have no finite slope where the log begins to move",
+            where=log.source,
+            hint="check the guesses, and effects of your own at velocity zero",
         )
     if steps > _MOST_STEPS:
         raise TooStiffError(
-            f"the plant would need {steps:.2g} integration steps every {period:.3g} s", where=log.source,
-            mend="an inertia that is far too small, or a stiffness or damping far too large, does "
+            f"the plant would need {steps:.2g} integration steps every {period:.3g} s",
+            where=log.source,
+            hint="an inertia that is far too small, or a stiffness or damping far too large, does "
             "that: check the guesses, or declare less",
         )
     return _rounded(max(1, int(np.ceil(steps))))
@@ -112,7 +114,7 @@ def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
     return worst
 
 
-def calmed(plant: Plant, q: Float[Array, " n"], period: float) -> Plant:
+def with_numerical_damping(plant: Plant, q: Float[Array, " n"], period: float) -> Plant:
     """The plant with damping beside springs that ring faster than samples can show.
 
     Args:
@@ -139,6 +141,6 @@ def calmed(plant: Plant, q: Float[Array, " n"], period: float) -> Plant:
     return plant
 
 
-def steps_when_calmed(steps: int, on: str) -> int:
+def steps_with_numerical_damping(steps: int, on: str) -> int:
     """Of the steps that a ring would ask for, those that do once it was calmed; `on`: what is compared."""
     return max(1, int(np.ceil((_COARSEST if on == "force" else _COARSER) * steps)))

@@ -47,8 +47,9 @@ def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...
     noises = [float(x) for x in setting.get("noise", (1.0,))]
     if not {"position_noise", "force_noise"} & set(case.sensor) and set(noises) != {1.0}:
         raise InputError(
-            "there is no noise to multiply", where=f"{case.path}, [study] noise",
-            mend="give position_noise or force_noise in [sensor]",
+            "there is no noise to multiply",
+            where=f"{case.path}, [study] noise",
+            hint="give position_noise or force_noise in [sensor]",
         )
     others = [name for name in SETTINGS[:-1] if name in setting]
     for name in (*others, "noise"):
@@ -56,12 +57,13 @@ def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...
         twice = next((x for x in values if values.count(x) > 1), None)
         if twice is not None:
             raise InputError(
-                f"{twice:g} stands there twice", where=f"{case.path}, [study] {name}", mend="once is enough"
+                f"{twice:g} stands there twice", where=f"{case.path}, [study] {name}", hint="once is enough"
             )
     if "sample_rate" in others and _follows_rate(case):
         raise InputError(
             "the file's samples have no time of their own, and would be played faster or slower",
-            where=f"{case.path}, [study] sample_rate", mend="give its time or sample_rate beside its kind",
+            where=f"{case.path}, [study] sample_rate",
+            hint="give its time or sample_rate beside its kind",
         )
     levels = []
     for values in itertools.product(*[[float(x) for x in setting[name]] for name in others]):

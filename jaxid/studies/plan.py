@@ -64,9 +64,7 @@ class Plan:
     seed: int
 
     @classmethod
-    def of(
-        cls, case: Case, *, runs: int | None = None, seed: int = 0, workers: int | None = None
-    ) -> Plan:
+    def of(cls, case: Case, *, runs: int | None = None, seed: int = 0, workers: int | None = None) -> Plan:
         """The study of a case.
 
         Args:
@@ -82,13 +80,13 @@ class Plan:
         """
         setting, where = case.study, str(case.path)
         if not 0 <= seed < 2**31:
-            raise InputError(f"the seed is {seed}", mend="give one from 0 to 2147483647")
+            raise InputError(f"the seed is {seed}", hint="give one from 0 to 2147483647")
         draw = float(setting.get("draw", 0.0))
         model = _without(case, setting.get("hidden", ()))
         levels = levels_of(case, model, float(np.exp(_FARTHEST * draw)))
         if not levels[0].machine.parameters.free:
             raise InputError(
-                "nothing is unknown", where=where, mend="give at least one parameter as { guess = ... }"
+                "nothing is unknown", where=where, hint="give at least one parameter as { guess = ... }"
             )
         estimators = tuple(setting.get("estimators", ("output_error",)))
         for method in estimators:
@@ -98,7 +96,7 @@ class Plan:
                 need_consistent(method, case)
         runs = int(setting.get("runs", _RUNS) if runs is None else runs)
         if runs < 1:
-            raise InputError(f"{runs} runs", where=where, mend="give one or more")
+            raise InputError(f"{runs} runs", where=where, hint="give one or more")
         chunk = int(setting.get("chunk", _fitting(levels, runs, workers or at_once())))
         start_spread = float(setting.get("start_spread", 0.0))
         return cls(case, levels, estimators, draw, start_spread, runs, chunk, seed)
@@ -173,12 +171,19 @@ class Plan:
 
         packages = ("jaxid", "jax", "jaxlib", "numpy", "scipy")
         return {
-            "case": self.case.path.name, "fingerprint": fingerprint(self.case),
-            "estimators": list(self.estimators), "hidden": list(self.case.study.get("hidden", ())),
-            **self.settings, "draw": self.draw,
-            "start_spread": self.start_spread, "runs": self.runs, "chunk": self.chunk,
-            "seed": self.seed, "parameters": self.names,
-            "layout": _LAYOUT, "versions": {p: version(p) for p in packages},
+            "case": self.case.path.name,
+            "fingerprint": fingerprint(self.case),
+            "estimators": list(self.estimators),
+            "hidden": list(self.case.study.get("hidden", ())),
+            **self.settings,
+            "draw": self.draw,
+            "start_spread": self.start_spread,
+            "runs": self.runs,
+            "chunk": self.chunk,
+            "seed": self.seed,
+            "parameters": self.names,
+            "layout": _LAYOUT,
+            "versions": {p: version(p) for p in packages},
         }
 
 
@@ -186,11 +191,11 @@ def _need_learner(case: Case, scene: Scene) -> None:
     """Refuse to ask a law what it found that does not identify, or that knows what is to be hidden."""
     law, where = scene.machine.controller, f"{case.path}, [study] estimators"
     if law is None or "estimator" not in law.of_machine:
-        mend = 'take [controller] kind = "adaptive", or leave in_loop out'
-        raise InputError("in_loop: no law identifies in this case", where=where, mend=mend)
+        hint = 'take [controller] kind = "adaptive", or leave in_loop out'
+        raise InputError("in_loop: no law identifies in this case", where=where, hint=hint)
     if case.study.get("hidden"):
         what = "in_loop: the law has the whole case for its model, and nothing is hidden from it"
-        raise InputError(what, where=where, mend="leave hidden out")
+        raise InputError(what, where=where, hint="leave hidden out")
 
 
 def _without(case: Case, hidden: tuple[str, ...]) -> Case:
@@ -198,8 +203,9 @@ def _without(case: Case, hidden: tuple[str, ...]) -> Case:
     for kind in hidden:
         if kind not in kinds:
             raise InputError(
-                f"{kind!r} is not among the effects of this case", where=f"{case.path}, [study] hidden",
-                mend=f"name what is to be hidden from the model: {', '.join(kinds)}",
+                f"{kind!r} is not among the effects of this case",
+                where=f"{case.path}, [study] hidden",
+                hint=f"name what is to be hidden from the model: {', '.join(kinds)}",
             )
     return replace(case, effects=tuple(e for e in case.effects if e.cls.kind not in hidden))
 

@@ -46,16 +46,18 @@ class Bundle:
         case, files = plan.case, {}
         if fingerprint(load_case(case.path)) != fingerprint(case):
             raise InputError(
-                "is not the case that was given", where=str(case.path),
-                mend="write what was changed in Python to the file: workers read it",
+                "is not the case that was given",
+                where=str(case.path),
+                hint="write what was changed in Python to the file: workers read it",
             )
         for path in (case.path, *named_files(case)):
             try:
                 name = path.resolve().relative_to(case.folder.resolve())
             except ValueError:
                 raise InputError(
-                    f"names {path}, which other machines do not have", where=str(case.path),
-                    mend="put it beside the case, and name it without its folder",
+                    f"names {path}, which other machines do not have",
+                    where=str(case.path),
+                    hint="put it beside the case, and name it without its folder",
                 ) from None
             files[name.as_posix()] = path.read_bytes()
         return cls(case.path.name, files, plan.runs, plan.chunk, plan.seed, plan.manifest)
@@ -76,7 +78,7 @@ class Bundle:
             own, wanted = plan.manifest["versions"], self.manifest["versions"]
         if own != wanted:
             raise InputError(
-                f"a worker has {own} where {wanted} belong", mend="install the same on every machine"
+                f"a worker has {own} where {wanted} belong", hint="install the same on every machine"
             )
         return plan
 
@@ -110,7 +112,7 @@ class Remote:
             from distributed import Client
         except ImportError:
             raise InputError(
-                "--scheduler needs Dask's distributed", mend="install jaxid with its extra: jaxid[scheduler]"
+                "--scheduler needs Dask's distributed", hint="install jaxid with its extra: jaxid[scheduler]"
             ) from None
         self.client = None
         try:
@@ -120,7 +122,7 @@ class Remote:
             what = "no scheduler answers" if self.client is None else "there is no worker"
             self.__exit__()
             raise InputError(
-                f"{what} at {self.address}: {error}", mend="give its address, as it prints it"
+                f"{what} at {self.address}: {error}", hint="give its address, as it prints it"
             ) from error
         return self
 
@@ -150,5 +152,5 @@ class Remote:
         except (KilledWorker, CancelledError, CommClosedError) as error:
             raise InputError(
                 f"the workers at {self.address} are lost: {error}",
-                mend="what is done is kept: see what ended them, then --resume",
+                hint="what is done is kept: see what ended them, then --resume",
             ) from error

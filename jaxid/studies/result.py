@@ -58,7 +58,9 @@ class Study:
         if "tracking_rms" not in self.table:
             return []
         sizes = lambda x: {
-            "median": float(np.median(x)), "most_95": float(np.percentile(x, 95)), "worst": float(np.max(x))
+            "median": float(np.median(x)),
+            "most_95": float(np.percentile(x, 95)),
+            "worst": float(np.max(x)),
         }
         rows = []
         for setting, own in conditions(self.table):
@@ -99,7 +101,8 @@ class Study:
         return [
             {"estimator": estimator, **setting, "what": str(what), "runs": runs}
             for estimator, setting, own in cells(self.table)
-            for what, runs in Counter(own["named"].values.tolist()).most_common() if what
+            for what, runs in Counter(own["named"].values.tolist()).most_common()
+            if what
         ]
 
     def __str__(self) -> str:
@@ -107,15 +110,15 @@ class Study:
 
         return study_table(self)
 
-    def save(self, folder: str | Path, *, force: bool = False) -> Path:
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write `study.nc` (NetCDF), `summary.json` and `report.html` to a folder.
 
         Raises:
-            InputError: If the folder holds what jaxid did not make and `force` is not given.
+            InputError: If the folder holds what jaxid did not make and `overwrite` is not given.
         """
         from jaxid.results.report.study import study_report
 
-        folder = ready_folder(Path(folder), FILES, force=force)
+        folder = ready_folder(Path(folder), FILES, overwrite=overwrite)
         write_whole(folder / "study.nc", bytes(self.table.to_netcdf(engine="scipy")))
         words = {"case": self.title, "seconds": self.seconds}
         words |= {"rows": self.summary, "failures": self.failures, "named": self.named}
@@ -170,8 +173,10 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
             "unit": (("parameter",), np.array([f.unit for f in free], dtype=object)),
         },
         coords={
-            "estimator": np.array(plan.estimators, dtype=object), **settings,
-            "run": np.arange(plan.runs, dtype=np.int32), "parameter": np.array(plan.names, dtype=object),
+            "estimator": np.array(plan.estimators, dtype=object),
+            **settings,
+            "run": np.arange(plan.runs, dtype=np.int32),
+            "parameter": np.array(plan.names, dtype=object),
         },
         attrs={"case": plan.case.path.name, "seed": plan.seed},
     )
@@ -228,8 +233,11 @@ def _moments(error: np.ndarray, std: np.ndarray) -> dict[str, float]:
     widths = {c: scipy.stats.norm.ppf(0.5 + 0.5 * c) for c in COVERAGES}
     held = {c: np.where(np.isfinite(std), np.abs(error) <= w * std, np.nan) for c, w in widths.items()}
     return {
-        "bias": float(np.mean(error)), "bias_std": spread / np.sqrt(len(error)), "spread": spread,
-        "rmse": float(np.sqrt(np.mean(error**2))), "std": float(np.mean(std)),
+        "bias": float(np.mean(error)),
+        "bias_std": spread / np.sqrt(len(error)),
+        "spread": spread,
+        "rmse": float(np.sqrt(np.mean(error**2))),
+        "std": float(np.mean(std)),
         **{f"coverage_{_percent(c)}": float(np.mean(x)) for c, x in held.items()},
     }
 

@@ -14,7 +14,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.logs.prepare import Recipe
-from jaxid.numerics.lanes import Steps, alone, together
+from jaxid.numerics.lanes import Steps, run_alone, run_batched
 from jaxid.session import Session, session_around
 from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics
@@ -53,12 +53,12 @@ class Runner:
     def _chosen(self, level: int) -> Ways:
         """As `identify` would choose on the log of the nominal machine."""
         at = self.plan.levels[level]
-        log = alone(at.scene.virtual(at.scene.machine, self.plan.drawn(0)[2])).log
+        log = run_alone(at.scene.simulated_log(at.scene.machine, self.plan.drawn(0)[2])).log
         session = session_around(at.model, at.machine, log)
         if not set(SIMULATING) & set(self.plan.estimators):
             return Ways(session.recipe, None)
         first = inverse_dynamics(session.machine, session.fit.data)
-        machine = first.machine if first.told else session.machine
+        machine = first.machine if first.all_identified else session.machine
         return Ways(session.recipe, choose_numerics(machine, log))
 
     def chunk(self, number: int) -> Arrays:
@@ -72,7 +72,7 @@ class Runner:
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
         ways = self.ways(level) if self.plan.fits else None
-        found = together([self._run(level, k, ways) for k in runs], self.plan.lanes)
+        found = run_batched([self._run(level, k, ways) for k in runs], self.plan.lanes)
         # Whatever ends a run, in a library too, ends that run only.
         found = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
         out = {name: np.stack([row[name] for row in found], axis=1) for name in (*_BY_METHOD, "tracking")}
@@ -87,15 +87,19 @@ class Runner:
         truth, start, rng = plan.drawn(number)
         machine = at.machine.with_estimate(start)
         rows = []
-        virtual = yield from at.scene.virtual(at.scene.machine.with_estimate(truth), rng)
+        simulated_log = yield from at.scene.simulated_log(at.scene.machine.with_estimate(truth), rng)
         # What is unknown of a reference is not in the log.
-        log = virtual.log if machine.course is None else replace(virtual.log, reference=None)
+        log = (
+            simulated_log.log
+            if machine.unknown_reference is None
+            else replace(simulated_log.log, reference=None)
+        )
         session = None if ways is None else session_around(at.model, machine, log, ways.recipe)
         for method in plan.estimators:
             options = {"numerics": ways.numerics} if method in SIMULATING else {}
             try:
                 if method == IN_LOOP:
-                    rows.append(_told(plan, virtual.trajectory))
+                    rows.append(_told(plan, simulated_log.trajectory))
                     continue
                 if method == DISCOVER:
                     aligned = replace(ways.recipe, align_hold=True)
@@ -105,9 +109,9 @@ class Runner:
                 rows.append(_row((yield from steps_of(method, session, **options))))
             except Exception as error:
                 rows.append(_failed(plan, _words(error)))
-        driven = machine.plant.driven(virtual.trajectory.position.shape[1])
-        followed = np.asarray(virtual.trajectory.position)[:: at.scene.every, list(driven)]
-        return _stacked(rows, _tracking(virtual.log.reference, followed))
+        driven = machine.plant.driven(simulated_log.trajectory.position.shape[1])
+        followed = np.asarray(simulated_log.trajectory.position)[:: at.scene.every, list(driven)]
+        return _stacked(rows, _tracking(simulated_log.log.reference, followed))
 
     def _all_failed(self, error: Exception) -> Arrays:
         drives = 0 if self.plan.machine.controller is None else self.plan.machine.gain.size
@@ -121,9 +125,12 @@ _BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message"
 def _row(estimate: Estimate) -> Arrays:
     told = estimate.identifiable & np.all(np.isfinite(estimate.theta))
     return {
-        "estimate": np.where(told, estimate.theta, np.nan), "std": np.where(told, estimate.std, np.nan),
-        "identifiable": told, "converged": np.asarray(estimate.converged),
-        "steps": np.asarray(estimate.steps), "message": np.asarray(estimate.message),
+        "estimate": np.where(told, estimate.theta, np.nan),
+        "std": np.where(told, estimate.std, np.nan),
+        "identifiable": told,
+        "converged": np.asarray(estimate.converged),
+        "steps": np.asarray(estimate.steps),
+        "message": np.asarray(estimate.message),
         "named": np.asarray(""),
     }
 
@@ -134,7 +141,9 @@ def _told(plan: Plan, run: Trajectory) -> Arrays:
     row = _failed(plan, "" if closed else "the law never trusted what it found")
     told = np.full(len(theta), closed) & np.isfinite(theta)
     return row | {
-        "estimate": np.where(told, theta, np.nan), "identifiable": told, "converged": np.asarray(closed),
+        "estimate": np.where(told, theta, np.nan),
+        "identifiable": told,
+        "converged": np.asarray(closed),
     }
 
 
@@ -168,8 +177,12 @@ def _words(error: Exception) -> str:
 def _failed(plan: Plan, why: str) -> Arrays:
     none = np.full(len(plan.names), np.nan)
     return {
-        "estimate": none, "std": none, "identifiable": np.zeros(len(none), bool),
-        "converged": np.asarray(False), "steps": np.asarray(0), "message": np.asarray(why),
+        "estimate": none,
+        "std": none,
+        "identifiable": np.zeros(len(none), bool),
+        "converged": np.asarray(False),
+        "steps": np.asarray(0),
+        "message": np.asarray(why),
         "named": np.asarray(""),
     }
 

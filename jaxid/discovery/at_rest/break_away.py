@@ -24,7 +24,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
-from jaxid.session import Run
+from jaxid.session import OpenedLog
 from jaxid.simulation.loops import Drive, open_loop
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError, needed_steps
@@ -78,7 +78,7 @@ class BreakAway:
 
 
 def break_away(
-    estimate: Estimate, runs: Sequence[Run], joints: Sequence[int] = (0,)
+    estimate: Estimate, runs: Sequence[OpenedLog], joints: Sequence[int] = (0,)
 ) -> list[BreakAway | str]:
     """Level of break-away friction above Coulomb's that the starts from rest of some logs ask for.
 
@@ -230,8 +230,14 @@ def _runs(
 
         def one(s: Starts) -> Array:
             run = open_loop(
-                now, drive, s.command, s.rest, s.velocity, start=s.time,
-                own=(*s.own, *[None] * few), past=s.past,
+                now,
+                drive,
+                s.command,
+                s.rest,
+                s.velocity,
+                start=s.time,
+                own=(*s.own, *[None] * few),
+                past=s.past,
             )
             e = s.position[:, joint] - run.position[:, joint]
             at_rest = jnp.arange(e.size) < s.still
@@ -276,9 +282,7 @@ class _Fit:
         """Usual RMS of a start's residual, at least the sensor's noise."""
         return float(max(np.sqrt(np.median(np.mean(self.e**2, axis=1))), self.noise))
 
-    def losses(
-        self, spread: float, train: np.ndarray, test: np.ndarray
-    ) -> tuple[np.ndarray, float]:
+    def losses(self, spread: float, train: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, float]:
         """Twice the negative log-likelihood of each of some starts after a fit to others.
 
         Heavy-tailed: a rest that was none must not decide.
@@ -324,8 +328,13 @@ def _judge(levels: np.ndarray, fits: list[_Fit], times: np.ndarray) -> BreakAway
     step = float(np.gradient(levels[order]) @ weight)
     variance = float((levels[order] - level) ** 2 @ weight) + step**2 / 12
     return BreakAway(
-        level, float(np.sqrt(variance)), 0.5 * float(np.sum(old - new)),
-        float(-np.log(_FALSE_POSITIVE)), _closed(old, new), times, count,
+        level,
+        float(np.sqrt(variance)),
+        0.5 * float(np.sum(old - new)),
+        float(-np.log(_FALSE_POSITIVE)),
+        _closed(old, new),
+        times,
+        count,
     )
 
 

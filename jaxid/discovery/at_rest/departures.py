@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxid.controllers import Controller, Tick
-from jaxid.dynamics.residuals import drive_own_states
+from jaxid.dynamics.residuals import integrate_internal_states
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
-from jaxid.session import Run
+from jaxid.session import OpenedLog
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.force_balance import ForceData
 
@@ -74,13 +74,11 @@ class Starts(eqx.Module):
         """With the last start repeated, so that one compiled shape serves any number."""
         more = count - len(self.time)
         spread = eqx.tree_at(lambda s: s.still, self, jnp.full(len(self.time), self.still))
-        return jax.tree.map(
-            lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]), spread
-        )
+        return jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]), spread)
 
 
 def starts_from_rest(
-    machine: Machine, runs: Sequence[Run], noise: Float[np.ndarray, " n"], joints: Sequence[int]
+    machine: Machine, runs: Sequence[OpenedLog], noise: Float[np.ndarray, " n"], joints: Sequence[int]
 ) -> tuple[list[list[Starts]], list[int]]:
     """Find where joints leave a rest, by a lax and by a strict notion of one.
 
@@ -130,7 +128,14 @@ def _joined(cuts: list[Starts]) -> Starts:
 
 
 def _cut(
-    own: tuple, log: Log, data: Prepared, noise: float, still: int, length: int, lead: int, joint: int,
+    own: tuple,
+    log: Log,
+    data: Prepared,
+    noise: float,
+    still: int,
+    length: int,
+    lead: int,
+    joint: int,
     most: int,
 ) -> Starts:
     after = length - still
@@ -142,10 +147,15 @@ def _cut(
     rest[:, joint] = log.position[rows[:, :still], joint].mean(axis=1)
     velocity[:, joint] = 0.0
     return Starts(
-        jnp.asarray(log.force[earlier]), jnp.asarray(log.force[rows]), jnp.asarray(log.position[rows]),
-        jnp.asarray(rest), jnp.asarray(velocity),
-        jnp.asarray(log.time[rows[:, 0]] - log.time[0]), jax.tree.map(lambda a: a[rows[:, 0]], own),
-        jnp.asarray(still), jnp.zeros(len(rows), int),
+        jnp.asarray(log.force[earlier]),
+        jnp.asarray(log.force[rows]),
+        jnp.asarray(log.position[rows]),
+        jnp.asarray(rest),
+        jnp.asarray(velocity),
+        jnp.asarray(log.time[rows[:, 0]] - log.time[0]),
+        jax.tree.map(lambda a: a[rows[:, 0]], own),
+        jnp.asarray(still),
+        jnp.zeros(len(rows), int),
     )
 
 
@@ -162,9 +172,7 @@ def _stills(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
     return [max(_STILL, 1 + 2 * int(np.ceil(min(h, _LONGEST / 2)))) for h in halves]
 
 
-def _departures(
-    q: Float[np.ndarray, " time"], noise: float, still: int, after: int
-) -> np.ndarray:
+def _departures(q: Float[np.ndarray, " time"], noise: float, still: int, after: int) -> np.ndarray:
     """Last samples of rests that are followed by motion."""
     if len(q) <= still + after:
         return np.zeros(0, int)
@@ -182,7 +190,7 @@ def _own_states(plant: Plant, data: ForceData) -> tuple:
     """Own states of the effects along a log, under the command as it acts."""
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
-    return drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
+    return integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
 
 
 def _acted(machine: Machine, log: Log) -> np.ndarray:
@@ -206,7 +214,10 @@ def _acted(machine: Machine, log: Log) -> np.ndarray:
 
 @eqx.filter_jit
 def _commands(
-    controller: Controller, driven: tuple[int, ...], position: Array, reference: Array,
+    controller: Controller,
+    driven: tuple[int, ...],
+    position: Array,
+    reference: Array,
     disturbance: Array,
 ) -> Array:
     def tick(memory: tuple, now: tuple) -> tuple[tuple, Array]:

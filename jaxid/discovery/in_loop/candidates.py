@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.discovery.candidates import Candidate, Union
+from jaxid.discovery.candidates import Candidate, CandidateModel
 from jaxid.discovery.score import Score
-from jaxid.discovery.superset import build_union
+from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where
 from jaxid.effects.coupling import Backlash, JointFlexibility
 from jaxid.effects.friction import StaticFriction
@@ -24,11 +24,11 @@ from jaxid.estimators.within_prior.problem import Problem, read
 from jaxid.estimators.within_prior.rounding import drawn_roundings
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import Session
 from jaxid.simulation.replay import Replay
-from jaxid.simulation.step_size import calmed
+from jaxid.simulation.step_size import with_numerical_damping
 
 # A smooth loop of fixed steps cannot take these in.
 _LEFT_OUT = (StaticFriction, Backlash, JointFlexibility)
@@ -45,7 +45,7 @@ _LAGS = 10
 
 
 @dataclass(frozen=True)
-class Fit:
+class LoopFit:
     """A fit within the prior.
 
     Args:
@@ -65,18 +65,16 @@ class Fit:
     minimum: Minimum
 
     @classmethod
-    def of(
-        cls, session: Session, machine: Machine, widths: dict[str, float], estimate: Estimate
-    ) -> Fit:
+    def of(cls, session: Session, machine: Machine, widths: dict[str, float], estimate: Estimate) -> LoopFit:
         """With the point anew: what rounding does on average was taken off the estimate."""
         stated, log = session.case.output_error, session.fit.log
         numerics, on = choose_numerics(machine, log), stated.get("on", "position")
         problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
         point = problem.prior.inward(problem.padded(estimate.theta))
-        here = alone(read(problem, problem.ladder[-1], point))
+        here = run_alone(read(problem, problem.ladder[-1], point))
         problem, here = problem.weighed(here)
         noise = problem.noise(here, len(estimate.details["directions"]))
-        point, here, _ = alone(most_probable(problem, noise, point))
+        point, here, _ = run_alone(most_probable(problem, noise, point))
         return cls(machine, widths, estimate, problem, point, here)
 
     @property
@@ -86,7 +84,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Look:
+class LinearTrial:
     """A candidate at one start, in the loop: what it adds to the residual, over the noise.
 
     Args:
@@ -104,7 +102,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Begin:
+class StartPoint:
     """Where a fit with a candidate begins.
 
     Args:
@@ -134,7 +132,7 @@ class Loop:
     """
 
     session: Session
-    union: Union
+    union: CandidateModel
     problem: Problem
     point: Float[np.ndarray, " q"]
     residual: Float[np.ndarray, " rows"]
@@ -142,13 +140,13 @@ class Loop:
     sigma: float
 
     @classmethod
-    def of(cls, session: Session, fit: Fit) -> Loop:
+    def of(cls, session: Session, fit: LoopFit) -> Loop:
         """Of what a fit within a prior found."""
         sigma, point, here = fit.noise, fit.point, fit.minimum
         # Sizes of motion from all samples: those of a short log may hardly leave its rest.
         data = replace(session.fit.data, moving=np.ones_like(session.fit.data.moving))
         searched = [e for e in session.case.searched if e not in _LEFT_OUT]
-        union = build_union(fit.estimate.machine, data, searched)
+        union = build_candidate_model(fit.estimate.machine, data, searched)
         residual = np.concatenate([np.asarray(here.residual).ravel() / sigma, point])
         base = np.concatenate([np.asarray(here.jacobian) / sigma, np.eye(point.size)])
         return cls(session, union, fit.problem, point, residual, base, sigma)
@@ -171,7 +169,7 @@ class Loop:
         e = self.sigma * self.residual[: self.samples].reshape(weight.shape)[:, counts] / weight[:, counts]
         return np.sqrt(np.mean(e**2, axis=0))
 
-    def looks(self) -> list[Look]:
+    def looks(self) -> list[LinearTrial]:
         """Every candidate at each of its starts; what cannot be simulated there is left out."""
         out = []
         free = self.union.machine.parameters.free
@@ -181,15 +179,15 @@ class Loop:
             for k in range(len(c.starts)):
                 e, columns = self._at(c, c.starts[k] if drive else c.probe(k), self.point)
                 if drive:
-                    look = Look(c, k, e - self.residual, columns * _size(c.starts[k]), False)
+                    look = LinearTrial(c, k, e - self.residual, columns * _size(c.starts[k]), False)
                 else:
                     strength = columns @ np.where(c.amplitude, c.starts[k], 0.0)
-                    look = Look(c, k, np.zeros_like(e), strength[:, None], positive)
+                    look = LinearTrial(c, k, np.zeros_like(e), strength[:, None], positive)
                 if np.all(np.isfinite(look.columns)) and np.all(np.isfinite(look.offset)):
                     out.append(look)
         return out
 
-    def begins(self, c: Candidate, looks: list[Look]) -> list[Begin]:
+    def begins(self, c: Candidate, looks: list[LinearTrial]) -> list[StartPoint]:
         """Where looks at a candidate lead when they are simulated, the lowest first; those that lead down."""
         own = [x for x in looks if x.candidate is c]
         found = zip(own, self._gains(own, self.residual[:, None]), strict=True)
@@ -201,12 +199,12 @@ class Loop:
             for part in _PARTS:
                 values, point = self._along(look, part * step[:, 0]), self.point + part * moved
                 e, _ = self._at(c, values, point)
-                each.append(Begin(look.start, values, point, float(np.nan_to_num(e @ e, nan=np.inf))))
+                each.append(StartPoint(look.start, values, point, float(np.nan_to_num(e @ e, nan=np.inf))))
             out.append(min(each, key=lambda b: b.squares))
         out.sort(key=lambda b: b.squares)
         return [b for b in out if b.squares < self.residual @ self.residual] or out[:1]
 
-    def _along(self, look: Look, step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def _along(self, look: LinearTrial, step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Values of a candidate's unknowns where a step of its look leads."""
         c, start = look.candidate, look.candidate.starts[look.start]
         if c.amplitude.any():
@@ -219,7 +217,7 @@ class Loop:
         moved = np.where(grows, start * np.exp(np.where(grows, step, 0.0)), start + _size(start) * step)
         return np.clip(moved, lower, upper)
 
-    def gained(self, after: Fit, before: Fit) -> float:
+    def gained(self, after: LoopFit, before: LoopFit) -> float:
         """Nats by which a log and the base's guesses are likelier with another effect."""
         ratio, (then, now) = after.minimum.cost / before.minimum.cost, (before.point, after.point)
         known = len(self.problem.places)
@@ -227,9 +225,7 @@ class Loop:
         guesses = then[:known] @ then[:known] - now[:known] @ now[:known]
         return 0.5 * float(guesses - self.samples * np.log(ratio))
 
-    def _at(
-        self, c: Candidate, values: np.ndarray, point: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _at(self, c: Candidate, values: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residual with a candidate at some values, and its derivatives in them, over the noise."""
         theta = self.theta.copy()
         theta[self.union.base] = np.asarray(self.problem.prior.outward(point))[: len(self.union.base)]
@@ -238,7 +234,7 @@ class Loop:
         directions = np.zeros((len(theta), max(len(c.index) for c in self.union.candidates)))
         directions[c.index, np.arange(len(c.index))] = 1.0
         p, log = self.problem, self.session.fit.log
-        plant = calmed(self.union.machine.plant, jnp.asarray(log.filled[0]), log.period)
+        plant = with_numerical_damping(self.union.machine.plant, jnp.asarray(log.filled[0]), log.period)
         plant = replace(plant, sharpness=p.ladder[-1])
         args = (p.replay, self.union.machine.parameters.places, plant, p.measured, p.weight, p.on)
         e, columns = _columns(*args, theta, directions)
@@ -246,7 +242,7 @@ class Loop:
         slope[: self.samples] = np.asarray(columns)[:, : len(c.index)] / self.sigma
         return np.concatenate([np.asarray(e) / self.sigma, point]), slope
 
-    def scored(self, looks: list[Look]) -> list[Score]:
+    def scored(self, looks: list[LinearTrial]) -> list[Score]:
         """Best start of every candidate by what it gains, the most first."""
         best: dict[int, Score] = {}
         for look, (gain, step) in zip(looks, self._gains(looks, self.residual[:, None]), strict=True):
@@ -256,7 +252,7 @@ class Loop:
                 best[id(c)] = score
         return sorted(best.values(), key=lambda s: -s.evidence)
 
-    def threshold(self, looks: list[Look]) -> tuple[float, bool]:
+    def threshold(self, looks: list[LinearTrial]) -> tuple[float, bool]:
         """Evidence that noise alone reaches once in a thousand searches; whether the residual is noise."""
         white = self._white()
         left = lambda e: (e - self.base @ self._giving_way(e))[: self.samples]
@@ -306,7 +302,7 @@ class Loop:
         return np.linalg.solve(self.base.T @ self.base, self.base.T @ e)
 
     def _gains(
-        self, looks: list[Look], residuals: Float[np.ndarray, "rows k"]
+        self, looks: list[LinearTrial], residuals: Float[np.ndarray, "rows k"]
     ) -> list[tuple[Float[np.ndarray, " k"], Float[np.ndarray, "own k"]]]:
         """Gain in log-likelihood of each look on some residuals, and its own steps."""
         squares = lambda e: np.sum((e - self.base @ self._giving_way(e)) * e, axis=0)
@@ -339,7 +335,13 @@ class Loop:
 
 @eqx.filter_jit
 def _columns(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, on: str, theta: Array,
+    replay: Replay,
+    places: tuple,
+    plant: Plant,
+    measured: Array,
+    weight: Array,
+    on: str,
+    theta: Array,
     directions: Array,
 ) -> tuple[Array, Array]:
     residual = lambda t: output_residual(replay, places, plant, measured, weight, on)(t).ravel()

@@ -8,7 +8,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.search import Search
 from jaxid.gap import simulated
 from jaxid.machine import Machine
-from jaxid.session import Run, Session
+from jaxid.session import OpenedLog, Session
 
 # An effect hinders where the simulated loop without it is nearer by so much: mean logarithm of the
 # relative gaps in position and command over all logs.
@@ -40,7 +40,7 @@ def hindering(search: Search, session: Session, final: Machine) -> cand.Candidat
     return search.added[worst] if nearer[worst] > _NEARER else None
 
 
-def _distance(machine: Machine, runs: list[Run]) -> float:
+def _distance(machine: Machine, runs: list[OpenedLog]) -> float:
     """Mean logarithm of the relative gaps in the loop, over the columns of a log and then the logs.
 
     A log from which the simulation runs away counts as far as one may be and still be a simulation.

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.discovery.candidates import Candidate, effect_at
-from jaxid.discovery.in_loop.candidates import Begin, Fit, Look, Loop
-from jaxid.discovery.result import Discovery, Found, Round
+from jaxid.discovery.in_loop.candidates import LinearTrial, Loop, LoopFit, StartPoint
+from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.estimators import steps_of
@@ -24,7 +24,7 @@ from jaxid.estimators.within_prior.fit import directions_steps
 from jaxid.gap import gaps, noise_floor
 from jaxid.machine import Machine
 from jaxid.model.unknowns import Free, free_effect
-from jaxid.numerics.lanes import alone
+from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session
 
 # So many candidates are fitted for good, the most promising first: those that a linear look gives this part
@@ -35,9 +35,7 @@ _AS_GOOD = 2.0
 UNSEEN = "a fit within a prior looks at the loop alone"
 
 
-def explore_within(
-    session: Session, *, max_effects: int, progress: Callable[[str], None]
-) -> Discovery:
+def explore_within(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
     """`discover` for a case with `[output_error] prior`.
 
     Args:
@@ -49,9 +47,9 @@ def explore_within(
         InputError: If the loop cannot be simulated, or a guess is zero.
     """
     progress("fitting what is there")
-    first = alone(steps_of("output_error", session))
-    before = after = Fit.of(session, session.machine, {}, first)
-    effects: list[Found] = []
+    first = run_alone(steps_of("output_error", session))
+    before = after = LoopFit.of(session, session.machine, {}, first)
+    effects: list[NamedEffect] = []
     rounds = []
     added: Score | None = None
     while True:
@@ -91,19 +89,17 @@ def explore_within(
 
 
 def _refitted(
-    loop: Loop, base: Fit, score: Score, looks: list[Look]
-) -> tuple[Score, Fit, Found]:
+    loop: Loop, base: LoopFit, score: Score, looks: list[LinearTrial]
+) -> tuple[Score, LoopFit, NamedEffect]:
     """The best fit within the prior with an effect beside the rest, and what it gains."""
     fits = [_fitted(loop, base, score.candidate, begin) for begin in loop.begins(score.candidate, looks)]
     gained, begin, fit = max(fits, key=lambda f: f[0])
     refitted = replace(score, start=begin.start, guess=begin.values, evidence=gained)
     c, own = score.candidate, fit.machine.parameters.names[len(loop.union.base) :]
-    return refitted, fit, Found(c.kind, c.label, fit.machine.plant.place(c.port), own, refitted, ())
+    return refitted, fit, NamedEffect(c.kind, c.label, fit.machine.plant.place(c.port), own, refitted, ())
 
 
-def _fitted(
-    loop: Loop, base: Fit, c: Candidate, begin: Begin
-) -> tuple[float, Begin, Fit]:
+def _fitted(loop: Loop, base: LoopFit, c: Candidate, begin: StartPoint) -> tuple[float, StartPoint, LoopFit]:
     machine = base.machine
     plant, free = free_effect(machine.plant, effect_at(loop.union, c, begin.values), machine.units)
     machine = machine.with_plant(plant, machine.parameters.extended(free))
@@ -114,16 +110,27 @@ def _fitted(
 
 
 def _fit(
-    session: Session, machine: Machine, widths: dict[str, float], begin: Float[np.ndarray, " p"], *,
+    session: Session,
+    machine: Machine,
+    widths: dict[str, float],
+    begin: Float[np.ndarray, " p"],
+    *,
     drawn: bool,
-) -> Fit:
+) -> LoopFit:
     """A fit within the prior from some values of the unknowns; `drawn`: as of `directions_steps`."""
     stated = session.case.output_error
-    found = alone(directions_steps(
-        machine, session.fit.log, prior=stated["prior"], on=stated.get("on", "position"), widths=widths,
-        begin=begin, drawn=drawn,
-    ))
-    return Fit.of(session, machine, widths, found)
+    found = run_alone(
+        directions_steps(
+            machine,
+            session.fit.log,
+            prior=stated["prior"],
+            on=stated.get("on", "position"),
+            widths=widths,
+            begin=begin,
+            drawn=drawn,
+        )
+    )
+    return LoopFit.of(session, machine, widths, found)
 
 
 def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:

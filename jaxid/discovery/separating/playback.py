@@ -13,7 +13,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.screen import Screen
 from jaxid.discovery.selection import TIE_NATS, TIE_PART
-from jaxid.discovery.separating.rivals import Bench, Pair
+from jaxid.discovery.separating.rivals import Experiment, Pair
 from jaxid.experiment_design.limits import Peaks
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Recipe, prepare
@@ -42,7 +42,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Stage:
+class Playback:
     """What it takes to play an experiment through.
 
     Args:
@@ -53,7 +53,7 @@ class Stage:
         floor: Standard deviation of white noise on the command, in its units.
     """
 
-    bench: Bench
+    bench: Experiment
     machine: Machine
     recipe: Recipe
     sensor: Sensor
@@ -71,7 +71,7 @@ class Stage:
         parts = [np.concatenate([np.asarray(getattr(r, n)) for r in runs]) for n in _MOTION]
         return Peaks.of(*parts)
 
-    def outcomes(self, union: cand.Union, pair: Pair, signal: np.ndarray) -> list[Outcome]:
+    def outcomes(self, union: cand.CandidateModel, pair: Pair, signal: np.ndarray) -> list[Outcome]:
         """What the search would find: first where the named effect is true, then the other."""
         rng = np.random.default_rng(20240501)
         noise = rng.standard_normal((len(signal), self.bench.start.size))
@@ -91,7 +91,7 @@ class Stage:
         log = Log(times, np.asarray(run.reading), command, hold=self.machine.hold, source="rehearsal")
         return self.recipe.cleaned(log)
 
-    def _outcome(self, union: cand.Union, pair: Pair, log: Log) -> Outcome:
+    def _outcome(self, union: cand.CandidateModel, pair: Pair, log: Log) -> Outcome:
         if not np.all(np.isfinite(log.position)):
             return Outcome(0.0, TIE_NATS)
         data = prepare(log, self.machine.gain, self.recipe, self.machine.hold_period)
@@ -102,11 +102,11 @@ _MOTION = ("position", "velocity", "command")
 
 
 @eqx.filter_jit
-def _played(bench: Bench, plant: Plant, sensor: Sensor, signal: Array, noise: Array) -> Trajectory:
+def _played(bench: Experiment, plant: Plant, sensor: Sensor, signal: Array, noise: Array) -> Trajectory:
     return bench.run(plant, signal, sensor, noise)
 
 
-def compared(union: cand.Union, pair: Pair, samples: cand.Samples, *, refit: bool = True) -> Outcome:
+def compared(union: cand.CandidateModel, pair: Pair, samples: cand.Samples, *, refit: bool = True) -> Outcome:
     """Evidence in a log for the first of a pair over the second.
 
     Args:
@@ -134,7 +134,7 @@ def compared(union: cand.Union, pair: Pair, samples: cand.Samples, *, refit: boo
     return Outcome(nats, max(TIE_NATS, TIE_PART * abs(total)))
 
 
-def exact(bench: Bench, substeps: int) -> Bench:
+def exact(bench: Experiment, substeps: int) -> Experiment:
     """The same experiment with dry friction that sticks."""
     drive = replace(bench.drive, set_valued=True, substeps=substeps)
     return eqx.tree_at(lambda b: b.drive, bench, drive)

@@ -13,10 +13,10 @@ from jaxtyping import Float
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.score import Score
-from jaxid.discovery.separating.playback import Outcome, Stage, compared, exact
-from jaxid.discovery.separating.rivals import Bench, Duel, Pair, loss
+from jaxid.discovery.separating.playback import Outcome, Playback, compared, exact
+from jaxid.discovery.separating.rivals import Experiment, ModelPair, Pair, loss
 from jaxid.experiment_design.improve import improved
-from jaxid.experiment_design.limits import Bounds, Limits, Peaks, kept_within
+from jaxid.experiment_design.limits import LimitCost, Limits, Peaks, kept_within
 from jaxid.experiment_design.shapes import Shapes, basis
 from jaxid.numerics.precision import NoiseModel
 from jaxid.sensors.encoder import Sensor
@@ -27,7 +27,7 @@ from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError, needed_steps
 
 if TYPE_CHECKING:
-    from jaxid.discovery.result import Found
+    from jaxid.discovery.result import NamedEffect
     from jaxid.discovery.search import Search
 
 # Ticks of the longest signal that is optimised: a longer log is met by a shorter experiment.
@@ -102,7 +102,7 @@ def _plain(kind: str) -> str:
 
 
 def proposals(
-    session: Session, search: Search, effects: tuple[Found, ...], progress: Callable[[str], None]
+    session: Session, search: Search, effects: tuple[NamedEffect, ...], progress: Callable[[str], None]
 ) -> tuple[Proposal, ...]:
     """An experiment for every effect that has alternatives.
 
@@ -146,7 +146,7 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
     stage = _stage(session, search, pair, bench)
     shapes, starts = _family(session, limits, bench)
     best, outcome, peaks = None, None, None
-    for p in _optimised(starts, bench, Duel.of(rounded), shapes, limits):
+    for p in _optimised(starts, bench, ModelPair.of(rounded), shapes, limits):
         fitting = kept_within(limits, shapes, p, lambda signal: stage.peaks(pair, signal))
         if fitting is None:
             continue
@@ -159,28 +159,36 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
     tick = bench.drive.period
     ticks = len(shapes.basis)
     return Proposal(
-        own.label, rival.candidate.label, tuple(pair.plant.place(p) for p in pair.ports),
-        "input" if bench.controller is None else "reference", tick * np.arange(ticks), best,
+        own.label,
+        rival.candidate.label,
+        tuple(pair.plant.place(p) for p in pair.ports),
+        "input" if bench.controller is None else "reference",
+        tick * np.arange(ticks),
+        best,
         np.asarray(bench.start if best is None else bench.start_of(best[0])),
-        present.nats, outcome.nats, outcome.needed, limits, peaks,
+        present.nats,
+        outcome.nats,
+        outcome.needed,
+        limits,
+        peaks,
     )
 
 
-def _bench(session: Session, search: Search, pair: Pair) -> tuple[Pair, Bench]:
+def _bench(session: Session, search: Search, pair: Pair) -> tuple[Pair, Experiment]:
     """How an experiment runs in its design, and the rivals with a sign round enough for it."""
     machine, log, data = session.machine, session.fit.log, session.fit.data
     tick = machine.hold_period or log.period
     delayed = "input_delay" in pair.kinds or any(e.kind == "input_delay" for e in pair.plant.effects)
     hold = machine.hold if machine.controller is None else "zero_order"
     drive = Drive(
-        jnp.asarray(machine.gain), tick, "linear" if hold == "band_limited" else hold,
+        jnp.asarray(machine.gain),
+        tick,
+        "linear" if hold == "band_limited" else hold,
         longest_delay=_DELAYS if delayed and machine.controller is not None else 0,
     )
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
-    asked = lambda of: max(
-        needed_substeps(of.model(k), drive, q, jnp.zeros_like(q), u) for k in range(2)
-    )
+    asked = lambda of: max(needed_substeps(of.model(k), drive, q, jnp.zeros_like(q), u) for k in range(2))
     rounded = pair.rounder(max(1.0, asked(pair) / _SMOOTH))
     e, _ = cand.evaluate(search.union, search.samples, pair.thetas[0], ())
     noise = [NoiseModel.fit(x, c, _ORDER) for x, c in zip(e.T, search.samples.moving.T, strict=True)]
@@ -189,15 +197,20 @@ def _bench(session: Session, search: Search, pair: Pair) -> tuple[Pair, Bench]:
         if n.innovation == 0.0:  # a joint that never moved in what the search looks at
             continue
         row[: 1 + len(n.coefficients)] = np.array([1.0, *-n.coefficients]) / n.innovation
-    return rounded, Bench(
-        replace(drive, substeps=asked(rounded)), machine.controller, jnp.asarray(log.position[0]),
+    return rounded, Experiment(
+        replace(drive, substeps=asked(rounded)),
+        machine.controller,
+        jnp.asarray(log.position[0]),
         tuple(int(i) for i in machine.plant.at_drives(np.arange(log.position.shape[1]))),
-        max(1, round(log.period / tick)), log.period, ForceData.of(data),
-        jnp.asarray(data.recipe.rest_velocity), jnp.asarray(whiten),
+        max(1, round(log.period / tick)),
+        log.period,
+        ForceData.of(data),
+        jnp.asarray(data.recipe.rest_velocity),
+        jnp.asarray(whiten),
     )
 
 
-def _stage(session: Session, search: Search, pair: Pair, bench: Bench) -> Stage:
+def _stage(session: Session, search: Search, pair: Pair, bench: Experiment) -> Playback:
     """Play an experiment through with the sensors' noise, or as much more as the log shows."""
     machine, log, recipe = session.machine, session.fit.log, session.recipe
     sensor = machine.sensor
@@ -213,10 +226,10 @@ def _stage(session: Session, search: Search, pair: Pair, bench: Bench) -> Stage:
     stated = 0.0 if sensor.force_noise is None else np.asarray(sensor.force_noise)
     rivals = [machine.with_plant(pair.model(k), machine.parameters) for k in range(2)]
     steps = max(bench.drive.substeps, *(needed_steps(rival, log) for rival in rivals))
-    return Stage(exact(bench, steps), machine, recipe, sensor, np.hypot(more, stated))
+    return Playback(exact(bench, steps), machine, recipe, sensor, np.hypot(more, stated))
 
 
-def _family(session: Session, limits: Limits, bench: Bench) -> tuple[Shapes, list[np.ndarray]]:
+def _family(session: Session, limits: Limits, bench: Experiment) -> tuple[Shapes, list[np.ndarray]]:
     """Signals within the limits, and where to start."""
     log, data, tick = session.fit.log, session.fit.data, bench.drive.period
     ticks = min((log.samples - 1) * bench.every + 1, _LONGEST)
@@ -245,10 +258,10 @@ def _family(session: Session, limits: Limits, bench: Bench) -> tuple[Shapes, lis
 
 
 def _optimised(
-    starts: list[np.ndarray], bench: Bench, duel: Duel, shapes: Shapes, limits: Limits
+    starts: list[np.ndarray], bench: Experiment, duel: ModelPair, shapes: Shapes, limits: Limits
 ) -> list[np.ndarray]:
     """The most promising starts, each improved, best first."""
-    bounds = Bounds.of(limits)
+    bounds = LimitCost.of(limits)
 
     def both(p: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(jnp.asarray(p), bench, duel, shapes, bounds)
@@ -267,5 +280,3 @@ def _optimised(
     each = min((affordable - len(looked_at)) // len(ranked), _EVALUATIONS)
     found = [improved(both, p, known[p.tobytes()], each) for p in ranked]
     return [p for _, p in sorted(found, key=lambda f: f[0])]
-
-

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxid.controllers import Controller
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.score import Score
-from jaxid.experiment_design.limits import Bounds
+from jaxid.experiment_design.limits import LimitCost
 from jaxid.experiment_design.shapes import Shapes
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
@@ -73,15 +73,18 @@ class Pair:
         ]
         plant, index, places = _reduced(union, [*rest, own, rival.candidate])
         return cls(
-            (own.kind, rival.candidate.kind), (own.port, rival.candidate.port),
-            (search.theta, rival.theta), tuple(active), plant, index, places,
+            (own.kind, rival.candidate.kind),
+            (own.port, rival.candidate.port),
+            (search.theta, rival.theta),
+            tuple(active),
+            plant,
+            index,
+            places,
         )
 
     def turned(self) -> Pair:
         """The same with the rival first."""
-        kinds, ports, thetas, active = (
-            x[::-1] for x in (self.kinds, self.ports, self.thetas, self.active)
-        )
+        kinds, ports, thetas, active = (x[::-1] for x in (self.kinds, self.ports, self.thetas, self.active))
         return Pair(kinds, ports, thetas, active, self.plant, self.index, self.places)
 
     def rounder(self, factor: float) -> Pair:
@@ -94,7 +97,7 @@ class Pair:
         return scatter(self.places, self.plant, jnp.asarray(self.thetas[which][self.index]))
 
 
-def _reduced(union: cand.Union, keep: list[cand.Candidate]) -> tuple[Plant, np.ndarray, tuple]:
+def _reduced(union: cand.CandidateModel, keep: list[cand.Candidate]) -> tuple[Plant, np.ndarray, tuple]:
     """The union's plant without the candidates that neither model has."""
     drop = {cand.position(union, c) for c in union.candidates if all(c is not k for k in keep)}
     effects = union.machine.plant.effects
@@ -112,7 +115,7 @@ def _reduced(union: cand.Union, keep: list[cand.Candidate]) -> tuple[Plant, np.n
     return plant, np.asarray(index, int), tuple(places)
 
 
-class Bench(eqx.Module):
+class Experiment(eqx.Module):
     """How an experiment runs: the loop, or the drive alone, and what is read of it.
 
     Args:
@@ -138,7 +141,10 @@ class Bench(eqx.Module):
     whiten: Float[Array, "n order"]
 
     def run(
-        self, plant: Plant, signal: Float[Array, "ticks m"], sensor: Sensor | None = None,
+        self,
+        plant: Plant,
+        signal: Float[Array, "ticks m"],
+        sensor: Sensor | None = None,
         noise: Float[Array, "ticks n"] | None = None,
     ) -> Trajectory:
         """Motion of a plant from rest under a reference or a command, at the samples of its log.
@@ -157,9 +163,7 @@ class Bench(eqx.Module):
         else:
             none = jnp.zeros((signal.shape[0], 1))
             start = self.start_of(signal[0])
-            run = closed_loop(
-                plant, self.drive, self.controller, signal, none, start, zero, sensor, noise
-            )
+            run = closed_loop(plant, self.drive, self.controller, signal, none, start, zero, sensor, noise)
         return jax.tree.map(lambda a: a[:: self.every], run)
 
     def start_of(self, first: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -173,7 +177,8 @@ class Bench(eqx.Module):
         slope = jnp.gradient(run.velocity, axis=0) / self.period
         force = self.drive.gain * run.command
         data = eqx.tree_at(
-            lambda d: (d.q, d.qd, d.qdd, d.force), self.data,
+            lambda d: (d.q, d.qd, d.qdd, d.force),
+            self.data,
             (run.position, run.velocity, slope, force),
         )
         d = self.data.decimator
@@ -187,7 +192,7 @@ class Bench(eqx.Module):
         return jnp.stack(columns, axis=1)
 
 
-class Duel(eqx.Module):
+class ModelPair(eqx.Module):
     """Both rivals as compiled code takes them.
 
     Args:
@@ -203,7 +208,7 @@ class Duel(eqx.Module):
     places: tuple = eqx.field(static=True)
 
     @classmethod
-    def of(cls, pair: Pair) -> Duel:
+    def of(cls, pair: Pair) -> ModelPair:
         """The arrays of a pair."""
         masks = [np.isin(pair.index, active).astype(float) for active in pair.active]
         thetas = [theta[pair.index] for theta in pair.thetas]
@@ -211,7 +216,7 @@ class Duel(eqx.Module):
 
 
 def expected(
-    bench: Bench, duel: Duel, signal: Float[Array, "ticks m"], bounds: Bounds
+    bench: Experiment, duel: ModelPair, signal: Float[Array, "ticks m"], bounds: LimitCost
 ) -> tuple[Float[Array, " 2"], Array]:
     """Evidence [nats] by which each rival, being true, would beat the other; and what limits cost."""
 
@@ -257,7 +262,7 @@ def _absorbed(apart, theta: Array, mask: Array) -> Array:
 
 @eqx.filter_jit
 def loss(
-    p: Float[Array, " p"], bench: Bench, duel: Duel, shapes: Shapes, bounds: Bounds
+    p: Float[Array, " p"], bench: Experiment, duel: ModelPair, shapes: Shapes, bounds: LimitCost
 ) -> tuple[Array, Array]:
     """What to minimise, and its gradient: minus the logarithms of both evidences, plus what limits cost."""
 

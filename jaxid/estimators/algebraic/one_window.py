@@ -25,7 +25,7 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, lasting
 from jaxid.machine import Machine
 from jaxid.model.unknowns import Free
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import Precision, assess
 
 # A matrix whose scaled condition is worse than this tells nothing at noise of rounding.
@@ -68,8 +68,9 @@ class Stretch:
         """
         if log.hold != "zero_order":
             raise InputError(
-                f"the command is {log.hold}, not held between samples", where=log.source,
-                mend="leave out [algebraic] window, or use inverse_dynamics",
+                f"the command is {log.hold}, not held between samples",
+                where=log.source,
+                hint="leave out [algebraic] window, or use inverse_dynamics",
             )
         start, end = window or (log.time[0], log.time[-1])
         # A log of 0.1 s ends one sample before 0.1 s.
@@ -77,13 +78,15 @@ class Stretch:
             raise InputError(
                 f"[algebraic] window = [{start:g}, {end:g}] s is not within the log, which runs from "
                 f"{log.time[0]:g} to {log.time[-1]:g} s",
-                where=log.source, mend="choose one that is",
+                where=log.source,
+                hint="choose one that is",
             )
         inside = (log.time >= start - 1e-9) & (log.time <= end + 1e-9)
         if inside.sum() < 4 * _SHORTEST:
             raise InputError(
                 f"[algebraic] window = [{start:g}, {end:g}] s holds {int(inside.sum())} samples",
-                where=log.source, mend=f"let it hold at least {4 * _SHORTEST}",
+                where=log.source,
+                hint=f"let it hold at least {4 * _SHORTEST}",
             )
         recipe = data.recipe
         position = (data.q if recipe.keeps_reversals else log.position)[inside]
@@ -93,8 +96,9 @@ class Stretch:
             velocity = data.qd[inside]
         fast = np.abs(velocity).max(axis=0)
         still = InputError(
-            f"nothing moves between {start:g} and {end:g} s", where=log.source,
-            mend="choose another [algebraic] window",
+            f"nothing moves between {start:g} and {end:g} s",
+            where=log.source,
+            hint="choose another [algebraic] window",
         )
         if not fast.any():
             raise still
@@ -107,9 +111,9 @@ class Stretch:
             raise still
         return cls(position, log.force[inside], online, moving, np.sign(velocity) * moving)
 
-    def rows(self, restart: Bool[np.ndarray, "time n"]) -> Solve:
+    def rows(self, restart: Bool[np.ndarray, "time n"]) -> SolveRequest:
         """The rows, windows beginning where it says."""
-        return Solve(window_rows, (self.online, self.position, self.command, restart))
+        return SolveRequest(window_rows, (self.online, self.position, self.command, restart))
 
     def ages(self, restart: Bool[np.ndarray, "time n"]) -> Float[np.ndarray, "time n"]:
         """Time since the start of each joint's window [s]."""
@@ -118,9 +122,7 @@ class Stretch:
         return self.online.period * (index - last)
 
 
-def least_squares_steps(
-    machine: Machine, log: Log, data: Prepared, window: Window | None
-) -> Steps[Estimate]:
+def least_squares_steps(machine: Machine, log: Log, data: Prepared, window: Window | None) -> Steps[Estimate]:
     """All rows of a window at once; dry friction is a column like any other."""
     cut = Stretch.of(machine, log, data, window)
     _, rows = yield cut.rows(~cut.moving)
@@ -299,9 +301,7 @@ def _is_friction(machine: Machine, free: Free) -> bool:
     return free.path[0] == "effects" and machine.plant.effects[free.path[1]].kind == "coulomb_friction"
 
 
-def _own(
-    online: Online, joint: int, rows: np.ndarray, ages: np.ndarray
-) -> tuple[tuple[int, ...], Rows]:
+def _own(online: Online, joint: int, rows: np.ndarray, ages: np.ndarray) -> tuple[tuple[int, ...], Rows]:
     """Unknowns that stand in a joint's rows, and these as the double integrals that they are."""
     whole = rows * ages[:, None] ** 2
     columns = [c for c, k in enumerate(online.owner[joint]) if k < online.guess.size]
@@ -347,8 +347,9 @@ def _merged(name: str, machine: Machine, found: list[tuple], log: Log) -> Estima
     told = times > 0
     if not told.any():
         raise InputError(
-            "no joint has an interval that its equations could be solved on", where=log.source,
-            mend="take a longer window, or `algebraic`",
+            "no joint has an interval that its equations could be solved on",
+            where=log.source,
+            hint="take a longer window, or `algebraic`",
         )
     theta = np.where(told, total / np.maximum(times, 1), machine.parameters.guess)
     unknown = np.full((p, p), np.nan)
@@ -362,14 +363,25 @@ def _merged(name: str, machine: Machine, found: list[tuple], log: Log) -> Estima
 
 
 def _estimate(
-    name: str, machine: Machine, theta: np.ndarray, precision: Precision, e: np.ndarray,
+    name: str,
+    machine: Machine,
+    theta: np.ndarray,
+    precision: Precision,
+    e: np.ndarray,
     notes: tuple[str, ...],
 ) -> Estimate:
     good = bool(np.all(np.isfinite(theta)))
     return Estimate(
-        method=name, machine=machine.with_estimate(theta), theta=theta, precision=precision,
-        converged=good, message="solved" if good else "the equations are singular", residual=e,
-        samples=int(np.isfinite(e).sum()), steps=1, notes=notes,
+        method=name,
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=good,
+        message="solved" if good else "the equations are singular",
+        residual=e,
+        samples=int(np.isfinite(e).sum()),
+        steps=1,
+        notes=notes,
     )
 
 

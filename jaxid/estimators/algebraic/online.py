@@ -72,7 +72,7 @@ class Integral(eqx.Module):
         return Integral(self.value + period * grown, past)
 
 
-class Memory(eqx.Module):
+class OnlineMemory(eqx.Module):
     """What is kept from sample to sample.
 
     Args:
@@ -93,7 +93,7 @@ class Memory(eqx.Module):
     normal: Array
 
 
-class Told(eqx.Module):
+class OnlineEstimate(eqx.Module):
     """What the rows so far say.
 
     Args:
@@ -121,7 +121,7 @@ class Online(eqx.Module):
         fast: Velocity at which the slope of the forces is taken for the linear part, (n,).
         owner: Which unknown each of the c columns of a joint's row is of, (n, c); p where of none.
         seeds: Of the columns: unknowns that share one stand in different joints' balances, (p, c).
-        tolerance: Of `Told.relative`, where an estimate may be trusted.
+        tolerance: Of `OnlineEstimate.relative`, where an estimate may be trusted.
     """
 
     plant: Plant
@@ -137,7 +137,11 @@ class Online(eqx.Module):
 
     @classmethod
     def of(
-        cls, machine: Machine, period: float, rest_velocity: np.ndarray, fast: np.ndarray,
+        cls,
+        machine: Machine,
+        period: float,
+        rest_velocity: np.ndarray,
+        fast: np.ndarray,
         tolerance: float = 0.05,
     ) -> Online:
         """The estimator of a machine.
@@ -159,11 +163,19 @@ class Online(eqx.Module):
         for k, number in enumerate(numbers):
             owner[enters[:, k], number] = k
         return cls(
-            plant, machine.parameters.places, np.asarray(machine.parameters.guess), machine.gain,
-            period, rest_velocity, fast, owner, seeds(numbers), tolerance,
+            plant,
+            machine.parameters.places,
+            np.asarray(machine.parameters.guess),
+            machine.gain,
+            period,
+            rest_velocity,
+            fast,
+            owner,
+            seeds(numbers),
+            tolerance,
         )
 
-    def start(self, position: Float[Array, " n"]) -> Memory:
+    def start(self, position: Float[Array, " n"]) -> OnlineMemory:
         """Memory at the first reading."""
         n, c = self.owner.shape
         square, wide = jnp.zeros((n, n)), jnp.zeros((n, c + 1))
@@ -173,12 +185,15 @@ class Online(eqx.Module):
         single = tuple(Integral.zero(f).next(f, zero, self.period) for f in functions)
         double = tuple(Integral.zero(x).next(x, zero, self.period) for x in (square, square, wide, wide))
         normal = jnp.zeros((n, c + 1, c + 1))
-        return Memory(zero, position, single, double, (wide, wide), normal)
+        return OnlineMemory(zero, position, single, double, (wide, wide), normal)
 
     def update(
-        self, memory: Memory, position: Float[Array, " n"], command: Float[Array, " m"],
+        self,
+        memory: OnlineMemory,
+        position: Float[Array, " n"],
+        command: Float[Array, " m"],
         restart: Bool[Array, " n"] | None = None,
-    ) -> tuple[Memory, Float[Array, "n c1"]]:
+    ) -> tuple[OnlineMemory, Float[Array, "n c1"]]:
         """Take one reading more.
 
         Args:
@@ -215,8 +230,9 @@ class Online(eqx.Module):
         joints = lambda new, old: jnp.where(resting.reshape(-1, *[1] * (new.ndim - 1)), old, new)
         past = lambda new, old: jax.vmap(joints)(new, old)
         mix = lambda new, old: Integral(joints(new.value, old.value), past(new.past, old.past))
-        grown = Memory(
-            joints(since, fresh.since), position,
+        grown = OnlineMemory(
+            joints(since, fresh.since),
+            position,
             tuple(mix(a, b) for a, b in zip(once, fresh.single, strict=True)),
             tuple(mix(a, b) for a, b in zip(twice, fresh.double, strict=True)),
             tuple(joints(a, b) for a, b in zip((slope, twofold), fresh.held, strict=True)),
@@ -224,7 +240,7 @@ class Online(eqx.Module):
         )
         return grown, rows
 
-    def told(self, memory: Memory) -> Told:
+    def estimate(self, memory: OnlineMemory) -> OnlineEstimate:
         """What the rows so far say; compiles, but is no part of a fast loop."""
         p = self.guess.size
         # Of all unknowns and, last but one, the value; what is of no unknown goes into the last.
@@ -244,7 +260,7 @@ class Online(eqx.Module):
         moved = jnp.sqrt(jnp.maximum(left, 0.0) * jnp.diagonal(inverse)) / scale
         blind = jnp.any((jnp.abs(vectors) > 0.1) & ~good, axis=1) | ~seen
         relative = jnp.where(blind, jnp.inf, moved / jnp.maximum(jnp.abs(theta), 1e-300))
-        return Told(theta, relative, relative < self.tolerance)
+        return OnlineEstimate(theta, relative, relative < self.tolerance)
 
     def _functions(self, q: Array, t: Array, smooth: Array, twofold: Array) -> tuple[Array, ...]:
         """What is integrated once: by the clock of each joint."""
@@ -330,8 +346,9 @@ def check_linear(machine: Machine) -> None:
     odd = [machine.parameters.names[k] for k in np.flatnonzero(~linear_unknowns(machine))]
     if odd:
         raise InputError(
-            f"{odd[0]} does not enter the balance in proportion", where=where,
-            mend="declare it known, friction by its level, or use inverse_dynamics",
+            f"{odd[0]} does not enter the balance in proportion",
+            where=where,
+            hint="declare it known, friction by its level, or use inverse_dynamics",
         )
 
 
@@ -343,12 +360,13 @@ def check_instant(machine: Machine, where: str) -> None:
     """
     for e in machine.plant.effects:
         if e.initial_state(jnp.zeros(())) is not None or not isinstance(e.command_delay(), float):
-            mend = "leave it out, or use inverse_dynamics"
-            raise InputError(f"{e.kind} has a memory or a delay", where=where, mend=mend)
+            hint = "leave it out, or use inverse_dynamics"
+            raise InputError(f"{e.kind} has a memory or a delay", where=where, hint=hint)
     if _ages(machine):
         raise InputError(
-            "the balance changes with time", where=where,
-            mend="leave out what does (friction_drift), or use inverse_dynamics",
+            "the balance changes with time",
+            where=where,
+            hint="leave out what does (friction_drift), or use inverse_dynamics",
         )
 
 
@@ -371,12 +389,14 @@ def _value(
 
 @eqx.filter_jit
 def window_rows(
-    online: Online, position: Float[Array, "time n"], command: Float[Array, "time m"],
+    online: Online,
+    position: Float[Array, "time n"],
+    command: Float[Array, "time m"],
     restart: Bool[Array, "time n"],
-) -> tuple[Memory, Float[Array, "time n c1"]]:
+) -> tuple[OnlineMemory, Float[Array, "time n c1"]]:
     """All rows of a log whose windows begin where `restart` says, and the memory at its end."""
 
-    def step(memory: Memory, now: tuple) -> tuple[Memory, Array]:
+    def step(memory: OnlineMemory, now: tuple) -> tuple[OnlineMemory, Array]:
         return online.update(memory, *now)
 
     start = online.start(position[0])

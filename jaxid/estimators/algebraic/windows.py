@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.dynamics.residuals import drive_own_states, drive_ratio
+from jaxid.dynamics.residuals import drive_ratio, integrate_internal_states
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.estimate import Estimate
@@ -29,7 +29,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
-from jaxid.numerics.lanes import Solve, Steps, alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import assess
 from jaxid.simulation.force_balance import ForceData, sharpened
 
@@ -40,9 +40,7 @@ _WINDOW_PERIODS = 20
 _LARGEST_REST = 0.05
 
 
-def iterated_integral(
-    x: Float[Array, "time k"], period: float, times: int
-) -> Float[Array, "time k"]:
+def iterated_integral(x: Float[Array, "time k"], period: float, times: int) -> Float[Array, "time k"]:
     """Integrate from the first sample on, so many times over.
 
     Fourth order: each interval is integrated under the cubic through its four nearest samples.
@@ -66,9 +64,7 @@ def first_by_parts(moment: Array, twofold: Array) -> Array:
     return moment - 2 * twofold
 
 
-def weak_motion(
-    q: Float[Array, "time n"], period: float
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def weak_motion(q: Float[Array, "time n"], period: float) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Double integrals of t^2 q'' and t^2 q' over a window, derivatives taken by parts.
 
     Returns:
@@ -109,7 +105,7 @@ def weak_residual(
     """
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
-    own = drive_own_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
+    own = integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
     times = data.start + data.period * jnp.arange(raw.shape[0])
     fast = jnp.abs(data.qd).max(axis=0)
 
@@ -142,8 +138,16 @@ def weak_residual(
 
 @eqx.filter_jit
 def _solve(
-    plant: Plant, places: tuple, data: ForceData, raw: Array, length: int, weight: Array,
-    theta: Array, transform: Transform, damping: float, bounds: tuple[Array, Array],
+    plant: Plant,
+    places: tuple,
+    data: ForceData,
+    raw: Array,
+    length: int,
+    weight: Array,
+    theta: Array,
+    transform: Transform,
+    damping: float,
+    bounds: tuple[Array, Array],
 ) -> Minimum:
     def residual(theta: Array) -> Array:
         return weight * weak_residual(scatter(places, plant, theta), data, raw, length)
@@ -166,7 +170,7 @@ def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
     Raises:
         InputError: If too few windows are left.
     """
-    return alone(algebraic_steps(machine, log, data))
+    return run_alone(algebraic_steps(machine, log, data))
 
 
 def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimate]:
@@ -182,25 +186,44 @@ def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimat
     if rows.sum() < 2 * len(parameters.free):
         raise InputError(
             f"only {int(rows.sum())} windows of {length * log.period:.3g} s hold no rest",
-            where=log.source, mend="take a log with longer motion, or use inverse_dynamics",
+            where=log.source,
+            hint="take a log with longer motion, or use inverse_dynamics",
         )
-    fit = yield Solve(_solve, (
-        plant, parameters.places, arrays, log.position, length,
-        np.asarray(rows, dtype=float), parameters.guess, *linear_scale(machine),
-        parameters.bounds,
-    ))
+    fit = yield SolveRequest(
+        _solve,
+        (
+            plant,
+            parameters.places,
+            arrays,
+            log.position,
+            length,
+            np.asarray(rows, dtype=float),
+            parameters.guess,
+            *linear_scale(machine),
+            parameters.bounds,
+        ),
+    )
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
     precision = assess(
-        parameters.names, jacobian, e, rows, force * np.sqrt(rows.sum()),
+        parameters.names,
+        jacobian,
+        e,
+        rows,
+        force * np.sqrt(rows.sum()),
         np.where(theta != 0, theta, 1.0),
     )
     converged = bool(fit.converged)
     return Estimate(
-        method="algebraic", machine=machine.with_estimate(theta), theta=theta,
-        precision=precision, converged=converged,
+        method="algebraic",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=converged,
         message="converged" if converged else f"no convergence within {int(fit.steps)} steps",
-        residual=np.where(rows, e, np.nan), samples=int(rows.sum()), steps=int(fit.steps),
+        residual=np.where(rows, e, np.nan),
+        samples=int(rows.sum()),
+        steps=int(fit.steps),
         notes=(f"{int(rows.sum())} windows of {length * log.period:.3g} s, half overlapping",),
     )

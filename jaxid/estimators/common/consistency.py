@@ -46,21 +46,25 @@ def need_bodies(session: Session) -> Session:
 def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -> Body:
     known = [name for name in TEN if name not in own]
     if known:
-        mend = "let all ten be unknown and start at those of a body; base parameters alone are of none"
-        raise InputError(f"{known[0]}[{link + 1}] is known and others are not, and physically_consistent "
-                         "asks for whole bodies", where=where, mend=mend)
+        hint = "let all ten be unknown and start at those of a body; base parameters alone are of none"
+        raise InputError(
+            f"{known[0]}[{link + 1}] is known and others are not, and physically_consistent "
+            "asks for whole bodies",
+            where=where,
+            hint=hint,
+        )
     places = tuple(own[name] for name in TEN)
     bounded = [unknown[k].name for k in places if np.isfinite([unknown[k].lower, unknown[k].upper]).any()]
     if bounded:
         what = f"{bounded[0]} has min or max, which physically_consistent does not keep"
-        raise InputError(what, where=where, mend="leave them out")
+        raise InputError(what, where=where, hint="leave them out")
     ten = jnp.asarray([unknown[k].guess for k in places])
     least = float(np.linalg.eigvalsh(np.asarray(pseudo_inertia(ten)))[0])
     x = np.asarray(log_cholesky(ten))
     if not (least > 0 and np.all(np.isfinite(x))):
         what = f"its guess is no body: the least eigenvalue of its pseudo-inertia is {least:.3g}"
-        mend = "start from mass, first_moment and inertia of a body: a rod, a ball"
-        raise InputError(what, where=where, mend=mend)
+        hint = "start from mass, first_moment and inertia of a body: a rod, a ball"
+        raise InputError(what, where=where, hint=hint)
     lower, upper = np.full(10, -np.inf), np.full(10, np.inf)
     # Half the logarithm of the mass, and those of the spread.
     for coordinates, factor in (([0], 0.5), ([4, 5, 6], 1.0)):
@@ -76,7 +80,8 @@ def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
         return estimate
     note = "links are what bodies can be; standard deviations are those of the log alone"
     return replace(
-        estimate, notes=(*estimate.notes, note),
+        estimate,
+        notes=(*estimate.notes, note),
         details={**estimate.details, "links": links_of(estimate.machine.plant)},
     )
 

@@ -18,8 +18,11 @@ _ON_PATH = 0.25
 
 
 def inner_start(
-    columns: Float[Array, "rows p"], rest: Float[Array, " rows"], theta: Float[Array, " p"],
-    bodies: tuple[tuple[int, ...], ...], solve: Callable[[Array, Array], Array],
+    columns: Float[Array, "rows p"],
+    rest: Float[Array, " rows"],
+    theta: Float[Array, " p"],
+    bodies: tuple[tuple[int, ...], ...],
+    solve: Callable[[Array, Array], Array],
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
     """The least squares of columns @ theta + rest among bodies, from a body of any kind.
 

@@ -162,16 +162,30 @@ class Progress(eqx.Module):
         """
         p, xp = x.size, np if isinstance(x, np.ndarray) else jnp
         return cls(
-            x, xp.asarray(0.0), x, xp.asarray(np.inf), xp.zeros(p), xp.zeros((p, p)),
-            (xp.zeros(size), xp.zeros((size, p))), xp.asarray(damping), xp.asarray(2.0), own,
-            xp.asarray(0.0), xp.asarray(0), xp.asarray(False),
+            x,
+            xp.asarray(0.0),
+            x,
+            xp.asarray(np.inf),
+            xp.zeros(p),
+            xp.zeros((p, p)),
+            (xp.zeros(size), xp.zeros((size, p))),
+            xp.asarray(damping),
+            xp.asarray(2.0),
+            own,
+            xp.asarray(0.0),
+            xp.asarray(0),
+            xp.asarray(False),
         )
 
     def minimum(self, transform: Transform) -> Minimum:
         """As a result."""
         theta = transform.outward(self.x)
         return Minimum(
-            theta, self.cost, self.steps, self.done & jnp.isfinite(self.cost), self.kept[0],
+            theta,
+            self.cost,
+            self.steps,
+            self.done & jnp.isfinite(self.cost),
+            self.kept[0],
             transform.physical(self.kept[1], theta),
         )
 
@@ -216,7 +230,12 @@ def levenberg_marquardt(
         e = residual(theta).ravel()
         cost, kept = 0.5 * e @ e, e if keep else e[:0]
         return Minimum(
-            theta, cost, jnp.asarray(1), jnp.isfinite(cost), kept, jnp.zeros((kept.size, 0)),
+            theta,
+            cost,
+            jnp.asarray(1),
+            jnp.isfinite(cost),
+            kept,
+            jnp.zeros((kept.size, 0)),
         )
     # Traced once, for its shape and for its Jacobian.
     residual, floor = jax.jit(residual), -jnp.inf
@@ -270,8 +289,13 @@ def descend(
 
 
 def _advanced(
-    p: Progress, e: Array, jacobian: Array, bounds: tuple[Array, Array], moves: Bool[Array, " p"],
-    tolerance: float, floor: Array | float,
+    p: Progress,
+    e: Array,
+    jacobian: Array,
+    bounds: tuple[Array, Array],
+    moves: Bool[Array, " p"],
+    tolerance: float,
+    floor: Array | float,
 ) -> Progress:
     """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
     (lower, upper), keep = bounds, p.kept[0].size > 0
@@ -303,14 +327,23 @@ def _advanced(
     stuck = rough | (~better & (damping > 1e12))
     growth = jnp.where(better, 2.0, 2 * p.growth)
     return Progress(
-        trial, predicted, x, cost, gradient, normal, kept, damping, growth, p.own, nothing, p.steps + 1,
+        trial,
+        predicted,
+        x,
+        cost,
+        gradient,
+        normal,
+        kept,
+        damping,
+        growth,
+        p.own,
+        nothing,
+        p.steps + 1,
         small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
     )
 
 
-def _step(
-    gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"]
-) -> Array:
+def _step(gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"]) -> Array:
     """Damped step of the free unknowns."""
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)

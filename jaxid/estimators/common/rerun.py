@@ -14,7 +14,7 @@ from jaxid.logs.prepare import Prepared, prepare
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.simulation.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
 
 # A simulated position this many times larger than the measured one has run away.
@@ -78,7 +78,7 @@ class Rerun:
             The simulated motion with its force; None where the simulation diverges.
         """
         places = self.machine.parameters.places
-        position, command = yield Solve(_simulated, (self.replay, places, self.machine.plant, theta))
+        position, command = yield SolveRequest(_simulated, (self.replay, places, self.machine.plant, theta))
         position = np.asarray(position)
         largest = _RUNAWAY * np.max(np.abs(self.log.filled))
         if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > largest:
@@ -103,7 +103,9 @@ def _simulated(replay: Replay, places: tuple, plant: Plant, theta: Array) -> tup
 
 
 def best_step(
-    parameters: Parameters, columns: Float[np.ndarray, "rows p"], e: Float[np.ndarray, " rows"],
+    parameters: Parameters,
+    columns: Float[np.ndarray, "rows p"],
+    e: Float[np.ndarray, " rows"],
     theta: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
     """Gauss-Newton's step: within bounds, or, where links are kept to bodies, to the best of all bodies.
@@ -125,16 +127,16 @@ def best_step(
 
 
 @eqx.filter_jit
-def _best_bodies(
-    triangle: Array, transform: Transform, guess: Array, bounds: tuple[Array, Array]
-) -> Minimum:
+def _best_bodies(triangle: Array, transform: Transform, guess: Array, bounds: tuple[Array, Array]) -> Minimum:
     linear = replace(transform, log=np.zeros(guess.size, bool), affine=True)
     residual = lambda theta: triangle[:, :-1] @ theta + triangle[:, -1]
     return levenberg_marquardt(residual, guess, linear, *bounds)
 
 
 def bounded_step(
-    columns: Float[np.ndarray, "rows p"], e: Float[np.ndarray, " rows"], theta: Float[np.ndarray, " p"],
+    columns: Float[np.ndarray, "rows p"],
+    e: Float[np.ndarray, " rows"],
+    theta: Float[np.ndarray, " p"],
     bounds: tuple[np.ndarray, np.ndarray],
 ) -> Float[np.ndarray, " p"]:
     """Gauss-Newton's step within bounds: an unknown that would pass one goes there, and the rest adapts.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxid.estimators.minimal.models import Samples, Structure, Term
+from jaxid.estimators.minimal.models import MinimalSamples, Structure, Term
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.model.unknowns import Parameters
@@ -38,9 +38,7 @@ class Basis:
         return np.linalg.pinv(self.spread)
 
 
-def basis_of(
-    structure: Structure, samples: Samples, parameters: Parameters, units: Units
-) -> Basis:
+def basis_of(structure: Structure, samples: MinimalSamples, parameters: Parameters, units: Units) -> Basis:
     """Regroup the coefficients of a model.
 
     Where they are linear in the unknowns these are the unknowns themselves, those with the same
@@ -73,17 +71,15 @@ def basis_of(
         return Basis(
             tuple(n if p else entries[largest[k]] for n, p, k in zip(names, plain, kept, strict=True)),
             tuple(
-                parameters.free[k].unit if p else labels[largest[k]]
-                for p, k in zip(plain, kept, strict=True)
+                parameters.free[k].unit if p else labels[largest[k]] for p, k in zip(plain, kept, strict=True)
             ),
-            spread, constant,
+            spread,
+            constant,
         )
     pivots = _regrouped(whole.T, entries)[0]
     spread = whole @ np.linalg.pinv(whole[pivots])
     constant = reference - spread @ reference[pivots]
-    return Basis(
-        tuple(entries[k] for k in pivots), tuple(labels[k] for k in pivots), spread, constant
-    )
+    return Basis(tuple(entries[k] for k in pivots), tuple(labels[k] for k in pivots), spread, constant)
 
 
 def _unit_columns(a: np.ndarray) -> np.ndarray:

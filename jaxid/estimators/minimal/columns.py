@@ -57,7 +57,12 @@ def reach_of(recipe: Recipe, rate_hz: float, order: int) -> int:
 
 
 def regression_of(
-    log: Log, machine: Machine, structure: Structure, basis: Basis, known: np.ndarray, recipe: Recipe,
+    log: Log,
+    machine: Machine,
+    structure: Structure,
+    basis: Basis,
+    known: np.ndarray,
+    recipe: Recipe,
     balance: LinearBalance,
 ) -> Regression:
     """Columns of a model along a log.
@@ -163,9 +168,7 @@ def _hidden_speed(
     return -pull / motion[0, row, joint]
 
 
-def _counting(
-    moved: dict, log: Log, structure: Structure, recipe: Recipe
-) -> Bool[np.ndarray, "kept rows"]:
+def _counting(moved: dict, log: Log, structure: Structure, recipe: Recipe) -> Bool[np.ndarray, "kept rows"]:
     """Samples at which the direction of all joints in a row is sure, as far as the model needs it.
 
     Without eliminated joints a reversal harms no more than in inverse dynamics. With them the model

@@ -51,8 +51,13 @@ class Spectrum:
 
 
 def spectrum_of(
-    log: Log, machine: Machine, structure: Structure, coefficients: np.ndarray, known: np.ndarray,
-    natural: np.ndarray, median: int | None = None,
+    log: Log,
+    machine: Machine,
+    structure: Structure,
+    coefficients: np.ndarray,
+    known: np.ndarray,
+    natural: np.ndarray,
+    median: int | None = None,
 ) -> Spectrum:
     """Force and noise over frequency, the noise as a row of the model amplifies it.
 
@@ -126,7 +131,10 @@ def choose_filtering(
     decimation = int(stated.get("decimation", spaced(log.rate_hz, edge)))
     trim = int(stated.get("trim", trimmed(log, edge, decimation, literal=False, periods=_ENDS)))
     recipe = replace(
-        recipe, cutoff_hz=min(2 * edge, 0.45 * log.rate_hz), decimation=decimation, trim=trim,
+        recipe,
+        cutoff_hz=min(2 * edge, 0.45 * log.rate_hz),
+        decimation=decimation,
+        trim=trim,
         edge=2 * edge / log.rate_hz,
     )
     why = f"the band ends at {edge:.3g} Hz, {edge / top:.2g} times the natural frequency of {top:.3g} Hz"

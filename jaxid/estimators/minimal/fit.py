@@ -23,12 +23,12 @@ from jaxid.estimators.minimal.matrices import LinearBalance, delays_command, lin
 from jaxid.estimators.minimal.models import Form, form_of, rigid_rows_hold, structure_of
 from jaxid.estimators.minimal.read_back import Model, constraint_steps, read_back
 from jaxid.estimators.minimal.report import minimal_json, minimal_notes
-from jaxid.estimators.minimal.statistics import Constraint, Fit, least_squares
+from jaxid.estimators.minimal.statistics import Constraint, MinimalFit, least_squares
 from jaxid.logs.prepare import Recipe
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import assess
 
 if TYPE_CHECKING:
@@ -88,10 +88,20 @@ def minimal_model_steps(
         weights = _weights(form, model.structure.rows, natural, weight)
         fit = least_squares(model.basis.names, data, weights)
         options = (Transform.of(parameters), parameters.bounds)
-        found, chi, slopes = yield Solve(read_back, (
-            machine.plant, parameters.places, model.structure, model.maps, fit.chi, fit.root,
-            np.asarray(np.linalg.norm(fit.residual)), parameters.guess, *options,
-        ))
+        found, chi, slopes = yield SolveRequest(
+            read_back,
+            (
+                machine.plant,
+                parameters.places,
+                model.structure,
+                model.maps,
+                fit.chi,
+                fit.root,
+                np.asarray(np.linalg.norm(fit.residual)),
+                parameters.guess,
+                *options,
+            ),
+        )
         chi, slopes, theta = (np.asarray(a) for a in (chi, slopes, found.theta))
         coefficients = model.basis.constant + model.basis.spread @ chi
         now = natural_frequencies(machine.plant, parameters.places, theta).hz
@@ -129,14 +139,16 @@ def _form(session: Session, printed: bool) -> Form:
     if session.case.preprocess.get("derivatives") == "parabolic":
         raise InputError(
             "[preprocess] derivatives = 'parabolic' filters each derivative differently, and a minimal model "
-            "needs one filter for all of its columns", where=where,
-            mend="leave it out, or use inverse_dynamics",
+            "needs one filter for all of its columns",
+            where=where,
+            hint="leave it out, or use inverse_dynamics",
         )
     unknown = {f.path[1] for f in session.machine.parameters.free if f.path[0] == "effects"}
     if any(delays_command(e) and k in unknown for k, e in enumerate(plant.effects)):
         raise InputError(
-            "the delay of the command is unknown, which no minimal model holds", where=where,
-            mend="give it as known, or use output_error",
+            "the delay of the command is unknown, which no minimal model holds",
+            where=where,
+            hint="give it as known, or use output_error",
         )
     accelerated = log.load_acceleration is not None
     form = form_of(plant.joints, log.measured, accelerated, printed)
@@ -144,17 +156,19 @@ def _form(session: Session, printed: bool) -> Form:
         raise InputError(
             "minimal_model_printed is the model with the load's acceleration and the motor's position",
             where=where,
-            mend="name load_acceleration in [log] and leave out load_position, or use minimal_model",
+            hint="name load_acceleration in [log] and leave out load_position, or use minimal_model",
         )
     if form.accelerated and log.load_acceleration.shape[1] != len(form.hidden):
         raise InputError(
             f"load_acceleration has {log.load_acceleration.shape[1]} columns where {len(form.hidden)} belong",
-            where=log.source, mend="name the column of the load's accelerometer",
+            where=log.source,
+            hint="name the column of the load's accelerometer",
         )
     if form.accelerated and not rigid_rows_hold(plant):
         raise InputError(
-            "the model with an acceleration needs a machine that no spring ties to the ground", where=where,
-            mend="leave out load_acceleration, or the spring",
+            "the model with an acceleration needs a machine that no spring ties to the ground",
+            where=where,
+            hint="leave out load_acceleration, or the spring",
         )
     return form
 
@@ -164,14 +178,16 @@ def _model(plant: Plant, parameters: Parameters, form: Form, session: Session, w
         structure, samples = structure_of(plant, parameters, form)
     except ValueError as error:
         raise InputError(
-            f"{error}, and with it the scale of all other unknowns", where=where,
-            mend="give actuator_gain as known, or use output_error",
+            f"{error}, and with it the scale of all other unknowns",
+            where=where,
+            hint="give actuator_gain as known, or use output_error",
         ) from error
     # A row from which a joint was eliminated has no scale without a force.
     if form.hidden and not form.accelerated and None in structure.leading:
         raise InputError(
-            "without the motion of some joints there is a row without a force", where=where,
-            mend="use inverse_dynamics or output_error",
+            "without the motion of some joints there is a row without a force",
+            where=where,
+            hint="use inverse_dynamics or output_error",
         )
     basis = basis_of(structure, samples, parameters, session.machine.units)
     known, guess = (samples.of(w, structure.leading)[0][-1] for w in (structure.known, structure.unknown))
@@ -182,8 +198,9 @@ def _require_samples(data: Regression, model: Model, source: str) -> None:
     left = int(data.counts.sum())
     if left < _A_COEFFICIENT * len(model.basis.names):
         raise InputError(
-            f"only {left} samples lie farther from rest than the filters reach", where=source,
-            mend="take a log with longer moves, lower rest_velocity, or raise cutoff_hz",
+            f"only {left} samples lie farther from rest than the filters reach",
+            where=source,
+            hint="take a log with longer moves, lower rest_velocity, or raise cutoff_hz",
         )
 
 
@@ -197,8 +214,14 @@ def _weights(form: Form, rows: int, natural: np.ndarray, weight: float | None) -
 
 
 def _estimate(
-    session: Session, model: Model, data: Regression, fit: Fit, weight: np.ndarray,
-    found: tuple[Minimum, np.ndarray, np.ndarray], constraint: Constraint | None, recipe: Recipe,
+    session: Session,
+    model: Model,
+    data: Regression,
+    fit: MinimalFit,
+    weight: np.ndarray,
+    found: tuple[Minimum, np.ndarray, np.ndarray],
+    constraint: Constraint | None,
+    recipe: Recipe,
     notes: tuple[str, ...],
 ) -> Estimate:
     machine, parameters = session.machine, session.machine.parameters
@@ -216,10 +239,14 @@ def _estimate(
     pressed = (f"at its bound: {', '.join(names)}",) if names else ()
     form = model.structure.form
     return Estimate(
-        method="minimal_model_printed" if form.printed else "minimal_model", machine=at, theta=theta,
-        precision=precision, converged=converged,
+        method="minimal_model_printed" if form.printed else "minimal_model",
+        machine=at,
+        theta=theta,
+        precision=precision,
+        converged=converged,
         message="solved" if converged else f"no convergence within {int(solved.steps)} steps",
-        residual=np.where(data.counts, residual, np.nan), samples=int(data.counts.any(axis=1).sum()),
+        residual=np.where(data.counts, residual, np.nan),
+        samples=int(data.counts.any(axis=1).sum()),
         steps=int(solved.steps),
         notes=(*notes, *minimal_notes(form, fit, model.basis, constraint), *pressed),
         details={"minimal": minimal_json(form, fit, model.basis, constraint, modes, recipe)},

@@ -56,26 +56,29 @@ def require_linear(plant: Plant, where: str) -> None:
     Raises:
         InputError: If it is not; the text names the effect.
     """
-    mend = "leave it out of the case, or use inverse_dynamics or output_error"
+    hint = "leave it out of the case, or use inverse_dynamics or output_error"
     for k, effect in enumerate(plant.effects):
         name = effect_name(eqx.tree_at(lambda p: p.effects, plant, plant.effects[:k]), effect)
         alone = eqx.tree_at(lambda p: p.effects, plant, (effect,))
         if jax.tree.leaves(effect.initial_state(jnp.zeros(()))):
-            raise InputError(f"{name} has a memory, which a minimal model has not", where=where, mend=mend)
+            raise InputError(f"{name} has a memory, which a minimal model has not", where=where, hint=hint)
         if not _linear(alone) and _linear(eqx.tree_at(lambda p: p.effects, plant, ())):
             raise InputError(
                 f"{name} is not linear in the motion, as a minimal model is away from rest",
-                where=where, mend=mend,
+                where=where,
+                hint=hint,
             )
         if any(i >= plant.joints for i in _slides(alone)):
             raise InputError(
                 f"{name} is dry friction in a spring, whose direction no encoder tells",
-                where=where, mend=mend,
+                where=where,
+                hint=hint,
             )
     if not _linear(plant):
         raise InputError(
             f"{plant.kind} with these effects is not linear in its motion, as a minimal model is",
-            where=where, mend="use inverse_dynamics or output_error",
+            where=where,
+            hint="use inverse_dynamics or output_error",
         )
 
 
@@ -90,9 +93,7 @@ def _at_rest(plant: Plant) -> tuple[Array, ...]:
     return q, q, q, jnp.zeros(len(plant.driven(plant.joints))), jnp.zeros(plant.ports(q).size)
 
 
-def _balance(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, reaction: Array, t: Array
-) -> Balance:
+def _balance(plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, reaction: Array, t: Array) -> Balance:
     return plant.balance(q, qd, qdd, u, t, plant.initial_states(u), reaction)
 
 

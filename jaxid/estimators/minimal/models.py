@@ -86,7 +86,9 @@ def form_of(joints: int, measured: tuple[bool, ...], accelerated: bool, printed:
 def _rows(balance: LinearBalance, form: Form, sign: float = -1.0) -> dict[str, Matrix]:
     """Coefficients of a model by signal, (orders, rows, index); `sign` as in `determinant`."""
     parts = {
-        "position": balance.motion, "force": balance.force[None], "sign": balance.sign[None],
+        "position": balance.motion,
+        "force": balance.force[None],
+        "sign": balance.sign[None],
         "one": balance.constant[None, :, None],
     }
     if not form.hidden:
@@ -192,8 +194,7 @@ def _terms(plant: Plant, form: Form) -> list[Term]:
         orders, rows, width = shapes[name].shape
         index = joints.get(name, tuple(range(width)))
         terms += [
-            Term(r, name, index[j], k)
-            for k in range(orders) for r in range(rows) for j in range(width)
+            Term(r, name, index[j], k) for k in range(orders) for r in range(rows) for j in range(width)
         ]
     return terms
 
@@ -224,7 +225,7 @@ class Structure:
 
 
 @dataclass(frozen=True)
-class Samples:
+class MinimalSamples:
     """All coefficients of a model at some values of the unknowns.
 
     Args:
@@ -265,7 +266,7 @@ def _sampled(plant: Plant, places: tuple, form: Form, draws: Array) -> tuple[Arr
     return values, slopes, size, force
 
 
-def structure_of(plant: Plant, parameters: Parameters, form: Form) -> tuple[Structure, Samples]:
+def structure_of(plant: Plant, parameters: Parameters, form: Form) -> tuple[Structure, MinimalSamples]:
     """Read off a plant which coefficients of a model are nothing, known or unknown.
 
     Args:
@@ -283,20 +284,21 @@ def structure_of(plant: Plant, parameters: Parameters, form: Form) -> tuple[Stru
     draws = scale * np.exp(random.uniform(-1.0, 1.0, (_DRAWS, len(guess))))
     draws = np.concatenate([draws, [np.where(offset, 0.0, scale), guess]])
     terms = _terms(plant, form)
-    values, slopes, size, force = (
-        np.asarray(a) for a in _sampled(plant, parameters.places, form, draws)
-    )
+    values, slopes, size, force = (np.asarray(a) for a in _sampled(plant, parameters.places, form, draws))
     if np.any(force != force[0]):
         raise ValueError("the gain between the declared force and the joints is unknown")
     there = np.any(np.abs(values) > _NOTHING * size, axis=0)
     rows = 1 + max(t.row for t in terms)
     leading = tuple(_leading(r, terms, there) for r in range(rows))
     every = tuple((k, t) for k, t in enumerate(terms) if there[k] and (k, t) not in leading)
-    samples = Samples(values, slopes, guess)
+    samples = MinimalSamples(values, slopes, guess)
     own, steep = samples.of(every, leading)
     moves = np.abs(steep * scale).max(axis=(0, 2), initial=0.0) > _NOTHING * np.abs(own).max(axis=0)
     return Structure(
-        form, rows, leading, tuple(e for e, m in zip(every, moves, strict=True) if m),
+        form,
+        rows,
+        leading,
+        tuple(e for e, m in zip(every, moves, strict=True) if m),
         tuple(e for e, m in zip(every, moves, strict=True) if not m),
     ), samples
 

@@ -47,9 +47,7 @@ def determinant(a: Matrix, sign: float = -1.0) -> Polynomial:
     n = a.shape[1]
     if n == 0:
         return jnp.ones(1)
-    parts = [
-        sign**j * jnp.convolve(a[:, 0, j], determinant(_minor(a, 0, j), sign)) for j in range(n)
-    ]
+    parts = [sign**j * jnp.convolve(a[:, 0, j], determinant(_minor(a, 0, j), sign)) for j in range(n)]
     return sum(parts[1:], parts[0])
 
 

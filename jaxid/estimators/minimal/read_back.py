@@ -17,10 +17,10 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.minimal.basis import Basis, chi_of
 from jaxid.estimators.minimal.models import Structure
-from jaxid.estimators.minimal.statistics import Constraint, Fit, chance
+from jaxid.estimators.minimal.statistics import Constraint, MinimalFit, chance
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 
 # Relative to the largest, below this a singular value of the scaled slopes is rounding.
 _RANK = 1e-6
@@ -50,8 +50,16 @@ class Model:
 
 @eqx.filter_jit
 def read_back(
-    plant: Plant, places: tuple, structure: Structure, maps: tuple[Array, Array], target: Array,
-    root: Array, rest: Array, theta: Array, transform: Transform, bounds: tuple[Array, Array],
+    plant: Plant,
+    places: tuple,
+    structure: Structure,
+    maps: tuple[Array, Array],
+    target: Array,
+    root: Array,
+    rest: Array,
+    theta: Array,
+    transform: Transform,
+    bounds: tuple[Array, Array],
 ) -> tuple[Minimum, Array, Array]:
     """Parameters whose chi is nearest to a target, that chi, and its slopes.
 
@@ -69,7 +77,7 @@ def read_back(
 
 
 def constraint_steps(
-    plant: Plant, parameters: Parameters, model: Model, fit: Fit, theta: np.ndarray, slopes: np.ndarray
+    plant: Plant, parameters: Parameters, model: Model, fit: MinimalFit, theta: np.ndarray, slopes: np.ndarray
 ) -> Steps[Constraint | None]:
     """Test whether the coefficients can be those of a plant, where there are more than a plant has.
 
@@ -94,10 +102,21 @@ def constraint_steps(
     transform = Transform.of(part)
     floor = np.where(transform.log, part.bounds[0], -wide)
     root = np.linalg.cholesky(np.linalg.inv(covariance)).T
-    found, _, slopes = yield Solve(read_back, (
-        bare, part.places, model.structure, model.maps, fit.chi, root, np.asarray(1.0),
-        theta[list(rest)], transform, (floor, wide),
-    ))
+    found, _, slopes = yield SolveRequest(
+        read_back,
+        (
+            bare,
+            part.places,
+            model.structure,
+            model.maps,
+            fit.chi,
+            root,
+            np.asarray(1.0),
+            theta[list(rest)],
+            transform,
+            (floor, wide),
+        ),
+    )
     freedom = len(fit.chi) - _rank(np.asarray(slopes), covariance, np.asarray(found.theta))
     if freedom == 0:
         return None
@@ -117,9 +136,7 @@ def _regroupable(plant: Plant, parameters: Parameters, hidden: tuple[int, ...]) 
     """Unknown friction of hidden joints that a measured joint has too."""
     kinds = [_friction(plant, f.path, f.index) for f in parameters.free]
     seen = {kind for kind, joint in (k for k in kinds if k is not None) if joint not in hidden}
-    return tuple(
-        k for k, at in enumerate(kinds) if at is not None and at[1] in hidden and at[0] in seen
-    )
+    return tuple(k for k, at in enumerate(kinds) if at is not None and at[1] in hidden and at[0] in seen)
 
 
 def _friction(plant: Plant, path: tuple, index: int | None) -> tuple[str, int] | None:
@@ -129,6 +146,6 @@ def _friction(plant: Plant, path: tuple, index: int | None) -> tuple[str, int] |
         regroups = effect.kind in ("viscous_friction", "coulomb_friction") and effect.port < plant.joints
         return (effect.kind, effect.port) if regroups else None
     for joint in range(plant.joints):
-        if plant.twin(EFFECTS["viscous_friction"], joint) == (path[0], index):
+        if plant.equivalent_parameter(EFFECTS["viscous_friction"], joint) == (path[0], index):
             return "viscous_friction", joint
     return None

@@ -8,25 +8,31 @@ import numpy as np
 
 from jaxid.estimators.minimal.basis import Basis
 from jaxid.estimators.minimal.models import Form
-from jaxid.estimators.minimal.statistics import DROPPED, Constraint, Fit
+from jaxid.estimators.minimal.statistics import DROPPED, Constraint, MinimalFit
 from jaxid.logs.prepare import Recipe
 
 
 def minimal_json(
-    form: Form, fit: Fit, basis: Basis, constraint: Constraint | None,
-    modes: dict[str, list[tuple[float, float]]], recipe: Recipe,
+    form: Form,
+    fit: MinimalFit,
+    basis: Basis,
+    constraint: Constraint | None,
+    modes: dict[str, list[tuple[float, float]]],
+    recipe: Recipe,
 ) -> dict[str, Any]:
     """The `minimal` object of result.json."""
-    rows = zip(
-        basis.names, basis.units, fit.chi, fit.precision.std, fit.white, fit.without, strict=True
-    )
+    rows = zip(basis.names, basis.units, fit.chi, fit.precision.std, fit.white, fit.without, strict=True)
     return {
         "model": form.name,
         "equation": form.equation,
         "coefficients": {
             name: {
-                "value": float(c), "unit": unit, "std": float(s), "relative_std": float(s / abs(c)),
-                "std_white": float(w), "relative_std_white": float(w / abs(c)),
+                "value": float(c),
+                "unit": unit,
+                "std": float(s),
+                "relative_std": float(s / abs(c)),
+                "std_white": float(w),
+                "relative_std_white": float(w / abs(c)),
                 "residual_without": float(g),
             }
             for name, unit, c, s, w, g in rows
@@ -35,26 +41,35 @@ def minimal_json(
         "condition_scaled": fit.condition_scaled,
         "residual_norm": fit.relative,
         "droppable": droppable(fit, basis),
-        "constraint": None if constraint is None else {
-            "chi_square": constraint.chi_square, "degrees_of_freedom": constraint.freedom,
-            "p_value": constraint.p_value, "regrouped": list(constraint.regrouped),
+        "constraint": None
+        if constraint is None
+        else {
+            "chi_square": constraint.chi_square,
+            "degrees_of_freedom": constraint.freedom,
+            "p_value": constraint.p_value,
+            "regrouped": list(constraint.regrouped),
         },
         "natural_frequency_hz": {
             name: [{"value": v, "std": s} for v, s in found] for name, found in modes.items()
         },
         "preprocess": {
-            "cutoff_hz": recipe.cutoff_hz, "order": recipe.order, "decimation": recipe.decimation,
-            "trim": recipe.trim, "derivatives": recipe.derivatives,
+            "cutoff_hz": recipe.cutoff_hz,
+            "order": recipe.order,
+            "decimation": recipe.decimation,
+            "trim": recipe.trim,
+            "derivatives": recipe.derivatives,
         },
     }
 
 
-def droppable(fit: Fit, basis: Basis) -> list[str]:
+def droppable(fit: MinimalFit, basis: Basis) -> list[str]:
     """Coefficients without any one of which the residual's norm changes by less than 1 %."""
     return [n for n, g in zip(basis.names, fit.without, strict=True) if g - 1 < DROPPED]
 
 
-def minimal_notes(form: Form, fit: Fit, basis: Basis, constraint: Constraint | None) -> tuple[str, ...]:
+def minimal_notes(
+    form: Form, fit: MinimalFit, basis: Basis, constraint: Constraint | None
+) -> tuple[str, ...]:
     """What a user should know of the model."""
     out = [f"minimal model {form.equation}: {form.name.replace('_', ' ')}"]
     if form.hidden:
@@ -79,15 +94,23 @@ def minimal_rows(content: dict[str, Any]) -> tuple[list[list[str]], list[str]]:
     percent = lambda x: "-" if x is None or not np.isfinite(x) else f"{100 * x:.3g} %"
     rows = [["coefficient", "value", "std", "relative", "white", "unit", "without it"]]
     for name, c in content["coefficients"].items():
-        rows.append([
-            name, number(c["value"]), number(c["std"]), percent(c["relative_std"]),
-            percent(c["relative_std_white"]), c["unit"], f"residual +{percent(c['residual_without'] - 1)}",
-        ])
+        rows.append(
+            [
+                name,
+                number(c["value"]),
+                number(c["std"]),
+                percent(c["relative_std"]),
+                percent(c["relative_std_white"]),
+                c["unit"],
+                f"residual +{percent(c['residual_without'] - 1)}",
+            ]
+        )
     free = content["natural_frequency_hz"]
     lines = [
         f"natural frequency, {name.replace('_', ' ')}: "
         + ", ".join(f"{number(m['value'])} +- {number(m['std'])} Hz" for m in modes)
-        for name, modes in free.items() if modes
+        for name, modes in free.items()
+        if modes
     ]
     lines.append(
         f"condition {number(content['condition'])} (columns of one length: "

@@ -16,7 +16,7 @@ DROPPED = 0.01
 
 
 @dataclass(frozen=True)
-class Fit:
+class MinimalFit:
     """What least squares says of the coefficients chi.
 
     Args:
@@ -47,7 +47,7 @@ class Fit:
         return float(np.linalg.norm(self.residual) / self.size)
 
 
-def least_squares(names: tuple[str, ...], data: Regression, weight: Float[np.ndarray, " rows"]) -> Fit:
+def least_squares(names: tuple[str, ...], data: Regression, weight: Float[np.ndarray, " rows"]) -> MinimalFit:
     """Ordinary least squares of all rows, stacked.
 
     Args:
@@ -73,13 +73,16 @@ def least_squares(names: tuple[str, ...], data: Regression, weight: Float[np.nda
     white = spread * np.linalg.norm(inverse, axis=1) / norm
     # Without one coefficient the squares grow by chi^2 / (W'W)^-1_jj.
     growth = (chi * norm / np.linalg.norm(inverse, axis=1)) ** 2
-    return Fit(
+    return MinimalFit(
         chi=chi,
         precision=assess(list(names), w, residual, counts, size, np.where(chi != 0, chi, 1.0)),
-        white=white, residual=residual, size=size,
+        white=white,
+        residual=residual,
+        size=size,
         condition=float(np.linalg.cond(root * norm)),
         condition_scaled=float(np.linalg.cond(root)),
-        without=np.sqrt(1 + growth / left**2), root=root * norm,
+        without=np.sqrt(1 + growth / left**2),
+        root=root * norm,
     )
 
 

@@ -21,13 +21,13 @@ from jaxtyping import Float
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.recursive.precision import details_of, precision_of
-from jaxid.estimators.recursive.recursion import Memory, Recursion, column_squares, instants, run
+from jaxid.estimators.recursive.recursion import Recursion, RecursiveMemory, column_squares, instants, run
 from jaxid.estimators.recursive.rows import Rows, rows_steps
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.effect import carries_force
 from jaxid.model.parameter import parameters_of
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 
 # So many samples the start counts as.
 REGULARIZATION = 1e-3
@@ -87,31 +87,38 @@ def recursive_steps(
     recursion, memory = _recursion(machine, data, used, stated, gains)
     if saved is not None:
         recursion = replace(recursion, start=saved["start"], information=saved["information"])
-        memory = Memory(**{k: jnp.asarray(v) for k, v in saved["memory"].items()})
+        memory = RecursiveMemory(**{k: jnp.asarray(v) for k, v in saved["memory"].items()})
     every = max(1, -(-len(full.rows) // _MOST))
-    memory, told, z = yield Solve(run, (recursion, memory, full.rows, full.target, full.counts, every))
+    memory, told, z = yield SolveRequest(run, (recursion, memory, full.rows, full.target, full.counts, every))
     told, z = jax.tree.map(np.asarray, told), used.rows if z is None else np.asarray(z)
     theta, times = told.theta[-1], data.times[instants(len(full.rows), every)]
     precision, inflation = precision_of(machine, used, z, recursion, told, every, saved is None)
     converged = bool(np.all(np.isfinite(theta)))
     return Estimate(
-        method="recursive", machine=machine.with_estimate(theta), theta=theta, precision=precision,
-        converged=converged, message="converged" if converged else "the estimate is not finite",
+        method="recursive",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=converged,
+        message="converged" if converged else "the estimate is not finite",
         residual=np.where(used.counts, used.rows @ theta - used.target, np.nan),
-        samples=int(used.counts.sum()), notes=_notes(machine, theta, stated, noisy),
+        samples=int(used.counts.sum()),
+        notes=_notes(machine, theta, stated, noisy),
         details={"recursive": details_of(machine, recursion, memory, told, times, inflation, stated)},
     )
 
 
 def _recursion(
     machine: Machine, data: Prepared, used: Rows, stated: Mapping[str, Any], gains: tuple
-) -> tuple[Recursion, Memory]:
+) -> tuple[Recursion, RecursiveMemory]:
     """The estimator as the case states it, and its memory before the first sample."""
     period, half_life = data.period * data.recipe.decimation, stated.get("half_life", np.inf)
     recursion = Recursion(
         machine.parameters.guess if stated.get("start") == "guess" else start_of(machine),
         stated.get("regularization", REGULARIZATION) * _sizes(machine, used),
-        np.asarray(2.0 ** (-period / half_life)), stated.get("rows") == "summed", gains,
+        np.asarray(2.0 ** (-period / half_life)),
+        stated.get("rows") == "summed",
+        gains,
         stated.get("instrument") == "model",
     )
     return recursion, recursion.memory()
@@ -140,18 +147,20 @@ def _check(
     rows, instrument = stated.get("rows", "full"), stated.get("instrument", "none")
     if instrument == "model" and not any(g is not None for g in gains):
         raise InputError(
-            'instrument = "model" is for gains of drives, and none is unknown', where="recursive",
-            mend="leave it out, or add an effect actuator_gain with gain = { guess = 1.0 }",
+            'instrument = "model" is for gains of drives, and none is unknown',
+            where="recursive",
+            hint="leave it out, or add an effect actuator_gain with gain = { guess = 1.0 }",
         )
     if rows == "summed" and len({machine.plant.motion(i) for i in range(machine.plant.joints)}) > 1:
         raise InputError(
-            'rows = "summed" would add forces to torques', where="recursive", mend='take rows = "full"'
+            'rows = "summed" would add forces to torques', where="recursive", hint='take rows = "full"'
         )
     was = saved and {"summed": rows == "summed", "instrument": instrument == "model"}
     if was and any(saved[k] != v for k, v in was.items()):
         raise InputError(
-            "restart is of a run with other rows or another instrument", where="recursive",
-            mend="state rows and instrument as that run did",
+            "restart is of a run with other rows or another instrument",
+            where="recursive",
+            hint="state rows and instrument as that run did",
         )
 
 
@@ -160,15 +169,18 @@ def _check_rows(machine: Machine, rows: Rows, gains: tuple) -> None:
     names = machine.parameters.names
     if rows.counts.sum() <= len(names):
         raise InputError(
-            f"{int(rows.counts.sum())} samples pass the gate, for {len(names)} unknowns", where="recursive",
-            mend="lower gate_velocity or gate_acceleration, or take a log with more motion",
+            f"{int(rows.counts.sum())} samples pass the gate, for {len(names)} unknowns",
+            where="recursive",
+            hint="lower gate_velocity or gate_acceleration, or take a log with more motion",
         )
     for k, g in enumerate(gains):
         known = np.abs(np.where(rows.counts, rows.target, 0.0)[:, k]).max()
         if g is not None and known <= _NOTHING * np.abs(rows.force[:, k]).max():
             raise InputError(
                 f"{names[g]} has nothing known in its balance to be told against: any multiple of all "
-                "unknowns fits as well", where="recursive", mend="declare the inertia or the gain known",
+                "unknowns fits as well",
+                where="recursive",
+                hint="declare the inertia or the gain known",
             )
 
 

@@ -26,21 +26,22 @@ def read_memory(path: Path, names: list[str]) -> dict[str, Any]:
     Raises:
         InputError: If the file is not there, is none of this method, or is about other unknowns.
     """
-    mend = "name the result.json of a run of the method recursive"
+    hint = "name the result.json of a run of the method recursive"
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))["recursive"]["restart"]
         memory = {k: np.asarray(v) for k, v in saved["memory"].items()}
         out = {**saved, "memory": memory, **{k: np.asarray(saved[k]) for k in ("start", "information")}}
     except OSError as error:
-        raise InputError("no such file", where=f"restart = {path}", mend=mend) from error
+        raise InputError("no such file", where=f"restart = {path}", hint=hint) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError("holds no memory of the method recursive", where=str(path), mend=mend) from error
+        raise InputError("holds no memory of the method recursive", where=str(path), hint=hint) from error
     if saved["names"] != names:
         raise InputError(
             f"is about {', '.join(saved['names'])}; the case's unknowns are {', '.join(names)}",
-            where=str(path), mend="let both be the same, in the same order",
+            where=str(path),
+            hint="let both be the same, in the same order",
         )
     values = (*memory.values(), out["start"], out["information"])
     if any(v.dtype == object or not np.all(np.isfinite(v)) for v in values):
-        raise InputError("its memory is not finite", where=str(path), mend="begin anew, without restart")
+        raise InputError("its memory is not finite", where=str(path), hint="begin anew, without restart")
     return out

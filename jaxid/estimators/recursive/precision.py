@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.estimators.recursive.recursion import Memory, Recursion, Told
+from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, RecursiveMemory
 from jaxid.estimators.recursive.rows import Rows
 from jaxid.machine import Machine
 from jaxid.numerics.precision import NoiseModel, Precision, assess, sandwich
@@ -22,8 +22,13 @@ def weights(rows: Rows, forgetting: float) -> Float[np.ndarray, " kept"]:
 
 
 def precision_of(
-    machine: Machine, rows: Rows, z: Float[np.ndarray, "kept m p"], recursion: Recursion, told: Told,
-    every: int, whole: bool,
+    machine: Machine,
+    rows: Rows,
+    z: Float[np.ndarray, "kept m p"],
+    recursion: Recursion,
+    told: RecursiveEstimate,
+    every: int,
+    whole: bool,
 ) -> tuple[Precision, Float[np.ndarray, " p"]]:
     """Precision at the end, and by how much the residual's colour widens what white noise would leave.
 
@@ -58,17 +63,15 @@ def precision_of(
         ratio = np.sqrt(np.diag(covariance) / np.diag(told.covariance[-1]))
         # All columns together say more than each alone.
         inflation = np.where(np.isfinite(ratio), ratio, inflation)
-    sure = told.told[-1] & (found.identifiable if whole else np.isfinite(inflation))
+    sure = told.identifiable[-1] & (found.identifiable if whole else np.isfinite(inflation))
     covariance[~sure], covariance[:, ~sure] = np.nan, np.nan
     named = found.unidentifiable if whole else []
     lost = [{n: 1.0} for k, n in enumerate(names) if not sure[k] and not any(n in c for c in named)]
-    return replace(
-        found, covariance=covariance, identifiable=sure, unidentifiable=[*named, *lost]
-    ), inflation
+    return replace(found, covariance=covariance, identifiable=sure, unidentifiable=[*named, *lost]), inflation
 
 
 def _residual(
-    rows: Rows, root: np.ndarray, recursion: Recursion, told: Told, every: int
+    rows: Rows, root: np.ndarray, recursion: Recursion, told: RecursiveEstimate, every: int
 ) -> Float[np.ndarray, "kept m"]:
     """Residual whose colour and size are those of the noise that the estimate has.
 
@@ -79,7 +82,7 @@ def _residual(
     if recursion.forgetting == 1.0:
         return last
     block = np.arange(len(last)) // every
-    then = np.where(told.told.all(axis=1)[block, None], told.theta[block], told.theta[-1])
+    then = np.where(told.identifiable.all(axis=1)[block, None], told.theta[block], told.theta[-1])
     e = np.where(rows.counts, np.einsum("tmp,tp->tm", rows.rows, then) - rows.target, 0.0)
     mean = lambda x, weight: np.sum(weight * x**2, axis=0) / np.maximum(np.sum(weight, axis=0), 1e-300)
     return e * np.sqrt(mean(last, root**2) / np.maximum(mean(e, rows.counts), 1e-300))
@@ -107,12 +110,17 @@ def _inflation(jacobian: np.ndarray, e: np.ndarray, counts: np.ndarray) -> Float
 
 
 def details_of(
-    machine: Machine, recursion: Recursion, memory: Memory, told: Told, times: np.ndarray,
-    inflation: np.ndarray, stated: Mapping[str, Any],
+    machine: Machine,
+    recursion: Recursion,
+    memory: RecursiveMemory,
+    told: RecursiveEstimate,
+    times: np.ndarray,
+    inflation: np.ndarray,
+    stated: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The `recursive` object of result.json: settings, history, and the memory for a warm restart."""
     names = machine.parameters.names
-    variance = np.where(told.told, np.diagonal(told.covariance, axis1=1, axis2=2), np.nan)
+    variance = np.where(told.identifiable, np.diagonal(told.covariance, axis1=1, axis2=2), np.nan)
     std = np.sqrt(variance) * inflation
     return {
         "half_life": stated.get("half_life"),
@@ -130,8 +138,10 @@ def details_of(
             "residual": told.residual,
         },
         "restart": {
-            "names": names, "start": np.asarray(recursion.start),
-            "information": np.asarray(recursion.information), "summed": recursion.summed,
+            "names": names,
+            "start": np.asarray(recursion.start),
+            "information": np.asarray(recursion.information),
+            "summed": recursion.summed,
             "instrument": recursion.instrument,
             "memory": {k: np.asarray(v) for k, v in vars(memory).items()},
         },

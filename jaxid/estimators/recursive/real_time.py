@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import check_instant, slopes
 from jaxid.estimators.recursive.estimate import gains_of, start_of
-from jaxid.estimators.recursive.recursion import Memory, Recursion, Told, column_squares
+from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, RecursiveMemory, column_squares
 from jaxid.estimators.recursive.rows import check_proportion, elsewhere
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
@@ -28,7 +28,7 @@ class RealTime(eqx.Module):
         live = RealTime.of(machine, 1e-3, noise=2.0, spread=[20.0, 200.0, 20.0], gate_velocity=1e-3)
         memory = live.memory()
         memory = live.update(memory, q, qd, qdd, command)    # every millisecond
-        live.told(memory).theta
+        live.estimate(memory).theta
 
     A memory is a tree of arrays: saved as it is and given to `update` again, all goes on bit for bit.
 
@@ -52,9 +52,17 @@ class RealTime(eqx.Module):
 
     @classmethod
     def of(
-        cls, machine: Machine, period: float, *, noise: float, spread: np.ndarray,
-        gate_velocity: float | np.ndarray, gate_acceleration: float | np.ndarray = np.inf,
-        half_life: float = np.inf, summed: bool = False, instrument: bool = False,
+        cls,
+        machine: Machine,
+        period: float,
+        *,
+        noise: float,
+        spread: np.ndarray,
+        gate_velocity: float | np.ndarray,
+        gate_acceleration: float | np.ndarray = np.inf,
+        half_life: float = np.inf,
+        summed: bool = False,
+        instrument: bool = False,
         start: np.ndarray | None = None,
     ) -> RealTime:
         """The estimator of a machine.
@@ -78,19 +86,19 @@ class RealTime(eqx.Module):
         sizes = {"period": period, "noise": noise, "spread": spread, "half_life": half_life}
         for name, value in {**sizes, "gate_velocity": gate_velocity}.items():
             if not np.all(np.asarray(value, float) > 0):
-                raise InputError(f"{name} = {value} is not positive", where="RealTime", mend="it must be > 0")
+                raise InputError(f"{name} = {value} is not positive", where="RealTime", hint="it must be > 0")
         # A negative gate would let samples at rest through.
         if not np.all(np.asarray(gate_acceleration, float) >= 0):
             what = f"gate_acceleration = {gate_acceleration} is negative"
-            raise InputError(what, where="RealTime", mend="it must be >= 0")
+            raise InputError(what, where="RealTime", hint="it must be >= 0")
         for name, value in {"spread": spread, "start": spread if start is None else start}.items():
             if np.shape(value) != (len(names),):
-                mend = f"give one of each of {', '.join(names)}"
-                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", mend=mend)
+                hint = f"give one of each of {', '.join(names)}"
+                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
         for name, value in {"gate_velocity": gate_velocity, "gate_acceleration": gate_acceleration}.items():
             if np.shape(value) not in ((), (1,), (n,)):
-                mend = f"give one for all joints, or {n}"
-                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", mend=mend)
+                hint = f"give one for all joints, or {n}"
+                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
         check_instant(machine, "RealTime")
         velocity, acceleration = (
             np.broadcast_to(np.asarray(x, float), (n,)) for x in (gate_velocity, gate_acceleration)
@@ -103,17 +111,23 @@ class RealTime(eqx.Module):
         check_proportion(names, here, there)
         recursion = Recursion(
             start_of(machine) if start is None else np.asarray(start, float),
-            np.square(noise / np.asarray(spread, float)), np.asarray(2.0 ** (-period / half_life)),
-            summed, gains_of(machine), instrument,
+            np.square(noise / np.asarray(spread, float)),
+            np.asarray(2.0 ** (-period / half_life)),
+            summed,
+            gains_of(machine),
+            instrument,
         )
         return cls(plant, places, guess, machine.gain, velocity, acceleration, recursion)
 
-    def memory(self) -> Memory:
+    def memory(self) -> RecursiveMemory:
         """Before the first sample."""
         return self.recursion.memory()
 
     def rows(
-        self, q: Float[Array, " n"], qd: Float[Array, " n"], qdd: Float[Array, " n"],
+        self,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        qdd: Float[Array, " n"],
         command: Float[Array, " m"],
     ) -> tuple[Float[Array, "n p"], Float[Array, " n"], Bool[Array, " n"]]:
         """Rows, right-hand side and which rows count of one sample."""
@@ -138,9 +152,13 @@ class RealTime(eqx.Module):
 
     @eqx.filter_jit
     def update(
-        self, memory: Memory, q: Float[Array, " n"], qd: Float[Array, " n"], qdd: Float[Array, " n"],
+        self,
+        memory: RecursiveMemory,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        qdd: Float[Array, " n"],
         command: Float[Array, " m"],
-    ) -> Memory:
+    ) -> RecursiveMemory:
         """Take one sample more.
 
         Args:
@@ -151,6 +169,6 @@ class RealTime(eqx.Module):
         return self.recursion.update(memory, *self.rows(q, qd, qdd, command))[0]
 
     @eqx.filter_jit
-    def told(self, memory: Memory) -> Told:
+    def estimate(self, memory: RecursiveMemory) -> RecursiveEstimate:
         """What the samples so far say."""
-        return self.recursion.told(memory)
+        return self.recursion.estimate(memory)

@@ -35,14 +35,14 @@ from jaxid.estimators.common.levenberg_marquardt import eliminated
 
 # Of the variance with which an unknown starts, what may be left where the rows tell it: it is then by less
 # than a hundredth of the start's own error off.
-TOLD = 0.01
+IDENTIFIED = 0.01
 # Below this part of the force a column is nothing.
 _NOTHING = 1e-9
 # A gain below this part of its start makes no model of the drive's force.
 _LEAST_GAIN = 0.1
 
 
-class Memory(eqx.Module):
+class RecursiveMemory(eqx.Module):
     """What is kept from sample to sample, and all that a warm restart needs.
 
     Args:
@@ -70,14 +70,14 @@ class Memory(eqx.Module):
     moment: Float[Array, " p"]
 
 
-class Told(eqx.Module):
+class RecursiveEstimate(eqx.Module):
     """What a memory says.
 
     Args:
         theta: Estimate, by instruments where there are any.
         covariance: For white noise, and the square of `pull`; says nothing of unknowns that are not `told`.
         pull: By how much the start holds the estimate back, to first order, (p,).
-        told: Whether the rows tell an unknown, and not its start.
+        identifiable: Whether the rows, and not the start, determine an unknown.
         noise: Standard deviation of a row's noise.
         residual: Root mean square of what every row left after its own update, (49).
         effective: Sum of the weights of all rows.
@@ -86,7 +86,7 @@ class Told(eqx.Module):
     theta: Float[Array, " p"]
     covariance: Float[Array, "p p"]
     pull: Float[Array, " p"]
-    told: Bool[Array, " p"]
+    identifiable: Bool[Array, " p"]
     noise: Float[Array, ""]
     residual: Float[Array, ""]
     effective: Float[Array, ""]
@@ -95,7 +95,7 @@ class Told(eqx.Module):
     def std(self) -> Float[Array, " p"]:
         """Standard deviations; NaN where not told."""
         return jnp.sqrt(
-            jnp.where(self.told, jnp.diagonal(self.covariance, axis1=-2, axis2=-1), jnp.nan)
+            jnp.where(self.identifiable, jnp.diagonal(self.covariance, axis1=-2, axis2=-1), jnp.nan)
         )
 
 
@@ -119,19 +119,31 @@ class Recursion(eqx.Module):
     gains: tuple[int | None, ...] = eqx.field(static=True, default=())
     instrument: bool = eqx.field(static=True, default=False)
 
-    def memory(self) -> Memory:
+    def memory(self) -> RecursiveMemory:
         """Before the first sample."""
         p = self.start.size
         zero, square = jnp.zeros(()), jnp.zeros((p, p))
         information = jnp.asarray(self.information)
-        return Memory(
-            jnp.asarray(self.start), jnp.diag(1 / jnp.sqrt(information)), square, zero, zero, zero, zero,
-            jnp.zeros((), int), jnp.diag(information), information * self.start,
+        return RecursiveMemory(
+            jnp.asarray(self.start),
+            jnp.diag(1 / jnp.sqrt(information)),
+            square,
+            zero,
+            zero,
+            zero,
+            zero,
+            jnp.zeros((), int),
+            jnp.diag(information),
+            information * self.start,
         )
 
     def update(
-        self, memory: Memory, rows: Float[Array, "m p"], target: Float[Array, " m"], counts: Bool[Array, " m"]
-    ) -> tuple[Memory, Float[Array, "k p"]]:
+        self,
+        memory: RecursiveMemory,
+        rows: Float[Array, "m p"],
+        target: Float[Array, " m"],
+        counts: Bool[Array, " m"],
+    ) -> tuple[RecursiveMemory, Float[Array, "k p"]]:
         """Take one sample more.
 
         Args:
@@ -158,19 +170,25 @@ class Recursion(eqx.Module):
         theta, root = self._reminded(theta, root, beta, memory.samples)
         square = jnp.sum((rows @ theta - target) ** 2)
         kept = jnp.diag((1 - beta) * self.information)
-        return Memory(
-            theta, root, beta**2 * memory.spread + z.T @ z, cost, beta * memory.weight + number,
-            memory.squares + square, memory.rows + number, memory.samples + moved,
+        return RecursiveMemory(
+            theta,
+            root,
+            beta**2 * memory.spread + z.T @ z,
+            cost,
+            beta * memory.weight + number,
+            memory.squares + square,
+            memory.rows + number,
+            memory.samples + moved,
             beta * memory.normal + kept + z.T @ rows,
             beta * memory.moment + (1 - beta) * self.information * self.start + z.T @ target,
         ), z
 
-    def told(self, memory: Memory) -> Told:
+    def estimate(self, memory: RecursiveMemory) -> RecursiveEstimate:
         """What a memory says."""
         inverse = memory.root @ memory.root.T
         noise = memory.weight - jnp.sum(inverse * memory.spread)
         variance = jnp.where(noise > 0, memory.cost / jnp.where(noise > 0, noise, 1.0), jnp.nan)
-        told = jnp.diagonal(inverse) * self.information < TOLD
+        told = jnp.diagonal(inverse) * self.information < IDENTIFIED
         theta = memory.theta
         if self.instrument:
             scale = jnp.sqrt(jnp.abs(jnp.diagonal(memory.normal)))
@@ -180,11 +198,9 @@ class Recursion(eqx.Module):
         pull = inverse @ (self.information * (theta - self.start))
         covariance = variance * inverse @ memory.spread @ inverse.T + jnp.outer(pull, pull)
         residual = jnp.sqrt(memory.squares / jnp.maximum(memory.rows, 1.0))
-        return Told(theta, covariance, pull, told, jnp.sqrt(variance), residual, memory.weight)
+        return RecursiveEstimate(theta, covariance, pull, told, jnp.sqrt(variance), residual, memory.weight)
 
-    def _reminded(
-        self, theta: Array, root: Array, beta: Array, samples: Array
-    ) -> tuple[Array, Array]:
+    def _reminded(self, theta: Array, root: Array, beta: Array, samples: Array) -> tuple[Array, Array]:
         """One unknown's start as a row, with what it has lost since its last turn."""
         p = theta.size
         turn = samples % p
@@ -226,9 +242,13 @@ def _alike(counts: Array, x: Array) -> Array:
 
 @eqx.filter_jit
 def run(
-    recursion: Recursion, memory: Memory, rows: Float[Array, "time m p"], target: Float[Array, "time m"],
-    counts: Bool[Array, "time m"], every: int = 1,
-) -> tuple[Memory, Told, Array | None]:
+    recursion: Recursion,
+    memory: RecursiveMemory,
+    rows: Float[Array, "time m p"],
+    target: Float[Array, "time m"],
+    counts: Bool[Array, "time m"],
+    every: int = 1,
+) -> tuple[RecursiveMemory, RecursiveEstimate, Array | None]:
     """Take all samples of a log.
 
     Args:
@@ -248,20 +268,22 @@ def run(
     padded = [jnp.pad(x, more + [(0, 0)] * (x.ndim - 1)) for x in (rows, target, counts)]
     padded = [x.reshape(blocks, every, *x.shape[1:]) for x in padded]
 
-    def sample(memory: Memory, now: list) -> tuple[Memory, Array | None]:
+    def sample(memory: RecursiveMemory, now: list) -> tuple[RecursiveMemory, Array | None]:
         memory, z = recursion.update(memory, *now)
         return memory, z if recursion.instrument else None
 
-    def block(memory: Memory, now: list) -> tuple[Memory, tuple]:
+    def block(memory: RecursiveMemory, now: list) -> tuple[RecursiveMemory, tuple]:
         memory, z = jax.lax.scan(sample, memory, now)
-        return memory, (recursion.told(memory), z)
+        return memory, (recursion.estimate(memory), z)
 
     memory, (told, z) = jax.lax.scan(block, memory, padded)
     return memory, told, None if z is None else z.reshape(-1, *z.shape[2:])[:time]
 
 
 def column_squares(
-    rows: Float[Array, "time m p"], counts: Bool[Array, "time m"], force: Float[Array, "time m"],
+    rows: Float[Array, "time m p"],
+    counts: Bool[Array, "time m"],
+    force: Float[Array, "time m"],
     natural: Float[Array, " p"],
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
     """Mean square of each column, and of the force, over the samples that count.

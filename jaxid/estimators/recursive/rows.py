@@ -22,7 +22,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
 from jaxid.numerics import filters as signals
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.simulation.force_balance import ForceData, measured_force, sharpened, whole_motion
 
 # Part of itself by which a column may differ elsewhere among the unknowns: of rounding.
@@ -91,11 +91,11 @@ def rows_steps(machine: Machine, data: Prepared, gates: tuple[np.ndarray, np.nda
     """
     plant, names, places = sharpened(machine.plant, data), machine.parameters.names, machine.parameters.places
     arrays, guess = ForceData.of(data, data.fitted), machine.parameters.guess
-    e, columns = yield Solve(load_columns, (plant, places, arrays, guess))
-    _, there = yield Solve(load_columns, (plant, places, arrays, elsewhere(guess)))
+    e, columns = yield SolveRequest(load_columns, (plant, places, arrays, guess))
+    _, there = yield SolveRequest(load_columns, (plant, places, arrays, elsewhere(guess)))
     e, columns = np.asarray(e), np.asarray(columns)
     check_proportion(names, columns, np.asarray(there))
-    force = yield Solve(_measured_force, (plant, arrays))
+    force = yield SolveRequest(_measured_force, (plant, arrays))
     counts = data.fitted if gates is None else gated(data, *gates)
     target = columns @ guess - e
     return Rows(columns, target, counts, np.asarray(force))
@@ -116,8 +116,9 @@ def check_proportion(names: list[str], columns: np.ndarray, there: np.ndarray) -
     if odd.any():
         several = " and ".join(n for n, o in zip(names, odd, strict=True) if o)
         raise InputError(
-            f"the balance is not in proportion to {several}", where="recursive",
-            mend=f"declare {'one of them' if odd.sum() > 1 else 'it'} known, or use inverse_dynamics",
+            f"the balance is not in proportion to {several}",
+            where="recursive",
+            hint=f"declare {'one of them' if odd.sum() > 1 else 'it'} known, or use inverse_dynamics",
         )
 
 
@@ -135,8 +136,8 @@ def in_proportion_steps(machine: Machine, data: Prepared) -> Steps[Machine]:
     """
     free, guess = machine.parameters.free, machine.parameters.guess
     args = (sharpened(machine.plant, data), machine.parameters.places, ForceData.of(data, data.fitted))
-    _, columns = yield Solve(load_columns, (*args, guess))
-    _, there = yield Solve(load_columns, (*args, elsewhere(guess)))
+    _, columns = yield SolveRequest(load_columns, (*args, guess))
+    _, there = yield SolveRequest(load_columns, (*args, elsewhere(guess)))
     odd = _out_of_proportion(np.asarray(columns), np.asarray(there))
     kept = tuple(f for f, o in zip(free, odd, strict=True) if not o)
     return machine.with_plant(machine.plant, Parameters(kept))

@@ -19,20 +19,28 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.within_prior.posterior import loss_of, most_probable, past_kinks, quadratic, spread
 from jaxid.estimators.within_prior.precision import (
-    Told,
+    DirectionPrecision,
     add_profiles,
     assessed,
     hessian_of,
-    told_of,
+    precision_of_directions,
     with_guesses,
 )
-from jaxid.estimators.within_prior.problem import AT_ONCE, DRAWN, STAYS, Found, Problem, at_each_soon, read
+from jaxid.estimators.within_prior.problem import (
+    AT_ONCE,
+    DRAWN,
+    STAYS,
+    Problem,
+    RoundsResult,
+    at_each_soon,
+    read,
+)
 from jaxid.estimators.within_prior.rounding import draws_soon, rounded, rounds, through_rounding
-from jaxid.estimators.within_prior.rounds import in_rounds, told_directions
+from jaxid.estimators.within_prior.rounds import identifiable_directions, in_rounds
 from jaxid.estimators.within_prior.starts import likely_points, many_starts, starts_within
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import Precision
 from jaxid.simulation.replay import Numerics
 
@@ -44,10 +52,19 @@ _FOLLOWED = 0.1
 
 
 def directions_steps(
-    machine: Machine, log: Log, *, prior: float, on: str = "position", starts: int = 1,
-    others: Sequence[np.ndarray] = (), hessian: bool = False, profile: bool = False,
-    numerics: Numerics | None = None, widths: Mapping[str, float] | None = None,
-    begin: np.ndarray | None = None, drawn: bool = True,
+    machine: Machine,
+    log: Log,
+    *,
+    prior: float,
+    on: str = "position",
+    starts: int = 1,
+    others: Sequence[np.ndarray] = (),
+    hessian: bool = False,
+    profile: bool = False,
+    numerics: Numerics | None = None,
+    widths: Mapping[str, float] | None = None,
+    begin: np.ndarray | None = None,
+    drawn: bool = True,
 ) -> Steps[Estimate]:
     """Fit what a log tells of the unknowns in the loop, and leave the rest to the guesses.
 
@@ -115,7 +132,11 @@ def _of_rounding(drawn: bool, told: bool, more: bool) -> list[str]:
 
 
 def _estimate(
-    machine: Machine, found: Found, precision: Precision, notes: tuple[str, ...], details: dict[str, Any]
+    machine: Machine,
+    found: RoundsResult,
+    precision: Precision,
+    notes: tuple[str, ...],
+    details: dict[str, Any],
 ) -> Estimate:
     """The fit as a result."""
     problem, minimum = found.problem, found.minimum
@@ -126,27 +147,40 @@ def _estimate(
         message = "the simulation is not finite where the fit ended"
     of_cost = {"criterion_percent": problem.criterion(minimum), "effective_parameters": found.effective}
     return Estimate(
-        method="output_error", machine=machine.with_estimate(theta), theta=theta, precision=precision,
-        converged=found.settled, message=message,
+        method="output_error",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=found.settled,
+        message=message,
         residual=np.where(counts, e / np.where(counts, problem.weight, 1.0), np.nan),
-        samples=int(counts.sum()), steps=found.evaluations, notes=notes, details=details | of_cost,
+        samples=int(counts.sum()),
+        steps=found.evaluations,
+        notes=notes,
+        details=details | of_cost,
     )
 
 
-def _by_hessian(found: Found, told: Told) -> Steps[tuple[Told, list[str]]]:
+def _by_hessian(found: RoundsResult, told: DirectionPrecision) -> Steps[tuple[DirectionPrecision, list[str]]]:
     """With the full Hessian's quadratic picture, where it has one; and what to remark."""
     z, noise = np.asarray(found.minimum.theta), found.problem.noise(found.minimum, found.count)
     args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
-    full = np.asarray((yield Solve(hessian_of, args))) / noise**2 + np.eye(z.size)
+    full = np.asarray((yield SolveRequest(hessian_of, args))) / noise**2 + np.eye(z.size)
     if np.linalg.eigvalsh(full)[0] <= 0.0:
         return told, ["the cost does not curve upwards everywhere: its curvature was not taken"]
-    return with_guesses(found, told_of(found), found.vectors @ np.linalg.inv(full) @ found.vectors.T), []
+    return with_guesses(
+        found, precision_of_directions(found), found.vectors @ np.linalg.inv(full) @ found.vectors.T
+    ), []
 
 
 def _searched(
-    machine: Machine, problem: Problem, first: np.ndarray | None, starts: int,
-    given: Sequence[np.ndarray], drawn: bool,
-) -> Steps[tuple[Found, Told | None, dict[str, Any]]]:
+    machine: Machine,
+    problem: Problem,
+    first: np.ndarray | None,
+    starts: int,
+    given: Sequence[np.ndarray],
+    drawn: bool,
+) -> Steps[tuple[RoundsResult, DirectionPrecision | None, dict[str, Any]]]:
     """Where the fit ends, how well its directions are told, and what is to be stated of its starts."""
     if drawn or first is None:
         yield at_each_soon(problem)
@@ -169,7 +203,7 @@ def _searched(
     return found, told, many
 
 
-def _begun_elsewhere(found: Found, drawn: bool) -> Steps[Found]:
+def _begun_elsewhere(found: RoundsResult, drawn: bool) -> Steps[RoundsResult]:
     """The most probable of where the fit ends from a few likely points, and of where it did.
 
     Points that do not simulate are passed over, and so is where it did if that does not.
@@ -180,7 +214,7 @@ def _begun_elsewhere(found: Found, drawn: bool) -> Steps[Found]:
         if not np.all(np.isfinite(here.jacobian)):
             continue
         if not np.all(np.isfinite(best.minimum.jacobian)):
-            best = found = Found(problem, np.eye(w.size), 0, here, found.evaluations, False)
+            best = found = RoundsResult(problem, np.eye(w.size), 0, here, found.evaluations, False)
         noise = best.noise
         found = yield from _ended(found, w, drawn)
         best = min(best, found, key=lambda f: loss_of(noise, f.minimum, f.point))
@@ -212,16 +246,20 @@ def expected_steps(
     if np.any(np.var(exact - followed, axis=0) > _FOLLOWED * np.var(followed, axis=0)):
         return np.eye(len(here[0]))
     jacobian = np.asarray(minimum.jacobian)
-    vectors, count = told_directions(jacobian / problem.noise(minimum, 0), 0)
+    vectors, count = identifiable_directions(jacobian / problem.noise(minimum, 0), 0)
     minimum = replace(minimum, theta=vectors.T @ here[0], jacobian=jacobian @ vectors)
     if count:
-        _, told = yield from through_rounding(machine, Found(problem, vectors, count, minimum, 1, True))
+        _, told = yield from through_rounding(
+            machine, RoundsResult(problem, vectors, count, minimum, 1, True)
+        )
         if told is not None:
             return told.whole
     return np.eye(len(vectors))
 
 
-def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[Found, Told | None]]:
+def _most_probable(
+    machine: Machine, found: RoundsResult, drawn: bool
+) -> Steps[tuple[RoundsResult, DirectionPrecision | None]]:
     """On to where guesses and log agree, and how well directions are told there by both."""
     if not np.all(np.isfinite(found.minimum.jacobian)):
         return found, None
@@ -239,7 +277,7 @@ def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[F
     else:
         whole = quadratic(found, found.noise)
     while found.count:
-        told = with_guesses(found, told_of(found), whole)
+        told = with_guesses(found, precision_of_directions(found), whole)
         stays = told.std <= STAYS
         if np.all(stays):
             return found, told
@@ -249,16 +287,16 @@ def _most_probable(machine: Machine, found: Found, drawn: bool) -> Steps[tuple[F
     return found, None
 
 
-def _ended(found: Found, w: Float[np.ndarray, " q"], drawn: bool) -> Steps[Found]:
+def _ended(found: RoundsResult, w: Float[np.ndarray, " q"], drawn: bool) -> Steps[RoundsResult]:
     """The fit taken from a point to the most probable one, its directions those that are told there."""
     noise = found.problem.noise(found.minimum, found.count)
     w, here, settled = yield from (past_kinks if drawn else most_probable)(found.problem, noise, w)
-    vectors, count = told_directions(np.asarray(here.jacobian) / noise, found.count)
+    vectors, count = identifiable_directions(np.asarray(here.jacobian) / noise, found.count)
     spent = found.evaluations + int(here.steps)
-    return _along(Found(found.problem, np.eye(len(w)), count, here, spent, settled), vectors, count)
+    return _along(RoundsResult(found.problem, np.eye(len(w)), count, here, spent, settled), vectors, count)
 
 
-def _along(found: Found, vectors: np.ndarray, count: int) -> Found:
+def _along(found: RoundsResult, vectors: np.ndarray, count: int) -> RoundsResult:
     """The same point along other directions, of which so many are fitted."""
     turn = vectors.T @ found.vectors
     minimum = found.minimum

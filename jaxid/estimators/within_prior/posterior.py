@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.estimators.common.levenberg_marquardt import Minimum
-from jaxid.estimators.within_prior.problem import DRAWN, Found, Problem, at_each, read
+from jaxid.estimators.within_prior.problem import DRAWN, Problem, RoundsResult, at_each, read
 from jaxid.numerics.lanes import Steps
 
 # Of damping: the first, by how much it changes, and where no step helps.
@@ -37,7 +37,9 @@ _HALVED = 40
 
 
 def most_probable(
-    problem: Problem, noise: float, w: Float[np.ndarray, " q"],
+    problem: Problem,
+    noise: float,
+    w: Float[np.ndarray, " q"],
     held: Float[np.ndarray, " q"] | None = None,
 ) -> Steps[tuple[Float[np.ndarray, " q"], Minimum, bool]]:
     """Down to the most probable point, the guesses counted in.
@@ -110,7 +112,7 @@ def loss_of(noise: float, here: Minimum, w: Float[np.ndarray, " q"]) -> float:
     return 0.5 * float(e @ e) + 0.5 * float(w @ w)
 
 
-def quadratic(found: Found, noise: float) -> Float[np.ndarray, "q q"]:
+def quadratic(found: RoundsResult, noise: float) -> Float[np.ndarray, "q q"]:
     """What `spread` draws, by the quadratic picture at the fit."""
     axes, left = _picture(np.asarray(found.minimum.jacobian) @ found.vectors.T / noise)
     return (axes.T * left) @ axes
@@ -126,7 +128,9 @@ def _picture(
     return axes, left
 
 
-def spread(found: Found, noise: float) -> Steps[tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]]:
+def spread(
+    found: RoundsResult, noise: float
+) -> Steps[tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]]:
     """Mean square about the fit of what is as probable, given guesses and log, in units of the prior.
 
     Points are drawn as the guesses say and led to the log by letting it count more and more. Where it ties

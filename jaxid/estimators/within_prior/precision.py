@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxid.estimators.within_prior.posterior import loss_of, most_probable
-from jaxid.estimators.within_prior.problem import Found, residual_of
+from jaxid.estimators.within_prior.problem import RoundsResult, residual_of
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision, assess, full_hessian
@@ -34,7 +34,7 @@ def hessian_of(*args: Any) -> Array:
 
 
 @dataclass(frozen=True)
-class Told:
+class DirectionPrecision:
     """How well the fitted directions are told.
 
     Args:
@@ -55,7 +55,7 @@ class Told:
         return np.sqrt(np.diag(self.covariance))
 
 
-def told_of(found: Found) -> Told:
+def precision_of_directions(found: RoundsResult) -> DirectionPrecision:
     """Precision of the fitted directions, one at least, by the log alone: from the residual's own colour."""
     problem, r = found.problem, found.count
     shape, counts = problem.measured.shape, problem.weight > 0
@@ -64,8 +64,13 @@ def told_of(found: Found) -> Told:
     deviation = problem.weight * (problem.measured - problem.measured.mean(axis=0))
     signal = float(np.linalg.norm(deviation))
     told = assess(
-        [f"direction {k + 1}" for k in range(r)], jacobian, e, counts,
-        signal, np.ones(r), crossed=problem.on == "both",
+        [f"direction {k + 1}" for k in range(r)],
+        jacobian,
+        e,
+        counts,
+        signal,
+        np.ones(r),
+        crossed=problem.on == "both",
     )
     # Of the triangle: some directions are told a million times better than others.
     triangle = np.linalg.qr(jacobian.reshape(-1, r), mode="r")
@@ -73,10 +78,10 @@ def told_of(found: Found) -> Told:
     # A colour read off a hundred samples is itself uncertain: never less than white noise would leave.
     larger = np.maximum(1.0, white / told.std)
     of_seen = told.covariance * np.outer(larger, larger)
-    return Told(of_seen, white, told.information)
+    return DirectionPrecision(of_seen, white, told.information)
 
 
-def with_guesses(found: Found, told: Told, whole: np.ndarray) -> Told:
+def with_guesses(found: RoundsResult, told: DirectionPrecision, whole: np.ndarray) -> DirectionPrecision:
     """With the guesses counted in.
 
     Args:
@@ -91,7 +96,7 @@ def with_guesses(found: Found, told: Told, whole: np.ndarray) -> Told:
 
 
 def assessed(
-    machine: Machine, found: Found, told: Told | None
+    machine: Machine, found: RoundsResult, told: DirectionPrecision | None
 ) -> tuple[Precision, list[dict[str, Any]]]:
     """Precision of the parameters, and of the directions; None where no direction is told."""
     problem, r = found.problem, found.count
@@ -109,8 +114,10 @@ def assessed(
     covariance[~identifiable] = covariance[:, ~identifiable] = np.nan
     stated = [
         {
-            "combination": dict(zip(names, found.vectors[:, k].tolist(), strict=True)), "value": float(z[k]),
-            "std": float(told.std[k]), "std_white": float(told.white[k]),
+            "combination": dict(zip(names, found.vectors[:, k].tolist(), strict=True)),
+            "value": float(z[k]),
+            "std": float(told.std[k]),
+            "std_white": float(told.white[k]),
         }
         for k in range(r)
     ]
@@ -130,7 +137,7 @@ def _named(names: Sequence[str], vector: np.ndarray) -> dict[str, float]:
     return {n: float(v) for n, v in zip(names, vector, strict=True) if abs(v) > _NEGLIGIBLE}
 
 
-def add_profiles(found: Found, noise: float, stated: list[dict[str, Any]]) -> Steps[list[str]]:
+def add_profiles(found: RoundsResult, noise: float, stated: list[dict[str, Any]]) -> Steps[list[str]]:
     """Add to each direction its profile: twice the nats by which guess and log speak against it elsewhere.
 
     Returns:

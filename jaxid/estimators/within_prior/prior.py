@@ -42,7 +42,10 @@ class Prior(eqx.Module):
 
     @classmethod
     def of(
-        cls, machine: Machine, width: float, nuisance: Float[np.ndarray, " k"],
+        cls,
+        machine: Machine,
+        width: float,
+        nuisance: Float[np.ndarray, " k"],
         own: Mapping[str, float] | None = None,
     ) -> Prior:
         """Of a machine's guesses, a relative width around each or its own, and of nuisances about zero.
@@ -56,7 +59,8 @@ class Prior(eqx.Module):
             if f.guess == 0.0 and f.name not in own:
                 raise InputError(
                     f"{f.name} has a guess of zero, which a relative prior says nothing of",
-                    where="[output_error] prior", mend="give it a guess of its natural size",
+                    where="[output_error] prior",
+                    hint="give it a guess of its natural size",
                 )
         guess, (lower, upper) = machine.parameters.guess, machine.parameters.bounds
         log = Transform.of(machine.parameters).log
@@ -64,7 +68,9 @@ class Prior(eqx.Module):
         scale = np.where(log, width, width * np.abs(guess))
         scale = np.array([own.get(f.name, s) for f, s in zip(free, scale, strict=True)])
         return cls(
-            np.concatenate([guess, none]), np.concatenate([scale, nuisance]),
+            np.concatenate([guess, none]),
+            np.concatenate([scale, nuisance]),
             np.concatenate([log, none.astype(bool)]),
-            np.concatenate([lower, none - np.inf]), np.concatenate([upper, none + np.inf]),
+            np.concatenate([lower, none - np.inf]),
+            np.concatenate([upper, none + np.inf]),
         )

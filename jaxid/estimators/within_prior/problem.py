@@ -23,10 +23,10 @@ from jaxid.estimators.within_prior.prior import Prior
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
-from jaxid.numerics.lanes import Parts, Solve, Soon, Steps
+from jaxid.numerics.lanes import ParallelCalls, Precompile, SolveRequest, Steps
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.replay import Numerics, Replay, from_rest, make_replay, with_sensor
-from jaxid.simulation.step_size import calmed, steps_when_calmed
+from jaxid.simulation.step_size import steps_with_numerical_damping, with_numerical_damping
 
 # In parts of the variance of one sample: where a fit has settled, and where it is near enough to go on
 # sharper.
@@ -82,7 +82,12 @@ class Problem:
 
     @classmethod
     def of(
-        cls, machine: Machine, log: Log, prior: float, on: str, numerics: Numerics,
+        cls,
+        machine: Machine,
+        log: Log,
+        prior: float,
+        on: str,
+        numerics: Numerics,
         widths: Mapping[str, float] | None = None,
     ) -> Problem:
         """Of a machine and its log, from rest; see `jaxid.estimators.within_prior.fit.directions_steps`.
@@ -91,9 +96,9 @@ class Problem:
             InputError: If a guess is zero, or the loop cannot be simulated.
         """
         n, encoders = log.position.shape[1], tuple(np.flatnonzero(log.measured).tolist())
-        plant = calmed(machine.plant, jnp.asarray(log.filled[0]), log.period)
+        plant = with_numerical_damping(machine.plant, jnp.asarray(log.filled[0]), log.period)
         if plant is not machine.plant and numerics.set_valued:
-            fewer = max(steps_when_calmed(numerics.substeps, on), turning_steps(machine, log))
+            fewer = max(steps_with_numerical_damping(numerics.substeps, on), turning_steps(machine, log))
             numerics = replace(numerics, substeps=min(fewer, numerics.substeps))
         replay = from_rest(make_replay(machine, log, numerics))
         if on != "position":
@@ -163,8 +168,15 @@ def columns(vectors: Float[np.ndarray, "q q"], count: int) -> Float[np.ndarray, 
 
 
 def residual_of(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, prior: Prior, on: str,
-    vectors: Array, origin: Array | float = 0.0,
+    replay: Replay,
+    places: tuple,
+    plant: Plant,
+    measured: Array,
+    weight: Array,
+    prior: Prior,
+    on: str,
+    vectors: Array,
+    origin: Array | float = 0.0,
 ) -> Any:
     """Residual as a function of the directions' coordinates, counted from a point in units of the prior."""
     physical = output_residual(replay, places, plant, measured, weight, on)
@@ -197,15 +209,17 @@ def at_each(
         starts = _at_rest(problem, len(w))
     cut = range(_PART, len(w), _PART)
     some = zip(np.split(w, cut), np.split(starts, cut), strict=True)
-    found = yield Parts(residual_at_each, [(*problem.args, problem.ladder[-1], *at) for at in some])
+    found = yield ParallelCalls(residual_at_each, [(*problem.args, problem.ladder[-1], *at) for at in some])
     return np.concatenate([np.asarray(e) for e in found]).reshape(len(w), -1)
 
 
-def at_each_soon(problem: Problem) -> Soon:
+def at_each_soon(problem: Problem) -> Precompile:
     """What `at_each` will ask for."""
     points = np.zeros((_PART, problem.prior.base.size)), _at_rest(problem, _PART)
     args = (*problem.args, problem.ladder[-1], *points)
-    return Soon(residual_at_each, args, (residual_at_each, jax.tree.structure(args), problem.measured.shape))
+    return Precompile(
+        residual_at_each, args, (residual_at_each, jax.tree.structure(args), problem.measured.shape)
+    )
 
 
 def _at_rest(problem: Problem, draws: int) -> np.ndarray:
@@ -225,8 +239,14 @@ _go_on = eqx.filter_jit(_goes_on)
 
 
 def descent(
-    problem: Problem, sharpness: np.ndarray, pull: np.ndarray, origin: np.ndarray, vectors: np.ndarray,
-    z: Float[np.ndarray, " k"], active: Bool[np.ndarray, " k"], settled: float = SETTLED,
+    problem: Problem,
+    sharpness: np.ndarray,
+    pull: np.ndarray,
+    origin: np.ndarray,
+    vectors: np.ndarray,
+    z: Float[np.ndarray, " k"],
+    active: Bool[np.ndarray, " k"],
+    settled: float = SETTLED,
 ) -> Steps[Minimum]:
     """Fit from one start, a few evaluations at a time: side by side no run then waits long for another.
 
@@ -245,7 +265,7 @@ def descent(
     args = (*problem.args, sharpness, pull, origin, vectors, active, tolerance)
     while not progress.done and progress.steps < _A_RUNG:
         stop = np.minimum(progress.steps + _A_CALL, _A_RUNG)
-        progress = yield Solve(_go_on, (*args, stop, progress))
+        progress = yield SolveRequest(_go_on, (*args, stop, progress))
     return _compared(progress)
 
 
@@ -295,7 +315,7 @@ def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
 
 
 @dataclass(frozen=True)
-class Found:
+class RoundsResult:
     """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum.
 
     The minimum is in the coordinates of the first directions, or of all; those of others are zero.
@@ -341,7 +361,11 @@ class Found:
 
 
 def criterion_steps(
-    machine: Machine, log: Log, theta: Float[np.ndarray, " p"], *, on: str = "position",
+    machine: Machine,
+    log: Log,
+    theta: Float[np.ndarray, " p"],
+    *,
+    on: str = "position",
     numerics: Numerics | None = None,
 ) -> Steps[float]:
     """Criterion of the same simulation at given unknowns, percent; nothing is fitted."""

@@ -13,10 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxid.estimators.within_prior.precision import Told, told_of
-from jaxid.estimators.within_prior.problem import DRAWN, STAYS, Found, Problem, at_each, at_each_soon, signed
+from jaxid.estimators.within_prior.precision import DirectionPrecision, precision_of_directions
+from jaxid.estimators.within_prior.problem import (
+    DRAWN,
+    STAYS,
+    Problem,
+    RoundsResult,
+    at_each,
+    at_each_soon,
+    signed,
+)
 from jaxid.machine import Machine
-from jaxid.numerics.lanes import Soon, Steps, alone
+from jaxid.numerics.lanes import Precompile, Steps, run_alone
 from jaxid.simulation.replay import with_sensor
 
 # Until passes settle logs are drawn so many deviations about the point that was found last, or as far as the
@@ -49,7 +57,7 @@ def rounds(machine: Machine, problem: Problem) -> bool:
     return coarse and problem.replay.controller is not None
 
 
-def draws_soon(machine: Machine, problem: Problem) -> Soon:
+def draws_soon(machine: Machine, problem: Problem) -> Precompile:
     """What `through_rounding` will ask for."""
     return at_each_soon(_rounding(machine, problem))
 
@@ -73,9 +81,7 @@ def _rounding(machine: Machine, problem: Problem) -> Problem:
     return replace(problem, replay=with_sensor(problem.replay, machine.sensor))
 
 
-def drawn_roundings(
-    machine: Machine, problem: Problem, draws: int
-) -> Float[np.ndarray, "draws rows"] | None:
+def drawn_roundings(machine: Machine, problem: Problem, draws: int) -> Float[np.ndarray, "draws rows"] | None:
     """What rounding does to a residual at the guesses, the start anywhere within its first count.
 
     Args:
@@ -89,7 +95,7 @@ def drawn_roundings(
     if not rounds(machine, problem):
         return None
     rng = np.random.default_rng(2)
-    e = [alone(rounded(machine, problem, rng)) for _ in range(-(-draws // DRAWN))]
+    e = [run_alone(rounded(machine, problem, rng)) for _ in range(-(-draws // DRAWN))]
     e = np.concatenate(e)[:draws]
     return e - e.mean(axis=0)
 
@@ -157,7 +163,7 @@ class _Summary:
     shifts: bool
 
     @classmethod
-    def of(cls, machine: Machine, found: Found) -> _Summary:
+    def of(cls, machine: Machine, found: RoundsResult) -> _Summary:
         """Of a fit; its minimum is in the coordinates of all directions."""
         problem, p = found.problem, len(found.problem.places)
         noise = problem.noise(found.minimum, found.count)
@@ -168,9 +174,17 @@ class _Summary:
         _, told, axes = np.linalg.svd(np.linalg.qr(own, mode="r"))
         count = int(np.sum(told > _SEEN))
         return cls(
-            _rounding(machine, problem), _counts(machine, problem), axes.T, count, axes @ found.point[:p],
-            noise, np.asarray(found.minimum.residual).ravel() / noise, seen, step,
-            axes[:count] @ found.vectors[:p, :r], machine.course is not None and bool(machine.course.names),
+            _rounding(machine, problem),
+            _counts(machine, problem),
+            axes.T,
+            count,
+            axes @ found.point[:p],
+            noise,
+            np.asarray(found.minimum.residual).ravel() / noise,
+            seen,
+            step,
+            axes[:count] @ found.vectors[:p, :r],
+            machine.unknown_reference is not None and bool(machine.unknown_reference.names),
         )
 
     def drawn(
@@ -213,7 +227,9 @@ class _Summary:
         return left - left @ self.step.T @ self.jacobian.T
 
 
-def through_rounding(machine: Machine, found: Found) -> Steps[tuple[Found, Told | None]]:
+def through_rounding(
+    machine: Machine, found: RoundsResult
+) -> Steps[tuple[RoundsResult, DirectionPrecision | None]]:
     """Where the truth is, given what rounding does to a log, and which directions that leaves told.
 
     Args:
@@ -299,8 +315,11 @@ def _leading(
 
 
 def _told_along_axes(
-    found: Found, summary: _Summary, point: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"]
-) -> tuple[Found, Told | None]:
+    found: RoundsResult,
+    summary: _Summary,
+    point: Float[np.ndarray, " k"],
+    covariance: Float[np.ndarray, "k k"],
+) -> tuple[RoundsResult, DirectionPrecision | None]:
     """A fit elsewhere, along directions that are not correlated; those that stay told."""
     k, p, q = summary.count, summary.point.size, len(found.vectors)
     # Starts stand behind the machine's unknowns, each a direction of its own.
@@ -316,7 +335,7 @@ def _told_along_axes(
     ended = replace(found, vectors=vectors, count=count, minimum=minimum)
     if not count:
         return ended, None
-    return ended, replace(told_of(ended), covariance=np.diag(variances[:count]), whole=whole)
+    return ended, replace(precision_of_directions(ended), covariance=np.diag(variances[:count]), whole=whole)
 
 
 def _noise_missing(

@@ -12,8 +12,8 @@ from jaxid.estimators.within_prior.problem import (
     FAR,
     NEAR,
     STAYS,
-    Found,
     Problem,
+    RoundsResult,
     at_each,
     columns,
     descent,
@@ -34,7 +34,7 @@ _LOOKED = 2.0
 
 def in_rounds(
     problem: Problem, w: np.ndarray, most: int, *, look: bool = True, last: bool = False
-) -> Steps[Found]:
+) -> Steps[RoundsResult]:
     """Read the directions, fit along them, so many at most, and again, each time sharper, until they stay.
 
     `look`: begin at the best of many points; `last`: at the sharpest only, from a point that is near.
@@ -53,9 +53,9 @@ def in_rounds(
                 # Coordinates are of the first few directions: one of them leads to where this was read.
                 whole = np.linalg.qr(np.column_stack([w, np.eye(size)]))[0]
                 here = replace(here, theta=columns(whole, 0).T @ w)
-                return Found(problem, whole, 0, here, spent, False)
+                return RoundsResult(problem, whole, 0, here, spent, False)
             noise = problem.noise(here, count)
-            vectors, count = told_directions(np.asarray(here.jacobian) / noise, count)
+            vectors, count = identifiable_directions(np.asarray(here.jacobian) / noise, count)
             count = min(count, most)
             if rung == 0 and look and not last and count:
                 w = yield from _looked(problem, vectors[:, : min(count, AT_ONCE)], w)
@@ -72,7 +72,7 @@ def in_rounds(
         settled, cost = close and sharpness is ladder[-1], float(minimum.cost)
         if settled or not np.isfinite(cost):
             break
-    return Found(problem, vectors, count, minimum, spent, settled)
+    return RoundsResult(problem, vectors, count, minimum, spent, settled)
 
 
 def _looked(problem: Problem, told: np.ndarray, w: np.ndarray) -> Steps[np.ndarray]:
@@ -85,7 +85,7 @@ def _looked(problem: Problem, told: np.ndarray, w: np.ndarray) -> Steps[np.ndarr
     return points[np.argmin(np.where(np.isfinite(costs), costs, np.inf))]
 
 
-def told_directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
+def identifiable_directions(jacobian: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     """Directions as columns, best told first, and how many are fitted; of a Jacobian over the noise."""
     size = jacobian.shape[1]
     # Of its triangle, a tenth as long.

@@ -8,9 +8,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxid.estimators.within_prior.problem import DRAWN, FAR, NEAR, NO_PULL, Found, Problem, at_each, fit_each
+from jaxid.estimators.within_prior.problem import (
+    DRAWN,
+    FAR,
+    NEAR,
+    NO_PULL,
+    Problem,
+    RoundsResult,
+    at_each,
+    fit_each,
+)
 from jaxid.estimators.within_prior.rounds import in_rounds
-from jaxid.numerics.lanes import Solve, Steps
+from jaxid.numerics.lanes import SolveRequest, Steps
 
 # Where along the best told direction a start is led from which the simulation does not move [priors].
 _LOOK = np.linspace(-3.0, 3.0, 13)
@@ -35,8 +44,8 @@ def likely_points(problem: Problem, points: int) -> Steps[np.ndarray]:
 
 
 def many_starts(
-    found: Found, points: np.ndarray, most: int
-) -> Steps[tuple[Found, dict[str, Any]]]:
+    found: RoundsResult, points: np.ndarray, most: int
+) -> Steps[tuple[RoundsResult, dict[str, Any]]]:
     """The best of many starts, and how many end there."""
     found = yield from _elsewhere(found, points, most)
     spent = found.evaluations
@@ -54,7 +63,7 @@ def many_starts(
         noise = np.asarray(found.problem.noise(found.minimum, found.count))
         for sharpness in found.problem.ladder:
             args = (*found.problem.args, sharpness, noise, origin, some, z, active)
-            z, costs, _, _ = (np.asarray(x) for x in (yield Solve(fit_each, args)))
+            z, costs, _, _ = (np.asarray(x) for x in (yield SolveRequest(fit_each, args)))
         costs = np.where(np.isfinite(costs), costs, np.inf)
         best, cost = int(np.argmin(costs)), float(found.minimum.cost)
         if abs(costs[-1] - cost) <= NEAR / len(found.problem.measured) * cost:
@@ -73,18 +82,18 @@ def many_starts(
     return replace(found, evaluations=spent), {"starts": stated}
 
 
-def _elsewhere(found: Found, points: np.ndarray, most: int) -> Steps[Found]:
+def _elsewhere(found: RoundsResult, points: np.ndarray, most: int) -> Steps[RoundsResult]:
     """The rounds from the best of some points too: a machine that sticks at the guesses shows nothing."""
     problem, nothing = found.problem, np.zeros(points.shape[1])
     still = (nothing, np.eye(points.shape[1]), points, np.zeros(points.shape, bool))
-    _, costs, _, _ = yield Solve(fit_each, (*problem.args, problem.ladder[0], NO_PULL, *still))
+    _, costs, _, _ = yield SolveRequest(fit_each, (*problem.args, problem.ladder[0], NO_PULL, *still))
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     other = yield from in_rounds(problem, points[best], most)
     better = float(other.minimum.cost) < float(found.minimum.cost) * (1 - _SAME)
     return replace(other if better else found, evaluations=found.evaluations + other.evaluations)
 
 
-def _led(found: Found, z: Float[np.ndarray, "starts k"]) -> Steps[Float[np.ndarray, "starts k"]]:
+def _led(found: RoundsResult, z: Float[np.ndarray, "starts k"]) -> Steps[Float[np.ndarray, "starts k"]]:
     """Each start led along the best told direction to where, at a coarse look, its cost is lowest.
 
     What keeps a simulation from moving is the level of its friction, and that is what is told best.
@@ -94,17 +103,17 @@ def _led(found: Found, z: Float[np.ndarray, "starts k"]) -> Steps[Float[np.ndarr
     looked[:, :, 0] = _LOOK[:, None]
     costs = []
     for there in looked:
-        costs.append(np.asarray((yield Solve(fit_each, (*args, there, np.zeros(z.shape, bool))))[1]))
+        costs.append(np.asarray((yield SolveRequest(fit_each, (*args, there, np.zeros(z.shape, bool))))[1]))
     best = np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0)
     return looked[best, np.arange(len(z))]
 
 
 def _flat(
-    found: Found, z: Float[np.ndarray, "starts k"], active: Bool[np.ndarray, "starts k"]
+    found: RoundsResult, z: Float[np.ndarray, "starts k"], active: Bool[np.ndarray, "starts k"]
 ) -> Steps[Bool[np.ndarray, " starts"]]:
     """Which starts show no slope: a machine that sticks throughout says nothing of where to go."""
     origin, own = np.zeros(len(found.vectors)), found.first.copy()
     own[len(found.problem.places) :] = 0.0
     args = (*found.problem.args, found.problem.ladder[0], NO_PULL, origin, own, z, active)
-    ended = np.asarray((yield Solve(fit_each, args))[0])
+    ended = np.asarray((yield SolveRequest(fit_each, args))[0])
     return np.all(ended == z, axis=1)

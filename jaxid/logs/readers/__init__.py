@@ -36,18 +36,18 @@ def read_columns(
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        mend = f"use one of {', '.join(READERS)}"
-        raise InputError(f"unknown suffix '{path.suffix}'", where=str(path), mend=mend)
+        hint = f"use one of {', '.join(READERS)}"
+        raise InputError(f"unknown suffix '{path.suffix}'", where=str(path), hint=hint)
     if not path.exists():
         beside = [p.name for p in path.parent.glob("*" + path.suffix)]
-        mend = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
-        raise InputError("no such file", where=str(path), mend=mend)
+        hint = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
+        raise InputError("no such file", where=str(path), hint=hint)
     if not path.is_file():
-        raise InputError("is not a file", where=str(path), mend="name the log itself")
+        raise InputError("is not a file", where=str(path), hint="name the log itself")
     if path.stat().st_size == 0:
-        raise InputError("is empty", where=str(path), mend="export the log again")
+        raise InputError("is empty", where=str(path), hint="export the log again")
     try:
         return reader(path, list(dict.fromkeys(names)), rows)
     except OSError as error:
-        mend = "check that it may be read"
-        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error
+        hint = "check that it may be read"
+        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error

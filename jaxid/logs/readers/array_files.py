@@ -21,14 +21,14 @@ def read_npz(path: Path, names: list[str], rows: Rows | None) -> Columns:
     try:
         with np.load(path, allow_pickle=False) as archive:
             if not hasattr(archive, "files"):
-                raise InputError("holds no named arrays", where=str(path), mend="use numpy.savez")
+                raise InputError("holds no named arrays", where=str(path), hint="use numpy.savez")
             wanted = {_base(name, archive.files) for name in names} & set(archive.files)
             known = {key: archive[key] if key in wanted else None for key in archive.files}
     except (ValueError, zipfile.BadZipFile, EOFError) as error:
         if isinstance(error, InputError):
             raise
-        mend = "save plain arrays of numbers with numpy.savez"
-        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error
+        hint = "save plain arrays of numbers with numpy.savez"
+        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
     return _pick(path, known, names, rows)
 
 
@@ -41,11 +41,11 @@ def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
     try:
         content = loadmat(path)
     except NotImplementedError as error:
-        mend = "in MATLAB: save('log.mat', '-v7', ...), or export CSV"
-        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), mend=mend) from error
+        hint = "in MATLAB: save('log.mat', '-v7', ...), or export CSV"
+        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), hint=hint) from error
     except (MatReadError, ValueError, TypeError, KeyError, IndexError) as error:
-        mend = "is it a MATLAB file? save it again with -v7"
-        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error
+        hint = "is it a MATLAB file? save it again with -v7"
+        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
     known = {key: value for key, value in content.items() if not key.startswith("__")}
     return _pick(path, known, names, rows)
 
@@ -56,16 +56,16 @@ def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
         import pyarrow
         import pyarrow.parquet as parquet
     except ImportError as error:
-        mend = "pip install pyarrow, or export CSV"
-        raise InputError("Parquet needs pyarrow", where=str(path), mend=mend) from error
+        hint = "pip install pyarrow, or export CSV"
+        raise InputError("Parquet needs pyarrow", where=str(path), hint=hint) from error
     try:
         known: dict[str, Any] = dict.fromkeys(parquet.read_schema(path).names)
         wanted = [name for name in names if name in known]
         table = parquet.read_table(path, columns=wanted)
         known.update({name: table[name].to_numpy() for name in wanted})
     except pyarrow.ArrowException as error:
-        mend = "is it a Parquet file? export it again"
-        raise InputError(f"cannot be read ({error})", where=str(path), mend=mend) from error
+        hint = "is it a Parquet file? export it again"
+        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
     return _pick(path, known, names, rows)
 
 
@@ -88,11 +88,11 @@ def _pick(path: Path, known: Mapping[str, Any], names: list[str], rows: Rows | N
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"'{name}' {count}" for name, count in lengths.items())
-        mend = "columns of one log have one length"
-        raise InputError(f"unequal lengths: {told}", where=str(path), mend=mend)
+        hint = "columns of one log have one length"
+        raise InputError(f"unequal lengths: {told}", where=str(path), hint=hint)
     count = next(iter(lengths.values()), 0)
     if names and not count:
-        raise InputError("is empty", where=str(path), mend="export the log again")
+        raise InputError("is empty", where=str(path), hint="export the log again")
     first, end = resolve_rows(rows, count, path)
     return {name: values[first:end] for name, values in columns.items()}, (first, end)
 
@@ -100,15 +100,15 @@ def _pick(path: Path, known: Mapping[str, Any], names: list[str], rows: Rows | N
 def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray, "samples _"]:
     base = _base(name, known)
     if base not in known:
-        mend = suggest(base, known)
-        raise InputError(f"has no variable '{name}'", where=str(path), mend=mend)
+        hint = suggest(base, known)
+        raise InputError(f"has no variable '{name}'", where=str(path), hint=hint)
     values = np.asarray(known[base])
     where = f"{path}, variable '{base}'"
     if values.dtype.kind not in "fiub":
-        mend = "save it as a plain array of real numbers"
-        raise InputError(f"is not numeric ({values.dtype})", where=where, mend=mend)
+        hint = "save it as a plain array of real numbers"
+        raise InputError(f"is not numeric ({values.dtype})", where=where, hint=hint)
     if values.ndim > 2:
-        raise InputError(f"has {values.ndim} dimensions", where=where, mend="save a matrix")
+        raise InputError(f"has {values.ndim} dimensions", where=where, hint="save a matrix")
     values = np.atleast_1d(values).astype(np.float64)
     values = values[:, None] if values.ndim == 1 else values
     # A log has more samples than joints, so the longer side is time.
@@ -117,6 +117,6 @@ def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray
         return values
     index = int(name[len(base) + 1 : -1])
     if not 1 <= index <= values.shape[1]:
-        mend = f"it has columns 1 to {values.shape[1]}"
-        raise InputError(f"has no column {index}", where=where, mend=mend)
+        hint = f"it has columns 1 to {values.shape[1]}"
+        raise InputError(f"has no column {index}", where=where, hint=hint)
     return values[:, index - 1 : index]

@@ -29,12 +29,10 @@ def read_csv(
     if not names:
         return {}, (first, end)
     try:
-        values = np.loadtxt(
-            body, delimiter=delimiter, usecols=columns, comments=None, quotechar='"', ndmin=2
-        )
+        values = np.loadtxt(body, delimiter=delimiter, usecols=columns, comments=None, quotechar='"', ndmin=2)
     except ValueError as error:
         _blame(body, names, columns, delimiter, first, path)
-        raise InputError(str(error), where=str(path), mend="export the log again") from error
+        raise InputError(str(error), where=str(path), hint="export the log again") from error
     return {name: values[:, [k]] for k, name in enumerate(names)}, (first, end)
 
 
@@ -43,7 +41,7 @@ def _text(path: Path) -> str:
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", errors="replace")
     if b"\0" in raw[:4096]:
-        raise InputError("is not a text file", where=str(path), mend="export the log as CSV")
+        raise InputError("is not a text file", where=str(path), hint="export the log as CSV")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -58,19 +56,19 @@ def _split(text: str, path: Path) -> tuple[list[str], str, list[str]]:
     while comments < len(lines) and lines[comments].lstrip().startswith("#"):
         comments += 1
     if comments == len(lines):
-        raise InputError("is empty", where=str(path), mend="export the log again")
+        raise InputError("is empty", where=str(path), hint="export the log again")
     head, body = lines[comments], lines[comments + 1 :]
     if comments and _is_numeric(head):
         # numpy.savetxt writes its header as the last comment.
         head, body = lines[comments - 1].lstrip(" #"), lines[comments:]
     if _is_numeric(head):
-        mend = "add a first row with the names of the columns"
-        raise InputError(f"no header row: it begins '{head[:40]}'", where=str(path), mend=mend)
+        hint = "add a first row with the names of the columns"
+        raise InputError(f"no header row: it begins '{head[:40]}'", where=str(path), hint=hint)
     if "#" in text:
         body = [line.split("#", 1)[0] for line in body]
         body = [line for line in body if line and not line.isspace()]
     if not body:
-        raise InputError("is empty below its header", where=str(path), mend="export the log again")
+        raise InputError("is empty below its header", where=str(path), hint="export the log again")
     delimiter = max(_DELIMITERS, key=head.count)
     return _cells(head, delimiter), delimiter, body
 
@@ -93,17 +91,15 @@ def _number(cell: str) -> float | None:
 
 def _find(name: str, header: list[str], path: Path) -> int:
     if name not in header:
-        mend = suggest(name, [known for known in header if known])
-        raise InputError(f"has no column '{name}'", where=str(path), mend=mend)
+        hint = suggest(name, [known for known in header if known])
+        raise InputError(f"has no column '{name}'", where=str(path), hint=hint)
     if header.count(name) > 1:
-        mend = "rename one of them"
-        raise InputError(f"has {header.count(name)} columns '{name}'", where=str(path), mend=mend)
+        hint = "rename one of them"
+        raise InputError(f"has {header.count(name)} columns '{name}'", where=str(path), hint=hint)
     return header.index(name)
 
 
-def _check_widths(
-    body: list[str], header: list[str], delimiter: str, first: int, path: Path
-) -> None:
+def _check_widths(body: list[str], header: list[str], delimiter: str, first: int, path: Path) -> None:
     """Refuse rows that are wider than the header: their cells belong to other columns.
 
     numpy's parser looks at the wanted columns only, and a decimal comma in a
@@ -114,9 +110,9 @@ def _check_widths(
             continue
         cells = _cells(line, delimiter)
         if any(cells[len(header) :]):
-            mend = "one cell a column; decimals are written with a point"
+            hint = "one cell a column; decimals are written with a point"
             what = f"row {first + k} has {len(cells)} cells, the header {len(header)}"
-            raise InputError(what, where=str(path), mend=mend)
+            raise InputError(what, where=str(path), hint=hint)
 
 
 def _blame(
@@ -135,8 +131,8 @@ def _blame(
             if _number(cell) is not None and "_" not in cell:
                 continue
             fault = f"'{cell}' is not a number" if cell else "the cell is empty"
-            mend = "mend or remove the row, or keep clear of it with rows = [first, end]"
+            hint = "correct or remove the row, or keep clear of it with rows = [first, end]"
             if _number(cell.replace(",", ".")) is not None:
-                mend = "write decimals with a point"
+                hint = "write decimals with a point"
             where = f"{path}, column '{name}', row {first + k} (0-based)"
-            raise InputError(fault, where=where, mend=mend)
+            raise InputError(fault, where=where, hint=hint)

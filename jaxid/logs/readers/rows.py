@@ -26,6 +26,6 @@ def resolve_rows(rows: Rows | None, count: int, path: Path) -> Rows:
         return (0, count)
     first, end = rows
     if not 0 <= first < end <= count:
-        mend = f"the file has {count} rows: give 0 <= first < end <= {count} (0-based, half open)"
-        raise InputError(f"rows = [{first}, {end}] are out of range", where=str(path), mend=mend)
+        hint = f"the file has {count} rows: give 0 <= first < end <= {count} (0-based, half open)"
+        raise InputError(f"rows = [{first}, {end}] are out of range", where=str(path), hint=hint)
     return (first, end)

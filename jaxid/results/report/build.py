@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jaxid.discovery.separating.propose import Proposal
     from jaxid.estimators.estimate import Estimate
     from jaxid.gap import Gap
-    from jaxid.session import Run, Session
+    from jaxid.session import OpenedLog, Session
 
 
 def identification_report(result: Identification) -> str:
@@ -118,20 +118,23 @@ def units_of(session: Session) -> dict[str, str]:
     """Labels of position, velocity, force and time."""
     units = session.machine.units
     return {
-        "position": units.label("position"), "velocity": units.label("position/time"),
-        "force": units.label("force"), "time": "s",
+        "position": units.label("position"),
+        "velocity": units.label("position/time"),
+        "force": units.label("force"),
+        "time": "s",
     }
 
 
 def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
     rows = zip(
-        estimate.machine.parameters.free, estimate.theta, estimate.std, estimate.identifiable,
+        estimate.machine.parameters.free,
+        estimate.theta,
+        estimate.std,
+        estimate.identifiable,
         strict=True,
     )
     return tuple(
-        ParameterRow(
-            f.name, float(v) if told else None, float(s) if told else None, f.unit, bool(told)
-        )
+        ParameterRow(f.name, float(v) if told else None, float(s) if told else None, f.unit, bool(told))
         for f, v, s, told in rows
     )
 
@@ -156,7 +159,7 @@ def _views(
     )
 
 
-def _driven(session: Session, run: Run, gap: Gap, joint: int) -> dict[str, np.ndarray]:
+def _driven(session: Session, run: OpenedLog, gap: Gap, joint: int) -> dict[str, np.ndarray]:
     """Declared force of a joint's drive, logged and simulated; nothing where either is not there."""
     gain = session.machine.gain
     drive = session.machine.plant.drive_of(joint, gain.size)
@@ -166,7 +169,7 @@ def _driven(session: Session, run: Run, gap: Gap, joint: int) -> dict[str, np.nd
     return {name: (command * gain)[:, drive] for name, command in both.items()}
 
 
-def _view(run: Run, before: Gap | None, after: Gap, joint: int, joints: int) -> LogView:
+def _view(run: OpenedLog, before: Gap | None, after: Gap, joint: int, joints: int) -> LogView:
     data, log = run.data, run.log
     rows = data.moving[:, joint]
     name = run.name if joints == 1 else f"{run.name}, joint {joint + 1}"
@@ -229,7 +232,9 @@ def _where_plot(result: Discovery) -> WherePlot | None:
         return None
     label = result.session.machine.units.label
     unit = {
-        "velocity": label("position/time"), "position": label("position"),
-        "acceleration": label("position/time2"), "force": label("force"),
+        "velocity": label("position/time"),
+        "position": label("position"),
+        "acceleration": label("position/time2"),
+        "force": label("force"),
     }.get(w.variable, label("position") if w.variable.startswith("elongation") else "s")
     return WherePlot(w.variable, unit, w.x, w.mean, w.low, w.high)

@@ -11,7 +11,10 @@ from jaxid.results.report.axes import legend
 
 
 def plot_filtering(
-    spectrum: Spectrum, recipe: Recipe, rate_hz: float, unit: str = "N",
+    spectrum: Spectrum,
+    recipe: Recipe,
+    rate_hz: float,
+    unit: str = "N",
     size: tuple[float, float] = (7.0, 3.6),
 ) -> Figure:
     """Draw force and noise with the filters' ends and the resonance.
@@ -27,7 +30,10 @@ def plot_filtering(
     ax = figure.add_subplot()
     ax.loglog(spectrum.frequency, spectrum.force**0.5, color="#0072B2", lw=1.0, label="force")
     ax.loglog(
-        spectrum.frequency, spectrum.noise**0.5, color="#D55E00", lw=1.0,
+        spectrum.frequency,
+        spectrum.noise**0.5,
+        color="#D55E00",
+        lw=1.0,
         label="amplified noise",
     )
     for k, f in enumerate(spectrum.natural):

@@ -83,7 +83,10 @@ def filled(template: str, **entries: object) -> str:
     """A page of this folder with its entries, and with the style that all of them share."""
     folder = resources.files("jaxid.results.report")
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
         loader=FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
     )
     style = (folder / "page.css").read_text(encoding="utf-8")

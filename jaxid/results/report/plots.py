@@ -28,9 +28,7 @@ _FEW = 200
 _JOINTS = (AFTER, "#009e73", "#cc79a7", "#56b4e9")
 
 
-def plot_fit(
-    view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
-) -> Figure:
+def plot_fit(view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)) -> Figure:
     """Measured and simulated position over time, with what parts them below.
 
     Args:
@@ -44,9 +42,7 @@ def plot_fit(
     return _compared(view, drawable(view.position_measured), _simulated(view), "position", units, size)
 
 
-def plot_drive(
-    view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
-) -> Figure:
+def plot_drive(view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)) -> Figure:
     """Declared force of the drive over time, as logged and as the simulated loop commands it.
 
     Args:
@@ -62,8 +58,12 @@ def plot_drive(
 
 
 def _compared(
-    view: LogView, measured: np.ndarray, simulated: Sequence[tuple[str, str, np.ndarray]], what: str,
-    units: Mapping[str, str], size: tuple[float, float],
+    view: LogView,
+    measured: np.ndarray,
+    simulated: Sequence[tuple[str, str, np.ndarray]],
+    what: str,
+    units: Mapping[str, str],
+    size: tuple[float, float],
 ) -> Figure:
     """A measured quantity and lines beside it over time, with what parts them below."""
     figure, top, below = time_axes(size, 2 if simulated else 1, ratios=(3, 2))
@@ -209,9 +209,7 @@ def plot_candidates(step: SearchStep) -> Figure:
         ax.annotate(text, at, (4, 0), textcoords="offset points", **style)
     ax.axvline(step.threshold, color=BEFORE, lw=1.2, ls=(0, (4, 3)))
     ax.axvline(0.0, color=TEXT, lw=0.6)
-    ax.set_title(
-        f"threshold {short(step.threshold)}", loc="right", fontsize=FONT - 0.5, color=_DARK[BEFORE]
-    )
+    ax.set_title(f"threshold {short(step.threshold)}", loc="right", fontsize=FONT - 0.5, color=_DARK[BEFORE])
     ax.set_xlim(left * 1.05, right * 1.18)
     ax.set_ylim(len(candidates) - 0.4, -0.6)
     dress(ax, "evidence: gain in held-out log-likelihood [nats]", "")

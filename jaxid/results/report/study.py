@@ -49,17 +49,26 @@ def study_report(result: Study) -> str:
         f"{name.replace('_', ' ')} {', '.join(f'{x:g}' for x in table[name].values)}" for name in settings
     )
     return filled(
-        "study.html", title=result.title, rows=[_line(r) for r in rows], settings=settings,
+        "study.html",
+        title=result.title,
+        rows=[_line(r) for r in rows],
+        settings=settings,
         failures=[f | {"where": words_of(f)} for f in result.failures],
         named=[n | {"where": words_of(n)} for n in result.named],
-        runs=table.sizes["run"], seconds=short(result.seconds, 3), figures=figures,
-        tried=tried, answer=_answer(result), tracking=[_followed(r) for r in result.tracking],
+        runs=table.sizes["run"],
+        seconds=short(result.seconds, 3),
+        figures=figures,
+        tried=tried,
+        answer=_answer(result),
+        tracking=[_followed(r) for r in result.tracking],
     )
 
 
 def _followed(row: dict) -> dict:
     return {
-        **row, "unit": pretty_unit(row["unit"]), "settings": [f"{x:g}" for x in setting_of(row).values()],
+        **row,
+        "unit": pretty_unit(row["unit"]),
+        "settings": [f"{x:g}" for x in setting_of(row).values()],
         "sizes": [short(x, 3) for name in ("rms", "peak") for x in row[name].values()],
     }
 
@@ -68,7 +77,9 @@ def _line(row: dict) -> dict:
     percent = lambda x: f"{100 * x:.1f}" if np.isfinite(x) else "–"
     number = lambda x: short(x, 3) if np.isfinite(x) else "–"
     return {
-        **row, "unit": pretty_unit(row["unit"]), "true": number(row["true"]),
+        **row,
+        "unit": pretty_unit(row["unit"]),
+        "true": number(row["true"]),
         "settings": [f"{x:g}" for x in setting_of(row).values()],
         **{k: number(row[k]) for k in ("bias", "spread", "rmse", "std", "bound")},
         **{k: percent(row[k]) for k in ("coverage_68", "coverage_95", "failed")},

@@ -22,7 +22,8 @@ _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 _COLUMNS = 3
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _AXES = {
-    "noise": "noise, times the sensor's", "sample_rate": "sampling rate [Hz]",
+    "noise": "noise, times the sensor's",
+    "sample_rate": "sampling rate [Hz]",
     "position_resolution": "resolution of the position [m or rad]",
 }
 
@@ -78,7 +79,8 @@ def plot_coverage(rows: Sequence[dict]) -> Figure:
         places = sorted({r[against] for r in own})
         for side, ((k, estimator), o) in enumerate(sides):
             line = {
-                r[against]: r for r in own
+                r[against]: r
+                for r in own
                 if r["estimator"] == estimator and words_of(r, without=against) == others[o] and r["used"]
             }
             step = min(0.12, 0.8 / len(sides))

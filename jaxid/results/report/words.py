@@ -162,11 +162,15 @@ def direction_lines(directions: Sequence[Mapping]) -> list[dict]:
         value, std = with_std(entry["value"], entry["std"])
         profile = entry.get("profile")
         rise = dict(zip(profile["at_std"], profile["rise"], strict=True)) if profile else {}
-        lines.append({
-            "terms": _terms(entry["combination"], SLIGHT), "value": value, "std": std,
-            "white": with_std(entry["value"], entry["std_white"])[1],
-            "profile": [short(rise[at], 2) for at in (-2.0, 2.0)] if rise else None,
-        })
+        lines.append(
+            {
+                "terms": _terms(entry["combination"], SLIGHT),
+                "value": value,
+                "std": std,
+                "white": with_std(entry["value"], entry["std_white"])[1],
+                "profile": [short(rise[at], 2) for at in (-2.0, 2.0)] if rise else None,
+            }
+        )
     return lines
 
 
