@@ -9,8 +9,8 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.case.case import Case
 from jaxid.case.declared import EffectEntry
 from jaxid.case.reference import info_of

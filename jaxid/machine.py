@@ -30,7 +30,7 @@ class Machine:
             start [s], or the name of a column of the log; None: none.
         sensor: What is known of the measurement.
         hold: How the command runs between samples.
-        unknown_reference: What the loop followed, with its unknowns, where the log has no reference; None: known.
+        unknown_reference: Reference with unknowns, where the log has no reference; None: it is known.
     """
 
     plant: Plant

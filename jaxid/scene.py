@@ -9,8 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
 from jaxid.errors import InputError

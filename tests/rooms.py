@@ -4,6 +4,7 @@ A newcomer reads the package in this order. A room is a folder or a module direc
 """
 
 ROOMS = {
+    "arrays": "the array type of annotations",
     "errors": "one-line errors with a hint",
     "_platform": "float64 and XLA's loop option",
     "_cache": "compiled code on disk",

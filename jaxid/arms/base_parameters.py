@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.model.effect import carries_force
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from jaxid.arrays import Array
 
 # Fields of an arm in the order of the ten parameters.
 TEN = (

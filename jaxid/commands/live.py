@@ -15,8 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case, load_case
 from jaxid.controllers import Controller, Tick, base

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxid.arrays import Array
 from jaxid.controllers.base import Path, Tick
 from jaxid.controllers.computed_torque import FeedForward
 from jaxid.model.unknowns import scatter

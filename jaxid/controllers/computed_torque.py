@@ -6,8 +6,9 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.controllers.base import Controller, Path, Tick
 from jaxid.model.plant import Plant
 

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.controllers.base import Controller, Path, Tick
 from jaxid.dynamics.rhs import State, acceleration
 from jaxid.model.plant import Plant, port_motion

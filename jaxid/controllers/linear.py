@@ -6,8 +6,8 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.controllers.base import Controller, Path, Tick
 
 

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine

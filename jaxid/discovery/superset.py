@@ -8,8 +8,9 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 
+from jaxid.arrays import Array
 from jaxid.discovery.candidates import Candidate, CandidateModel
 from jaxid.discovery.user_effects import check_user_effect, is_user_effect
 from jaxid.effects import EFFECTS

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.dynamics.rhs import (
     State,
     acceleration,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from jaxtyping import Array
-
+from jaxid.arrays import Array
 from jaxid.effects.registry import register
 from jaxid.model.effect import Action, Effect, Scales, Signals
 from jaxid.model.parameter import parameter

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.effects.registry import register
 from jaxid.model.effect import Action, Effect, Scales, Signals
 from jaxid.model.parameter import parameter

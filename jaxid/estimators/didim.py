@@ -20,8 +20,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.estimators.common.rerun import Rerun, best_step, settled, span
 from jaxid.estimators.estimate import Estimate

@@ -10,8 +10,9 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 
+from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import DAMPING, Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.estimate import Estimate
 from jaxid.logs.prepare import Prepared

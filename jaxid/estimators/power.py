@@ -23,9 +23,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxid.arms.base_parameters import base_parameters
+from jaxid.arrays import Array
 from jaxid.dynamics.residuals import drive_ratio, integrate_internal_states
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt

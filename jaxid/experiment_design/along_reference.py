@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxid.arms.base_parameters import independent
+from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
 from jaxid.case.tables import CRITERIA

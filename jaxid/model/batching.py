@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+
+from jaxid.arrays import Array
 
 if TYPE_CHECKING:
     from jaxid.model.effect import Action, Effect, Signals

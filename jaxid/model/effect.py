@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import equinox as eqx
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.model.parameter import ParameterInfo, parameters_of
 
 

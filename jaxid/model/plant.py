@@ -14,8 +14,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.model.batching import act_batched, group_by_kind
 from jaxid.model.effect import Effect, Signals

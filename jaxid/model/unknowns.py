@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxid.arrays import Array
 from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant

@@ -9,7 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Jaxpr, Literal, jaxpr_as_fun
-from jaxtyping import Array
+
+from jaxid.arrays import Array
 
 # What becomes of the arguments on their way: not seen, affine, or anything else.
 _CONSTANT, _AFFINE, _OTHER = range(3)

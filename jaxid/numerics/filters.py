@@ -12,7 +12,9 @@ import scipy.fft
 import scipy.ndimage
 import scipy.optimize
 import scipy.signal
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from jaxid.arrays import Array
 
 # Periods of the cut-off over which a signal fades out beyond its ends: by then the roll-off's own
 # memory is 10^-4.

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Array
+
+from jaxid.arrays import Array
 
 T = TypeVar("T")
 

@@ -12,7 +12,9 @@ import numpy as np
 import scipy.fft
 import scipy.linalg
 import scipy.signal
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+
+from jaxid.arrays import Array
 
 # A combination of parameters counts as untold where its standard deviation, seen as force or
 # position, exceeds this part of the measured signal itself.

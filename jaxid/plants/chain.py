@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.model.effect import Effect
 from jaxid.model.parameter import as_array, parameter
 from jaxid.model.plant import Plant

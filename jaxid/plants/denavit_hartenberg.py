@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.model.parameter import as_array
 from jaxid.plants.geometry import Geometry
 

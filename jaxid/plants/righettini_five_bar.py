@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from jaxtyping import Array
-
+from jaxid.arrays import Array
 from jaxid.model.effect import Effect
 from jaxid.plants.five_bar import FiveBar
 

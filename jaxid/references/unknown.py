@@ -8,8 +8,9 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.model.unknowns import REFERENCE
 from jaxid.references import REFERENCES
 

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.sensors.inertial import InertialSensors
 
 # Noise of so many counts leaves of the rounding's error nothing that goes with the signal

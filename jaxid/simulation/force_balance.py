@@ -6,8 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.dynamics.hidden_joints import complete_motion
 from jaxid.dynamics.residuals import residual_along
 from jaxid.logs.prepare import Prepared

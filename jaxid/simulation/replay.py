@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.interpolate
 import scipy.signal
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.controllers import Controller
 from jaxid.dynamics.hidden_joints import resting
 from jaxid.errors import InputError

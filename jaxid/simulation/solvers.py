@@ -10,8 +10,9 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.dynamics.rhs import State, derivative, hold_polynomial
 from jaxid.errors import InputError, suggest
 from jaxid.model.plant import Plant

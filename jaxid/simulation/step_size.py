@@ -6,8 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.dynamics.rhs import State, acceleration, derivative
 from jaxid.effects.friction import ViscousFriction
 from jaxid.errors import InputError

@@ -14,8 +14,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.discovery.at_rest.departures import Starts, starts_from_rest
 from jaxid.effects.friction import CoulombFriction, StaticFriction, StribeckFriction
 from jaxid.estimators.estimate import Estimate

@@ -9,8 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.controllers import Controller, Tick
 from jaxid.dynamics.residuals import integrate_internal_states
 from jaxid.logs.log import Log

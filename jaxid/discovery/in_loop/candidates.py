@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.discovery.candidates import Candidate, CandidateModel
 from jaxid.discovery.score import Score
 from jaxid.discovery.superset import build_candidate_model

@@ -23,8 +23,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.windows import first_by_parts, second_by_parts
 from jaxid.estimators.inverse_dynamics import linear_unknowns

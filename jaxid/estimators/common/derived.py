@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.dynamics.frequencies import natural_frequencies
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.plant import Plant

@@ -7,9 +7,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxid.arms.pseudo_inertia import pseudo_inertia
+from jaxid.arrays import Array
 
 # Weights of the barrier, each with two Newton steps; the last over the first.
 _WEIGHTS, _LAST = 112, 1e-14

@@ -8,9 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky
+from jaxid.arrays import Array
 from jaxid.estimators.common.interior import inner_start
 from jaxid.model.unknowns import Parameters
 

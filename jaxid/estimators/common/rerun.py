@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, prepare

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.estimators.minimal.models import MinimalSamples, Structure, Term
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units

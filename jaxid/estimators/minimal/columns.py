@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxid.arrays import Array
 from jaxid.estimators.minimal.basis import Basis
 from jaxid.estimators.minimal.matrices import LinearBalance
 from jaxid.estimators.minimal.models import Structure, Term, neighbour

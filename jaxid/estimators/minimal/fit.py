@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.dynamics.frequencies import natural_frequencies
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform

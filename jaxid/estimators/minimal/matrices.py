@@ -5,8 +5,9 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.estimators.minimal.polynomials import Matrix
 from jaxid.model.effect import Effect

@@ -17,8 +17,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.estimators.minimal.matrices import LinearBalance, linear_balance
 from jaxid.estimators.minimal.polynomials import Matrix, adjugate, determinant, product, scaled, total
 from jaxid.model.plant import Plant

@@ -7,7 +7,9 @@ A polynomial is an array of coefficients, lowest order first, (orders,); a matri
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from jaxid.arrays import Array
 
 Polynomial = Float[Array, " orders"]
 Matrix = Float[Array, "orders rows columns"]

@@ -10,8 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import check_instant, slopes
 from jaxid.estimators.recursive.estimate import gains_of, start_of

@@ -29,8 +29,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import eliminated
 
 # Of the variance with which an unknown starts, what may be left where the rows tell it: it is then by less

@@ -13,8 +13,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxid.arrays import Array
 from jaxid.dynamics.residuals import balance_along
 from jaxid.errors import InputError
 from jaxid.logs.prepare import Prepared, smeared

@@ -8,8 +8,8 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 
+from jaxid.arrays import Array
 from jaxid.estimators.within_prior.posterior import loss_of, most_probable
 from jaxid.estimators.within_prior.problem import RoundsResult, residual_of
 from jaxid.machine import Machine

@@ -10,8 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Progress, descend
 from jaxid.estimators.output_error import (
     choose_numerics,
