@@ -22,7 +22,7 @@ def session(tmp_path_factory):
 def test_a_large_union_is_differentiated_in_parts_alike(session, monkeypatch):
     """By the same columns as all at once; of those not asked for nothing is said."""
     union = build_candidate_model(session.machine, session.fit.data)
-    samples = cand.Samples(session.fit.data)
+    samples = cand.CandidateSamples(session.fit.data)
     theta = union.neutral.copy()
     for c in union.candidates:
         theta[c.index] = c.probe(0)

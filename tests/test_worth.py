@@ -201,11 +201,11 @@ def test_many_starts_are_evaluated_once(axis, monkeypatch):
 def test_a_joint_that_moves_between_the_pieces_only_is_looked_at(axis, monkeypatch):
     data = axis[0].fit.data
     monkeypatch.setattr(cand, "_MOST", 80)
-    parts = cand.Samples(data).parts
+    parts = cand.CandidateSamples(data).parts
     assert len(parts) == 4
     inside = np.isin(data.times.round(9), np.concatenate([p.times for p in parts]).round(9))
     elsewhere = dataclasses.replace(data, moving=data.moving & ~inside[:, None])
-    samples = cand.Samples(elsewhere)
+    samples = cand.CandidateSamples(elsewhere)
     assert len(samples.parts) == 5
     assert len({len(p.q) for p in samples.parts}) == 1
     assert samples.moving.any()
@@ -246,7 +246,7 @@ def test_the_validation_log_may_ask_for_a_search(axis):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search.worth, "others", [search.samples])
         assert search.worth.at_floor(search.theta)
-        shown = cand.Samples(session.fit.data)
+        shown = cand.CandidateSamples(session.fit.data)
         moved = session.fit.data.force + 1.0
         shown.arrays = [ForceData.of(dataclasses.replace(session.fit.data, force=moved))]
         patch.setattr(search.worth, "others", [shown])

@@ -274,6 +274,6 @@ def _round(search: Search, step: Step) -> Round:
     return Round(step, fit, np.max(others, axis=0) if others else None)
 
 
-def _rms(search: Search, samples: cand.Samples, theta: np.ndarray) -> np.ndarray:
+def _rms(search: Search, samples: cand.CandidateSamples, theta: np.ndarray) -> np.ndarray:
     e, _ = cand.evaluate(search.union, samples, theta, ())
     return np.sqrt(np.nanmean(np.where(samples.moving, e, np.nan) ** 2, axis=0))

@@ -50,8 +50,8 @@ class Acceptance:
         machine = self.union.machine
         known = machine.sensor.force_noise
         noise = None if known is None else np.asarray(known) * machine.gain
-        self.samples = cand.Samples(self.data, noise)
-        self.others = [cand.Samples(d, noise) for d in self.validation]
+        self.samples = cand.CandidateSamples(self.data, noise)
+        self.others = [cand.CandidateSamples(d, noise) for d in self.validation]
         force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
         rows = len(self.samples.moving) / len(force)
         self._numerics = rows * float(np.sum((NUMERICS * force) ** 2))
@@ -93,7 +93,7 @@ class Acceptance:
         # half of the residual counts as gap.
         return float((before - after) / max(before - self._noise, 0.5 * before))
 
-    def swallowed(self, samples: cand.Samples, old: np.ndarray, new: np.ndarray) -> float:
+    def swallowed(self, samples: cand.CandidateSamples, old: np.ndarray, new: np.ndarray) -> float:
         """Part of the noise that the drive of a new model swallows and the old one's does not.
 
         Noise of the logged force is on the log only. A drive that filters the force filters it

@@ -96,7 +96,7 @@ class Playback:
         if not np.all(np.isfinite(log.position)):
             return Outcome(0.0, TIE_NATS)
         data = prepare(log, self.machine.gain, self.recipe, self.machine.hold_period)
-        return compared(union, pair, cand.Samples(data))
+        return compared(union, pair, cand.CandidateSamples(data))
 
 
 _MOTION = ("position", "velocity", "command")
@@ -107,7 +107,9 @@ def _played(bench: Experiment, plant: Plant, sensor: Sensor, signal: Array, nois
     return bench.run(plant, signal, sensor, noise)
 
 
-def compared(union: cand.CandidateModel, pair: Pair, samples: cand.Samples, *, refit: bool = True) -> Outcome:
+def compared(
+    union: cand.CandidateModel, pair: Pair, samples: cand.CandidateSamples, *, refit: bool = True
+) -> Outcome:
     """Evidence in a log for the first of a pair over the second.
 
     Args:
