@@ -57,7 +57,7 @@ WANTED = {
 
 def test_both_positions(log):
     estimate = fitted(log, "positions")
-    assert estimate.told
+    assert estimate.all_identified
     check(estimate, WANTED)
     content = estimate.details["minimal"]
     assert content["equation"] == "(6)"
