@@ -41,9 +41,9 @@ def child(kind: str, *words: object) -> dict:
 
 def sets(kind: str, count: int, numerics: str) -> dict:
     """Cost, or normal equations too, of so many sets of the axis' four parameters; 25 000 samples."""
-    import axis
     import jax
 
+    from benchmarks import axis
     from jaxid.simulation.replay import Numerics
 
     reference, measured = axis.log()

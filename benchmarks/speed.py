@@ -21,15 +21,14 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["NUMBA_NUM_THREADS"] = "2"
 
-import axis
-import axis_loops as loops
-import axis_rivals as rivals
 import jax.numpy as jnp
 import numpy as np
-import speed_scale
-from speed_peers import against_peers, installed
-from speed_rows import HEAD, Row, compare, in_process, line, table
 
+from benchmarks import axis, speed_scale
+from benchmarks import axis_loops as loops
+from benchmarks import axis_rivals as rivals
+from benchmarks.speed_peers import against_peers, installed
+from benchmarks.speed_rows import HEAD, Row, compare, in_process, line, table
 from jaxid.simulation.replay import Numerics
 
 HERE = Path(__file__).parent

@@ -14,9 +14,8 @@ import sys
 import time
 from pathlib import Path
 
-from common import Table, arguments, case_with_data
-
 import jaxid
+from experiments.common import Table, arguments, case_with_data
 
 # Janot, Gautier & Brunot (2019): IDIM-LS and closed-loop simulation. The offset stands on the side
 # of friction there: as a force on the joint its sign is the other.

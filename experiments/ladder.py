@@ -19,9 +19,9 @@ import sys
 import time
 
 import numpy as np
-from common import Table, arguments, copied
 
 import jaxid
+from experiments.common import Table, arguments, copied
 from jaxid.results.report.study_plots import plot_errors
 
 

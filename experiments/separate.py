@@ -18,14 +18,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from common import Table, arguments, copied
-
 import jaxid
+from experiments.common import Table, arguments, copied
 from jaxid.references import make_reference
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from separate_setup import curved, started
-from stepper import write_csv
+from truth.axis.ambiguous import curved, started
+from truth.axis.stepper import write_csv
 
 TRUE, COEFFICIENT = "quadratic_stiffness", 400.0
 

@@ -12,9 +12,8 @@ from __future__ import annotations
 import sys
 import time
 
-from common import Table, arguments, case_with_data
-
 import jaxid
+from experiments.common import Table, arguments, case_with_data
 
 # One C-like reference simulation with cubic, offset and quadratic term (see the data's README).
 REFERENCE_MV = {"multisine": 0.30, "arrow": 0.41}

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import scipy.signal
-from common import Table, copied, parser_of
 
 import jaxid
+from experiments.common import Table, copied, parser_of
 from jaxid.files import write_whole
 
 JOINTS = 6

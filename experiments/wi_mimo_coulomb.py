@@ -22,21 +22,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import Table, copied, parser_of
 
 import jaxid
+from experiments import wi_figures
+from experiments.common import Table, copied, parser_of
+from experiments.wi_cases import CASE, FIRST, long_chain, one_driven, undeclared, variant
+from experiments.wi_loop import driven, machine, true_values
+from experiments.wi_noise import FORMS, noise
 from jaxid.build import build_machine
 from jaxid.estimators import METHODS
 from jaxid.estimators.algebraic.online import Online, OnlineEstimate, window_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.numerics.lanes import run_alone
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import wi_figures
-from chain_stepper import name_of
-from six_masses import KINDS, driven, machine, true_values
-from wi_cases import CASE, FIRST, long_chain, one_driven, undeclared, variant
-from wi_noise import FORMS, noise
+from truth.chain.six_masses import KINDS
+from truth.chain.stepper import name_of
 
 SECONDS, TRACKED_FROM = 10.0, 0.2
 # The law with measured velocity, and the one with a reconstructed one and the error's integral.
