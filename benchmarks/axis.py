@@ -1,6 +1,6 @@
 """The axis that the speed benchmarks run: EMPS-like, in its cascade loop, 25 000 samples at 1 kHz.
 
-Its log comes from the independent stepper of the tests, with an encoder's rounding and noise.
+Its log comes from the independent stepper of `truth/`, with an encoder's rounding and noise.
 """
 
 import time

@@ -1,4 +1,4 @@
-"""One fit in a fresh process: `python benchmarks/cold_fit.py smooth|ideal [solver of optimistix]`.
+"""One fit in a fresh process: `python -m benchmarks.cold_fit smooth|ideal [solver of optimistix]`.
 
 Prints JSON: wall time [s], CPU time [s], half the sum of squares.
 """

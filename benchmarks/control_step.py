@@ -1,6 +1,6 @@
 """One tick of the law `adaptive`, identification included, against the 0.25 ms of a loop at 4 kHz.
 
-    python benchmarks/control_step.py [CASE.toml] [--ticks 100000]
+    python -m benchmarks.control_step [CASE.toml] [--ticks 100000]
 
 The case (absent: two links, as in the tests) is simulated, and its readings are given to `jaxid.Live` one
 by one, as a machine's loop would. Times are of whole calls, from array to array; *in a scan* is what the

@@ -1,8 +1,8 @@
 """How often `discover` names what was hidden, and how often it names what is not there.
 
-    python benchmarks/discovery.py [--split test] [--groups effects,pairs] [--only cogging] [--resume]
+    python -m benchmarks.discovery [--split test] [--groups effects,pairs] [--only cogging] [--resume]
 
-Every case of `tests/hidden_cases.py` and `tests/hidden_chains.py` goes through `jaxid.discover`; a
+Every case of `truth/hidden/cases.py` and `truth/hidden/chains.py` goes through `jaxid.discover`; a
 line of JSON each, then the table as `discovery.md` and `discovery.json`. Exits with 1 where an aim is missed.
 """
 

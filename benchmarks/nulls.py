@@ -1,6 +1,6 @@
 """How often discovery sees something where nothing is missing: logs of the stepper, all declared.
 
-    python benchmarks/nulls.py [--logs N] [--machine NAME] [--no-sensor]
+    python -m benchmarks.nulls [--logs N] [--machine NAME] [--no-sensor]
 
 prints the table and exits with 1 where more than one log in sixty is not `nothing_missing`.
 """

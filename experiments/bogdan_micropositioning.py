@@ -1,10 +1,10 @@
 """The micropositioning stage: what a hundred noisy samples of its current tell, and what they do not.
 
 Bogdan & Abba, "Identification of mechanical parameters at low velocities for a micropositioning stage using a
-velocity hysteresis model". Its Table 1, read in SI as `tests/stages.py` says, is the truth here, in an exact
-simulator that shares no code with jaxid (set-valued friction, 5 us).
+velocity hysteresis model". Its Table 1, read in SI as `truth/chain/stages.py` says, is the truth here, in an
+exact simulator that shares no code with jaxid (set-valued friction, 5 us).
 
-    python experiments/bogdan_micropositioning.py [-o FOLDER] [--only NAME] [--runs N]
+    python -m experiments.bogdan_micropositioning [-o FOLDER] [--only NAME] [--runs N]
 """
 
 from __future__ import annotations

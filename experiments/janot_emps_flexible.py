@@ -5,7 +5,7 @@ Availability". Its parameters (Table 2) are the truth here, in an exact simulato
 jaxid (set-valued friction, 5 us): trapezoidal velocity with pulses, lead 5 mm, 100 000 counts a revolution,
 noise on the force such that the residual is a tenth of it.
 
-    python experiments/janot_emps_flexible.py [-o results/janot_emps_flexible] [--only NAME]
+    python -m experiments.janot_emps_flexible [-o results/janot_emps_flexible] [--only NAME]
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 inertia is read off the period of what swings. The joint, the first, is an exact-friction simulator that
 shares no code with jaxid; its friction crosses the report's K_d = -12 at 1.2 rad/s, as theirs did.
 
-    python experiments/pa10.py [-o FOLDER] [--only NAME]
+    python -m experiments.pa10 [-o FOLDER] [--only NAME]
 """
 
 from __future__ import annotations

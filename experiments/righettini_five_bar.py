@@ -4,7 +4,7 @@ Righettini et al., "Real Time MEMS-Based Joint Friction Identification for Enhan
 Robotic Applications" (Robotics 14, 36). The robot is an exact-friction simulator that shares no code with
 jaxid; what is not published is chosen, and stands in `five_bar_robot.py`. Its controller is `jaxid.Live`.
 
-    python experiments/righettini_five_bar.py [-o FOLDER] [--only NAME]
+    python -m experiments.righettini_five_bar [-o FOLDER] [--only NAME]
 """
 
 from __future__ import annotations

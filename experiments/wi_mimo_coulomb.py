@@ -5,10 +5,10 @@ Coulomb Friction". Hypotheses, of logs without noise and samples before 0.1 s on
 stiffness within 1 %, every damping and friction within 5 %, at 1 kHz and 10 kHz, with friction and
 without; and x2 tracked to 0.5 mm RMS from 0.2 s on, once the controller knows what was found.
 
-The machine is the exact simulator of the tests (set-valued friction, 5 us), which shares no code with
+The machine is the exact simulator of `truth/` (set-valued friction, 5 us), which shares no code with
 jaxid; the controller is the case's own, called tick by tick. The paper's claims are set beside ours.
 
-    python experiments/wi_mimo_coulomb.py [-o results/wi_mimo_coulomb] [--only NAME]
+    python -m experiments.wi_mimo_coulomb [-o results/wi_mimo_coulomb] [--only NAME]
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A serial arm by other physics than the package's: energies of point sums, differenced, in numpy.
+"""Torques of a serial arm from energies of point sums, differenced, in numpy.
 
 Kinetic and potential energy come from homogeneous transforms and 4 x 4 pseudo-inertias, as in
 Lagrange's derivation; nothing is recursive, and no frame but the base's is used.

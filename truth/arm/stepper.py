@@ -1,4 +1,4 @@
-"""Logs of an arm in a PD loop with exact dry friction in every joint: Pinocchio's links, no jax, no jaxid.
+"""Logs of an arm in a PD loop with exact dry friction in every joint, on Pinocchio's links.
 
 Moreau's midpoint step: friction impulses lie within their levels and bring a joint to rest where they can,
 found by projected Gauss-Seidel sweeps. Mass matrix and the other forces are Pinocchio's, halfway.
@@ -17,8 +17,8 @@ class Arm:
     """Joints that turn about the z axes of their frames, in a weight along -z of the base.
 
     axes, origins: of each link's frame in that before it at zero angles, (n, 3, 3) and (n, 3) [m]; bodies:
-    ten parameters a link, in the order of `arm_oracle.NAMES`; viscous [N m s/rad] and coulomb [N m], one a
-    joint.
+    ten parameters a link, in the order of `truth.arm.oracle.NAMES`; viscous [N m s/rad] and coulomb [N m],
+    one a joint.
     """
 
     axes: np.ndarray

@@ -1,4 +1,7 @@
-"""Two links in a vertical plane, in closed form and by plain numbers: no jax, no jaxid, no recursion."""
+"""Two links in a vertical plane: closed-form equations of motion in plain numbers, without recursion.
+
+The equations are exact; dry friction is a sign smoothed far below any speed at which a sample counts.
+"""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The case of two links under the laws that feed a model forward, its true values beside its guesses."""
+"""A case of two links under a law that feeds a model forward; true values are those of the equations."""
 
 from pathlib import Path
 

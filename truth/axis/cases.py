@@ -1,4 +1,7 @@
-"""From a stepper's machine to what `discover` takes: a case file and logs."""
+"""Case files and recorded columns of an exact axis: what `jaxid discover` takes.
+
+Known values go into a case as they are; guesses are off by a stated factor.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""Make the demo's two logs with the exact-friction stepper: a slide with a ripple it does not declare.
+"""Make the demo's two logs on the exact axis: a slide with a ripple that its case does not declare.
 
-Run from the repository root: python -m truth.axis.demo_logs
+Run in the checkout: python -m truth.axis.demo_logs
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""One row per registered effect: a 100 kg slide's parameters, and the force that the table states.
+"""One row per registered effect: the parameters of a 100 kg slide, and the exact force in plain Python.
 
-The forces are the table of `interface.md` written out in plain Python: no line of them is shared
-with the package. The stepper takes effects under the same names and parameters.
+The forces are written out from the published formulas; no line is shared with the package. The stepper takes
+effects under the same names and parameters.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""One row per registered effect: a machine that has it, and a case that does not know it."""
+"""One row per registered effect: an exact axis that has it, and a case that does not declare it."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,7 @@
-"""Three machines to simulate, and references that excite them."""
+"""Three machines on the exact axis, and references that excite them: the EMPS slide, a servo, a heavy slide.
+
+Friction, limits, encoder and sampling are those of `truth.axis.stepper`; each machine gives its values.
+"""
 
 import dataclasses
 import math

@@ -1,8 +1,7 @@
-"""Ground truth for tests: one axis under set-valued friction, without jax and jaxid.
+"""Ground truth of one axis under set-valued friction.
 
-Real sign, real clipping, exact sticking, in a loop closed by a sampled
-controller through a quantised noisy encoder. It shares no line with the
-package, so that agreement between the two means something.
+Exact are sign, clipping and sticking, in a loop closed by a sampled controller through a quantised noisy
+encoder: nothing is smoothed. No line is shared with the package, so agreement between the two is evidence.
 
 Conventions:
     The drive acts in the order delay, gain, offset, lag, saturation, limit by the supply's voltage.

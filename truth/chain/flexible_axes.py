@@ -1,7 +1,7 @@
-"""The flexible ball-screw axis of Janot et al. by independent physics: its log, and its case.
+"""The flexible ball-screw axis of Janot et al. on the exact chain: its log, and its case.
 
-Truth is Table 2 of "Experimental joint stiffness identification depending on measurements
-availability", on the set-valued chain of `chain_stepper`: two masses, a spring and a damper between.
+Truth is Table 2 of "Experimental joint stiffness identification depending on measurements availability", on
+the set-valued chain of `truth.chain.stepper`: two masses, a spring and a damper between.
 """
 
 import dataclasses

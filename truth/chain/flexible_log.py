@@ -1,4 +1,4 @@
-"""The axis of `flexible_axes` in another loop, with pulses that excite its resonance.
+"""The exact axis of `truth.chain.flexible_axes` in another loop, with pulses that excite its resonance.
 
 Noise on the logged command is chosen, none on the encoders; guesses are off by a factor.
 """

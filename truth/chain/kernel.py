@@ -1,6 +1,6 @@
 """Compiled loop of the ground-truth chain: masses in a row under set-valued dry friction.
 
-What acts on one mass is the axis's own (`stepper_kernel`); here the springs couple them. One step
+The forces on one mass are those of `truth.axis.kernel`; here the springs couple them. One step
 is drift, kick, drift (second order where all is smooth). Positions, and with them the springs,
 stand still in the kick, so that each mass stops, sticks and breaks away by itself, in closed form.
 Where a spring has a damper, its force is that of the velocities halfway.

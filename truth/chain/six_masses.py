@@ -1,4 +1,4 @@
-"""The six masses of the experiment on the exact chain, from their values by the names of a case."""
+"""Six masses with Coulomb friction on the exact chain, from their values by the names of a case."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,10 +1,10 @@
-"""The micropositioning stage of Bogdan and Abba by independent physics: its log, and its case.
+"""The micropositioning stage of Bogdan and Abba on the exact chain: its log, and its case.
 
 Truth is Table 1 of "Identification of mechanical parameters at low velocities for a micropositioning stage
 using a velocity hysteresis model" in SI. As printed it contradicts itself: read here with k_e in mN m/A, a
 pitch of 2 mm, velocities in rev/s, K_l in 1e9 N/m (as printed it would carry the table's friction after
-487 rad), C_p in N m at the motor, B_t in N s/rad. It runs on the set-valued chain of `chain_stepper` in the
-coordinate of the table: what turns is a mass J / R^2.
+487 rad), C_p in N m at the motor, B_t in N s/rad. It runs on the set-valued chain of `truth.chain.stepper` in
+the coordinate of the table: what turns is a mass J / R^2.
 
 Gains of the loop and the ramp of the reference are not published; those here are chosen:
 5 Hz, damped, and just fast enough that the short move of data 2 begins within half a second.

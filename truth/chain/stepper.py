@@ -1,9 +1,9 @@
-"""Ground truth for tests: a chain of masses under set-valued friction, without jax and jaxid.
+"""Ground truth of a chain of masses under set-valued friction.
 
 m_i a_i + c_i v_i + s_i - s_(i+1) = u_i + effects, s_i = k_i (x_i - x_(i-1)) + d_i (v_i - v_(i-1)), the
-masses between two walls at 0. Real sign, exact sticking, sampled loops through a quantised noisy encoder.
+masses between two walls at 0. Sign and sticking are exact; sampled loops through a quantised noisy encoder.
 
-Conventions, beside those of `stepper`:
+Conventions, beside those of `truth.axis.stepper`:
     Masses, springs and drives count from 1; spring i joins mass i - 1 and mass i.
     The command is held between ticks. A mass that is not driven has no reference: its column is 0.
 """

@@ -1,4 +1,4 @@
-"""A five-bar robot by other physics than the package's: rigid bodies under constraints, in numpy.
+"""A five-bar robot as rigid bodies under constraints, in numpy: its exact accelerations and forces.
 
 Ten coordinates, X = (q1, q2, x1, y1, phi1, x2, y2, phi2, px, py): the proximal links by their angles, the
 distal links by centre and angle, the tool by its position. Hinges are eight constraints with multipliers;

@@ -1,8 +1,8 @@
-"""Logs of a five-bar robot with exact dry friction in every hinge, without jax and jaxid.
+"""Logs of a five-bar robot with exact dry friction in every hinge.
 
 Moreau's midpoint step: friction impulses lie within their levels and bring a hinge to rest where they can,
 found by projected Gauss-Seidel sweeps. Rates and accelerations of the links are solved for as vectors, by
-hand; `test_five_bar` holds them against the multipliers of `five_bar_oracle`.
+hand; a test compares them with the multipliers of `truth.five_bar.oracle`.
 """
 
 import numpy as np

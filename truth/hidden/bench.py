@@ -1,4 +1,4 @@
-"""Hidden cases of both machines, the axis and the chain: their files, and their oracle."""
+"""Hidden cases on both exact machines, the axis and the chain: their files, and their oracle."""
 
 import re
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""Cases in which the physics that is missing is known: what is hidden, where, and under how much noise.
+"""Exact axes that hide known physics, under several levels of noise.
 
-Everything about a case follows from its id. Neither jax nor jaxid is needed to make its logs.
+Everything about a case follows from its id.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
-"""What the best reader of a chain's log could see of a hidden effect; see `hidden_oracle`.
+"""An oracle for hidden effects of a chain, from its exact forces; see `truth.hidden.oracle`.
 
 Forces at all masses are stacked, since a spring that two of them share ties their balances
 together. Each is whitened by itself: neighbours read each other's position noise through a spring,
-which is small beside the noise of the drive and is left out. Neither jax nor jaxid takes part.
+which is small beside the noise of the drive and is left out.
 """
 
 import functools

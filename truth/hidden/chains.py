@@ -1,7 +1,7 @@
-"""Chains of masses in which the physics that is missing is known: what, at which mass or spring.
+"""Exact chains of masses that hide a known effect at a known mass or spring.
 
-As in `hidden_cases`, everything follows from the id, and neither jax nor jaxid is needed to make
-the logs. Damping is the plant's own, and an added mass is no more than a mass: neither is hidden.
+As in `truth.hidden.cases`, everything follows from the id of a case. Damping belongs to the plant, and an
+added mass is the same as a mass: neither is hidden.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ DURATION = 8.0  # s
 
 @dataclasses.dataclass(frozen=True)
 class ChainSetup:
-    """A chain with its loops, sensor and experiment; attributes as in `stepper_machines.Setup`."""
+    """A chain with its loops, sensor and experiment; attributes as in `truth.axis.machines.Setup`."""
 
     machine: chain.ChainMachine
     loops: Sequence[Loop]

@@ -1,4 +1,4 @@
-"""Right or wrong: what a record of a hidden case says. No jax and no jaxid."""
+"""Judge a record of a hidden case against the truth that made its log."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""Three scales of machine at several sampling rates, each with tours to fit and to validate on."""
+"""Exact axes at three scales and several sampling rates, each with tours to fit and to validate on."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ class Scale:
     """A machine's size and what it does.
 
     Attributes:
-        name: Of the preset in `stepper_machines`, which gives machine and sensor.
+        name: Of the preset in `truth.axis.machines`, which gives machine and sensor.
         motion: As the case file says it.
         waypoints: Of the tour [m].
         speeds: Of its moves [m/s].

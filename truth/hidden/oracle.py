@@ -1,8 +1,9 @@
-"""What the best reader of a log could see of a hidden effect, from the truth and the noise alone.
+"""An oracle for hidden effects: how well the best reader of a log could see one.
 
-The stepper's truth gives the force that the case's own effects cannot explain, whatever their
-parameters. A matched filter in noise of known spectrum says how surely it shows. Neither jax nor
-jaxid takes part: what counts as visible is settled before jaxid sees the log.
+It uses the exact force of the stepper and the true spectrum of the noise, nothing estimated. The stepper's
+truth gives the force that the case's effects cannot explain, for any of their parameters; a matched filter in
+noise of known spectrum gives the evidence. So what counts as visible is settled
+before jaxid reads the log.
 """
 
 import dataclasses
