@@ -17,7 +17,8 @@ from truth.axis.hidden_effects import COULOMB, VISCOUS
 # A force in time at a known frequency: nothing that is registered does that.
 OWN = """
 import jax.numpy as jnp
-from jaxid.model.plant import Action, Effect, parameter
+from jaxid.model.effect import Action, Effect
+from jaxid.model.parameter import parameter
 
 
 class Hum(Effect):
