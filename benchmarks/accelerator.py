@@ -1,6 +1,6 @@
 """Batches on an accelerator against all cores of the same machine: many sets at once, and whole studies.
 
-    python benchmarks/accelerator.py [--quick] [--no-write]
+    python -m benchmarks.accelerator [--quick] [--no-write]
 
 prints the table and writes results/accelerator.json and .md beside this file. Needs a machine with an
 accelerator that JAX sees, and a JAX that can use it.
@@ -32,8 +32,8 @@ def child(kind: str, *words: object) -> dict:
     environment = os.environ | dict.fromkeys(names, "1") | {"JAX_PLATFORMS": kind}
     # Without it jaxlib 0.11 waits for itself where threads run compiled code on a processor at once.
     environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"
-    line = [sys.executable, __file__, "--child", *map(str, words)]
-    done = subprocess.run(line, capture_output=True, text=True, env=environment)
+    line = [sys.executable, "-m", "benchmarks.accelerator", "--child", *map(str, words)]
+    done = subprocess.run(line, capture_output=True, text=True, env=environment, cwd=HERE.parent)
     if done.returncode:
         raise RuntimeError(f"{kind}, {words}: {done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
@@ -41,9 +41,9 @@ def child(kind: str, *words: object) -> dict:
 
 def sets(kind: str, count: int, numerics: str) -> dict:
     """Cost, or normal equations too, of so many sets of the axis' four parameters; 25 000 samples."""
-    import axis
     import jax
 
+    from benchmarks import axis
     from jaxid.simulation.replay import Numerics
 
     reference, measured = axis.log()
@@ -129,7 +129,7 @@ def table(rows: list[dict], seen: dict) -> str:
     """In Markdown."""
     lines = [
         "# Batches on an accelerator", "",
-        "Written by `python benchmarks/accelerator.py`; what is measured is in `benchmarks/README.md`.", "",
+        "Written by `python -m benchmarks.accelerator`; what is measured is in `benchmarks/README.md`.", "",
         "{kind} against {cores} cores of the same machine, python {python}, jax {jax}.".format(**seen), "",
         "| of | sets or runs | cores s | accelerator s | ratio | first, cores s | accelerator s | differ |",
         "|---|---|---|---|---|---|---|---|",

@@ -1,21 +1,16 @@
 """The axis that the speed benchmarks run: EMPS-like, in its cascade loop, 25 000 samples at 1 kHz.
 
-Its log comes from the independent stepper of the tests, with an encoder's rounding and noise.
+Its log comes from the independent stepper of `truth/`, with an encoder's rounding and noise.
 """
 
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import stepper_machines as machines
 
 from jaxid.controllers import CascadePD
 from jaxid.effects import EFFECTS
@@ -26,6 +21,7 @@ from jaxid.plants import Axis
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive
 from jaxid.simulation.replay import Numerics, Replay
+from truth.axis import machines
 
 PERIOD, GAIN = 1e-3, 35.15065
 NOISE = 1e-6  # of a reading [m]

@@ -7,10 +7,10 @@ import numpy as np
 import optimistix as optx
 import scipy.integrate
 import scipy.optimize
-from axis import PLACES, TRANSFORM
-from axis_loops import ideal_forward, rk4_forward
 from numba import njit
 
+from benchmarks.axis import PLACES, TRANSFORM
+from benchmarks.axis_loops import ideal_forward, rk4_forward
 from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
 from jaxid.simulation.loops import with_diffrax

@@ -1,4 +1,4 @@
-"""One fit in a fresh process: `python benchmarks/cold_fit.py smooth|ideal [solver of optimistix]`.
+"""One fit in a fresh process: `python -m benchmarks.cold_fit smooth|ideal [solver of optimistix]`.
 
 Prints JSON: wall time [s], CPU time [s], half the sum of squares.
 """
@@ -7,10 +7,10 @@ import json
 import sys
 import time
 
-import axis
 import jax
 import jax.numpy as jnp
 
+from benchmarks import axis
 from jaxid.simulation.replay import Numerics
 
 reference, measured = axis.log()
@@ -18,7 +18,7 @@ run = axis.replay(reference, Numerics(set_valued=sys.argv[1] == "ideal"))
 base = axis.plant(axis.TRUTH)
 jax.block_until_ready(jnp.zeros(1) + 1)
 if len(sys.argv) > 2:
-    import axis_rivals as rivals
+    from benchmarks import axis_rivals as rivals
 
     solver, start, seen = rivals.OPTIMISTIX[sys.argv[2]], jnp.asarray(axis.START), jnp.asarray(measured)
 wall, cpu = time.perf_counter(), time.process_time()

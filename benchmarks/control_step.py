@@ -1,6 +1,6 @@
 """One tick of the law `adaptive`, identification included, against the 0.25 ms of a loop at 4 kHz.
 
-    python benchmarks/control_step.py [CASE.toml] [--ticks 100000]
+    python -m benchmarks.control_step [CASE.toml] [--ticks 100000]
 
 The case (absent: two links, as in the tests) is simulated, and its readings are given to `jaxid.Live` one
 by one, as a machine's loop would. Times are of whole calls, from array to array; *in a scan* is what the
@@ -10,14 +10,11 @@ processor time, of all threads, is what a machine of its own would take.
 
 import argparse
 import gc
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 BUDGET_US = 250.0
 
@@ -37,7 +34,7 @@ def main() -> None:
 
 
 def two_links(folder: Path, ticks: int) -> Path:
-    from adaptive_arm import written
+    from truth.arm.two_links_case import written
 
     return written(folder, "velocity_average = 4\nreach = 8", ticks * 2.5e-4)
 

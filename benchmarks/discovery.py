@@ -1,8 +1,8 @@
 """How often `discover` names what was hidden, and how often it names what is not there.
 
-    python benchmarks/discovery.py [--split test] [--groups effects,pairs] [--only cogging] [--resume]
+    python -m benchmarks.discovery [--split test] [--groups effects,pairs] [--only cogging] [--resume]
 
-Every case of `tests/hidden_cases.py` and `tests/hidden_chains.py` goes through `jaxid.discover`; a
+Every case of `truth/hidden/cases.py` and `truth/hidden/chains.py` goes through `jaxid.discover`; a
 line of JSON each, then the table as `discovery.md` and `discovery.json`. Exits with 1 where an aim is missed.
 """
 
@@ -19,14 +19,13 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-import hidden_cases
-import hidden_chains
-from discovery_table import aims_hold, markdown, summary
-from hidden_cases import FIRST_SEED, NOISES, SCALES
-from hidden_run import Case
 from tqdm import tqdm
+
+from benchmarks.discovery_table import aims_hold, markdown, summary
+from truth.hidden import cases as hidden_cases
+from truth.hidden import chains as hidden_chains
+from truth.hidden.bench import Case
+from truth.hidden.cases import FIRST_SEED, NOISES, SCALES
 
 ROOT = Path(__file__).parent.parent
 GROUPS = ("effects", "pairs", "nulls", "outside", "short", "chains", "chain_nulls")
@@ -106,7 +105,7 @@ def read(lines: Path) -> list[dict]:
 
 def ask_again(lines: Path, cases: dict[str, Case]) -> None:
     """Replace what the oracle said of cases that are done, where it has learned since."""
-    from hidden_run import oracle
+    from truth.hidden.bench import oracle
 
     records = read(lines)
     for record in tqdm(records, unit="case", desc="oracle"):
@@ -138,7 +137,7 @@ def run(chosen: Sequence[Case], lines: Path, workers: int) -> None:
 
 
 def _work(group: Sequence[Case], lines: str) -> None:
-    from hidden_run import run_case
+    from benchmarks.hidden_run import run_case
 
     with tempfile.TemporaryDirectory() as folder:
         for k, case in enumerate(group):
@@ -150,7 +149,7 @@ def _work(group: Sequence[Case], lines: str) -> None:
 
 def measure_cold(chosen: Sequence[Case], path: Path) -> None:
     """Seconds of a fresh `jaxid discover`, refits in simulation and all."""
-    from hidden_run import write_files
+    from truth.hidden.bench import write_files
 
     command = Path(sys.executable).parent / "jaxid"
     seconds = []

@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from statistics import median
 
-import hidden_judge as judge
+from truth.hidden import judge
 
 Record = dict
 # What the totals must reach: name -> bound, and whether it is a largest value.

@@ -1,6 +1,6 @@
 """How often discovery sees something where nothing is missing: logs of the stepper, all declared.
 
-    python benchmarks/nulls.py [--logs N] [--machine NAME] [--no-sensor]
+    python -m benchmarks.nulls [--logs N] [--machine NAME] [--no-sensor]
 
 prints the table and exits with 1 where more than one log in sixty is not `nothing_missing`.
 """
@@ -11,12 +11,10 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-import stepper_machines as machines
-from search_setup import case_text, log_of, write_case
-
 from jaxid.commands.discover import discover
+from tests.support.axis_log import log_of
+from truth.axis import machines
+from truth.axis.cases import case_text, write_case
 
 NOISE = (0.3, 1.0, 3.0)
 # Name -> preset, motion, and seconds of the log of each seed in turn.

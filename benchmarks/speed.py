@@ -1,6 +1,6 @@
 """Speed of jaxid on one axis, as ratios to hand-written loops and to other tools; and what it grows with.
 
-    python benchmarks/speed.py [--quick] [--no-write] [--only ratios|optimistix|peers|scale]
+    python -m benchmarks.speed [--quick] [--no-write] [--only ratios|optimistix|peers|scale]
 
 prints the tables and writes results/speed.json and results/speed.md beside this file.
 """
@@ -21,18 +21,18 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["NUMBA_NUM_THREADS"] = "2"
 
-import axis
-import axis_loops as loops
-import axis_rivals as rivals
 import jax.numpy as jnp
 import numpy as np
-import speed_scale
-from speed_peers import against_peers, installed
-from speed_rows import HEAD, Row, compare, in_process, line, table
 
+from benchmarks import axis, speed_scale
+from benchmarks import axis_loops as loops
+from benchmarks import axis_rivals as rivals
+from benchmarks.speed_peers import against_peers, installed
+from benchmarks.speed_rows import HEAD, Row, compare, in_process, line, table
 from jaxid.simulation.replay import Numerics
 
 HERE = Path(__file__).parent
+COLD_FIT = ("-m", "benchmarks.cold_fit")
 WIDTH = 1e-3
 LOOP = (axis.GAIN, 160.18, 243.45, 10.0, axis.PERIOD, WIDTH)
 REST = (0.0, 0.0)
@@ -201,10 +201,9 @@ def against_optimistix(sides: Sides, n: int, cold: int) -> list[Row]:
 
 def cold_row(quantity: str, name: str, solver: str, repeats: int) -> Row:
     """First fits of fresh processes in turn, tracing and compiling included."""
-    script = str(HERE / "cold_fit.py")
     pairs = np.array(
         [
-            [json.loads(in_process(script, name, *who)[1].splitlines()[-1]) for who in ((), (solver,))]
+            [json.loads(in_process(*COLD_FIT, name, *who)[1].splitlines()[-1]) for who in ((), (solver,))]
             for _ in range(repeats)
         ]
     )
@@ -239,7 +238,7 @@ def compile_times(sides: Sides) -> dict[str, dict]:
 
 def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
     """First fit of a fresh process, without and with compiled code on disk [s, CPU s]."""
-    script, out = str(HERE / "cold_fit.py"), {}
+    out = {}
     for name in ("smooth", "ideal"):
         with tempfile.TemporaryDirectory() as folder:
             cache = {
@@ -247,10 +246,10 @@ def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
                 "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
             }
             fits: dict[str, list] = {"no cache": [], "cache": []}
-            in_process(script, name, **cache)
+            in_process(*COLD_FIT, name, **cache)
             for _ in range(repeats):
                 for label, environment in (("no cache", {}), ("cache", cache)):
-                    words = in_process(script, name, **environment)[1]
+                    words = in_process(*COLD_FIT, name, **environment)[1]
                     fits[label].append(json.loads(words.splitlines()[-1])[:2])
         for label, seconds in fits.items():
             out[f"first fit, {name}, {label}"] = tuple(np.median(seconds, axis=0).tolist())
@@ -280,7 +279,7 @@ def report(rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float]
     lines = [
         "# Speed",
         "",
-        "Written by `python benchmarks/speed.py`; what is measured is in `benchmarks/README.md`.",
+        "Written by `python -m benchmarks.speed`; what is measured is in `benchmarks/README.md`.",
         "",
         f"{os.cpu_count()} CPU cores, {shown}.",
         "",

@@ -8,11 +8,11 @@ sample; figaroh builds the regressor of a motion by Pinocchio, sample by sample.
 from collections.abc import Callable
 from importlib.util import find_spec
 
-import axis
 import jax.numpy as jnp
 import numpy as np
-from speed_rows import Row, compare
 
+from benchmarks import axis
+from benchmarks.speed_rows import Row, compare
 from jaxid.numerics.filters import Decimator
 from jaxid.simulation.force_balance import ForceData, force_and_columns
 

@@ -31,8 +31,8 @@ AIMS = {"axis": 10.0, "stage": 10.0, "fit": 30.0, "memory": 2 * 2**30, "help": 0
 def child(what: str, *words: object, cores: int | None = None) -> dict:
     """What a fresh process prints of itself, on so many cores."""
     prefix = [] if cores is None else ["taskset", "-c", f"0-{cores - 1}"]
-    line = [*prefix, sys.executable, __file__, what, *map(str, words)]
-    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    line = [*prefix, sys.executable, "-m", "benchmarks.speed_scale", what, *map(str, words)]
+    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=HERE.parent)
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import equinox as eqx
@@ -22,9 +21,7 @@ from jaxid.model.unknowns import scatter
 from jaxid.scene import Scene
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import closed_loop
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import stages
+from truth.chain import stages
 
 # The move of data 1, for a simulation by jaxid itself.
 SIMULATED = f"""[reference]

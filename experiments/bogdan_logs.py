@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -22,9 +21,7 @@ from jaxid.estimators.within_prior.problem import criterion_steps
 from jaxid.logs.log import Log
 from jaxid.numerics.lanes import cores, run_alone, run_batched
 from jaxid.session import open_session
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import stages
+from truth.chain import stages
 
 PRIOR = 0.5
 ON_FORCE = f'[output_error]\non = "force"\nprior = {PRIOR}\n'

@@ -1,32 +1,29 @@
 """The micropositioning stage: what a hundred noisy samples of its current tell, and what they do not.
 
 Bogdan & Abba, "Identification of mechanical parameters at low velocities for a micropositioning stage using a
-velocity hysteresis model". Its Table 1, read in SI as `tests/stages.py` says, is the truth here, in an exact
-simulator that shares no code with jaxid (set-valued friction, 5 us).
+velocity hysteresis model". Its Table 1, read in SI as `truth/chain/stages.py` says, is the truth here, in an
+exact simulator that shares no code with jaxid (set-valued friction, 5 us).
 
-    python experiments/bogdan_micropositioning.py [-o FOLDER] [--only NAME] [--runs N]
+    python -m experiments.bogdan_micropositioning [-o FOLDER] [--only NAME] [--runs N]
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import Table, parser_of
 
 import jaxid
+from experiments import bogdan_figures
+from experiments.bogdan_logs import ON_FORCE, case_of, logs_of, noise_of, off_in_sigma, studied
+from experiments.bogdan_scatter import calibrated, elastic, nearest, scatter, within
+from experiments.common import Table, parser_of
 from jaxid.commands.identify import identify_many
 from jaxid.logs.log import Log
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import bogdan_figures
-import stages
-from bogdan_logs import ON_FORCE, case_of, logs_of, noise_of, off_in_sigma, studied
-from bogdan_scatter import calibrated, elastic, nearest, scatter, within
+from truth.chain import stages
 
 # Of the published table: relative precision of data 1 and 2 [%].
 PUBLISHED = {

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import stages
-from bogdan_logs import apart, case_of, logs_of, studied
-from common import Table
+
+from experiments.bogdan_logs import apart, case_of, logs_of, studied
+from experiments.common import Table
+from truth.chain import stages
 
 # Of `scatter` and its like: data set, encoder, its count, whether the screw is rigid.
 ROWS = (

@@ -5,7 +5,7 @@ viscous friction alone, simulates the axis in its loop more closely than the pub
 Accepted where the relative position error is at most 0.0012 % and 0.0015 % (published: 0.0138 and
 0.0080 %) and the relative force error on the validation log at most 5.4 % with the published filter.
 
-    JAXID_DATA=... python experiments/emps.py [-o results/emps]
+    JAXID_DATA=... python -m experiments.emps [-o results/emps]
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import sys
 import time
 from pathlib import Path
 
-from common import Table, arguments, case_with_data
-
 import jaxid
+from experiments.common import Table, arguments, case_with_data
 
 # Janot, Gautier & Brunot (2019): IDIM-LS and closed-loop simulation. The offset stands on the side
 # of friction there: as a force on the joint its sign is the other.

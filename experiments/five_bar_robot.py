@@ -6,20 +6,16 @@ the PD law, friction, the drives' gains, noise, and the region of the targets.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import jax
 import numpy as np
 import scipy.signal
 
 import jaxid
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from five_bar_oracle import ORDERS, PLANT, Robot
-from five_bar_stepper import _advance, arrays
+from truth.five_bar.oracle import ORDERS, PLANT, Robot
+from truth.five_bar.stepper import _advance, arrays
 
 REDUCTION = 20.0
 # Actual torque over the measured one, by drive.

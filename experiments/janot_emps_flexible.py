@@ -5,7 +5,7 @@ Availability". Its parameters (Table 2) are the truth here, in an exact simulato
 jaxid (set-valued friction, 5 us): trapezoidal velocity with pulses, lead 5 mm, 100 000 counts a revolution,
 noise on the force such that the residual is a tenth of it.
 
-    python experiments/janot_emps_flexible.py [-o results/janot_emps_flexible] [--only NAME]
+    python -m experiments.janot_emps_flexible [-o results/janot_emps_flexible] [--only NAME]
 """
 
 from __future__ import annotations
@@ -17,19 +17,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from common import Table, parser_of
 
 import jaxid
+from experiments import janot_figures
+from experiments.common import Table, parser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.minimal.fit import filtering_of
 from jaxid.results.as_json import derived_json
 from jaxid.results.report.minimal_plots import plot_filtering
 from jaxid.session import Session, open_session
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import flexible_axes as axes
-import janot_figures
-from stepper import Sensor
+from truth.axis.stepper import Sensor
+from truth.chain import flexible_axes as axes
 
 # Force noise of 0.8 V leaves 7 % of the force after the published filter, as in the paper.
 NOISY = dataclasses.replace(axes.SENSOR, force_noise=0.8)

@@ -10,7 +10,7 @@ coverage of intervals and the basin of convergence need no script:
     jaxid study experiments/cases/coverage.toml -o results/coverage
     jaxid study experiments/cases/basin.toml -o results/basin
 
-    python experiments/ladder.py [-o results/ladder]
+    python -m experiments.ladder [-o results/ladder]
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import sys
 import time
 
 import numpy as np
-from common import Table, arguments, copied
 
 import jaxid
+from experiments.common import Table, arguments, copied
 from jaxid.results.report.study_plots import plot_errors
 
 

@@ -4,24 +4,22 @@
 inertia is read off the period of what swings. The joint, the first, is an exact-friction simulator that
 shares no code with jaxid; its friction crosses the report's K_d = -12 at 1.2 rad/s, as theirs did.
 
-    python experiments/pa10.py [-o FOLDER] [--only NAME]
+    python -m experiments.pa10 [-o FOLDER] [--only NAME]
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pa10_arm
-import pa10_configurations
-import pa10_drive
-import pa10_figures
-from common import Table, run_studies
-from pa10_joint import (
+
+import jaxid
+from experiments import pa10_arm, pa10_configurations, pa10_drive, pa10_figures
+from experiments.common import Table, run_studies
+from experiments.pa10_joint import (
     COULOMB,
     CROSSING,
     EXACT,
@@ -40,14 +38,10 @@ from pa10_joint import (
     swinging,
     unknown,
 )
-
-import jaxid
 from jaxid.arms.dominant_inertia import of_swing
 from jaxid.logs.log import Log
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from chain_stepper import ChainMachine, simulate_chain
-from stepper import Loop, Machine, Sensor, simulate
+from truth.axis.stepper import Loop, Machine, Sensor, simulate
+from truth.chain.stepper import ChainMachine, simulate_chain
 
 # Table C.I: joint, and viscous and Coulomb friction forwards and backwards.
 TABLE = {

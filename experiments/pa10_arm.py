@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import Table
 
 import jaxid
+from experiments.common import Table
 from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.base_parameters import base_parameters, inertial_regressor
 from jaxid.dynamics.residuals import balance_along
@@ -23,10 +22,8 @@ from jaxid.machine import Machine
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import run_alone
 from jaxid.plants import SerialArm, pa10
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import arm_oracle
-import arm_stepper
+from truth.arm import oracle as arm_oracle
+from truth.arm import stepper as arm_stepper
 
 CASES = Path(__file__).parent / "cases"
 # Table 4.1, by row from the first: of d11 ... d77 those that a base parameter stands in, "1" as it is, "t"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,19 +9,17 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from common import Table
-from pa10_arm import COULOMB, KNOWN, VISCOUS, arm_of, random_bodies
-from pa10_joint import CROSSING, EXACT, FAST, RATE, case_text, settled, unknown
 
 import jaxid
+from experiments.common import Table
+from experiments.pa10_arm import COULOMB, KNOWN, VISCOUS, arm_of, random_bodies
+from experiments.pa10_joint import CROSSING, EXACT, FAST, RATE, case_text, settled, unknown
 from jaxid.arms.base_parameters import BaseParameters, base_parameters
 from jaxid.arms.dominant_inertia import DominantInertias, from_dominant_inertias, of_swing
 from jaxid.logs.log import Log
 from jaxid.plants import SerialArm, pa10
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from arm_oracle import NAMES
-from stepper import Loop, Machine, Sensor, simulate
+from truth.arm.oracle import NAMES
+from truth.axis.stepper import Loop, Machine, Sensor, simulate
 
 # Configurations a joint, and as many others to predict; angles within two rad, drawn.
 CONFIGURATIONS, RANGE = 8, 2.0

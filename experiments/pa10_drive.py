@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
-import pa10_figures
-from common import Table
-from pa10_joint import COULOMB, FASTEST, RATE, VISCOUS, case_text, unknown
 
 import jaxid
+from experiments import pa10_figures
+from experiments.common import Table
+from experiments.pa10_joint import COULOMB, FASTEST, RATE, VISCOUS, case_text, unknown
 from jaxid.logs.log import Log
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from stepper import Loop, Machine, Sensor, simulate
-from stepper_machines import moves
+from truth.axis.machines import moves
+from truth.axis.stepper import Loop, Machine, Sensor, simulate
 
 # Table 5.1: rated torque [N m] and torque constant [N m/A]; and table 5.2 as printed, whose first is 0.766.
 RATED = {"1, 2": (5.3, 0.692, 0.776), "3, 4": (2.0, 0.501, 0.399), "5, 6, 7": (0.36, 0.0831, 0.433)}

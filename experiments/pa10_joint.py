@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from stepper import Loop, Machine, Sensor, simulate
+from truth.axis.stepper import Loop, Machine, Sensor, simulate
 
 # Illustrative, for the report has none of the first joint but 14.4 N m at 1.2 rad/s: inertia [kg m^2],
 # Coulomb [N m] and viscous friction [N m s/rad].

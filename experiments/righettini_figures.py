@@ -10,7 +10,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from five_bar_robot import PERIOD, Ran
+
+from experiments.five_bar_robot import PERIOD, Ran
 
 UNITS = {
     "coulomb_friction": "N m",

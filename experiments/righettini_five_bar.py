@@ -4,7 +4,7 @@ Righettini et al., "Real Time MEMS-Based Joint Friction Identification for Enhan
 Robotic Applications" (Robotics 14, 36). The robot is an exact-friction simulator that shares no code with
 jaxid; what is not published is chosen, and stands in `five_bar_robot.py`. Its controller is `jaxid.Live`.
 
-    python experiments/righettini_five_bar.py [-o FOLDER] [--only NAME]
+    python -m experiments.righettini_five_bar [-o FOLDER] [--only NAME]
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import five_bar_robot as robots
 import jax
 import jax.numpy as jnp
 import numpy as np
-import righettini_figures
-from common import Table, run_studies
-from five_bar_robot import LOOK, PD, PERIOD, Ran, driven, robot
-from righettini_logs import hidden, orders, payload
 
 import jaxid
+from experiments import five_bar_robot as robots
+from experiments import righettini_figures
+from experiments.common import Table, run_studies
+from experiments.five_bar_robot import LOOK, PD, PERIOD, Ran, driven, robot
+from experiments.righettini_logs import hidden, orders, payload
 from jaxid.controllers.computed_torque import inverse_dynamics
 
 ADAPTIVE = 'kind = "adaptive"\ngate_velocity = 0.05\nhalf_life = 600.0'

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import five_bar_robot as robots
 import numpy as np
-import righettini_figures
-from common import Table
-from five_bar_robot import PD, Ran, driven, robot
 
 import jaxid
+from experiments import five_bar_robot as robots
+from experiments import righettini_figures
+from experiments.common import Table
+from experiments.five_bar_robot import PD, Ran, driven, robot
 from jaxid.logs.log import Log
 
 # Noise of the torque in a log, at the motor [N m]; for how long the loop holds a command [s].

@@ -6,9 +6,9 @@ the true one alone. Accepted where the two rivals are within 3 nats on the first
 100 nats apart on the second, the true spring (400 N/m^2, quadratic) is named there without rivals,
 its coefficient is within 5 %, and the machine kept within the limits of the case.
 
-The machine is the exact simulator of the tests, which shares no code with jaxid.
+The machine is the exact simulator of `truth/`, which shares no code with jaxid.
 
-    python experiments/separate.py [-o results/separate]
+    python -m experiments.separate [-o results/separate]
 """
 
 from __future__ import annotations
@@ -18,14 +18,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from common import Table, arguments, copied
-
 import jaxid
+from experiments.common import Table, arguments, copied
 from jaxid.references import make_reference
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from separate_setup import curved, started
-from stepper import write_csv
+from truth.axis.ambiguous import curved, started
+from truth.axis.stepper import write_csv
 
 TRUE, COEFFICIENT = "quadratic_stiffness", 400.0
 

@@ -4,7 +4,7 @@ Hypothesis: from a linear mass-spring-damper, `discover` names a cubic stiffness
 the model then simulates the test logs in open loop to within 0.45 mV (arrow) and 0.33 mV
 (multisine) RMS, from about 15 and 9 mV. Black-box networks stand at 2.7 and 1.5 mV.
 
-    JAXID_DATA=... python experiments/silverbox.py [-o results/silverbox]
+    JAXID_DATA=... python -m experiments.silverbox [-o results/silverbox]
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from __future__ import annotations
 import sys
 import time
 
-from common import Table, arguments, case_with_data
-
 import jaxid
+from experiments.common import Table, arguments, case_with_data
 
 # One C-like reference simulation with cubic, offset and quadratic term (see the data's README).
 REFERENCE_MV = {"multisine": 0.30, "arrow": 0.41}

@@ -5,7 +5,7 @@ squares, and less of the torque is left on the last third of the log than by a f
 each joint alone; what is left at the last two joints is the friction of the shaft that both turn, and
 `discover` names it. Of the last half holds: it names the shaft's viscous friction, not its Coulomb friction.
 
-    JAXID_DATA=... python experiments/tx40.py [-o results/tx40] [--only models|hidden]
+    JAXID_DATA=... python -m experiments.tx40 [-o results/tx40] [--only models|hidden]
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import scipy.signal
-from common import Table, copied, parser_of
 
 import jaxid
+from experiments.common import Table, copied, parser_of
 from jaxid.files import write_whole
 
 JOINTS = 6

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from six_masses import KINDS, Driven
+
+from experiments.wi_loop import Driven
+from truth.chain.six_masses import KINDS
 
 UNITS = {"mass": "kg", "stiffness": "N/m", "damping": "N s/m", "coulomb_friction": "N"}
 # End of the first instants, drawn on an axis of their own [s].

@@ -5,10 +5,10 @@ Coulomb Friction". Hypotheses, of logs without noise and samples before 0.1 s on
 stiffness within 1 %, every damping and friction within 5 %, at 1 kHz and 10 kHz, with friction and
 without; and x2 tracked to 0.5 mm RMS from 0.2 s on, once the controller knows what was found.
 
-The machine is the exact simulator of the tests (set-valued friction, 5 us), which shares no code with
+The machine is the exact simulator of `truth/` (set-valued friction, 5 us), which shares no code with
 jaxid; the controller is the case's own, called tick by tick. The paper's claims are set beside ours.
 
-    python experiments/wi_mimo_coulomb.py [-o results/wi_mimo_coulomb] [--only NAME]
+    python -m experiments.wi_mimo_coulomb [-o results/wi_mimo_coulomb] [--only NAME]
 """
 
 from __future__ import annotations
@@ -22,21 +22,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import Table, copied, parser_of
 
 import jaxid
+from experiments import wi_figures
+from experiments.common import Table, copied, parser_of
+from experiments.wi_cases import CASE, FIRST, long_chain, one_driven, undeclared, variant
+from experiments.wi_loop import driven, machine, true_values
+from experiments.wi_noise import FORMS, noise
 from jaxid.build import build_machine
 from jaxid.estimators import METHODS
 from jaxid.estimators.algebraic.online import Online, OnlineEstimate, window_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.numerics.lanes import run_alone
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import wi_figures
-from chain_stepper import name_of
-from six_masses import KINDS, driven, machine, true_values
-from wi_cases import CASE, FIRST, long_chain, one_driven, undeclared, variant
-from wi_noise import FORMS, noise
+from truth.chain.six_masses import KINDS
+from truth.chain.stepper import name_of
 
 SECONDS, TRACKED_FROM = 10.0, 0.2
 # The law with measured velocity, and the one with a reconstructed one and the error's integral.

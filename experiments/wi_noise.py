@@ -6,13 +6,14 @@ import time
 from pathlib import Path
 
 import numpy as np
-import wi_figures
-from common import Table
-from six_masses import KINDS, driven, true_values
-from wi_cases import FIRST, noisy
 
 import jaxid
+from experiments import wi_figures
+from experiments.common import Table
+from experiments.wi_cases import FIRST, noisy
+from experiments.wi_loop import driven, true_values
 from jaxid.estimators import METHODS
+from truth.chain.six_masses import KINDS
 
 FORMS = [name for name in METHODS if name.startswith("algebraic")]
 RUNS, EXACT_RUNS = 1000, 30

@@ -8,12 +8,12 @@ import sys
 
 import numpy as np
 import pytest
-from cli_setup import TRUTH, held, place, recorded, refused, run, text
 
 from jaxid import cli
 from jaxid.effects import EFFECTS
 from jaxid.estimators import METHODS
 from jaxid.plants import PLANTS
+from tests.support.cli_setup import TRUTH, held, place, recorded, refused, run, text
 
 COMMANDS = ("demo", "plants", "effects", "simulate", "check", "identify", "discover")
 SIMULATED = """

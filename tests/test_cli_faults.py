@@ -4,7 +4,8 @@ import shlex
 
 import numpy as np
 import pytest
-from cli_setup import place, recorded, refused, text
+
+from tests.support.cli_setup import place, recorded, refused, text
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """The demo: check, identify, discover and report on a log whose truth the case does not know.
 
 The two logs were made by an exact set-valued friction stepper that shares no code with jaxid
-(`tests/make_demo.py`), with an encoder's noise and rounding.
+(`truth/axis/demo_logs.py`), with an encoder's noise and rounding.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The effects that can be added to a plant, by the names of the case file.
 
 To add one: write its class in the file of its family, decorate it with `register`, and give it a
-row in `tests/effect_cases.py`. A user's own effect needs no more than the class and the decorator.
+row in `truth/axis/effect_forces.py`. A user's own effect needs no more than the class and the decorator.
 """
 
 from jaxid.effects.registry import EFFECTS as EFFECTS

@@ -1,0 +1,64 @@
+"""Discovery on part of the bench of hidden effects; the whole is `benchmarks/discovery.py`."""
+
+import pytest
+
+from benchmarks.hidden_run import run_case
+from truth.hidden import judge
+from truth.hidden.cases import cases
+
+EVERY = {c.id: c for c in cases("seen")}
+NAMED = [c for c in EVERY.values() if c.group in ("effects", "pairs")]
+# One noise level for each kind and scale in turn; and a quick one, whose log is short.
+SOME = [c for k, c in enumerate(NAMED) if k % 3 == (k // 3) % 3]
+NULLS = [c for c in EVERY.values() if c.group == "nulls"][::7]
+OUTSIDE = [c for c in EVERY.values() if c.group == "outside"][1::3]
+# Missed when first looked at: by a log whose own fit absorbs the effect, and by a limit that no sample
+# reaches, whose column was the residual itself.
+MISSED = [c for c in cases("seen_too") if c.seed in (6050, 6052)]
+QUICK = [next(c for c in NAMED if c.what == "constant_force" and c.scale == "servo" and c.noise == 1.0)]
+
+
+def said(record):
+    """What stands in the message of a failure."""
+    return " | ".join(f"{k}: {record.get(k)}" for k in ("verdict", "named", "alternatives", "where", "error"))
+
+
+def searched(case, folder):
+    """The record of a case that the oracle sees."""
+    record = run_case(case, folder)
+    if not judge.visible(record):
+        pytest.skip("the oracle does not see it")
+    return record
+
+
+@pytest.mark.parametrize(
+    "case",
+    [*QUICK, *[pytest.param(c, marks=pytest.mark.slow) for c in (*MISSED, *SOME) if c not in QUICK]],
+    ids=lambda c: c.id,
+)
+def test_a_hidden_effect_is_named(case, tmp_path):
+    record = searched(case, tmp_path)
+    assert judge.right(record), said(record)
+    closed = judge.closed(record)
+    # what acts at rest closes nothing of the force while moving, and neither does its truth
+    assert case.what == "static_friction" if closed is None else closed >= 0.9
+
+
+def test_nothing_is_seen_in_a_complete_model(tmp_path):
+    case = next(c for c in EVERY.values() if c.group == "nulls" and c.scale == "servo" and c.sensor)
+    record = run_case(case, tmp_path)
+    assert not judge.false_positive(record), said(record)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", NULLS, ids=lambda c: c.id)
+def test_nothing_is_seen_in_complete_models(case, tmp_path):
+    record = run_case(case, tmp_path)
+    assert not judge.false_positive(record), said(record)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", OUTSIDE, ids=lambda c: c.id)
+def test_disturbances_are_shown(case, tmp_path):
+    record = searched(case, tmp_path)
+    assert judge.pointed_at(record), said(record)

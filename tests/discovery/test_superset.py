@@ -1,0 +1,53 @@
+"""The plant with all candidates: what is evaluated of it, and what a search does with what is found."""
+
+import numpy as np
+import pytest
+
+from jaxid.commands import discover as discovery
+from jaxid.discovery import candidates as cand
+from jaxid.discovery.superset import build_candidate_model
+from jaxid.session import open_session
+from tests.support.axis_log import log_of
+from truth.axis import machines
+from truth.axis.cases import case_text, write_case
+from truth.axis.hidden_effects import COULOMB, VISCOUS
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    setup = machines.emps_like(5, 1.0, 6.0)
+    case = write_case(tmp_path_factory.mktemp("union"), case_text(setup, (VISCOUS, COULOMB)))
+    return open_session(case, log_of(setup), align_hold=True)
+
+
+def test_a_large_union_is_differentiated_in_parts_alike(session, monkeypatch):
+    """By the same columns as all at once; of those not asked for nothing is said."""
+    union = build_candidate_model(session.machine, session.fit.data)
+    samples = cand.CandidateSamples(session.fit.data)
+    theta = union.neutral.copy()
+    for c in union.candidates:
+        theta[c.index] = c.probe(0)
+    with monkeypatch.context() as at_once:
+        at_once.setattr(cand, "_COLUMNS", len(theta))
+        e, whole = cand.evaluate(union, samples, theta)
+    assert whole.shape[-1] > 5 * cand._COLUMNS
+    same, parts = cand.evaluate(union, samples, theta)
+    np.testing.assert_allclose(same, e, rtol=1e-12)
+    size = np.abs(whole).max(axis=(0, 1))
+    assert np.all(np.abs(parts - whole).max(axis=(0, 1)) <= 1e-9 * size)
+    wanted = [0, 9, 17]
+    same, some = cand.evaluate(union, samples, theta, wanted)
+    np.testing.assert_allclose(same, e, rtol=1e-12)
+    np.testing.assert_array_equal(some[..., wanted], parts[..., wanted])
+    assert not np.any(np.delete(some, wanted, axis=-1))
+    same, none = cand.evaluate(union, samples, theta, ())
+    np.testing.assert_allclose(same, e, rtol=1e-12)
+    assert not np.any(none)
+
+
+@pytest.mark.parametrize("experiments", [True, False])
+def test_experiments_are_left_out_where_they_are_not_wanted(session, monkeypatch, experiments):
+    asked = []
+    monkeypatch.setattr(discovery, "proposals", lambda *args: asked.append(args) or ())
+    discovery.explore(session, max_effects=0, refit=False, experiments=experiments)
+    assert bool(asked) == experiments

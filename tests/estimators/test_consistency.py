@@ -1,0 +1,295 @@
+"""Links that bodies can be: the coordinates, a fit that noise would make impossible, and what it refuses."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.build import build_machine
+from jaxid.case.case import load_case
+from jaxid.cli import main
+from jaxid.estimators import _start, need_consistent
+from jaxid.estimators.common.consistency import need_bodies
+from jaxid.estimators.common.interior import inner_start
+from jaxid.estimators.common.levenberg_marquardt import eliminated
+from jaxid.logs.log import Log
+from jaxid.numerics.lanes import run_alone
+from truth.arm import oracle as arm_oracle
+from truth.arm import stepper as arm_stepper
+
+RNG = np.random.default_rng(4)
+GRAVITY = np.array([0.0, 0.0, -9.81])
+# A wrist, whose last link is light and short.
+WRIST = [
+    ("revolute", 0.0, 0.0, 0.0, 0.0),
+    ("revolute", np.pi / 2, 0.0, 0.3, 0.0),
+    ("revolute", -np.pi / 2, 0.2, 0.0, 0.0),
+]
+SHORT = np.array([1.0, 0.3, 0.3, 0.3, *[0.09] * 6])
+SIZES = np.array([np.ones(10), 0.5 * np.ones(10), 0.02 * SHORT])
+TRUE = SIZES * arm_oracle.bodies(3, np.random.default_rng(1))
+NOISE = 2.0
+RATE, SECONDS = 100.0, 12.0
+
+
+def test_pseudo_inertia_is_the_sum_over_the_body():
+    bodies = arm_oracle.bodies(3, RNG)
+    ours = pseudo_inertia(jnp.asarray(bodies))
+    np.testing.assert_allclose(ours, arm_oracle.pseudo_inertias(bodies), atol=1e-12)
+
+
+def test_coordinates_go_there_and_back_and_cover_only_bodies():
+    for body in arm_oracle.bodies(5, RNG):
+        x = log_cholesky(jnp.asarray(body))
+        np.testing.assert_allclose(of_log_cholesky(x), body, rtol=1e-10, atol=1e-12)
+    for x in RNG.normal(scale=2.0, size=(50, 10)):
+        ten = of_log_cholesky(jnp.asarray(x))
+        assert np.linalg.eigvalsh(arm_oracle.pseudo_inertias([ten])[0])[0] > 0
+        np.testing.assert_allclose(log_cholesky(ten), x, rtol=1e-5, atol=1e-5)
+    slope = jax.jacfwd(log_cholesky)(ten) @ jax.jacfwd(of_log_cholesky)(jnp.asarray(x))
+    np.testing.assert_allclose(slope, np.eye(10), atol=1e-5)
+
+
+def test_an_unknown_without_effect_does_not_stop_the_start_inside():
+    """A friction of a joint that never turns, say: the bodies beside it are found all the same."""
+    true, guess = arm_oracle.bodies(2, np.random.default_rng(0))
+    columns = np.column_stack([np.random.default_rng(0).normal(size=(50, 10)), np.zeros(50)])
+    theta = jnp.asarray(np.append(guess, 0.3))
+    found, _ = inner_start(columns, -columns[:, :10] @ true, theta, (tuple(range(10)),), eliminated)
+    np.testing.assert_allclose(found[:10], true, rtol=0, atol=1e-6)
+    assert found[10] == 0.3
+
+
+def test_of_what_nothing_tells_bodies_stay_near_their_start():
+    """Where a body may have any mass, nothing pulls it to infinity."""
+    rng = np.random.default_rng(0)
+    true, guess = arm_oracle.bodies(2, rng)
+    # Six of the ten, as of a link near the base.
+    columns = np.zeros((40, 10))
+    columns[:, [1, 2, 4, 5, 7, 9]] = rng.normal(size=(40, 6))
+    found, _ = inner_start(columns, -columns @ true, jnp.asarray(guess), (tuple(range(10)),), eliminated)
+    assert guess[0] / 3 < found[0] < 3 * guess[0]
+    np.testing.assert_allclose(columns @ found, columns @ true, atol=1e-4)
+
+
+def test_no_body_has_less_than_the_floor():
+    """Noise asks for what no body can be: the best has no extent some way, and is known to be the best."""
+    rng = np.random.default_rng(0)
+    true, guess = arm_oracle.bodies(2, rng)
+    columns = rng.normal(size=(40, 10))
+    rest = -columns @ (true * np.where(np.arange(10) == 9, -0.2, 1.0)) + 0.01 * rng.normal(size=40)
+    found, floor = inner_start(columns, rest, jnp.asarray(guess), (tuple(range(10)),), eliminated)
+    cost = lambda theta: 0.5 * np.sum((columns @ theta + rest) ** 2)
+    assert cost(np.linalg.lstsq(columns, -rest)[0]) < 0.5 * cost(found)
+    assert 0 <= cost(found) - floor < 1e-8 * cost(found)
+    for body in arm_oracle.bodies(50, rng):
+        assert cost(found + 1e-4 * rng.uniform() * (body - found)) > floor
+
+
+def motion(seed: int, rate: float = RATE) -> tuple[np.ndarray, ...]:
+    """Sums of sines, and their derivatives."""
+    rng, t = np.random.default_rng(seed), np.arange(0, SECONDS, 1 / rate)[:, None, None]
+    ranges = ((0.1, 1.0), (0.0, 6.0), (0.1, 0.5))
+    hz, phase, size = (rng.uniform(*r, (3, 5)) for r in ranges)
+    w = 2 * np.pi * hz
+    angle = w * t + phase
+    parts = (size * np.sin(angle), size * w * np.cos(angle), -size * w**2 * np.sin(angle))
+    return (t.ravel(), *(x.sum(axis=-1) for x in parts))
+
+
+def torque(seed: int) -> tuple[np.ndarray, ...]:
+    t, q, qd, qdd = motion(seed)
+    tau = [arm_oracle.inverse_dynamics(WRIST, TRUE, *x, GRAVITY) for x in zip(q, qd, qdd, strict=True)]
+    return t, q, qd, qdd, np.array(tau)
+
+
+@pytest.fixture(scope="module")
+def log():
+    t, q, _, _, tau = torque(0)
+    noise = NOISE * np.random.default_rng(9).standard_normal(tau.shape)
+    return Log(time=t, position=q, force=tau + noise, source="wrist")
+
+
+def case(consistent: bool) -> str:
+    """Every link starts as a ball of 1 kg off its joint."""
+    numbers = "{ guess = %s }"
+    ball = ("1.0", ["0.1", "0.05", "0.1"], ["0.03", "-0.005", "-0.01", "0.03", "-0.005", "0.03"])
+    listed = lambda values: "[" + ", ".join(numbers % v for v in values) + "]"
+    links = "".join(
+        f'[[plant.links]]\njoint = "revolute"\nalpha = {alpha!r}\na = {a}\nd = {d}\n'
+        f"mass = {numbers % ball[0]}\nfirst_moment = {listed(ball[1])}\ninertia = {listed(ball[2])}\n"
+        for _, alpha, a, d, _ in WRIST
+    )
+    columns = 'position = ["q1", "q2", "q3"]\nforce = ["u1", "u2", "u3"]\n'
+    asked = "[identification]\nphysically_consistent = true\n" if consistent else ""
+    return f'[plant]\nkind = "serial_arm"\n{links}{asked}[log]\ntime = "t"\n{columns}'
+
+
+def fitted(folder, log, consistent, method="inverse_dynamics"):
+    (folder / "case.toml").write_text(case(consistent))
+    return jaxid.identify(folder / "case.toml", log, method=method)
+
+
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory, log):
+    folder = tmp_path_factory.mktemp("fits")
+    return {consistent: fitted(folder, log, consistent) for consistent in (False, True)}
+
+
+def eigenvalues(found) -> np.ndarray:
+    plant = found.estimate.machine.plant
+    ten = np.stack([np.asarray(getattr(plant, name)) for name in arm_oracle.NAMES], axis=-1)
+    return np.linalg.eigvalsh(arm_oracle.pseudo_inertias(ten))
+
+
+def left(found) -> float:
+    """RMS of a noisy torque on another motion less the one that is predicted, over the noise."""
+    _, q, qd, qdd, tau = torque(9)
+    noise = NOISE * np.random.default_rng(5).standard_normal(tau.shape)
+    told = jax.vmap(found.estimate.machine.plant.inertial)(*(jnp.asarray(x) for x in (q, qd, qdd)))
+    return float(np.sqrt(np.mean((tau + noise - told) ** 2)) / NOISE)
+
+
+def test_noise_makes_plain_least_squares_impossible_and_not_the_other(fits):
+    plain, kept = fits[False], fits[True]
+    # the moment about its own axis is told, and negative: no choice of the others makes a body of it
+    at = plain.estimate.names.index("inertia_zz[3]")
+    assert plain.estimate.identifiable[at]
+    assert plain.estimate.theta[at] < -0.001
+    assert eigenvalues(plain).min() < -0.001
+    assert kept.estimate.converged
+    assert eigenvalues(kept).min() > 0
+    assert kept.value("inertia_zz[3]") > 0
+    assert left(kept) < 1.05
+    assert left(kept) < left(plain)
+
+
+def test_results_hold_the_links(fits, tmp_path):
+    saved = json.loads((fits[True].save(tmp_path / "out") / "result.json").read_text())
+    assert len(saved["links"]) == 3
+    for link, true in zip(saved["links"], eigenvalues(fits[True]), strict=True):
+        assert link["mass"] > 0
+        assert link["eigenvalue_ratio"] == pytest.approx(true[0] / true[-1], rel=1e-6)
+    assert any("bodies" in note for note in fits[True].estimate.notes)
+    assert "links" not in json.loads((fits[False].save(tmp_path / "plain") / "result.json").read_text())
+
+
+def test_output_error_starts_at_the_bodies_that_inverse_dynamics_finds(fits):
+    """Sums that no log tells are no reason to start at the guesses, far from what was told."""
+    start = run_alone(_start(need_bodies(fits[True].session)))
+    np.testing.assert_allclose(start, fits[True].estimate.theta)
+    # without, what is untold may be anything
+    assert run_alone(_start(fits[False].session)) is None
+
+
+@pytest.mark.slow
+def test_power_keeps_links_too(log, tmp_path):
+    found = fitted(tmp_path, log, True, "power")
+    assert found.estimate.converged
+    assert eigenvalues(found).min() > 0
+    assert left(found) < 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["instrumental_variable", "didim"])
+def test_methods_that_simulate_the_motion_keep_links_too(tmp_path, method):
+    """From a loop of other physics; without, the noise of the torque asks for what no body can be."""
+    rate, kp, kd = 200.0, [600.0, 150.0, 3.0], [30.0, 8.0, 0.15]
+    t, q, _, _ = motion(0, rate)
+    reference = q * np.minimum(1.0, t)[:, None] ** 3
+    law = f'[controller]\nkind = "pd"\nkp = {kp}\nkd = {kd}\nperiod = {1 / rate}\n'
+    text = case(True).replace("[log]\n", '[log]\nreference = ["r1", "r2", "r3"]\n') + law
+    (tmp_path / "case.toml").write_text(text)
+    (tmp_path / "plain.toml").write_text(text.replace("consistent = true", "consistent = false"))
+    geometry = build_machine(load_case(tmp_path / "case.toml"), period=1 / rate).plant.geometry
+    axes, origins = (np.asarray(x) for x in geometry.frames(np.zeros(3)))
+    arm = arm_stepper.Arm(axes, origins, TRUE, np.zeros(3), np.zeros(3))
+    run = arm_stepper.followed(arm, reference, rate=rate, kp=np.array(kp), kd=np.array(kd))
+    rng = np.random.default_rng(3)
+    position = run["q"] + 1e-5 * rng.standard_normal(q.shape)
+    force = run["u"] + NOISE * rng.standard_normal(q.shape)
+    log = Log(time=t, position=position, force=force, reference=reference, source="loop")
+    cases = (tmp_path / f"{name}.toml" for name in ("case", "plain"))
+    kept, plain = (jaxid.identify(path, log, method=method) for path in cases)
+    assert kept.estimate.converged
+    assert eigenvalues(kept).min() > 0
+    assert eigenvalues(plain).min() < -0.001
+    assert left(kept) < 1.02
+
+
+@pytest.mark.slow
+def test_output_error_keeps_links_too(tmp_path):
+    """One link that swings; its moment about the joint, and its first moments, are told."""
+    true = TRUE[0]
+    t = np.arange(0, 4, 1 / RATE)
+    u = 3.0 * np.sin(2 * np.pi * 0.6 * t) + 2.0 * np.sin(2 * np.pi * 1.4 * t)
+    q, v, positions = 0.0, 0.0, []
+    # The joint lies level: weight is g (-mx cos q + my sin q) about it.
+    push = lambda q, u: (u - 9.81 * (true[1] * np.cos(q) - true[2] * np.sin(q))) / true[9]
+    for now in u:
+        positions.append(q)
+        for _ in range(20):
+            half = v + 0.5 / (20 * RATE) * push(q, now)
+            q += half / (20 * RATE)
+            v = half + 0.5 / (20 * RATE) * push(q, now)
+    noisy = np.array(positions) + 1e-4 * np.random.default_rng(0).standard_normal(len(t))
+    log = Log(time=t, position=noisy, force=u, source="pendulum")
+    text = case(True)
+    one = text[: text.index("[[plant.links]]", text.index("[[plant.links]]") + 1)]
+    tail = text[text.index("[identification]") :].replace(', "q2", "q3"', "").replace(', "u2", "u3"', "")
+    level = one.replace('"serial_arm"', '"serial_arm"\ngravity_vector = [0.0, -9.81, 0.0]')
+    (tmp_path / "case.toml").write_text(level + tail)
+    found = jaxid.identify(tmp_path / "case.toml", log)
+    assert found.estimate.method == "output_error"
+    assert found.estimate.converged
+    assert eigenvalues(found).min() > 0
+    for name, value in (("first_moment_x", true[1]), ("first_moment_y", true[2]), ("inertia_zz", true[9])):
+        at = found.estimate.names.index(f"{name}[1]")
+        assert abs(found.estimate.theta[at] - value) < 4 * found.estimate.std[at], name
+        assert found.estimate.std[at] < 0.01 * np.abs(true[9])
+
+
+def test_a_prior_is_in_the_way_of_output_error_only(tmp_path):
+    (tmp_path / "case.toml").write_text(case(True) + "[output_error]\nprior = 0.5\n")
+    prior = load_case(tmp_path / "case.toml")
+    for method in ("inverse_dynamics", "power", "algebraic"):
+        need_consistent(method, prior)
+    with pytest.raises(jaxid.InputError, match="output_error with a prior"):
+        need_consistent("output_error", prior)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "method", "words"),
+    [
+        ("mass = { guess = 1.0 }", "mass = 1.0", "power", ["link 1", "mass[1] is known and others are not"]),
+        ("mass = { guess = 1.0 }", "mass = { guess = 1.0, max = 2.0 }", "power", ["mass[1] has min or max"]),
+        ("mass = { guess = 1.0 }", "mass = { guess = 0.1 }", "power", ["link 1", "its guess is no body"]),
+        (
+            "mass = { guess",
+            "mass = { guess",
+            "recursive",
+            ["does not go with recursive", "inverse_dynamics, power"],
+        ),
+        (
+            "[log]",
+            "[output_error]\nprior = 0.5\n[log]",
+            "output_error",
+            ["output_error with a prior", "leave one of them out"],
+        ),
+        ("= true", "= 1", "power", ["physically_consistent", "true or false"]),
+    ],
+)
+def test_what_is_no_body_is_refused_in_one_line(tmp_path, log, capsys, old, new, method, words):
+    assert old in case(True)
+    (tmp_path / "case.toml").write_text(case(True).replace(old, new, 1))
+    rows = np.column_stack([log.time, log.position, log.force])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="t,q1,q2,q3,u1,u2,u3", comments="")
+    argv = ["identify", "case.toml", "log.csv", "--method", method]
+    assert main([*argv[:1], *(str(tmp_path / a) for a in argv[1:3]), *argv[3:]]) == 2
+    error = capsys.readouterr().err
+    assert len(error.strip().splitlines()) == 1
+    assert not [word for word in words if word not in error], error

@@ -1,0 +1,127 @@
+"""What jaxid must show on measured logs; needs JAXID_DATA (see README)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+import jaxid
+
+CASES = Path(__file__).parents[2] / "experiments" / "cases"
+DATA = os.environ.get("JAXID_DATA")
+needs_data = pytest.mark.skipif(not DATA, reason="JAXID_DATA is not set: no measured logs")
+
+
+def folder_of(tmp_path_factory, data, files):
+    folder = tmp_path_factory.mktemp(data)
+    for case in CASES.glob(f"{data}*.toml"):
+        shutil.copy(case, folder)
+    for name in files:
+        (folder / name).symlink_to(Path(DATA) / data / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def emps(tmp_path_factory):
+    return folder_of(tmp_path_factory, "emps", ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"))
+
+
+@pytest.fixture(scope="module")
+def silverbox(tmp_path_factory):
+    return folder_of(tmp_path_factory, "silverbox", ("SNLS80mV.mat",))
+
+
+@needs_data
+def test_published_recipe_gives_the_published_parameters(emps):
+    result = jaxid.identify(emps / "emps_recipe.toml", emps / "DATA_EMPS.mat", method="inverse_dynamics")
+    # Janot, Gautier & Brunot (2019); their offset stands on the side of friction.
+    published = {
+        "inertia": (95.109, 0.005),
+        "viscous_friction.coefficient": (203.50, 0.015),
+        "coulomb_friction.level": (20.39, 0.015),
+        "constant_force.level": (3.165, 0.03),
+    }
+    for name, (value, part) in published.items():
+        assert result.value(name) == pytest.approx(value, rel=part), name
+    fit, pulses = result.gaps
+    assert fit.force.relative[0] <= 0.042
+    assert pulses.force.relative[0] <= 0.061
+
+
+PUBLISHED = {"inertia": 95.109, "viscous_friction.coefficient": 203.50, "coulomb_friction.level": 20.39}
+
+
+@needs_data
+@pytest.mark.parametrize("method", ["instrumental_variable", "didim", "power"])
+def test_every_method_gives_the_published_parameters(emps, method):
+    result = jaxid.identify(emps / "emps_recipe.toml", emps / "DATA_EMPS.mat", method=method)
+    assert result.converged
+    for name, value in PUBLISHED.items():
+        assert result.value(name) == pytest.approx(value, rel=0.02), name
+    fit, pulses = result.gaps
+    assert fit.force.relative[0] <= 0.042
+    assert pulses.force.relative[0] <= 0.061
+    assert pulses.simulation.relative[0] <= 1.5e-5
+
+
+@needs_data
+def test_output_error_sees_the_hold_that_the_published_recipe_does_not(emps):
+    """Half a sample is 2 % of the viscous friction; told of it, inverse dynamics says the same."""
+    recipe = (emps / "emps_recipe.toml").read_text()
+    aligned = emps / "aligned.toml"
+    aligned.write_text(recipe.replace("trim = 50", "trim = 50\nalign_hold = true"))
+    log = emps / "DATA_EMPS.mat"
+    seen = jaxid.identify(aligned, log, method="inverse_dynamics")
+    for on in ("position", "force", "both"):
+        fitted = jaxid.identify(emps / "emps_recipe.toml", log, on=on)
+        for name in PUBLISHED:
+            assert fitted.value(name) == pytest.approx(seen.value(name), rel=0.02), (on, name)
+    assert seen.gaps[1].force.relative[0] < 0.045
+
+
+@needs_data
+@pytest.mark.slow
+def test_friction_that_differs_by_direction_is_found_on_emps(emps):
+    found = jaxid.discover(emps / "emps_bare.toml", emps / "DATA_EMPS.mat")
+    assert found.verdict == "found"
+    added = [r.step.added.candidate.kind for r in found.rounds if r.step.added]
+    assert added[0] == "coulomb_friction"
+    assert "asymmetric_viscous" in found.kinds
+    assert "cogging" not in found.kinds
+    fit, pulses = found.gaps_after
+    assert pulses.force.relative[0] <= 0.054
+    # in the loop, reference in, position and command out
+    assert fit.simulation.relative[0] <= 1.2e-5
+    assert pulses.simulation.relative[0] <= 1.5e-5
+    assert fit.simulation.command_relative[0] <= 0.048
+    assert pulses.simulation.command_relative[0] <= 0.053
+
+
+@needs_data
+def test_emps_in_open_loop(emps):
+    result = jaxid.identify(emps / "emps_open_loop.toml", emps / "DATA_EMPS.mat")
+    assert result.converged
+    fit, pulses = result.gaps
+    # plain output error leaves 5.1 mm on the second file, inverse dynamics 9.2 mm
+    assert pulses.simulation.rms[0] < 5.1e-3
+    # the start is what the first samples tell: the fit's own residual is the simulation's gap
+    own = float((result.estimate.residual**2).mean()) ** 0.5
+    assert fit.simulation.rms[0] == pytest.approx(own, rel=0.02)
+
+
+@needs_data
+@pytest.mark.slow
+def test_cubic_spring_and_offset_are_found_in_silverbox(silverbox):
+    found = jaxid.discover(silverbox / "silverbox.toml", silverbox / "SNLS80mV.mat")
+    assert found.verdict == "found"
+    assert {"cubic_stiffness", "constant_force"} <= set(found.kinds)
+    assert set(found.kinds) <= {"cubic_stiffness", "constant_force", "quadratic_stiffness"}
+    before = {g.name: 1e3 * g.simulation.rms[0] for g in found.gaps_before}
+    after = {g.name: 1e3 * g.simulation.rms[0] for g in found.gaps_after}
+    assert before["arrow"] == pytest.approx(15.3, abs=0.5)
+    assert before["multisine"] == pytest.approx(9.0, abs=0.5)
+    assert after["arrow"] <= 0.45
+    assert after["multisine"] <= 0.33

@@ -1,0 +1,231 @@
+"""Logs that cannot be read: every fault is one clear line with its hint."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxid.errors import suggest
+from jaxid.logs.log import read_log
+from tests.support.written_logs import COLUMNS, ROWS, edit, refuse, signals, write_csv
+
+
+@pytest.fixture
+def csv_file(tmp_path):
+    return write_csv(tmp_path / "log.csv", signals())
+
+
+# The file
+
+
+def test_missing_file_names_its_neighbours(csv_file):
+    refuse(csv_file.with_name("lag.csv"), match=r"lag\.csv: no such file; .*log\.csv")
+
+
+def test_folder_is_no_log(tmp_path):
+    (tmp_path / "log.csv").mkdir()
+    refuse(tmp_path / "log.csv", match="is not a file")
+
+
+def test_unreadable_file(csv_file, monkeypatch):
+    def denied(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", denied)
+    refuse(csv_file, match="cannot be read .*Permission denied.*; check that it may be read")
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "# only a comment\n", "t,q,u\n", "t,q,u\n# none\n"])
+def test_empty_file(tmp_path, text):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    refuse(path, match="is empty")
+
+
+def test_unknown_suffix(tmp_path):
+    (tmp_path / "log.xlsx").write_bytes(b"x")
+    refuse(tmp_path / "log.xlsx", match=r"unknown suffix '.xlsx'; use one of .csv, .npz")
+
+
+def test_binary_file_called_csv(tmp_path):
+    (tmp_path / "log.csv").write_bytes(b"\x00\x01\x02")
+    refuse(tmp_path / "log.csv", match="is not a text file")
+
+
+def test_no_header(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("0,1,2\n1,2,3\n")
+    refuse(path, match="no header row.*; add a first row")
+
+
+def test_matlab_73(tmp_path):
+    path = tmp_path / "log.mat"
+    # The 128 bytes with which MATLAB opens an HDF5 file: version 2.0.
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" * 20)
+    refuse(path, match="v7.3.*; in MATLAB: save")
+
+
+def test_parquet_without_pyarrow_says_so(tmp_path, monkeypatch):
+    (tmp_path / "log.parquet").write_bytes(b"PAR1")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    refuse(tmp_path / "log.parquet", match="pip install pyarrow")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "mat", "parquet"])
+def test_garbage(tmp_path, suffix):
+    path = tmp_path / f"log.{suffix}"
+    path.write_bytes(b"this is no such file, whatever it is called" * 10)
+    refuse(path, match="cannot be read")
+
+
+def test_pickles_are_refused(tmp_path):
+    np.savez(tmp_path / "log.npz", t=np.array([{"a": 1}] * 60, dtype=object), q=1, u=1)
+    refuse(tmp_path / "log.npz", match="cannot be read.*plain arrays")
+
+
+# Columns and cells
+
+
+def test_missing_column_suggests_the_nearest(tmp_path):
+    data = dict(zip(["time", "pos", "Torque"], signals().values(), strict=True))
+    path = write_csv(tmp_path / "log.csv", data)
+    columns = {"time": "time", "position": "pos", "force": "torque"}
+    refuse(path, columns, match="no column 'torque'; did you mean 'Torque'. there is: time, pos, T")
+    np.savez(tmp_path / "log.npz", pos=data["pos"], Torque=data["Torque"])
+    columns = {"sample_rate": 1.0, "position": "pos", "force": "torque"}
+    refuse(tmp_path / "log.npz", columns, match="no variable 'torque'; did you mean 'Torque'")
+
+
+def test_doubled_column(tmp_path, csv_file):
+    csv_file.write_text(csv_file.read_text().replace("t,q,u", "t,q,q", 1))
+    refuse(csv_file, {**COLUMNS, "force": "q"}, match="same column")
+    refuse(csv_file, {"time": "t", "position": "q", "force": "t"}, match="same column")
+    refuse(csv_file, {"sample_rate": 1.0, "position": "q", "force": "t"}, match="2 columns 'q'")
+
+
+def test_cell_that_is_no_number(csv_file):
+    refuse(edit(csv_file, 7, "0.007,n/a,1"), match=r"column 'q', row 7 .*'n/a' is not a number; ")
+
+
+def test_empty_cell_and_short_row(csv_file):
+    refuse(edit(csv_file, 7, "0.007,,1"), match="column 'q', row 7 .*the cell is empty")
+    refuse(edit(csv_file, 7, "0.007"), match="column 'q', row 7 .*the cell is empty")
+
+
+def test_decimal_commas(tmp_path, csv_file):
+    text = csv_file.read_text().replace(",", ";").replace(".", ",")
+    (tmp_path / "comma.csv").write_text(text)
+    refuse(tmp_path / "comma.csv", match="row 0 .*is not a number; write decimals with a point")
+    refuse(edit(csv_file, 7, "0,007,1,2,3"), match="row 7 has 5 cells, the header 3; .*point")
+
+
+def test_text_in_an_array_file(tmp_path):
+    data = signals()
+    np.savez(tmp_path / "log.npz", t=data["t"], q=data["q"], u=np.array(["a"] * ROWS))
+    refuse(tmp_path / "log.npz", match="variable 'u': is not numeric")
+
+
+@pytest.mark.parametrize(("text", "kind"), [("nan", "NaN"), ("-inf", "infinite")])
+def test_not_finite(csv_file, text, kind):
+    edit(edit(csv_file, 9, f"0.009,1,{text}"), 12, f"0.012,1,{text}")
+    refuse(csv_file, match=rf"column 'u': 2 row\(s\).*first is row 9 \({kind}\); cut")
+
+
+def test_unequal_lengths(tmp_path):
+    data = signals()
+    np.savez(tmp_path / "log.npz", t=data["t"], q=data["q"], u=data["u"][:-3])
+    refuse(tmp_path / "log.npz", match="unequal lengths: 't' 200, 'q' 200, 'u' 197")
+
+
+def test_number_of_joints(tmp_path):
+    data = {**signals(), "q2": signals()["u"]}
+    path = write_csv(tmp_path / "log.csv", data)
+    refuse(path, joints=2, match=r"position = \['q'\]: 1 column\(s\) where 2 belong; name one")
+    one_driven = {**COLUMNS, "position": ["q", "q2"]}
+    assert read_log(path, one_driven, joints=2).force.shape == (ROWS, 1)
+    assert read_log(path, one_driven, joints=None).position.shape == (ROWS, 2)
+
+
+# Time and rows
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "match"),
+    [
+        (60, 0.059, r"column 't': time repeats in row 60 \(0.059 s, then 0.059 s\)"),
+        (60, 0.010, "time runs backwards in row 60"),
+    ],
+)
+def test_time_must_run_forward(tmp_path, row, value, match):
+    data = signals()
+    data["t"][row] = value
+    refuse(write_csv(tmp_path / "log.csv", data), match=match)
+
+
+def test_time_with_too_few_digits(tmp_path):
+    data = signals()
+    data["t"] = np.round(data["t"], 2)
+    refuse(write_csv(tmp_path / "log.csv", data), match="time repeats in 179 rows.*sample_rate")
+
+
+def test_gap(tmp_path):
+    data = signals()
+    data["t"][150:] += 0.5
+    path = write_csv(tmp_path / "log.csv", data)
+    refuse(path, match=r"gap.*of 0.501 s after row 149 .*rows = \[0, 150\]")
+    assert read_log(path, {**COLUMNS, "rows": [0, 150]}).samples == 150
+
+
+def test_jitter(tmp_path):
+    data = signals()
+    jitter = np.random.default_rng(1).uniform(-2e-4, 2e-4, ROWS)
+    path = write_csv(tmp_path / "log.csv", {**data, "t": data["t"] + jitter})
+    refuse(path, match="not constant: .* by more than 1 %, the worst by .* %.*; resample")
+    # Half a percent is what clocks do, and one loose row is not the log's fault.
+    read_log(write_csv(path, {**data, "t": data["t"] + jitter / 80}), COLUMNS)
+    data["t"][100] += 2e-4
+    read_log(write_csv(path, data), COLUMNS)
+
+
+def test_rate_and_time_must_agree(csv_file):
+    columns = {**COLUMNS, "sample_rate": 1.0}
+    refuse(csv_file, columns, match="time column says 1000 Hz, sample_rate says 1 Hz.*in seconds")
+
+
+@pytest.mark.parametrize("rows", [[0, 201], [-5, 100], [100, 100], [150, 20]])
+def test_rows_out_of_range(csv_file, rows):
+    refuse(csv_file, {**COLUMNS, "rows": rows}, match="out of range; the file has 200 rows")
+
+
+def test_too_short(csv_file):
+    refuse(csv_file, {**COLUMNS, "rows": [0, 49]}, match="too short: 49 samples; at least 50")
+
+
+# The table itself
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"time": None}, "neither time nor sample_rate"),
+        ({"position": None}, "'position' is missing; add position"),
+        ({"forse": "u"}, "unknown key 'forse'; did you mean 'force'"),
+        ({"hold": "zero-order"}, "hold = 'zero-order' is unknown; did you mean 'zero_order'"),
+        ({"sample_rate": -1.0}, "sample_rate = -1.0 is not a rate"),
+        ({"rows": [0.5, 7]}, "rows = .* is no range"),
+        ({"rows": 7}, "rows = 7 is no range"),
+        ({"force": 3}, "force = 3 names no column"),
+        ({"force": ["u", "u"]}, "names a column twice"),
+    ],
+)
+def test_table(csv_file, change, match):
+    columns = {**COLUMNS, **change}
+    columns = {key: value for key, value in columns.items() if value is not None}
+    refuse(csv_file, columns, match=rf"^\[log\]: .*{match}")
+
+
+def test_suggestions():
+    assert suggest("postion", ["time", "position"]).startswith("did you mean 'position'?")
+    assert suggest("xyz", ["time"]) == "there is: time"
+    assert suggest("a", []) == "there are none"

@@ -1,0 +1,72 @@
+"""A case of two links under a law that feeds a model forward; true values are those of the equations."""
+
+from pathlib import Path
+
+import numpy as np
+
+# Drive gains, viscous and Coulomb friction, as the case lists them; nothing of it in its guesses.
+TRUTH = np.array([0.93, 1.06, 1.5, 0.8, 4.0, 2.4])
+PERIOD = 2.5e-4
+
+TEXT = """
+[plant]
+kind = "serial_arm"
+gravity_vector = [0.0, -9.81, 0.0]
+[[plant.links]]
+joint = "revolute"
+alpha_deg = 0.0
+a = 0.0
+mass = 3.0
+first_moment = [0.6, 0.0, 0.0]
+inertia = [0.0, 0.0, 0.0, 0.0, 0.0, 0.18]
+[[plant.links]]
+joint = "revolute"
+alpha_deg = 0.0
+a = 0.5
+mass = 2.0
+first_moment = [0.5, 0.06, 0.0]
+inertia = [0.0, 0.0, 0.0, 0.0, 0.0, 0.1768]
+[[effects]]
+kind = "actuator_gain"
+gain = [{ guess = 1.0, true = 0.93 }, { guess = 1.0, true = 1.06 }]
+[[effects]]
+kind = "viscous_friction"
+coefficient = [{ guess = 0.0, true = 1.5 }, { guess = 0.0, true = 0.8 }]
+[[effects]]
+kind = "coulomb_friction"
+level = [{ guess = 0.0, true = 4.0 }, { guess = 0.0, true = 2.4 }]
+[controller]
+kind = "adaptive"
+kp = [2000.0, 600.0]
+kd = [60.0, 18.0]
+period = 0.00025
+gate_velocity = 0.1
+[sensor]
+[reference]
+kind = "synchronized"
+polygon = [[0.3, 0.2], [1.6, 0.2], [1.6, 1.2], [0.3, 1.2]]
+start = [0.3, 0.2]
+velocity = 3.665
+acceleration = 29.3
+jerk = 440.0
+dwell = 0.05
+[simulation]
+duration = 3.0
+sample_rate = 4000.0
+initial_position = [0.3, 0.2]
+substeps = 1
+"""
+
+
+def written(folder: Path, law: str = "", duration: float = 3.0, sensor: str = "", **swap: str) -> Path:
+    """The case with other keys of its controller (all of them, where a kind is among them), and sensor."""
+    text = TEXT.replace("[sensor]\n", f"[sensor]\n{sensor}\n" if sensor else "")
+    text = text.replace("duration = 3.0", f"duration = {duration}")
+    text = text.replace('kind = "adaptive"\n', "" if "kind =" in law else 'kind = "adaptive"\n')
+    text = text.replace("gate_velocity = 0.1\n", "" if "kind =" in law else "gate_velocity = 0.1\n")
+    text = text.replace("[controller]\n", f"[controller]\n{law}\n")
+    for old, new in swap.items():
+        text = text.replace(old, new)
+    path = folder / "case.toml"
+    path.write_text(text)
+    return path
