@@ -21,7 +21,7 @@ NAMES = (
 
 
 def bodies(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Ten parameters of n clouds of 20 random points each, (n, 10): what bodies can have."""
+    """Return ten parameters of n clouds of 20 random points each, (n, 10): what bodies can have."""
     out = []
     for _ in range(n):
         m, r = rng.uniform(0.05, 0.4, 20), rng.uniform(-0.2, 0.2, (20, 3)) + rng.uniform(-0.2, 0.2, 3)
@@ -32,7 +32,7 @@ def bodies(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def transforms(rows, q):
-    """Homogeneous transforms of all links in the base's frame, (n, 4, 4): turns and shifts, multiplied."""
+    """Multiply turns and shifts to the transforms of all links in the base's frame, (n, 4, 4)."""
     whole, out = np.eye(4), []
     for (joint, alpha, a, d, theta), value in zip(rows, q, strict=True):
         theta, d = (theta + value, d) if joint == "revolute" else (theta, d + value)
@@ -58,7 +58,7 @@ def _shift(axis: int, length: float) -> np.ndarray:
 
 
 def pseudo_inertias(parameters) -> np.ndarray:
-    """Sums of m r r' over each link, r = (x, y, z, 1), (n, 4, 4)."""
+    """Return the sums of m r r' over each link, r = (x, y, z, 1), (n, 4, 4)."""
     out = []
     for m, x, y, z, xx, xy, xz, yy, yz, zz in parameters:
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -71,7 +71,7 @@ def pseudo_inertias(parameters) -> np.ndarray:
 
 
 def slopes(rows, q):
-    """Derivatives of the transforms in the coordinates, (n joints, n links, 4, 4), by complex steps."""
+    """Differentiate the transforms by complex steps, (n joints, n links, 4, 4)."""
     h = 1e-40
     out = []
     for k in range(len(q)):
@@ -87,13 +87,13 @@ def mass_matrix(rows, parameters, q):
 
 
 def gravity_torque(rows, parameters, q, gravity):
-    """Slope of the potential energy -sum m g' r."""
+    """Return the slope of the potential energy -sum m g' r."""
     s, j = slopes(rows, q), pseudo_inertias(parameters)
     return -np.einsum("m,aimn,in->a", np.append(gravity, 0.0), s, j[:, :, 3])
 
 
 def inverse_dynamics(rows, parameters, q, qd, qdd, gravity):
-    """M qdd + h, by d/dt dT/dqd - dT/dq - the slope of the potential energy."""
+    """Return M qdd + h, by d/dt dT/dqd - dT/dq - the slope of the potential energy."""
     j, first = pseudo_inertias(parameters), slopes(rows, q)
     second = _second(rows, q)
     acceleration = np.einsum("aimn,a->imn", first, qdd) + np.einsum("abimn,a,b->imn", second, qd, qd)
@@ -102,7 +102,7 @@ def inverse_dynamics(rows, parameters, q, qd, qdd, gravity):
 
 
 def _second(rows, q):
-    """Second derivatives, from products of single factors' derivatives."""
+    """Return the second derivatives, from products of single factors' derivatives."""
     n = len(q)
     alone = [transforms([row], [value])[0] for row, value in zip(rows, q, strict=True)]
     one = [slopes([row], [value])[0, 0] for row, value in zip(rows, q, strict=True)]

@@ -28,7 +28,7 @@ class Arm:
     coulomb: np.ndarray
 
     def model(self):
-        """Pinocchio's model and data of the links."""
+        """Return Pinocchio's model and data of the links."""
         import pinocchio
 
         model, before = pinocchio.Model(), 0
@@ -42,7 +42,7 @@ class Arm:
         return model, model.createData()
 
     def torque(self, position, velocity, acceleration) -> np.ndarray:
-        """Along a motion, (time, n) [N m]."""
+        """Return the torques along a motion, (time, n) [N m]."""
         import pinocchio
 
         model, data = self.model()
@@ -52,7 +52,7 @@ class Arm:
 
 
 def advance(arm: Arm, links, q, v, torque, h: float, steps: int):
-    """Position and velocity after `steps` of h [s] under constant torques."""
+    """Return the position and velocity after `steps` of h [s] under constant torques."""
     import pinocchio
 
     model, data = links
@@ -75,7 +75,7 @@ def advance(arm: Arm, links, q, v, torque, h: float, steps: int):
 
 
 def stopped(free, mobility, most) -> np.ndarray:
-    """Velocities after friction impulses that stop joints where they may.
+    """Return the velocities after friction impulses that stop joints where they may.
 
     free: without friction; mobility: change of velocities per impulse; most: largest impulse of each joint.
     """
@@ -93,7 +93,7 @@ def stopped(free, mobility, most) -> np.ndarray:
 
 
 def followed(arm: Arm, reference, *, rate: float, kp, kd, step: float = 1e-4) -> dict[str, np.ndarray]:
-    """A PD loop from rest, without noise of sensors: q, qd and u, (time, n).
+    """Run a PD loop from rest, without noise of sensors; return q, qd and u, (time, n).
 
     u = kp (r - q) + kd (r' - q'), both differenced backwards, held until the next tick.
 

@@ -35,7 +35,7 @@ class TwoLinks:
 
     @property
     def base(self) -> dict[str, float]:
-        """What its torques tell, by the inertial parameters that stand for it."""
+        """Identifiable sums, by the inertial parameters that stand for them."""
         return {
             "inertia_zz[1]": self.i1 + self.m1 * self.x1**2 + self.m2 * self.length**2,
             "first_moment_x[1]": self.m1 * self.x1 + self.m2 * self.length,
@@ -46,7 +46,7 @@ class TwoLinks:
         }
 
     def acceleration(self, q1, q2, v1, v2, u1, u2):
-        """Of both joints, from Lagrange's equations as textbooks print them."""
+        """Return the accelerations of both joints, from Lagrange's equations as textbooks print them."""
         b, g, cos, sin, tanh = self.base, self.gravity, math.cos, math.sin, math.tanh
         px, py, l = b["first_moment_x[2]"], b["first_moment_y[2]"], self.length
         c, s = cos(q2), sin(q2)
@@ -67,7 +67,7 @@ class TwoLinks:
         return (m22 * r1 - m12 * r2) / det, (m11 * r2 - m12 * r1) / det
 
     def advance(self, x, u, h, steps):
-        """Classical Runge-Kutta over `steps` of h [s] at constant torque; x is (q1, q2, v1, v2)."""
+        """Advance x = (q1, q2, v1, v2) by `steps` classical Runge-Kutta steps of h [s] at constant torque."""
 
         def rate(x):
             return (x[2], x[3], *self.acceleration(*x, *u))
@@ -87,7 +87,7 @@ class TwoLinks:
 
 
 def unknown_reference(times, seed):
-    """Six sines of 0.1 to 1.5 Hz, about 1 rad: by joint, (time, 2)."""
+    """Return six sines of 0.1 to 1.5 Hz, about 1 rad: by joint, (time, 2)."""
     rng = np.random.default_rng(seed)
     f, phase = rng.uniform(0.1, 1.5, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6))
     waves = np.sin(2 * np.pi * f[:, None] * times[:, None] + phase[:, None])
@@ -95,7 +95,7 @@ def unknown_reference(times, seed):
 
 
 def followed(arm: TwoLinks, duration=8.0, rate=1000.0, noise=1e-5, seed=0) -> dict[str, np.ndarray]:
-    """A log of a PD loop that follows a course: columns t, q1, q2, u1, u2."""
+    """Run a PD loop along a random reference; return the columns t, q1, q2, u1, u2."""
     times = np.arange(round(duration * rate)) / rate
     reference = unknown_reference(times, seed)
     speed = np.gradient(reference, 1 / rate, axis=0)

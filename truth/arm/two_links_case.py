@@ -59,7 +59,7 @@ substeps = 1
 
 
 def written(folder: Path, law: str = "", duration: float = 3.0, sensor: str = "", **swap: str) -> Path:
-    """The case with other keys of its controller (all of them, where a kind is among them), and sensor."""
+    """Write the case with other keys of its controller, all of them if a kind is among them, and sensor."""
     text = TEXT.replace("[sensor]\n", f"[sensor]\n{sensor}\n" if sensor else "")
     text = text.replace("duration = 3.0", f"duration = {duration}")
     text = text.replace('kind = "adaptive"\n', "" if "kind =" in law else 'kind = "adaptive"\n')

@@ -20,7 +20,7 @@ WIDER = "[limits]\nstroke = [0.0, 0.25]\nspeed = 0.15\n"
 def hidden(
     kind: str, values: Mapping[str, float], declared: Declared, reference: np.ndarray, noise: float
 ) -> Setup:
-    """An axis with one effect that its case does not know, under a reference."""
+    """Build an axis with one effect that its case does not declare, under a reference."""
     own = machines.emps_like(0, noise, len(reference) / 1000.0)
     effects = {name: dict(v) for name, v in declared} | {kind: dict(values)}
     machine = dataclasses.replace(own.machine, effects=effects)
@@ -28,7 +28,7 @@ def hidden(
 
 
 def curved(seconds: float = 8.0) -> tuple[Setup, Declared]:
-    """A progressive spring seen over 2 cm only, where any curvature looks alike.
+    """Hide a progressive spring on an axis that moves by 2 cm, over which two curvatures look equal.
 
     Two degrees of polynomial differ by 400 N/m^2 times (1 cm)^2, a tenth of the noise.
     """
@@ -39,7 +39,7 @@ def curved(seconds: float = 8.0) -> tuple[Setup, Declared]:
 
 
 def one_speed(seconds: float = 8.0) -> tuple[Setup, Declared]:
-    """Friction that differs by direction, seen at one speed, where it is a constant force."""
+    """Hide friction that differs by direction on an axis with one speed, at which it is a constant force."""
     declared = (VISCOUS, COULOMB)
     t = np.arange(round(seconds * 1000.0)) / 1000.0
     reference = machines.moves(t, (0.1, 0.2), (0.05, 0.05), 2.0)
@@ -47,7 +47,7 @@ def one_speed(seconds: float = 8.0) -> tuple[Setup, Declared]:
 
 
 def heavier(seconds: float = 4.0) -> tuple[Setup, Declared]:
-    """A load that the case does not know: a mass, or a drive that is weaker than it says."""
+    """Hide a load: a mass, or a drive that is weaker than the case says."""
     declared = (VISCOUS, COULOMB)
     t = np.arange(round(seconds * 1000.0)) / 1000.0
     reference = machines.moves(t, machines.EMPS_WAYPOINTS, machines.EMPS_SPEEDS, 0.8424)
@@ -55,7 +55,7 @@ def heavier(seconds: float = 4.0) -> tuple[Setup, Declared]:
 
 
 def sprung(seconds: float = 4.0) -> tuple[Setup, Declared]:
-    """An axis on a spring in open loop, shaken at one frequency."""
+    """Shake an axis on a spring in open loop, at one frequency."""
     t = np.arange(round(seconds * 1000.0)) / 1000.0
     loop = Loop(kind="open_loop", input=2.0 * np.sin(2 * np.pi * 1.0 * t))
     own = hidden("quadratic_drag", {"coefficient": 3000.0}, (VISCOUS, SPRING), t, 10.0)
@@ -71,5 +71,5 @@ def again(setup: Setup, values: np.ndarray, start: float, seed: int = 5) -> dict
 
 
 def started(setup: Setup) -> float:
-    """Where its reference starts."""
+    """Return the first value of a setup's reference, 0 in open loop."""
     return 0.0 if setup.loop.reference is None else float(setup.loop.reference[0])

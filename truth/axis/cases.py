@@ -37,7 +37,7 @@ def case_text(
     sensor: bool = True,
     closed: bool = True,
 ) -> str:
-    """A case of a setup whose guesses are off by a factor.
+    """Return the case of a setup, its guesses off by a factor.
 
     Args:
         setup: Machine, loop and sensor; their known parts go in as they are.
@@ -90,7 +90,7 @@ def _loop_lines(setup: Setup) -> list[str]:
 
 
 def write_case(folder: Path, text: str) -> Path:
-    """The case's file."""
+    """Write a case to a folder; return its path."""
     path = Path(folder) / "case.toml"
     path.write_text(text)
     return path

@@ -17,7 +17,7 @@ HIDDEN = {"amplitude": 4.0, "period": 0.02, "phase": 0.7}
 
 
 def demo_log(seed: int) -> dict[str, np.ndarray]:
-    """One log of the demo, 1 kHz: what a user would have recorded."""
+    """Simulate one log of the demo at 1 kHz; return what a user would have recorded."""
     machine = emps_like(seed, duration=6.0).with_effect("cogging", **HIDDEN)
     return {k: v for k, v in machine.run().items() if k in ("t", "position", "force", "reference")}
 

@@ -43,7 +43,7 @@ class SearchCase:
     asked: bool = False
 
     def setup(self, seed: int, *, hidden: bool = True) -> Setup:
-        """The machine with its hidden effect, and one reference."""
+        """Build the machine with its hidden effect, and one reference."""
         own = self.preset(seed, 1.0, self.duration)
         gravity = -9.81 * own.machine.inertia if self.orientation == "vertical" else 0.0
         effects = {kind: dict(values) for kind, values in self.declared}
@@ -53,7 +53,7 @@ class SearchCase:
         return dataclasses.replace(own, machine=machine)
 
     def text(self, off: float = 1.4) -> str:
-        """The case file that does not know the effect."""
+        """Return the case file that does not declare the effect."""
         text = case_text(
             self.setup(0),
             self.declared,

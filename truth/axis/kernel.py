@@ -76,7 +76,7 @@ class Law(NamedTuple):
 
 @njit(cache=True)
 def position_force(p, q, z):
-    """Force that depends on position q [m] and the presliding state z [m] alone [N]."""
+    """Return the force that depends on position q [m] and the presliding state z [m] alone [N]."""
     force = p.constant - q * (p.stiffness1 + q * (p.stiffness2 + q * p.stiffness3))
     if p.cogging != 0.0:
         force -= p.cogging * math.cos(2.0 * math.pi * q / p.cogging_period + p.cogging_phase)
@@ -85,14 +85,14 @@ def position_force(p, q, z):
 
 @njit(cache=True)
 def velocity_force(p, v):
-    """Force that is a continuous function of velocity v [m/s], zero at rest [N]."""
+    """Return the force that is a continuous function of velocity v [m/s], zero at rest [N]."""
     w = abs(v)
     return -(p.viscous + p.quadratic * w + (p.cubic + p.quartic * w) * w * w) * v - p.absolute * w
 
 
 @njit(cache=True)
 def supplied(p, drive, v):
-    """What the supply's voltage leaves of a wanted force [N] at velocity v [m/s]."""
+    """Limit a wanted force [N] by the supply's voltage at velocity v [m/s]."""
     if p.stall == math.inf:
         return drive
     return max(min(drive, p.stall * (1.0 - v / p.no_load)), -p.stall * (1.0 + v / p.no_load))
@@ -100,7 +100,7 @@ def supplied(p, drive, v):
 
 @njit(cache=True)
 def slip_level(p, w, scale):
-    """Dry friction while sliding at speed w > 0 [N]."""
+    """Return the dry friction while sliding at speed w > 0 [N]."""
     level = p.coulomb
     if p.stribeck != 0.0:
         level += p.stribeck * math.exp(-((w / p.stribeck_velocity) ** 2))
@@ -109,20 +109,20 @@ def slip_level(p, w, scale):
 
 @njit(cache=True)
 def rising_level(p, side, w, scale):
-    """What comes on top while speeding up to `side` at speed w [N]."""
+    """Return the extra dry friction while speeding up to `side` at speed w [N]."""
     level = p.rising_forth if side > 0.0 else p.rising_back
     return scale * level * math.exp(-((w / p.rising_velocity) ** 2)) if level != 0.0 else 0.0
 
 
 @njit(cache=True)
 def drift_scale(p, t):
-    """Factor on every dry level at t [s]; a level cannot turn negative."""
+    """Return the factor on every dry level at t [s]; a level cannot turn negative."""
     return max(0.0, 1.0 + p.drift * t)
 
 
 @njit(cache=True)
 def kick(p, v, w, h, net, scale):
-    """Velocity after h [s] under a constant force, dry friction solved exactly.
+    """Return the velocity after h [s] under a constant force, dry friction solved exactly.
 
     Slides until it stops; the rest of h is spent at rest if friction can hold |net|, else it leaves
     in the direction of `net`. What acts while speeding up only cannot do more than hold the speed.
@@ -148,7 +148,7 @@ def kick(p, v, w, h, net, scale):
 
 @njit(cache=True)
 def dahl(p, z, dx, scale):
-    """Presliding state after a stroke dx [m] in one direction: exact for Dahl's law."""
+    """Return the presliding state after a stroke dx [m] in one direction: exact for Dahl's law."""
     if p.dahl_stiffness == 0.0 or dx == 0.0:
         return z
     reach = scale * p.dahl_level / p.dahl_stiffness
@@ -159,7 +159,7 @@ def dahl(p, z, dx, scale):
 
 @njit(cache=True)
 def outside_force(p, bursts, t, h):
-    """Mean over [t, t + h] of the bursts, plus the clock force at mid-step [N].
+    """Return the mean over [t, t + h] of the bursts, plus the clock force at mid-step [N].
 
     Bursts enter by their overlap: their impulse is exact wherever they start.
     """
@@ -176,7 +176,7 @@ def outside_force(p, bursts, t, h):
 
 @njit(cache=True)
 def advance(p, bursts, q, v, z, lagged, target, t, h):
-    """One step of h [s] from t; `target` is gain times the delayed command, and the offset [N]."""
+    """Take one step of h [s] from t; `target` is gain times the delayed command, and the offset [N]."""
     half = 0.5 * h
     scale = drift_scale(p, t + half)
     z = dahl(p, z, half * v, scale)
@@ -197,7 +197,7 @@ def advance(p, bursts, q, v, z, lagged, target, t, h):
 
 @njit(cache=True)
 def acceleration(p, bursts, q, v, z, drive, t):
-    """Acceleration [m/s^2] just after t, from the balance of forces; 0 where it sticks."""
+    """Return the acceleration [m/s^2] just after t, from the balance of forces; 0 where it sticks."""
     scale = drift_scale(p, t)
     net = drive + p.weight + position_force(p, q, z) + velocity_force(p, v)
     net += outside_force(
@@ -214,7 +214,7 @@ def acceleration(p, bursts, q, v, z, drive, t):
 
 @njit(cache=True)
 def pulse(law, t):
-    """Square disturbance on the command at t [s]."""
+    """Return the square disturbance on the command at t [s]."""
     since = t - law.start + 1e-9  # chosen: a tick that falls on an edge belongs to what begins there
     if law.level == 0.0 or since < 0.0 or since % (law.on + law.off) >= law.on + 1e-12:
         return 0.0
@@ -223,7 +223,7 @@ def pulse(law, t):
 
 @njit(cache=True)
 def pid(law, error, slope, memory, extra, period):
-    """PID command before clipping; memory holds the integral and the filtered slope."""
+    """Return PID command before clipping; memory holds the integral and the filtered slope."""
     memory[1] += period / (law.derivative_filter + period) * (slope - memory[1])
     integral = memory[0] + period * error
     u = law.kp * error + law.ki * integral + law.kd * memory[1] + extra
@@ -235,7 +235,7 @@ def pid(law, error, slope, memory, extra, period):
 
 @njit(cache=True)
 def command(law, k, reference, reading, memory, period):
-    """Command at tick k from the readings up to k; before the log all readings equal the first."""
+    """Return the command at tick k from the readings up to k; before the log all readings equal the first."""
     now, before = reading[k], reading[max(k - law.average, 0)]
     error = reference[k] - now
     speed = (now - before) / (law.average * period)
@@ -261,7 +261,7 @@ def command(law, k, reference, reading, memory, period):
 
 @njit(cache=True)
 def looked_up(u, i, fraction, linear):
-    """Command a fraction of a period after sample i; nothing was commanded before the log."""
+    """Return the command a fraction of a period after sample i; nothing was commanded before the log."""
     if i < 0:
         return 0.0
     if not linear:

@@ -14,7 +14,7 @@ from truth.axis.stepper import Loop, Machine, Sensor, simulate
 
 
 def single_move(t: np.ndarray, distance: float, speed: float, acceleration: float) -> np.ndarray:
-    """Trapezoid in velocity from 0 to `distance`, at rest before t = 0 and after its end.
+    """Return a trapezoid in velocity from 0 to `distance`, at rest before t = 0 and after its end.
 
     Args:
         t: Time since the start [s].
@@ -34,7 +34,7 @@ def single_move(t: np.ndarray, distance: float, speed: float, acceleration: floa
 
 
 def move_time(distance: float, speed: float, acceleration: float) -> float:
-    """Duration of a trapezoid move [s]."""
+    """Return the duration of a trapezoid move [s]."""
     length = abs(distance)
     peak = min(speed, math.sqrt(length * acceleration))
     return length / peak + peak / acceleration if length > 0.0 else 0.0
@@ -47,7 +47,7 @@ def moves(
     acceleration: float,
     rest: float = 0.0,
 ) -> np.ndarray:
-    """Tour of the waypoints and back to the first, over and over, with a rest after each move.
+    """Tour the waypoints and return to the first, repeatedly, with a rest after each move.
 
     Args:
         t: Time [s], from 0 on.
@@ -67,7 +67,7 @@ def moves(
 
 
 def multisine(t: np.ndarray, frequencies: Sequence[float], peak: float, seed: int = 0) -> np.ndarray:
-    """Sum of equal sines of random phase, scaled to `peak` and shifted to start at zero.
+    """Return the sum of equal sines of random phase, scaled to `peak` and shifted to start at zero.
 
     Args:
         t: Time [s].
@@ -82,7 +82,7 @@ def multisine(t: np.ndarray, frequencies: Sequence[float], peak: float, seed: in
 
 
 def random_bursts(duration: float, count: int, length: float, amplitude: float, seed: int = 0) -> list:
-    """Force pulses of either sign at random times, for `Machine.bursts`.
+    """Return force pulses of either sign at random times, for `Machine.bursts`.
 
     Args:
         duration: Span in which they start [s].
@@ -119,7 +119,7 @@ class Setup:
     seed: int
 
     def with_effect(self, kind: str, **parameters: float) -> "Setup":
-        """The same experiment on a machine with one effect added or replaced."""
+        """Return this experiment on a machine with one effect added or replaced."""
         return dataclasses.replace(self, machine=self.machine.with_effect(kind, **parameters))
 
     def run(self, **changes: Any) -> dict[str, np.ndarray]:
@@ -133,7 +133,7 @@ class Setup:
 
 
 def varied(seed: int, values: Sequence[float], spread: float) -> np.ndarray:
-    """Values as they stand for seed 0, else each scaled at random by 1 +/- spread."""
+    """Return the values unchanged for seed 0, else each scaled at random by 1 +/- spread."""
     if seed == 0:
         return np.array(values, dtype=float)
     return np.array(values) * np.random.default_rng(seed).uniform(1.0 - spread, 1.0 + spread, len(values))
@@ -146,7 +146,7 @@ EMPS_LOOP = Loop(kind="cascade_pd", kp=160.18, kv=243.45, velocity_average=2, li
 
 
 def emps_like(seed: int = 0, noise: float = 1.0, duration: float = 25.0) -> Setup:
-    """Ball-screw axis with the size, loop, tour and encoder of the EMPS benchmark.
+    """Build a ball-screw axis with the size, loop, tour and encoder of the EMPS benchmark.
 
     Seed 0 runs the benchmark's own tour, read off its reference; other seeds vary
     stroke and speeds by up to 20 %, so that two seeds make a log and a validation.
@@ -167,7 +167,7 @@ def emps_like(seed: int = 0, noise: float = 1.0, duration: float = 25.0) -> Setu
 
 
 def servo(seed: int = 0, noise: float = 1.0, duration: float = 10.0) -> Setup:
-    """Small rotary servo under a PID: 1e-4 kg m^2, 0.1 N m/A, 20-bit encoder; all values chosen.
+    """Build a rotary servo under a PID: 1e-4 kg m^2, 0.1 N m/A, 20-bit encoder; all values chosen.
 
     Moves between rests cover dry friction and rest, a multisine on top covers inertia.
     """
@@ -191,7 +191,7 @@ def servo(seed: int = 0, noise: float = 1.0, duration: float = 10.0) -> Setup:
 
 
 def heavy_slide(seed: int = 0, noise: float = 1.0, duration: float = 25.0) -> Setup:
-    """Slide of 1000 kg under a PD, 1000 N/V, scale of 0.1 um; all values chosen.
+    """Build a slide of 1000 kg under a PD, 1000 N/V, scale of 0.1 um; all values chosen.
 
     8 Hz of bandwidth: kp = M w^2 / k, kd = 1.6 M w / k.
     """

@@ -80,7 +80,7 @@ class Machine:
     clock_force: tuple[float, float] = (0.0, 0.0)
 
     def with_effect(self, kind: str, **parameters: float) -> "Machine":
-        """The same machine with one effect added or replaced."""
+        """Return this machine with one effect added or replaced."""
         return dataclasses.replace(self, effects={**self.effects, kind: parameters})
 
 
@@ -184,7 +184,7 @@ def control_law(loop: Loop) -> kernel.Law:
 
 
 def first_samples(values: np.ndarray | None, count: int, what: str) -> np.ndarray:
-    """The first `count` samples as a fresh array of floats.
+    """Return the first `count` samples as a fresh array of floats.
 
     Raises:
         ValueError: If there are fewer.

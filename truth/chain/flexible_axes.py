@@ -42,7 +42,7 @@ PULSES = {"level": 4.0, "on": 0.5, "off": 0.5, "start": 0.3405}  # V, between ti
 
 
 def machine(**changed: float) -> ChainMachine:
-    """The axis of Table 2; entries by their names there."""
+    """Build the axis of Table 2; entries by their names there."""
     p = TRUTH | changed
     return ChainMachine(
         (p["motor_inertia"], p["load_inertia"]),
@@ -58,7 +58,7 @@ def machine(**changed: float) -> ChainMachine:
 def trapezoids(
     duration: float, stroke: float = 0.2, speed: float = 0.2, acceleration: float = 2.0, dwell: float = 0.2
 ) -> np.ndarray:
-    """To and fro with trapezoidal velocity, one value a tick [m]."""
+    """Return a motion to and fro with trapezoidal velocity, one value a tick [m]."""
     ramp = speed / acceleration
     cruise = stroke / speed - ramp
     corners = np.cumsum([0.0, ramp, cruise, ramp, dwell])
@@ -78,7 +78,7 @@ def record(
     sensor: Sensor = SENSOR,
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
-    """A log of the axis in its loop, as `simulate_chain` returns it."""
+    """Simulate the axis in its loop; return the log of `simulate_chain`."""
     axis = machine() if axis is None else axis
     reference = trapezoids(duration) if reference is None else reference
     loop = Loop("cascade_pd", reference=reference, disturbance=pulses, limit=10.0, **law)
@@ -86,7 +86,7 @@ def record(
 
 
 def columns(log: dict[str, np.ndarray], noise: float = 0.01) -> dict[str, np.ndarray]:
-    """What a user would have: t, q, q_load, a_load (through so much noise [m/s^2]), u, ref."""
+    """Return the columns t, q, q_load, a_load (through so much noise [m/s^2]), u, ref of a user's log."""
     accelerometer = noise * np.random.default_rng(len(log["t"])).standard_normal(len(log["t"]))
     return {
         "t": log["t"],
@@ -124,7 +124,7 @@ def text(
     joints: tuple[int, ...] = (1, 2),
     effects: str = "",
 ) -> str:
-    """The case file: all of the axis unknown but what is given as known.
+    """Return the case file: all of the axis unknown except what is given as known.
 
     Args:
         load, accelerometer: Whether the load's encoder, and its acceleration, are in the log.
@@ -161,7 +161,7 @@ def text(
 
 
 def rigid_text(sensor: Sensor = SENSOR) -> str:
-    """The case of who takes the axis for one inertia, and reads the motor alone."""
+    """Return a case that takes the axis for one inertia, and reads the motor alone."""
     motor = text(load=False, sensor=sensor)
     return RIGID + motor[motor.index("[actuator]") :]
 

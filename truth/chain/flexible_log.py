@@ -27,7 +27,7 @@ SMALL = {"stiffness": 8e5} | {
 def flexible_log(
     *, duration: float = 20.0, force_noise: float = 0.02, resolution: float = COUNT, **changed: float
 ) -> dict[str, np.ndarray]:
-    """Trapezoids of velocity with pulses of force, in closed loop; as `simulate_chain` returns it.
+    """Simulate trapezoids of velocity with pulses of force in closed loop, as `simulate_chain` does.
 
     Args:
         duration: [s].
@@ -50,7 +50,7 @@ def flexible_log(
 
 
 def write(log: dict[str, np.ndarray], folder: Path) -> Path:
-    """The log as a file, its accelerometer exact."""
+    """Write the log to a file, its accelerometer exact."""
     path = folder / "log.csv"
     axes.write(log, path, noise=0.0)
     return path
@@ -59,7 +59,7 @@ def write(log: dict[str, np.ndarray], folder: Path) -> Path:
 def case(
     measured: str, extra: str = "", effects: str = "", far: float = 2.0, joints: tuple[int, ...] = (1, 2)
 ) -> str:
-    """A case whose guesses are off by a factor, and that names what was measured.
+    """Return a case whose guesses are off by a factor, and that names what was measured.
 
     Args:
         measured: "positions", "acceleration" or "motor".

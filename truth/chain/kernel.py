@@ -42,7 +42,7 @@ def pull_of_springs(springs, q, v, pull):
 
 @njit(cache=True)
 def advance(masses, springs, q, v, drive, pull, h):
-    """One step of h [s], in place: positions q [m] and velocities v [m/s]."""
+    """Take one step of h [s], in place: positions q [m] and velocities v [m/s]."""
     half, middle = 0.5 * h, np.empty(q.size)
     for i in range(q.size):
         q[i] += half * v[i]

@@ -28,7 +28,7 @@ LAW = {"kp": 1.0, "ki": 12.0, "kd": 0.03, "derivative_filter": 0.01}
 
 
 def _table(j, bm, fm, mt, bt, ft, cs1, cs2, vs, kl, cp, psi) -> dict[str, float]:
-    """A column of Table 1 in SI, by the names of a case."""
+    """Return a column of Table 1 in SI, by the names of a case."""
     return {
         "motor_inertia": j,
         "viscous_friction[1].coefficient": bm,
@@ -60,7 +60,7 @@ _RISING = ("level", "level_negative", "velocity")
 
 
 def machine(data: int = 1, rigid: bool = False, **changed: float) -> ChainMachine:
-    """The stage of one column of Table 1; entries by their names there."""
+    """Build the stage of one column of Table 1; entries by their names there."""
     p = TRUTH[data] | changed
     motor, table = p["motor_inertia"] / R**2, p["table_mass"]
     effects = {
@@ -90,7 +90,7 @@ def machine(data: int = 1, rigid: bool = False, **changed: float) -> ChainMachin
 
 
 def move(duration: float, distance: float, speed: float, onset: float, ramp: float = RAMP) -> np.ndarray:
-    """Position of the motor [rad] for a trapezoidal velocity of the table, one value a tick."""
+    """Return the position of the motor [rad] for a trapezoidal velocity of the table, one value a tick."""
     ramp = min(ramp, distance / speed)
     cruise = distance / speed - ramp
     t = np.arange(round(duration * RATE)) / RATE - onset
@@ -110,7 +110,7 @@ def record(
     seed: int = 0,
     step: float = 5e-6,
 ) -> dict[str, np.ndarray]:
-    """A log of the stage in its loop: t, q [rad], x [m], i [A] through noise [A], ref [rad], and the truth.
+    """Simulate the stage in its loop: t, q [rad], x [m], i [A] through noise [A], ref [rad], and the truth.
 
     `start` [rad] is where the motor truly stands at first: anywhere within the count that reads zero.
     """
@@ -154,7 +154,7 @@ def text(
     more: str = "",
     load: bool = True,
 ) -> str:
-    """The case file: everything unknown, guesses at the truth unless others are given.
+    """Return the case file: everything unknown, guesses at the truth unless others are given.
 
     `load`: an elastic stage's log has the position of the table.
     """
@@ -209,7 +209,7 @@ def text(
 
 
 def combined(p: dict[str, float]) -> dict[str, float]:
-    """What a rigid coupling leaves of some pairs, at the motor."""
+    """Return the sums, at the motor, to which a rigid coupling reduces pairs of parameters."""
     return {
         "inertia": p["motor_inertia"] + R**2 * p["table_mass"],
         "dry": p["coulomb_friction[1].level"] + R * p["coulomb_friction[2].level"],
@@ -218,34 +218,34 @@ def combined(p: dict[str, float]) -> dict[str, float]:
 
 
 def drawn(seed: int, spread: float = 0.5, data: int = 1) -> dict[str, float]:
-    """Guesses drawn up to so far around the truth, relative."""
+    """Draw guesses uniformly about the truth, up to a relative spread."""
     rng = np.random.default_rng(seed)
     return {k: v * (1 + spread * rng.uniform(-1, 1)) for k, v in TRUTH[data].items()}
 
 
 def believed(seed: int, width: float = 0.5, data: int = 1) -> dict[str, float]:
-    """Guesses off as a prior of a relative width says, by a factor; the phase, of either sign, as `drawn`."""
+    """Draw guesses from a log-normal prior of a relative width about the truth; the phase as in `drawn`."""
     rng, uniform = np.random.default_rng(seed), drawn(seed, width, data)
     off = {k: np.exp(width * rng.standard_normal()) for k in TRUTH[data]}
     return {k: uniform[k] if k.endswith("phase") else v * off[k] for k, v in TRUTH[data].items()}
 
 
 def to_and_fro(seconds: float = 20.0) -> np.ndarray:
-    """Motion at many speeds [rad]; a ripple with turns is one only where a stroke has more than two."""
+    """Return a motion at many speeds [rad] whose strokes have more than two turns, to show a ripple."""
     t = np.arange(round(seconds * RATE)) / RATE
     tones = zip((0.3, 0.7, 1.3), (1.0, 0.5, 0.12), (0.0, 1.0, 2.0), strict=True)
     return TURN * sum(a * (np.sin(2 * np.pi * f * t + p) - np.sin(p)) for f, a, p in tones)
 
 
 def one_way(seconds: float = 20.0) -> np.ndarray:
-    """Motion that never turns, at speeds that come and go [rad]."""
+    """Return a motion in one direction, at speeds that rise and fall [rad]."""
     t = np.arange(round(seconds * RATE)) / RATE
     speed = 4 + 4 * np.sin(2 * np.pi * 0.3 * t) + 2 * np.sin(2 * np.pi * 0.9 * t)
     return np.cumsum(np.maximum(speed, 0.0) * np.minimum(t, 1.0)) / RATE
 
 
 def long_case(folder: Path, reference: np.ndarray) -> tuple[Path, Path]:
-    """A log that is read finely, and a case without the physics of its table.
+    """Write a finely read log, and a case without the physics of its table.
 
     The motor's viscous and Coulomb friction are declared, and its current loop.
     """

@@ -55,7 +55,7 @@ class ChainMachine:
 
     @property
     def count(self) -> int:
-        """Masses."""
+        """Number of masses."""
         return len(self.mass)
 
     @property
@@ -70,11 +70,11 @@ class ChainMachine:
         return np.broadcast_to(np.asarray(self.actuator_gain, dtype=float), self.driven.shape)
 
     def with_effect(self, kind: str, place: int, **parameters: float) -> "ChainMachine":
-        """The same machine with one effect added or replaced."""
+        """Return this machine with one effect added or replaced."""
         return dataclasses.replace(self, effects={**self.effects, (kind, place): parameters})
 
     def frequencies(self) -> np.ndarray:
-        """Of the undamped chain, nothing driving it (n,) [Hz]."""
+        """Natural frequencies of the undamped chain without drives (n,) [Hz]."""
         k, root = np.asarray(self.stiffness), np.sqrt(self.mass)
         matrix = np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
         return np.sqrt(np.linalg.eigvalsh(matrix / np.outer(root, root))) / (2.0 * np.pi)
@@ -242,17 +242,17 @@ def simulate_under(
 
 
 def elongations(position: np.ndarray) -> np.ndarray:
-    """Of the springs (time, n + 1) from positions of the masses (time, n) [m]."""
+    """Return the elongations of the springs (time, n + 1) from positions of the masses (time, n) [m]."""
     return np.diff(np.pad(position, ((0, 0), (1, 1))), axis=1)
 
 
 def name_of(kind: str, place: int) -> str:
-    """An effect as results name it."""
+    """Return the name of an effect in results."""
     return f"{kind}[{'spring ' if kind in ('backlash', *SPRING_EFFECTS) else ''}{place}]"
 
 
 def column_names(log: Mapping[str, np.ndarray]) -> list[str]:
-    """Of the log as a file: t, position1.., force1.. (by drive), reference1.. (by mass)."""
+    """Return the log's columns: t, position1.., force1.. (by drive), reference1.. (by mass)."""
     wide = ("position", "force", "reference")
     return ["t", *[f"{name}{k + 1}" for name in wide for k in range(log[name].shape[1])]]
 

@@ -45,7 +45,7 @@ class Robot:
 
     @property
     def coefficients(self) -> np.ndarray:
-        """Of friction, (5 orders, 5 hinges)."""
+        """Coefficients of friction, (5 orders, 5 hinges)."""
         return np.array([self.friction.get(kind, np.zeros(5)) for kind in ORDERS], dtype=float)
 
 
@@ -59,7 +59,7 @@ def across(vector):
 
 
 def coordinates(robot: Robot, q) -> np.ndarray:
-    """X of joint angles, the tool by the law of cosines, left of the way from elbow 1 to elbow 2."""
+    """Return X of joint angles, the tool by the law of cosines, left of the line from elbow 1 to elbow 2."""
     l = robot.length
     elbow = [turned(q[k], [l[1 + k], 0.0]) + [(-l[0], l[0])[k] / 2, 0.0] for k in range(2)]
     way = elbow[1] - elbow[0]
@@ -74,7 +74,7 @@ def coordinates(robot: Robot, q) -> np.ndarray:
 
 
 def constraints(robot: Robot, x, v):
-    """Gaps of the hinges (8,), their Jacobian (8, 10), and its rate times the velocity (8,)."""
+    """Return the gaps of the hinges (8,), their Jacobian (8, 10), and its rate times the velocity (8,)."""
     l = robot.length
     gap, slope, bias = np.zeros(8), np.zeros((8, 10)), np.zeros(8)
     for k in range(2):
@@ -102,7 +102,7 @@ def masses(robot: Robot) -> np.ndarray:
 
 
 def moving(robot: Robot, q, qd):
-    """X and its rate, by the constraints."""
+    """Return X and its rate, by the constraints."""
     x = coordinates(robot, q)
     slope = constraints(robot, x, np.zeros(10))[1]
     rest = np.linalg.solve(slope[:, 2:], -slope[:, :2] @ qd)
@@ -110,13 +110,13 @@ def moving(robot: Robot, q, qd):
 
 
 def friction_of(robot: Robot, rates, sign=np.sign) -> np.ndarray:
-    """Moment of friction in every hinge, against its rate, (5,)."""
+    """Return the moment of friction in every hinge, against its rate, (5,)."""
     s, a = sign(rates), np.abs(rates)
     return -np.sum(robot.coefficients * np.array([s, rates, rates * a, rates**3, rates**3 * a]), axis=0)
 
 
 def inverse_dynamics(robot: Robot, q, qd, qdd, sign=np.sign) -> np.ndarray:
-    """Torques at the two joints that give an acceleration, with the hinges' multipliers as unknowns."""
+    """Solve for the torques that give an acceleration, with the hinges' multipliers as unknowns."""
     x, v = moving(robot, q, qd)
     _, slope, bias = constraints(robot, x, v)
     a = np.array([*qdd, *np.linalg.solve(slope[:, 2:], -bias - slope[:, :2] @ qdd)])
@@ -127,7 +127,7 @@ def inverse_dynamics(robot: Robot, q, qd, qdd, sign=np.sign) -> np.ndarray:
 
 
 def forward_dynamics(robot: Robot, q, qd, torque, sign=np.sign) -> np.ndarray:
-    """Accelerations of the joints under torques, from all ten equations of motion and the eight hinges."""
+    """Solve the ten equations of motion and eight hinges for the joints' accelerations under torques."""
     x, v = moving(robot, q, qd)
     _, slope, bias = constraints(robot, x, v)
     load = np.zeros(10)
@@ -142,7 +142,7 @@ def kinetic_energy(robot: Robot, q, qd) -> float:
 
 
 def possible_states(robot: Robot, count: int, seed: int = 0) -> np.ndarray:
-    """q, qd, qdd of random states with the distal links well apart from one line, (3, count, 2)."""
+    """Draw q, qd, qdd of states with the distal links well apart from one line, (3, count, 2)."""
     rng = np.random.default_rng(seed)
     q, l = rng.uniform(-np.pi, np.pi, (60 * count, 2)), robot.length
     x = -l[0] + l[1] * np.cos(q[:, 0]) - l[2] * np.cos(q[:, 1])

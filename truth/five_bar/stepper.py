@@ -147,14 +147,14 @@ def _run(l, c, m, friction, gains, law, reference, noise, resolution, period, st
 
 
 def arrays(robot: Robot) -> tuple:
-    """What the kernels take of a robot."""
+    """Return the arguments of the kernels for a robot."""
     (m1, m2), m = robot.mass, robot.tip_mass
     body = np.array([*robot.inertia, m1, m1, m2, m2, m, m])
     return np.array(robot.length), np.array(robot.center), body, robot.coefficients
 
 
 def acceleration(robot: Robot, q, v, torque) -> np.ndarray:
-    """Of one tiny step; friction must slide."""
+    """Return the acceleration over one tiny step; friction must slide."""
     l, c, m, friction = arrays(robot)
     work = (np.empty((10, 2)), np.empty(10), np.empty((5, 2)), np.empty((2, 2)), np.empty(2), np.empty(5))
     h, q, end = 1e-9, np.array(q, float), np.array(v, float)
@@ -163,7 +163,7 @@ def acceleration(robot: Robot, q, v, torque) -> np.ndarray:
 
 
 def unknown_reference(times, seed, home=(1.9, 1.24), peak=0.32, count=6, band=(0.4, 3.0)) -> np.ndarray:
-    """Sines about a place amid the workspace, which a robot of `Robot()` can reach, (time, 2) [rad]."""
+    """Return sines about the middle of the workspace of `Robot()`, (time, 2) [rad]."""
     rng = np.random.default_rng(seed)
     f, phase = rng.uniform(*band, (2, count)), rng.uniform(0, 2 * np.pi, (2, count))
     waves = np.sin(2 * np.pi * f * times[:, None, None] + phase).sum(axis=-1)
@@ -186,7 +186,7 @@ def followed(
     step=1e-5,
     reference=None,
 ) -> dict[str, np.ndarray]:
-    """A log of a PD loop: t, q1, q2, measured motor torques u1, u2, r1, r2.
+    """Run a PD loop; return t, q1, q2, measured motor torques u1, u2, r1, r2.
 
     gains: actual over measured torque of each drive. The law's gains count at the motors [N m/rad].
     """

@@ -15,7 +15,7 @@ Case = HiddenCase | ChainCase
 
 
 def oracle(case: Case) -> dict[str, dict]:
-    """What it says of each hidden effect."""
+    """Return visibility, evidence, share and ties of each hidden effect."""
     seen = (chain_oracle if isinstance(case, ChainCase) else axis_oracle).sights(case)
     return {
         kind: {"visible": s.visible, "evidence": s.evidence, "share": s.share, "ties": s.ties}
@@ -24,7 +24,7 @@ def oracle(case: Case) -> dict[str, dict]:
 
 
 def text_of(case: Case) -> str:
-    """The case file that knows nothing of what is hidden."""
+    """Return the case file that does not declare the hidden effects."""
     if isinstance(case, ChainCase):
         return chains.text_of_chain(case)
     declared = [(kind, case.values[kind]) for kind in case.declared]
@@ -35,7 +35,7 @@ def text_of(case: Case) -> str:
 
 
 def known_text(case: Case) -> str:
-    """The case file that knows all."""
+    """Return the case file at the truth, with every effect declared and known."""
     if isinstance(case, ChainCase):
         return chains.text_of_chain(case, known=True)
     declared = [*case.values.items()]
@@ -44,7 +44,7 @@ def known_text(case: Case) -> str:
 
 
 def write_files(case: Case, folder: Path) -> list[str]:
-    """Case, log and validation as files; what `jaxid discover` takes."""
+    """Write case, log and validation to files; return the arguments of `jaxid discover`."""
     names = ["log.csv", "validation.csv"] if case.validated else ["log.csv"]
     for k, name in enumerate(names):
         write = (chain_stepper if isinstance(case, ChainCase) else axis_stepper).write_csv

@@ -56,33 +56,33 @@ class HiddenCase:
 
     @property
     def inertia_known(self) -> bool:
-        """A gain and a mass can only be told from an inertia that is known."""
+        """Whether the case gives the inertia; a gain and a mass are identifiable only then."""
         return bool({"actuator_gain", "added_mass"} & set(self.hidden))
 
     @property
     def size(self) -> Scale:
-        """What drawn parameters are relative to."""
+        """Scale to which drawn parameters are relative."""
         return COARSE if self.scale == "coarse" else SCALES[self.scale]
 
     @property
     def rate(self) -> float:
-        """Of loop and log [Hz]; varies by seed."""
+        """Rate of loop and log [Hz]; varies by seed."""
         return float(self._random("rate").choice(list(self.size.bandwidth)))
 
     @property
     def duration(self) -> float:
-        """Of each log [s]."""
+        """Duration of each log [s]."""
         return self.size.durations[self.length]
 
     @property
     def off(self) -> float:
-        """How far the guesses are off: 20 to 60 % either way."""
+        """Factor between guesses and truth: 20 to 60 % either way."""
         random = self._random("off")
         return float(random.uniform(1.2, 1.6) ** random.choice([-1.0, 1.0]))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is hidden, as results name it."""
+        """Names of the hidden effects in results."""
         return self.hidden
 
     @property
@@ -98,7 +98,7 @@ class HiddenCase:
         return out | {kind: self._drawn(kind) for kind in self.hidden}
 
     def setup(self, *, validation: bool = False) -> Setup:
-        """The experiment with all that is in it."""
+        """Build the experiment with its hidden effects."""
         base = self._bare(validation)
         machine = dataclasses.replace(base.machine, effects=self.values)
         if self.group == "outside":
@@ -158,7 +158,7 @@ class HiddenCase:
         return self.size.bandwidth[self.rate]
 
     def _peak(self) -> float:
-        """Force that the same run exerts where nothing clips it, but for the rarest samples [N]."""
+        """Return the largest force of the same run without clipping, except the rarest samples [N]."""
         bare = self._bare()
         values = {k: self._drawn(k) for k in (*self.declared, *self.hidden) if k != "saturation"}
         machine = dataclasses.replace(bare.machine, effects=values)
@@ -166,7 +166,7 @@ class HiddenCase:
         return float(np.quantile(np.abs(force), 0.995))
 
     def _outside(self, base: Setup, validation: bool) -> dict:
-        """Bursts while it moves, or a sine in time."""
+        """Add bursts while the axis moves, or a force that is a sine in time."""
         level = base.machine.effects["coulomb_friction"]["level"]
         random = self._random(f"outside {validation}")
         if self.what == "clock":
@@ -236,7 +236,7 @@ SHORT = (
 
 
 def declared_beside(hidden: tuple[str, ...]) -> tuple[str, ...]:
-    """What a case declares where these are hidden: viscous and Coulomb friction.
+    """Return the effects that a case declares beside hidden ones: viscous and Coulomb friction.
 
     Presliding takes the place of Coulomb friction, as in the machine.
     """
@@ -251,7 +251,7 @@ def _hiding(group: str, hidden: tuple[str, ...], scale: str, noise: float, seed:
 
 
 def cases(split: str, seeds: int = 1) -> Iterator[HiddenCase]:
-    """All cases of a split, `seeds` of each kind.
+    """Return all cases of a split, `seeds` of each kind.
 
     Every case has a seed of its own, so that nothing that is drawn repeats.
     """

@@ -27,7 +27,7 @@ Log = Mapping[str, np.ndarray]
 
 
 def sights(case: ChainCase) -> dict[str, Sight]:
-    """What shows of the hidden kind on the logs that are given; nothing for a null.
+    """Return the evidence of the hidden kind on the logs that are given; empty for a null.
 
     Kind and place are named as results name them, in the ties too.
     """
@@ -39,7 +39,7 @@ def sights(case: ChainCase) -> dict[str, Sight]:
 
 
 def view(case: ChainCase, validation: bool) -> View:
-    """The hidden effect as one log shows it."""
+    """Return the hidden effect as one log shows it."""
     setup = case.setup(validation=validation)
     log = setup.run()
     baseline, rivals = baseline_forces(case, log), rival_forces(case, log)
@@ -63,7 +63,7 @@ def _flat(fades: np.ndarray, forces: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _ties(views: Sequence[View]) -> list[str]:
-    """Rivals that leave next to nothing, one set of parameters for all logs."""
+    """Return the rivals that explain nearly all, with one set of parameters for all logs."""
     names = list(views[0].rivals)
     stacked = [np.column_stack([v.force, *(v.rivals[name] for name in names)]) for v in views]
     columns = np.concatenate([v.columns for v in views])
@@ -73,19 +73,19 @@ def _ties(views: Sequence[View]) -> list[str]:
 
 
 def fading(log: Log) -> np.ndarray:
-    """Weight of each sample of each mass (time, n): nothing where that mass is at rest."""
+    """Return the weight of each sample of each mass (time, n): zero while that mass is at rest."""
     return np.column_stack([faded(moving(v)) for v in log["true_velocity"].T])
 
 
 def moving_force(machine: ChainMachine, log: Log) -> np.ndarray:
-    """Of the drives, and of the springs where a mass has none (time, n) [N]."""
+    """Return the force of the drives, and of the springs for masses without drive (time, n) [N]."""
     out = np.diff(elongations(log["true_position"]) * machine.stiffness, axis=1)
     out[:, machine.driven] = log["true_force"][:, machine.driven]
     return out
 
 
 def noise_density(i: int, setup: ChainSetup, f: np.ndarray) -> np.ndarray:
-    """One-sided density of the noise that a log leaves in the balance at mass i (from 0) [N^2/Hz]."""
+    """Return the one-sided density of a log's noise in the balance at mass i (from 0) [N^2/Hz]."""
     sensor, machine = setup.sensor, setup.machine
     w, k = 2.0 * np.pi * f, np.asarray(machine.stiffness)
     drag = machine.damping[i] * w
@@ -97,19 +97,19 @@ def noise_density(i: int, setup: ChainSetup, f: np.ndarray) -> np.ndarray:
 
 
 def at_mass(i: int, force: np.ndarray, count: int) -> np.ndarray:
-    """A force that acts on mass i alone (from 0), as (time, n)."""
+    """Return a force that acts on mass i alone (from 0), as (time, n)."""
     out = np.zeros((len(force), count))
     out[:, i] = force
     return out
 
 
 def of_spring(j: int, tension: np.ndarray, count: int) -> np.ndarray:
-    """Tension of spring j (from 0): it draws mass j back and the one before it on, as (time, n)."""
+    """Return the tension of spring j (from 0), which pulls mass j back and mass j - 1 on, as (time, n)."""
     return np.diff(at_mass(j, tension, count + 1), axis=1)
 
 
 def baseline_forces(case: ChainCase, log: Log) -> list[np.ndarray]:
-    """What the case's own unknowns can explain: masses, dampings, springs, declared friction."""
+    """Return the forces that the case's unknowns explain: masses, dampings, springs, declared friction."""
     n, v, a = case.count, log["true_velocity"], log["true_acceleration"]
     e = elongations(log["true_position"])
     out = [at_mass(i, x[:, i], n) for x in (a, v) for i in range(n)]
@@ -118,7 +118,7 @@ def baseline_forces(case: ChainCase, log: Log) -> list[np.ndarray]:
 
 
 def rival_forces(case: ChainCase, log: Log) -> dict[str, np.ndarray]:
-    """Forces of every other effect that has one parameter, by kind and place."""
+    """Return the forces of every other effect with one parameter, by kind and place."""
     n, t, e = case.count, log["t"], elongations(log["true_position"])
     out = {}
     for i in range(n):
@@ -141,7 +141,7 @@ def rival_forces(case: ChainCase, log: Log) -> dict[str, np.ndarray]:
 
 
 def effect_force(kind: str, place: int, machine: ChainMachine, log: Log) -> np.ndarray:
-    """Force of one effect along a run, from the truth (time, n) [N]."""
+    """Return the force of one effect along a run, from the truth (time, n) [N]."""
     values, n, i = machine.effects[kind, place], machine.count, place - 1
     if kind in SPRING_EFFECTS:
         e = elongations(log["true_position"])[:, i]

@@ -90,12 +90,12 @@ class ChainCase:
 
     @property
     def hidden(self) -> tuple[str, ...]:
-        """Kinds not declared."""
+        """Hidden kinds."""
         return () if self.what == "null" else (self.what,)
 
     @property
     def sort(self) -> str:
-        """What the hidden effect acts on, as the case file calls it."""
+        """Element on which the hidden effect acts, by its key in the case file."""
         return "spring" if self.what in chain.SPRING_EFFECTS else "joint"
 
     @property
@@ -108,7 +108,7 @@ class ChainCase:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is hidden, as results name it."""
+        """Names of the hidden effects in results."""
         return tuple(chain.name_of(kind, self.place) for kind in self.hidden)
 
     @property
@@ -120,24 +120,24 @@ class ChainCase:
 
     @property
     def declared(self) -> tuple[chain.Place, ...]:
-        """Kind and mass of what the case has: Coulomb friction wherever it is not hidden."""
+        """Kind and mass of the declared effects: Coulomb friction at each mass that does not hide it."""
         kind = "coulomb_friction"
         hidden = self.place if self.what == kind else None
         return tuple((kind, i) for i in range(1, self.count + 1) if i != hidden)
 
     @property
     def count(self) -> int:
-        """Masses."""
+        """Number of masses."""
         return int(self.scale[-1])
 
     @property
     def rate(self) -> float:
-        """Of loops and log [Hz]."""
+        """Rate of loops and log [Hz]."""
         return float(self._random("rate").choice(list(BANDWIDTH)))
 
     @property
     def duration(self) -> float:
-        """Of each log [s]."""
+        """Duration of each log [s]."""
         return DURATION
 
     @functools.cached_property
@@ -149,7 +149,7 @@ class ChainCase:
 
     @property
     def values(self) -> dict[str, Values]:
-        """The same under the names that results use: `cubic_stiffness[spring 2]`."""
+        """True parameters by the names of results: `cubic_stiffness[spring 2]`."""
         return {chain.name_of(*place): values for place, values in self.effects.items()}
 
     @functools.cached_property
@@ -166,11 +166,11 @@ class ChainCase:
         return chain.ChainMachine(*lists, actuated=driven, actuator_gain=gains)
 
     def setup(self, *, validation: bool = False) -> ChainSetup:
-        """The experiment with all that is in it."""
+        """Build the experiment with its hidden effects."""
         return self._setup(self.effects, validation)
 
     def run(self, *, validation: bool = False) -> dict[str, np.ndarray]:
-        """The log and the truth behind it, as `simulate_chain` returns them."""
+        """Simulate; return the log and the truth behind it."""
         return self.setup(validation=validation).run()
 
     def _setup(self, effects: Mapping[chain.Place, Values], validation: bool) -> ChainSetup:
@@ -181,7 +181,7 @@ class ChainCase:
         return ChainSetup(machine, loops, sensor, self.rate, DURATION, 2 * self.seed + validation)
 
     def _loop(self, joint: int, random: np.random.Generator) -> Loop:
-        """PD on a tour of its own: kp = m w^2 / g, kd = 1.6 m w / g."""
+        """Return a PD loop with a tour for one mass: kp = m w^2 / g, kd = 1.6 m w / g."""
         t = np.arange(round(DURATION * self.rate)) / self.rate
         # Alone, a drive must also move the mass beside it, against that one's friction.
         stroke = STROKE * random.uniform(0.8, 1.2) * (1.5 if self.count == 2 else 1.0)
@@ -202,7 +202,7 @@ class ChainCase:
         return {("coulomb_friction", i): {"level": float(x)} for i, x in enumerate(levels, start=1)}
 
     def _drawn(self) -> Values:
-        """Of the hidden effect; a force at full speed or elongation goes by the Coulomb level."""
+        """Draw the hidden effect's parameters; forces at full motion scale with the Coulomb level."""
         if self.what == "coulomb_friction":
             return self._friction()[self.what, self.place]
         log, i = self._setup(self._friction(), False).run(), self.place - 1
@@ -234,7 +234,7 @@ class ChainCase:
 
 
 def cases(split: str, seeds: int = 1) -> Iterator[ChainCase]:
-    """All cases of a split, `seeds` of each kind, every case with a seed of its own."""
+    """Return all cases of a split, `seeds` of each kind, each case with a separate seed."""
     seed = FIRST_SEED[split]
     for _ in range(seeds):
         for case in (*_hiding(), *_nulls()):
@@ -259,7 +259,7 @@ def _nulls() -> Iterator[ChainCase]:
 
 
 def text_of_chain(case: ChainCase, *, known: bool = False) -> str:
-    """The case file that knows nothing of what is hidden, its guesses 20 to 60 % off.
+    """Return the case file that does not declare what is hidden, its guesses 20 to 60 % off.
 
     Args:
         case: The case.
@@ -290,7 +290,7 @@ def text_of_chain(case: ChainCase, *, known: bool = False) -> str:
 
 
 def _drive_lines(setup: ChainSetup) -> list[str]:
-    """Actuator, log and controller: a force, a reference and gains for each drive."""
+    """Return actuator, log and controller: a force, a reference and gains for each drive."""
     machine, text = setup.machine, lambda names: "[" + ", ".join(f'"{n}"' for n in names) + "]"
     return [
         "[actuator]", f"gain = {machine.gains.tolist()}",
@@ -303,7 +303,7 @@ def _drive_lines(setup: ChainSetup) -> list[str]:
 
 
 def write_files(case: ChainCase, folder: Path) -> list[Path]:
-    """Case, log and, where there is one, validation as files."""
+    """Write case, log and, if there is one, validation to files."""
     names = ["case.toml", "log.csv", "validation.csv"][: 2 + case.validated]
     paths = [Path(folder) / name for name in names]
     paths[0].write_text(text_of_chain(case))

@@ -11,17 +11,17 @@ _LINE = 0.02  # part by which a frequency may be off, and no less than a tenth o
 
 
 def visible(record: Record) -> bool:
-    """Whether the oracle sees each hidden effect beside the others."""
+    """Return whether the oracle sees each hidden effect beside the others."""
     return all(sight["visible"] for sight in record["oracle"].values())
 
 
 def strictly_right(record: Record) -> bool:
-    """Whether exactly the hidden effects are named."""
+    """Return whether exactly the hidden effects are named."""
     return record["verdict"] == "found" and sorted(record["named"]) == sorted(record["hidden"])
 
 
 def right(record: Record) -> bool:
-    """The same, where a rival that the oracle calls tied may stand, the truth beside it."""
+    """Return whether exactly the hidden effects are named, or a tied rival with the truth beside it."""
     if record["verdict"] != "found" or len(record["named"]) != len(record["hidden"]):
         return False
     left = list(record["hidden"])
@@ -36,12 +36,12 @@ def right(record: Record) -> bool:
 
 
 def false_positive(record: Record) -> bool:
-    """Whether anything is seen in a complete model."""
+    """Return whether anything is seen in a complete model."""
     return record["verdict"] != "nothing_missing"
 
 
 def pointed_at(record: Record) -> bool:
-    """Whether a disturbance is called unexplained and shown where it is."""
+    """Return whether a disturbance is called unexplained and shown where it is."""
     where = record.get("where")
     if record["verdict"] != "unexplained" or where is None:
         return False
@@ -60,7 +60,7 @@ def pointed_at(record: Record) -> bool:
 
 
 def closed(record: Record) -> float | None:
-    """Gap closed on the last log, over what the truth closes there; None where that is nothing."""
+    """Return the gap closed on the last log over the gap that the truth closes; None if that is zero."""
     gap = record.get("gap")
     if not gap or not gap["truth"]:
         return None
@@ -69,7 +69,7 @@ def closed(record: Record) -> float | None:
 
 
 def deviations(record: Record) -> list[float]:
-    """How many of their own standard deviations the parameters are off, where all are right."""
+    """Return the errors of the parameters over their standard deviations, if all effects are right."""
     if not strictly_right(record):
         return []
     return [

@@ -48,13 +48,13 @@ class Scale:
 
     @property
     def speed(self) -> float:
-        """Of the fastest move [m/s]."""
+        """Speed of the fastest move [m/s]."""
         return max(self.speeds)
 
     def setup(
         self, seed: int, noise: float, duration: float, rate: float, *, validation: bool = False
     ) -> Setup:
-        """Machine, loop, sensor and tour.
+        """Build machine, loop, sensor and tour.
 
         The tour to validate on is longer where the one to fit is shorter, by 10 to 40 %; every
         speed and the acceleration are drawn anew.
@@ -77,7 +77,7 @@ class Scale:
 
 
 def _emps_loop(bandwidth: float, rate: float) -> Loop:
-    """The benchmark's own cascade at its own bandwidth of 120 rad/s, slower by as much as asked."""
+    """Return the benchmark's cascade at its bandwidth of 120 rad/s, slowed by a factor."""
     slower = bandwidth / 120.0
     own = machines.EMPS_LOOP
     average = own.velocity_average if rate >= 1000.0 else 1
@@ -85,7 +85,7 @@ def _emps_loop(bandwidth: float, rate: float) -> Loop:
 
 
 def _servo_loop(bandwidth: float, rate: float) -> Loop:
-    """As the preset: kp = J w^2 / k, kd = 1.6 J w / k, the integral five times slower."""
+    """Return the preset's PID: kp = J w^2 / k, kd = 1.6 J w / k, the integral five times slower."""
     kp = 1e-4 * bandwidth**2 / 0.1
     return Loop(
         kind="pid", kp=kp, kd=1.6 * kp / bandwidth, ki=kp * bandwidth / 5.0,
@@ -94,7 +94,7 @@ def _servo_loop(bandwidth: float, rate: float) -> Loop:
 
 
 def _slide_loop(bandwidth: float, rate: float) -> Loop:
-    """As the preset: kp = M w^2 / k, kd = 1.6 M w / k."""
+    """Return the preset's PD: kp = M w^2 / k, kd = 1.6 M w / k."""
     kp = 1000.0 * bandwidth**2 / 1000.0
     return Loop(kind="pd", kp=kp, kd=1.6 * kp / bandwidth, limit=10.0)
 
@@ -137,7 +137,7 @@ COARSE_RESOLUTION = 2.0 * math.pi / 500.0  # rad
 
 
 def coarse_setup(seed: int, noise: float, duration: float, rate: float, *, validation: bool = False) -> Setup:
-    """The servo through that encoder, with three times the friction."""
+    """Build the servo with a coarse encoder, and three times the friction."""
     setup = COARSE.setup(seed, noise, duration, rate, validation=validation)
     sensor = Sensor(COARSE_RESOLUTION, 3e-6 * noise, 5e-3 * noise)
     effects = {

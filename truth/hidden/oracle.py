@@ -42,12 +42,12 @@ class Sight:
 
     @property
     def visible(self) -> bool:
-        """Whether every log shows it."""
+        """Whether every log shows the effect."""
         return min(self.evidence) >= VISIBLE_NATS and min(self.share) >= VISIBLE_SHARE
 
 
 def sights(case: HiddenCase) -> dict[str, Sight]:
-    """Each hidden kind -> what shows of it beside the others, on the logs that are given.
+    """Return the evidence of each hidden kind beside the others, on the logs that are given.
 
     A disturbance from outside the vocabulary goes by the case's `what`; a null has none.
     """
@@ -70,7 +70,7 @@ def _sight(case: HiddenCase, kind: str, setups: Sequence[Setup], logs: Sequence[
 
 
 def _left(views: Sequence["View"], rival: str) -> float:
-    """Evidence that a rival leaves, one set of parameters for all logs [nats]."""
+    """Return the evidence that a rival leaves, with one set of parameters for all logs [nats]."""
     columns = np.concatenate([np.column_stack([v.columns, v.rivals[rival]]) for v in views])
     return evidence_beyond(columns, np.concatenate([v.force for v in views]))
 
@@ -93,12 +93,12 @@ class View:
 
     @property
     def evidence(self) -> float:
-        """Beyond the baseline [nats]."""
+        """Evidence beyond the baseline [nats]."""
         return evidence_beyond(self.columns, self.force)
 
     @classmethod
     def of(cls, case: HiddenCase, kind: str, setup: Setup, log: Log) -> "View":
-        """A log as it bears on one of the hidden kinds, the forces of the others known."""
+        """Return the view of one hidden kind in a log, the forces of the others known."""
         gain, inertia = setup.machine.actuator_gain, setup.machine.inertia
         force = gain * log["true_command"]
         others = [effect_force(k, setup, log) for k in case.hidden if k != kind]
@@ -122,7 +122,7 @@ class View:
 
 
 def between(case: HiddenCase, kind: str, setup: Setup, log: Log) -> float:
-    """Evidence of the balance between samples, where a log of positions has it [nats].
+    """Return the evidence of the balance between samples of a log of positions [nats].
 
     A log holds no acceleration but the second difference of its positions, which is the acceleration
     averaged over two periods. A ripple that is faster than half the sampling rate stands in the
@@ -144,12 +144,12 @@ def between(case: HiddenCase, kind: str, setup: Setup, log: Log) -> float:
 
 
 def _of_held(x: np.ndarray) -> np.ndarray:
-    """The same mean of a signal that is held from its sample on."""
+    """Average a signal that is held from its sample on, as `_averaged` does a smooth one."""
     return np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1])])
 
 
 def _averaged(x: np.ndarray) -> np.ndarray:
-    """Mean of a smooth signal over two periods with the weights of a second difference."""
+    """Average a smooth signal over two periods with the weights of a second difference."""
     return np.concatenate([x[:1], (x[:-2] + 4.0 * x[1:-1] + x[2:]) / 6.0, x[-1:]])
 
 
@@ -170,7 +170,7 @@ class Whitener:
         self.fade = fade
 
     def __call__(self, signals: np.ndarray) -> np.ndarray:
-        """Rows whose sum of squares is twice the evidence; one column a signal."""
+        """Return rows whose sum of squares is twice the evidence; one column a signal."""
         fade = self.fade.reshape(-1, *[1] * (signals.ndim - 1))
         scale = self.scale.reshape(-1, *[1] * (signals.ndim - 1))
         rows = np.fft.rfft(fade * signals, axis=0) / scale
@@ -180,12 +180,12 @@ class Whitener:
 
 
 def noise_density(setup: Setup, f: np.ndarray) -> np.ndarray:
-    """One-sided density of the noise that a log leaves in the balance of forces [N^2/Hz]."""
+    """Return the one-sided density of a log's noise in the balance of forces [N^2/Hz]."""
     return _density(setup, 2.0 * np.pi * f, np.ones_like(f))
 
 
 def averaged_noise(setup: Setup, f: np.ndarray) -> np.ndarray:
-    """The same of the balance between samples: differences for derivatives, commands in pairs."""
+    """Return the density for the balance between samples: differences for derivatives, commands in pairs."""
     half = np.pi * f / setup.rate
     return _density(setup, 2.0 * np.sin(half) * setup.rate, np.cos(half))
 
@@ -200,31 +200,31 @@ def _density(setup: Setup, w: np.ndarray, of_command: np.ndarray) -> np.ndarray:
 
 
 def evidence_beyond(columns: np.ndarray, force: np.ndarray) -> float:
-    """Half the sum of squares that no combination of the columns explains [nats]."""
+    """Return half the sum of squares that no combination of the columns explains [nats]."""
     return 0.5 * float(np.sum(explained_away(columns, force) ** 2))
 
 
 def explained_away(columns: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """What no combination of the columns explains of a force."""
+    """Return the part of a force that no combination of the columns explains."""
     norm = np.linalg.norm(columns, axis=0)
     columns = columns[:, norm > 0] / norm[norm > 0]
     return force - columns @ np.linalg.lstsq(columns, force, rcond=1e-12)[0]
 
 
 def moving(velocity: np.ndarray) -> np.ndarray:
-    """Samples that are not practically at rest."""
+    """Return which samples are not practically at rest."""
     return np.abs(velocity) > _REST * np.sqrt(np.mean(velocity**2))
 
 
 def faded(counts: np.ndarray) -> np.ndarray:
-    """Weight of each sample: zero where it does not count, one a few samples inside, smooth."""
+    """Return the weight of each sample: zero if it does not count, one a few samples inside, smooth."""
     ramp = np.hanning(_RAMP + 1)[1:]
     inside = np.convolve(counts, np.ones(_RAMP), "same") > _RAMP - 0.5
     return np.convolve(inside, ramp / ramp.sum(), "same")
 
 
 def baseline_columns(case: HiddenCase, setup: Setup, log: Log) -> list[np.ndarray]:
-    """What the case's own unknowns can explain."""
+    """Return the forces that the case's unknowns can explain."""
     v, side = log["true_velocity"], np.sign(log["true_velocity"])
     columns = [] if case.inertia_known else [log["true_acceleration"]]
     for kind in case.declared:
@@ -238,7 +238,7 @@ def baseline_columns(case: HiddenCase, setup: Setup, log: Log) -> list[np.ndarra
 
 
 def one_parameter(case: HiddenCase, setup: Setup, log: Log) -> dict[str, np.ndarray]:
-    """Column of every effect that has one parameter, where it is nearly without effect."""
+    """Return the column of every effect with one parameter, linearised near its neutral value."""
     q, v, side = log["true_position"], log["true_velocity"], np.sign(log["true_velocity"])
     force = setup.machine.actuator_gain * log["true_command"]
     out = {
@@ -263,7 +263,7 @@ def one_parameter(case: HiddenCase, setup: Setup, log: Log) -> dict[str, np.ndar
 
 
 def effect_force(kind: str, setup: Setup, log: Log) -> np.ndarray:
-    """Force of one effect along a run, from the truth [N]."""
+    """Return the force of one effect along a run, from the truth [N]."""
     if kind in DRIVES:
         return log["true_force"] - setup.machine.actuator_gain * log["true_command"]
     if kind == "hysteresis":
@@ -290,7 +290,7 @@ def effect_force(kind: str, setup: Setup, log: Log) -> np.ndarray:
 
 
 def _beyond_coulomb(setup: Setup, log: Log) -> np.ndarray:
-    """Force on a resting axis beyond what Coulomb friction can hold: only that tells static friction."""
+    """Return the force on a resting axis beyond Coulomb friction: only it determines static friction."""
     net = setup.machine.actuator_gain * log["true_command"]
     level = setup.machine.effects["coulomb_friction"]["level"]
     resting = log["true_velocity"] == 0.0
