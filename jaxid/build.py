@@ -21,6 +21,7 @@ from jaxid.errors import InputError
 from jaxid.machine import Machine
 from jaxid.model.parameter import ParameterInfo, as_array, parameters_of
 from jaxid.model.plant import Plant
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import REFERENCE, Free, Parameters, effect_name, label
 from jaxid.references import REFERENCES
 from jaxid.references.unknown import UnknownReference
@@ -164,7 +165,8 @@ def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
     """The plant without effects, and its own unknowns."""
     entry = case.plant
     known: dict[str, Any] = {"gravity": entry.gravity, "vertical": entry.vertical}
-    known |= {"sharpness": case.simulation.get("sharpness"), "actuated": entry.actuated}
+    sharpness = case.simulation.get("sharpness")
+    known |= {"smoothing": None if sharpness is None else Smoothing(sharpness), "actuated": entry.actuated}
     options = {
         name: value
         for name, value in known.items()

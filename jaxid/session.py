@@ -263,5 +263,5 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepare
 def _scaled(machine: Machine, data: Prepared) -> Machine:
     """The machine with the velocity scale of its log, which the smoothed sign multiplies."""
     speed = float(np.sqrt(np.mean(data.qd**2)))
-    plant = replace(machine.plant, velocity_scale=np.asarray(speed))
+    plant = machine.plant.smoothed(velocity_scale=np.asarray(speed))
     return machine.with_plant(plant, machine.parameters)

@@ -28,8 +28,9 @@ from jaxid.case.values import Value, read_value, read_values
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.model.effect import Effect
+from jaxid.model.interface import PLACES
 from jaxid.model.parameter import ParameterInfo, parameters_of
-from jaxid.model.plant import PLACES, Plant
+from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.plants import PLANTS
 

@@ -94,8 +94,7 @@ class FeedForward(Controller):
 
     def fed(self, model: Plant, tick: Tick) -> tuple[Array, Array]:
         """What a model asks for along the reference, without friction and for it, in units of the command."""
-        width = (jnp.ones(()), jnp.asarray(self.epsilon))
-        model = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), model, width)
+        model = model.smoothed(jnp.ones(()), jnp.asarray(self.epsilon))
         path = (tick.path.reference, tick.path.slope, tick.path.curvature)
         motion = (tick.at_joints(x) for x in path)
         forces = inverse_dynamics(model, *motion, len(tick.driven))

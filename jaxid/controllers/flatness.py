@@ -13,7 +13,8 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.controllers.base import Controller, Path, Tick
 from jaxid.dynamics.rhs import State, acceleration
-from jaxid.model.plant import Plant, port_motion
+from jaxid.model.balance import port_motion
+from jaxid.model.plant import Plant
 from jaxid.numerics.smooth import sharp_clip
 
 

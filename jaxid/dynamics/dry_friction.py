@@ -22,7 +22,8 @@ from jaxid.dynamics.rhs import (
     spread,
     step,
 )
-from jaxid.model.plant import Balance, Plant, port_motion
+from jaxid.model.balance import Balance, port_motion
+from jaxid.model.plant import Plant
 from jaxid.numerics.affine import depends
 from jaxid.numerics.smooth import ramp
 
@@ -186,7 +187,7 @@ def _sliding(
     if levels.rises:
         need_apart(plant, mass, ports)
         own = own * picked(_yielding(plant, x, u, t, h), ports)
-    return _Sliding(ports, before, speed, None if alone else mobility, own, plant.sharpness)
+    return _Sliding(ports, before, speed, None if alone else mobility, own, plant.smoothing.sharpness)
 
 
 def _yielding(plant: Plant, x: State, u: Array, t: Array, h: Array) -> Array:

@@ -19,7 +19,8 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, picked, small_solve, spread
-from jaxid.model.plant import Balance, Plant
+from jaxid.model.balance import Balance
+from jaxid.model.plant import Plant
 
 Motion = tuple[Array, Array, Array]
 
@@ -42,8 +43,7 @@ class HiddenJoints(Plant):
     seen: tuple[int, ...] = eqx.field(static=True)
     hidden: tuple[int, ...] = eqx.field(static=True)
     effects: ClassVar[property] = property(lambda self: self.plant.effects)
-    sharpness: ClassVar[property] = property(lambda self: self.plant.sharpness)
-    velocity_scale: ClassVar[property] = property(lambda self: self.plant.velocity_scale)
+    smoothing: ClassVar[property] = property(lambda self: self.plant.smoothing)
     diagonal: ClassVar[property] = property(lambda self: self.plant.diagonal)
 
     def balance(

@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.errors import InputError
-from jaxid.model.plant import Balance, Plant
+from jaxid.model.balance import Balance
+from jaxid.model.plant import Plant
 from jaxid.numerics.affine import Affine, affine
 from jaxid.numerics.smooth import ramp, sign
 
@@ -88,7 +89,8 @@ def acceleration(
     forth, back = (spread(picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
     left = -rest.residual
     forth, back = 0.5 * (1 + way) * forth, 0.5 * (1 - way) * back
-    more = ramp(left, forth, plant.sharpness * forth) - ramp(-left, back, plant.sharpness * back)
+    corner = plant.smoothing.sharpness
+    more = ramp(left, forth, corner * forth) - ramp(-left, back, corner * back)
     return (left - more) / each
 
 

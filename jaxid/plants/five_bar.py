@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,8 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.model.effect import Effect
-from jaxid.model.parameter import as_array, parameter
-from jaxid.model.plant import Plant
+from jaxid.model.links import WithLinks
+from jaxid.model.parameter import parameter
 
 # Sine of the angle between the distal links below which they count as one line. Chosen: the tool then moves a
 # hundred times as fast as the elbows, and what it weighs at the joints has grown ten thousandfold.
@@ -42,7 +41,7 @@ class Pose(NamedTuple):
     distal: Array
 
 
-class FiveBar(Plant):
+class FiveBar(WithLinks):
     """iota tau = M(q) qdd + C(q, qd) qd - effects, M = D' M* D, of two arms that hold one tool.
 
     q1 and q2 are the angles of the proximal links from the x axis, which runs from fixed joint 1 through
@@ -69,9 +68,6 @@ class FiveBar(Plant):
         tip_mass: At the tool [kg].
         reduction: iota, turns of each motor for one of its joint, (2,), or None for ones. The torque of a
             log is the motor's, its position the joint's: `gearing` turns one into the other.
-        effects: Forces beside these, in the order of the drive.
-        sharpness: Width of the smoothed sign over `velocity_scale`, dimensionless.
-        velocity_scale: A typical velocity [rad/s].
 
     Source:
         Righettini et al. (2025), Robotics 14(4), 36, (24)-(46). As printed, (16)-(18) want D_m^-T; (30), (31)
@@ -102,9 +98,6 @@ class FiveBar(Plant):
     reduction: Array | None = parameter(
         "1", "positive", "turns of each motor for one of its joint", optional=True, more=0, known=True
     )
-    effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
-    sharpness: Array = eqx.field(converter=as_array, default=1e-3, kw_only=True)
-    velocity_scale: Array = eqx.field(converter=as_array, default=1.0, kw_only=True)
 
     def pose(self, q: Float[Array, " 2"]) -> Pose:
         """The closure: two circles about the elbows meet in the tool; not a number where they do not."""

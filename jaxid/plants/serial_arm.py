@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.model.effect import Effect
+from jaxid.model.links import WithLinks
 from jaxid.model.parameter import as_array, parameter
-from jaxid.model.plant import Plant
 from jaxid.plants.geometry import Geometry
 
 _FIRST = ("inertia*position", "free")
@@ -21,7 +21,7 @@ _SECOND = ("inertia", "free")
 _Z = np.array([0.0, 0.0, 1.0])
 
 
-class SerialArm(Plant):
+class SerialArm(WithLinks):
     """tau = M(q) qdd + h(q, qd), of links by ten inertial parameters each.
 
     What stands in `inertial` is linear in the parameters: mass, first moments and inertia of a link
@@ -39,9 +39,6 @@ class SerialArm(Plant):
         geometry: Frames of the links; the first one's predecessor is the base.
         shafts: By how much each turns with every joint, a row of n ratios a shaft.
         gravity_vector: Acceleration of gravity in the base's frame, (3,) [m/s^2].
-        effects: Forces beside these, in the order of the drive.
-        sharpness: Width of the smoothed sign over `velocity_scale`, dimensionless.
-        velocity_scale: A typical velocity [rad/s or m/s].
 
     Source:
         Luh, Walker & Paul (1980) for the recursion; Khalil & Kleinfinger (1987) for its form about the
@@ -71,9 +68,6 @@ class SerialArm(Plant):
     geometry: Geometry = eqx.field(kw_only=True)
     shafts: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
     gravity_vector: Array = eqx.field(converter=as_array, default=(0.0, 0.0, -9.81), kw_only=True)
-    effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
-    sharpness: Array = eqx.field(converter=as_array, default=1e-3, kw_only=True)
-    velocity_scale: Array = eqx.field(converter=as_array, default=1.0, kw_only=True)
 
     @property
     def joints(self) -> int:
@@ -99,6 +93,10 @@ class SerialArm(Plant):
 
     def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         return ("rotor_inertia", port) if effect.kind == "added_mass" and port < self.joints else None
+
+    @property
+    def base_gravity(self) -> Array:
+        return jnp.asarray(self.gravity_vector)
 
     @classmethod
     def links(cls, joints: int) -> int:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.model.plant import PLACES
+from jaxid.model.interface import PLACES
 from jaxid.model.units import Units
 
 if TYPE_CHECKING:

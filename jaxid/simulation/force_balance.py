@@ -107,11 +107,7 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
     The width is a third of the rest velocity: samples nearer to zero are left out, so that the
     smoothing biases nothing.
     """
-    return eqx.tree_at(
-        lambda p: (p.sharpness, p.velocity_scale),
-        plant,
-        (np.asarray(1 / 3), np.asarray(min(data.recipe.rest_velocity))),
-    )
+    return plant.smoothed(np.asarray(1 / 3), np.asarray(min(data.recipe.rest_velocity)))
 
 
 def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:

@@ -156,8 +156,7 @@ class Online(eqx.Module):
         # A joint that never moves has no velocity of its own.
         fast = np.where(fast > 0, fast, np.max(fast))
         rest_velocity = np.maximum(rest_velocity, _LEAST * fast)
-        sharp = (np.asarray(1 / 3), np.asarray(np.min(rest_velocity)))
-        plant = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), machine.plant, sharp)
+        plant = machine.plant.smoothed(np.asarray(1 / 3), np.asarray(np.min(rest_velocity)))
         enters = _enters(plant, machine.parameters, len(fast), machine.gain.size)
         numbers = colours(enters)
         owner = np.full((len(fast), max(numbers, default=-1) + 1), len(numbers))

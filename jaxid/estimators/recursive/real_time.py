@@ -104,8 +104,7 @@ class RealTime(eqx.Module):
         velocity, acceleration = (
             np.broadcast_to(np.asarray(x, float), (n,)) for x in (gate_velocity, gate_acceleration)
         )
-        sharp = (np.asarray(1 / 3), np.asarray(np.min(velocity)))
-        plant = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), machine.plant, sharp)
+        plant = machine.plant.smoothed(np.asarray(1 / 3), np.asarray(np.min(velocity)))
         random, guess = np.random.default_rng(0), machine.parameters.guess
         motion, u = plant.any_motion(random), random.uniform(0.5, 1.5, machine.gain.size)
         here, there = (np.asarray(slopes(plant, places, x, motion, u)) for x in (guess, elsewhere(guess)))
