@@ -21,6 +21,7 @@ from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, picked, small_solve, spread
 from jaxid.model.balance import Balance
 from jaxid.model.plant import Plant
+from jaxid.model.smoothing import Smoothing
 
 Motion = tuple[Array, Array, Array]
 
@@ -43,7 +44,7 @@ class HiddenJoints(Plant):
     seen: tuple[int, ...] = eqx.field(static=True)
     hidden: tuple[int, ...] = eqx.field(static=True)
     effects: ClassVar[property] = property(lambda self: self.plant.effects)
-    smoothing: ClassVar[property] = property(lambda self: self.plant.smoothing)
+    smoothing: ClassVar[property] = property(lambda self: _of_joints(self.plant.smoothing, self.hidden))
     diagonal: ClassVar[property] = property(lambda self: self.plant.diagonal)
 
     def balance(
@@ -69,6 +70,12 @@ class HiddenJoints(Plant):
             tuple(k for k, i in enumerate(self.hidden) if i in ports) for ports in (whole.slides, whole.rises)
         )
         return Balance(*rows, rising, whole.rates, whole.drive, slides, rises)
+
+
+def _of_joints(smoothing: Smoothing, joints: tuple[int, ...]) -> Smoothing:
+    """Return the smoothing at some joints, if each has a width of its own."""
+    scale = smoothing.velocity_scale
+    return smoothing if scale.ndim == 0 else Smoothing(smoothing.sharpness, scale[np.asarray(joints)])
 
 
 def complete_motion(

@@ -19,5 +19,8 @@ class WithGears(Plant):
         """Return the velocity of each port per velocity of the first joint."""
         raise NotImplementedError
 
+    def velocity_groups(self) -> list[tuple[int, ...]]:
+        return [tuple(range(self.joints))]
+
     def port_width(self, q: Float[Array, " n"]) -> Float[Array, " ports"]:
         return self.smoothing.width * self.port_ratios(q)

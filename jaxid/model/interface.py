@@ -33,6 +33,8 @@ class PlantInterface(SearchHints):
     load: ClassVar[int | None] = None
     # Classes by the coupling that a case may state; empty if there is no choice.
     couplings: ClassVar[Mapping[str, type[PlantInterface]]] = {}
+    # "linear" or "rotary" for each port of a machine that has both kinds; empty: as the case states.
+    motions: ClassVar[tuple[str, ...]] = ()
     # "linear" or "rotary" if a case does not state `motion`; None: linear.
     usual_motion: ClassVar[str | None] = None
     # Whether a case describes the plant link by link, which then takes a `geometry`.
@@ -47,7 +49,12 @@ class PlantInterface(SearchHints):
 
     def motion(self, port: int) -> str | None:
         """Return "linear" or "rotary" for a port of a machine that has both; None: as the case states."""
-        return None
+        return self.motions[port] if port < len(self.motions) else None
+
+    def velocity_groups(self) -> list[tuple[int, ...]]:
+        """Return the joints that share a typical velocity: those of one kind of motion."""
+        motions = [self.motion(k) for k in range(self.joints)]
+        return [tuple(k for k, m in enumerate(motions) if m == kind) for kind in dict.fromkeys(motions)]
 
     def place(self, port: int) -> tuple[str, int]:
         """Return the name of a port: one of `PLACES`, and its number from 1."""

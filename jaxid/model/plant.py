@@ -12,6 +12,7 @@ from typing import Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
@@ -60,7 +61,12 @@ class Plant(PlantInterface):
 
     def port_width(self, q: Float[Array, " n"]) -> Float[Array, " ports"]:
         """Return the velocity of each port over which the sign is smoothed."""
-        return jnp.broadcast_to(self.smoothing.width, self.ports(q).shape)
+        width, ports = self.smoothing.width, self.ports(q).shape
+        if width.ndim == 0 or self.ports_are_joints:
+            return jnp.broadcast_to(width, ports)
+        # One width a joint: any other port takes that of the first joint that it loads.
+        joints = [self.joints_loaded_by(k, q.size)[0] for k in range(q.size, ports[0])]
+        return jnp.concatenate([width, width[np.asarray(joints)]])
 
     def command_delays(self, drives: int) -> Float[Array, " m"]:
         """Return the total delay of the command of each drive [s]."""

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import equinox as eqx
+import numpy as np
+from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.model.parameter import as_array
+
+if TYPE_CHECKING:
+    from jaxid.model.plant import Plant
 
 
 class Smoothing(eqx.Module):
@@ -25,3 +33,28 @@ class Smoothing(eqx.Module):
     def width(self) -> Array:
         """Velocity over which the sign is smoothed [m/s or rad/s]."""
         return self.sharpness * self.velocity_scale
+
+
+def typical_velocity(
+    plant: Plant, speeds: Float[np.ndarray, "rows n"], combine: Callable[[np.ndarray], float]
+) -> np.ndarray:
+    """Return a typical velocity of all joints, or one for each if they do not move alike.
+
+    A root mean square over metres and radians together would have no meaning.
+
+    Args:
+        plant: The plant, which groups its joints by `velocity_groups`.
+        speeds: Velocities by joint [m/s or rad/s].
+        combine: The statistic of a group, such as the root mean square or the largest.
+
+    Returns:
+        A scalar for one group of joints, else (n,). A group at rest takes the value of all joints together.
+    """
+    whole, groups = combine(speeds), plant.velocity_groups()
+    if len(groups) == 1:
+        return np.asarray(whole)
+    out = np.full(plant.joints, whole, dtype=np.float64)
+    for joints in groups:
+        of_group = combine(speeds[:, list(joints)])
+        out[list(joints)] = of_group if of_group > 0 else whole
+    return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 _LABELS = {
@@ -46,6 +47,11 @@ class Units:
         if not below:
             return over
         return f"{over}/({below})" if " " in below else f"{over}/{below}"
+
+
+def joined(unit: str | Sequence[str]) -> str:
+    """Return one label as it is, and labels by joint as text."""
+    return unit if isinstance(unit, str) else ", ".join(unit)
 
 
 def _power(word: str, labels: dict[str, str]) -> str:

@@ -12,7 +12,6 @@ from jaxid.model.parameter import parameter
 from jaxid.model.springs import WithSprings
 
 _INERTIAS = ("motor_inertia", "table_mass")
-_MOTIONS = ("rotary", "linear", "linear")
 _SCREW = ("inertia", "positive", "of the screw")
 
 
@@ -32,7 +31,8 @@ class Stage(WithGears):
     kind = "micropositioning_stage"
     diagonal = True
     stage = True
-    usual_motion = _MOTIONS[0]
+    motions = ("rotary", "linear", "linear")
+    usual_motion = "rotary"
 
     motor_inertia: Array = parameter("inertia", "positive", "of the motor", motion="rotary")
     table_mass: Array = parameter("inertia", "positive", "of the table", motion="linear")
@@ -43,9 +43,6 @@ class Stage(WithGears):
     def ratio(self) -> Array:
         """R: way of the table for an angle of the motor [m/rad]."""
         return self.pitch / (2 * np.pi)
-
-    def motion(self, port: int) -> str:
-        return _MOTIONS[port]
 
     def port_ratios(self, q: Array) -> Array:
         along = jnp.broadcast_to(self.ratio, (self.ports(q).size - 1,))
