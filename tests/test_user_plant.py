@@ -10,6 +10,7 @@ from cli_setup import run
 
 from jaxid.build import build_machine
 from jaxid.case.case import load_case
+from jaxid.errors import InputError
 from jaxid.plants import PLANTS
 
 PLANT = """
@@ -171,3 +172,37 @@ def test_own_plant_with_springs(tmp_path):
     assert plant.effects[-1].port == 2
     assert plant.place(2) == ("spring", 1)
     np.testing.assert_allclose(plant.ports(jnp.asarray([1.0, 1.5])), [1.0, 1.5, 0.5])
+
+
+CART = """
+from jaxid.model.parameter import parameter
+from jaxid.model.plant import Plant
+import jax.numpy as jnp
+
+class Cart(Plant):
+    joints = 2
+    actuated = (0,)
+    mass: object = parameter("inertia", "positive", "of both")
+
+    def inertial(self, q, qd, qdd):
+        return self.mass * (jnp.asarray([2.0, 1.0]) * qdd + 0.5 * qdd[::-1])
+"""
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [
+        ('"flatness"\npoles = [-5.0, -6.0]\nepsilon = 0.01', "whose joints accelerate each other"),
+        ('"computed_torque"\nkp = 1.0\nkd = 1.0', "since no reference states the motion of the others"),
+    ],
+)
+def test_advice_on_controllers_holds_for_a_joint_without_a_drive(tmp_path, law, words):
+    write(tmp_path, CART, "cart.py")
+    plant = '[plant]\nkind = "cart.py:Cart"\n[plant.parameters]\nmass = { guess = 3.0 }\n'
+    path = write(tmp_path, f"{plant}[controller]\nkind = {law}\nperiod = 0.001\n")
+    with pytest.raises(InputError, match="needs a drive at every joint") as caught:
+        build_machine(load_case(path))
+    told = str(caught.value)
+    assert words in told
+    assert "take a law without a model: cascade_pd, pd, pid" in told
+    assert "flatness" not in told.split("take")[1]

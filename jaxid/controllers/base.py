@@ -91,6 +91,8 @@ class Controller(eqx.Module):
     of_machine: ClassVar[tuple[str, ...]] = ()
     # Whether it needs a drive at every joint.
     every_drive: ClassVar[bool] = False
+    # Whether joints without a drive are allowed only if their accelerations enter no other joint's balance.
+    separate_drives: ClassVar[bool] = False
 
     def path(self, reference: Float[Array, "ticks m"]) -> Path:
         """The reference as the law needs it, at every tick; differences are central."""

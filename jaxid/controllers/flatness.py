@@ -72,6 +72,7 @@ class Flatness(Controller):
 
     anticipates: ClassVar[bool] = True
     of_machine: ClassVar[tuple[str, ...]] = ("model", "gain")
+    separate_drives: ClassVar[bool] = True
 
     poles: tuple[float, ...] = eqx.field(static=True, converter=tuple)
     epsilon: Array

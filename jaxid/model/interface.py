@@ -27,8 +27,6 @@ class PlantInterface(SearchHints):
     kind: ClassVar[str]
     # Whether the mass matrix is diagonal: no linear system is solved then.
     diagonal: ClassVar[bool] = False
-    # Whether the mass matrix varies and couples the joints strongly, as that of an arm.
-    coupled: ClassVar[bool] = False
     # Joint behind an elastic coupling, which may have no encoder; None: there is none.
     load: ClassVar[int | None] = None
     # Classes by the coupling that a case may state; empty if there is no choice.

@@ -15,8 +15,20 @@ class SearchHints(Drives):
     parameter that an effect would duplicate.
     """
 
+    # Whether the mass matrix varies with the position, and joints accelerate each other through it.
+    coupled: ClassVar[bool] = False
     # Whether the plant is a positioning stage (see `Effect.of_stages`).
     stage: ClassVar[bool] = False
+
+    @property
+    def starts_alone(self) -> bool:
+        """Whether starts from rest show break-away friction: no joint is pushed by more than its drive."""
+        return not self.coupled
+
+    @property
+    def designs_experiments(self) -> bool:
+        """Whether `discover` designs experiments unasked; for coupled joints that compiles for minutes."""
+        return not self.coupled
 
     @classmethod
     def bodies(cls, joints: int) -> int:

@@ -286,7 +286,7 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
     for score in left[:most]:
         name, nats = score.candidate.label, score.evidence
         lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
-    if session.machine.plant.coupled and not result.proposals:
+    if not session.machine.plant.designs_experiments and not result.proposals:
         tied = [e.label for e in result.effects if e.alternatives]
         told = f"no experiment was designed that tells {', '.join(tied)} from rivals"
         lines += [f"{told}: --experiments does, in minutes"] if tied else []
