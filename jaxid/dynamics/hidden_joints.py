@@ -1,8 +1,8 @@
-"""Motion of joints that have no encoder, that of the others being known.
+"""Motion of joints without an encoder, driven by the measured motion of the others.
 
-Their own rows of the balance are an ordinary differential equation that the measured motion drives.
-With linear forces this is the elimination by which minimal models arise; friction that they regroup
-stays where it is.
+Their rows of the balance are an ordinary differential equation with the measured motion as input.
+With linear forces this is the elimination that leads to minimal models; friction that those regroup
+stays at its joint here.
 """
 
 from __future__ import annotations
@@ -25,23 +25,24 @@ from jaxid.model.smoothing import Smoothing
 
 Motion = tuple[Array, Array, Array]
 
-# Steps of Newton to where joints without an encoder stand.
+# Newton steps to the rest position of joints without an encoder.
 _RELAXING = 4
 
 
 class HiddenJoints(Plant):
-    """The joints without an encoder as a plant of their own, which the others' motion drives.
+    """The joints without an encoder as a separate plant that the motion of the others drives.
 
-    Its force is the declared one and, behind that, position, velocity and acceleration of the others.
-    Its ports are its joints: of dry friction only theirs is set-valued.
+    Its input is the declared force and, behind that, position, velocity and acceleration of the others.
+    Its ports are its joints: only their dry friction is set-valued.
 
     Args:
         plant: The whole plant.
-        seen, hidden: Its joints with an encoder, and without.
+        measured: Its joints with an encoder.
+        hidden: Its joints without one.
     """
 
     plant: Plant
-    seen: tuple[int, ...] = eqx.field(static=True)
+    measured: tuple[int, ...] = eqx.field(static=True)
     hidden: tuple[int, ...] = eqx.field(static=True)
     effects: ClassVar[property] = property(lambda self: self.plant.effects)
     smoothing: ClassVar[property] = property(lambda self: _of_joints(self.plant.smoothing, self.hidden))
@@ -57,10 +58,10 @@ class HiddenJoints(Plant):
         states: tuple,
         reaction: Array | None = None,
     ) -> Balance:
-        n = len(self.seen) + q.size
-        declared, known = jnp.split(u, [u.size - 3 * len(self.seen)])
+        n = len(self.measured) + q.size
+        declared, known = jnp.split(u, [u.size - 3 * len(self.measured)])
         pairs = zip(known.reshape(3, -1), (q, qd, qdd), strict=True)
-        motion = (spread(a, self.seen, n) + spread(b, self.hidden, n) for a, b in pairs)
+        motion = (spread(a, self.measured, n) + spread(b, self.hidden, n) for a, b in pairs)
         if reaction is not None:
             reaction = spread(reaction, self.hidden, self.plant.ports(jnp.zeros(n)).size)
         whole = self.plant.balance(*motion, declared, t, states, reaction)
@@ -92,21 +93,21 @@ def complete_motion(
 
     Args:
         plant: The plant; dry friction of those joints sticks exactly.
-        q, qd, qdd: Motion, (time, n); what stands there for joints without an encoder is not used.
+        q, qd, qdd: Motion, (time, n); columns of joints without an encoder are not used.
         u: Declared force at the samples, delay applied, (time, m).
-        times: Of the samples [s].
-        measured: Which joints have an encoder.
-        steps: Integration steps a sample.
+        times: Times of the samples [s].
+        measured: Flags of the joints with an encoder.
+        steps: Integration steps per sample.
 
     Returns:
-        The whole motion, (time, n). It starts where the joints would follow the others rigidly, in
-        balance; what was otherwise dies out.
+        The whole motion, (time, n). It starts in balance, with the joints following the others rigidly;
+        any other start dies out.
     """
     if all(measured):
         return q, qd, qdd
-    seen, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
-    carried = HiddenJoints(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
-    known = tuple(a[:, seen] for a in (q, qd, qdd))
+    visible, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
+    carried = HiddenJoints(plant, tuple(visible.tolist()), tuple(hidden.tolist()))
+    known = tuple(a[:, visible] for a in (q, qd, qdd))
     period = times[1] - times[0]
     h = period / steps
     # Force of the carried plant at the start, in the middle and at the end of every step.
@@ -135,58 +136,58 @@ def complete_motion(
     last = slice(steps - 1, None, steps)
     x, reaction = jax.tree.map(lambda a: a[last], later)
     solved = jax.vmap(lambda *now: acceleration(carried, *now))
-    found = (x.q, x.qd, solved(x, force[last, 2], times[1:], reaction))
-    own = [jnp.concatenate([a[None], b]) for a, b in zip((relaxed, *together[1:]), found, strict=True)]
-    return tuple(a.at[:, hidden].set(b) for a, b in zip((q, qd, qdd), own, strict=True))
+    motion = (x.q, x.qd, solved(x, force[last, 2], times[1:], reaction))
+    filled = [jnp.concatenate([a[None], b]) for a, b in zip((relaxed, *together[1:]), motion, strict=True)]
+    return tuple(a.at[:, hidden].set(b) for a, b in zip((q, qd, qdd), filled, strict=True))
 
 
 def resting(
     plant: Plant, q: Float[np.ndarray, " n"], drives: int, measured: tuple[bool, ...]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n k"]]:
-    """Where joints without an encoder stand while all is at rest, and how they go along with the others.
+    """Compute the rest position of joints without an encoder, and how they follow the others.
 
     Args:
-        plant: The plant.
-        q: Positions; what stands there for joints without an encoder is not used.
-        drives: How many forces the plant is driven by.
-        measured: Which joints have an encoder, k of them.
+        plant: The plant with its effects.
+        q: Positions; entries of joints without an encoder are not used.
+        drives: Number of drives of the plant.
+        measured: Flags of the joints with an encoder, k of them.
 
     Returns:
         Positions of all joints, and their derivative in those of the joints with an encoder. Joints that
-        nothing holds stand where the others do on average.
+        nothing holds take the mean position of the others.
     """
     if all(measured):
         return q, np.eye(q.size)
-    seen, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
-    carried = HiddenJoints(plant, tuple(seen.tolist()), tuple(hidden.tolist()))
-    return tuple(np.asarray(a) for a in _resting(carried, q[seen], drives))
+    visible, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
+    carried = HiddenJoints(plant, tuple(visible.tolist()), tuple(hidden.tolist()))
+    return tuple(np.asarray(a) for a in _resting(carried, q[visible], drives))
 
 
 @eqx.filter_jit
 def _resting(carried: HiddenJoints, known: Array, drives: int) -> tuple[Array, Array]:
-    n, u = len(carried.seen) + len(carried.hidden), jnp.zeros(drives)
+    n, u = len(carried.measured) + len(carried.hidden), jnp.zeros(drives)
     still, memory = jnp.zeros(len(carried.hidden)), carried.plant.initial_states(u)
 
     def whole(known: Array) -> Array:
         force = jnp.concatenate([u, known, jnp.zeros(2 * known.size)])
         pull = lambda q: carried.balance(q, still, still, force, jnp.zeros(()), memory, still).residual
-        own = _relaxed(pull, jnp.broadcast_to(jnp.mean(known), still.shape))
-        return spread(known, carried.seen, n) + spread(own, carried.hidden, n)
+        rest = _relaxed(pull, jnp.broadcast_to(jnp.mean(known), still.shape))
+        return spread(known, carried.measured, n) + spread(rest, carried.hidden, n)
 
     return whole(known), jax.jacfwd(whole)(known)
 
 
 def _relaxed(pull: Callable[[Array], Array], together: Array) -> Array:
-    """Where nothing pulls; where the others are if there is no such place, as within a clearance."""
+    """Find the position without forces; return that of the others if there is none, as within a clearance."""
     q = together
-    # One step for linear forces; a ripple along a stiff spring takes more, and slopes one more than places.
+    # Linear forces take one step; a ripple along a stiff spring more, and slopes one more than positions.
     for _ in range(_RELAXING):
         q = q - small_solve(jax.jacfwd(pull)(q), pull(q))
     return jnp.where(jnp.all(jnp.abs(pull(q)) <= jnp.abs(pull(together))), q, together)
 
 
 def _between(known: Motion, s: Array, period: Array) -> Motion:
-    """Motion at a fraction of every sample: cubics with the velocities, and accelerations, of its ends."""
+    """Interpolate the motion at a fraction of every sample: cubics with the derivatives at its ends."""
     (q0, v0, a0), (q1, v1, a1) = ([a[k : len(a) - 1 + k] for a in known] for k in range(2))
 
     def hermite(x0: Array, x1: Array, d0: Array, d1: Array) -> Array:

@@ -13,7 +13,7 @@ from jaxid.model.parameter import ParameterInfo, parameters_of
 
 
 class Signals(eqx.Module):
-    """All that an effect may look at, in the coordinate of its port.
+    """The signals that an effect may use, in the coordinate of its port.
 
     Args:
         y: Coordinate [m or rad].

@@ -1,4 +1,4 @@
-"""One axis, linear or rotary: a single inertia with forces beside it."""
+"""A single axis, linear or rotary: one inertia with forces beside it."""
 
 from __future__ import annotations
 

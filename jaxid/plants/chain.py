@@ -11,7 +11,7 @@ from jaxid.model.parameter import parameter
 from jaxid.model.springs import WithSprings
 from jaxid.model.weight import WithWeight
 
-# Effects that are a parameter of the plant by another name: on joints, and on springs.
+# Parameters of the plant that effects duplicate: on joints, and on springs.
 _OF_JOINTS = {"added_mass": "mass", "viscous_friction": "damping"}
 _OF_SPRINGS = {"linear_stiffness": "stiffness"}
 

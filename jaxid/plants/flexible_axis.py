@@ -21,15 +21,15 @@ class FlexibleAxis(WithSprings, WithWeight):
 
     Joint 1 is the motor, joint 2 the load, both in the coordinate of the load; the drive acts on the
     motor. Ports are the two joints and then the coupling, by its elongation e. g acts along a
-    vertical axis only, and on the load: what turns does not weigh.
+    vertical axis only, and on the load only.
 
     Args:
         motor_inertia: J_1 [kg or kg m^2].
         load_inertia: J_2 [kg or kg m^2].
         stiffness: k, of the coupling [N/m or N m/rad].
         damping: d, of the coupling [N s/m or N m s/rad].
-        zero_offset: q_0, reading of the load minus that of the motor where the coupling is relaxed, or
-            None for zero [m or rad].
+        zero_offset: q_0, reading of the load minus that of the motor at a relaxed coupling, or None for
+            zero [m or rad].
 
     Source:
         Janot, Gautier, Jubien and Vandanjon, "Experimental joint stiffness identification depending
@@ -47,7 +47,7 @@ class FlexibleAxis(WithSprings, WithWeight):
     stiffness: Array = parameter("force/position", "positive", "of the coupling")
     damping: Array = parameter("force*time/position", "nonnegative", "of the coupling")
     zero_offset: Array | None = parameter(
-        "position", "free", "load's reading minus motor's where the coupling is relaxed", optional=True
+        "position", "free", "load's reading minus motor's at a relaxed coupling", optional=True
     )
 
     def own_inertia(self) -> Array:

@@ -16,16 +16,16 @@ _SCREW = ("inertia", "positive", "of the screw")
 
 
 class Stage(WithGears):
-    """What the stage has with either screw: a motor that turns it, and a table that it moves.
+    """The common part of both stages: a motor that turns a screw, and a table that it moves.
 
     Joint 1 is the motor with its screw, by its angle th [rad]; joint 2 the table, by its position x [m];
     the drive is a torque on the motor. R = pitch / 2 pi.
 
     Args:
-        motor_inertia: J, of the motor, and of the screw where that is not stated apart [kg m^2].
-        table_mass: M [kg].
-        pitch: Way of the table for a turn of the motor [m].
-        screw_inertia: Of the screw, a part of J, or None [kg m^2].
+        motor_inertia: Inertia J of the motor, and of the screw if that is not stated apart [kg m^2].
+        table_mass: Mass M of the table [kg].
+        pitch: Travel of the table for one turn of the motor [m].
+        screw_inertia: Inertia of the screw, a part of J, or None [kg m^2].
     """
 
     kind = "micropositioning_stage"
@@ -41,7 +41,7 @@ class Stage(WithGears):
 
     @property
     def ratio(self) -> Array:
-        """R: way of the table for an angle of the motor [m/rad]."""
+        """R, the travel of the table per angle of the motor [m/rad]."""
         return self.pitch / (2 * np.pi)
 
     def port_ratios(self, q: Array) -> Array:
@@ -58,8 +58,8 @@ class MicropositioningStage(Stage, WithSprings):
     The port behind motor and table is the elongation x - R th of the screw.
 
     Args:
-        stiffness: k, axial, of screw, nut and bearing [N/m].
-        damping: d, beside it, or None for none [N s/m].
+        stiffness: Axial stiffness k of screw, nut and bearing [N/m].
+        damping: Damping d in parallel with it, or None for none [N s/m].
 
     Source:
         Bogdan and Abba, "Identification of mechanical parameters at low velocities for a micropositioning
@@ -101,9 +101,8 @@ class MicropositioningStage(Stage, WithSprings):
 class RigidMicropositioningStage(Stage):
     """(J + R^2 M) th'' = u + R (effects on the table) + effects; x = R th.
 
-    `MicropositioningStage` with a screw that does not give: what a log sees that is sampled far below its
-    1 kHz. Effects act on the motor or the table, as there; of what they do, and of J and M, such a log
-    tells sums only.
+    `MicropositioningStage` with a rigid screw, for logs that are sampled far below its 1 kHz. Effects act on
+    the motor or the table, as there; such a log identifies only sums of their forces, and of J and R^2 M.
 
     Source:
         Bogdan and Abba, as there, with (3) replaced by x_t = R theta_m.
@@ -129,7 +128,8 @@ class RigidMicropositioningStage(Stage):
         return jnp.stack([q[0], self.ratio * q[0]])
 
     def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
-        # Of what one coordinate cannot tell apart: the table's, but for what sits in the drive or at rest.
+        # One coordinate does not separate motor and table: effects are named at the table, except those
+        # of the drive and at rest.
         at_motor = effect.in_drive or effect.kind == "static_friction"
         return super().accepts(effect, port, drives) and port == (0 if at_motor else 1)
 
@@ -139,5 +139,5 @@ def _turning(stage: MicropositioningStage | RigidMicropositioningStage) -> Array
     return stage.motor_inertia + (0.0 if stage.screw_inertia is None else stage.screw_inertia)
 
 
-# By the coupling that a case states.
+# Classes by the coupling that a case states.
 Stage.couplings = {"elastic": MicropositioningStage, "rigid": RigidMicropositioningStage}
