@@ -64,7 +64,7 @@ def class_of_file(
         missing = "is not there" if cls is None else f"is not a subclass of {base.__module__}.{base.__name__}"
         raise spot.refuse(kind, f": {name} {missing}", suggest(name, known))
     if not hasattr(cls, "kind"):
-        cls.kind = kind
+        setattr(cls, "kind", kind)  # noqa: B010  # the base of a user's class declares it, `type[T]` does not
     return cls, module
 
 
@@ -115,7 +115,7 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
     assert spec is not None, "the path ends in .py"
     assert spec.loader is not None, "the path is a file's"
     module = importlib.util.module_from_spec(spec)
-    registries = [(registry, dict(registry)) for registry in (EFFECTS, PLANTS)]
+    effects, plants = dict(EFFECTS), dict(PLANTS)
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
@@ -126,8 +126,9 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
         ) from error
     finally:
         # What it registers is its case's, not every case's.
-        for registry, before in registries:
-            registry.clear()
-            registry.update(before)
+        EFFECTS.clear()
+        EFFECTS.update(effects)
+        PLANTS.clear()
+        PLANTS.update(plants)
     _LOADED[path] = (changed, module)
     return module

@@ -99,7 +99,8 @@ class Adaptive(FeedForward):
         return self.reach or self.velocity_average
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Learning:
-        path = jax.tree.map(lambda x: jnp.asarray(x)[None], tick.path) if path is None else path
+        path = path or jax.tree.map(lambda x: jnp.asarray(x)[None], tick.path)
+        assert path is not None, "a tick has a path"
         square, force = _along(self, path, tick.driven)
         back = self.period * jnp.arange(1, 2 * self.stride + 1)[:, None]
         start = jnp.asarray(self.estimator.recursion.start)
@@ -208,7 +209,7 @@ def _along(law: Adaptive, path: Path, driven: tuple[int, ...]) -> tuple[Float[Ar
     def one(now: Path) -> tuple:
         tick = Tick(jnp.zeros(len(driven)), now, driven)
         u = law.fed(law.model, tick)[0]
-        motion = (tick.at_joints(x) for x in (now.reference, now.slope, now.curvature))
+        motion = (tick.at_joints(x) for x in (now.reference, *now.derivatives))
         return *law.estimator.rows(*motion, u)[::2], tick.at_joints(law.gain * u)
 
     return law.estimator.sizes(*jax.vmap(one)(path))

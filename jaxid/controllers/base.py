@@ -24,6 +24,13 @@ class Path(eqx.Module):
     slope: Array | None = None
     curvature: Array | None = None
 
+    @property
+    def derivatives(self) -> tuple[Array, Array]:
+        """Slope and curvature, for a controller that anticipates."""
+        assert self.slope is not None, "the path of a controller that anticipates"
+        assert self.curvature is not None, "the path of a controller that anticipates"
+        return self.slope, self.curvature
+
 
 class Tick(eqx.Module):
     """The inputs of a controller at one tick.

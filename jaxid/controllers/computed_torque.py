@@ -37,7 +37,7 @@ def drive_gains(plant: Plant, drives: int) -> Float[Array, " m"]:
     for e in plant.effects:
         j = plant.drive_of(e.port, drives)
         if e.kind == "actuator_gain" and j is not None:
-            out[j] = out[j] * e.gain
+            out[j] = out[j] * e.gain  # pyright: ignore[reportAttributeAccessIssue]  # a field of that kind
     return jnp.stack(out)
 
 
@@ -78,14 +78,14 @@ class FeedForward(Controller):
     def start_feedback(self, tick: Tick) -> tuple[Array, Array]:
         """Return past references, and the last parts of the PD law."""
         back = self.period * jnp.arange(1, self.velocity_average + 1)[:, None]
-        return tick.reference - back * tick.path.slope, jnp.zeros((2, tick.reference.size))
+        return tick.reference - back * tick.path.derivatives[0], jnp.zeros((2, tick.reference.size))
 
     def feedback(self, tick: Tick, velocity: Array, memory: tuple) -> tuple[Array, tuple]:
         """Compute the command of the PD law, and its memory."""
         past, held = memory
         slope = (tick.reference - past[-1]) / (self.velocity_average * self.period)
         measured = tick.velocity is not None
-        slope = tick.path.slope if measured else slope
+        slope = tick.path.derivatives[0] if measured else slope
         error = tick.reference - tick.position
         parts = self.kp * error, self.kd * (slope - tick.at_drives(velocity))
         fresh = tick.fresh, tick.renewed if measured else tick.fresh
@@ -95,10 +95,9 @@ class FeedForward(Controller):
     def fed(self, model: Plant, tick: Tick) -> tuple[Array, Array]:
         """Compute the commands of a model along the reference, without friction and for friction."""
         model = model.smoothed(jnp.ones(()), jnp.asarray(self.epsilon))
-        path = (tick.path.reference, tick.path.slope, tick.path.curvature)
-        motion = (tick.at_joints(x) for x in path)
-        forces = inverse_dynamics(model, *motion, len(tick.driven))
-        return tuple(tick.at_drives(f) / self.gain for f in forces)
+        q, qd, qdd = (tick.at_joints(x) for x in (tick.path.reference, *tick.path.derivatives))
+        smooth, friction = inverse_dynamics(model, q, qd, qdd, len(tick.driven))
+        return tick.at_drives(smooth) / self.gain, tick.at_drives(friction) / self.gain
 
     def over_gains(self, u: Array, model: Plant) -> Array:
         """Divide a command by the drives' gains."""

@@ -39,7 +39,7 @@ def flat_inputs(plant: Plant, path: Path, drives: int) -> Float[Array, "time m"]
         own = plant.initial_states(none)
         return plant.at_drives(plant.balance(q, v, a, none, jnp.zeros(()), own).residual)
 
-    return jax.vmap(forces)(path.reference, path.slope, path.curvature)
+    return jax.vmap(forces)(path.reference, *path.derivatives)
 
 
 class Flatness(Controller):
@@ -96,16 +96,16 @@ class Flatness(Controller):
         return velocity, tick.joints, none, none, none
 
     def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
-        path, error = tick.path, tick.position - tick.reference
+        (slope, curvature), error = tick.path.derivatives, tick.position - tick.reference
         if not self.reconstructs:
             b1, b0 = self.gains
-            v = path.curvature - b1 * (tick.at_drives(velocity) - path.slope) - b0 * error
+            v = curvature - b1 * (tick.at_drives(velocity) - slope) - b0 * error
             return self._force(tick, velocity, v) / self.gain, None
         b2, b1, b0 = self.gains
         before, joints, force, integral, last = memory
         velocity = self._reconstructed(before, velocity, joints, tick.joints, force)
         integral = integral + 0.5 * self.period * (last + error)
-        v = path.curvature - b2 * (tick.at_drives(velocity) - path.slope) - b1 * error - b0 * integral
+        v = curvature - b2 * (tick.at_drives(velocity) - slope) - b1 * error - b0 * integral
         u = self._force(tick, velocity, v) / self.gain
         given = self.gain * self.clipped(u + disturbance)
         return u, (velocity, tick.joints, given, integral, error)

@@ -56,9 +56,10 @@ class FrictionCompensation(Controller):
     anticipates = True
 
     def law(self, tick: Tick, velocity: Array, memory: None, disturbance: Array) -> tuple:
-        v, path = tick.at_drives(velocity), tick.path
-        fed = self.inertia * path.curvature + self.viscous * v + self.coulomb * jnp.sign(v)
-        return self.kp * (path.reference - tick.position) + self.kd * (path.slope - v) + fed, None
+        v, reference = tick.at_drives(velocity), tick.path.reference
+        slope, curvature = tick.path.derivatives
+        fed = self.inertia * curvature + self.viscous * v + self.coulomb * jnp.sign(v)
+        return self.kp * (reference - tick.position) + self.kd * (slope - v) + fed, None
 
 
 class PID(Controller):

@@ -116,10 +116,10 @@ class _Answer(NamedTuple):
         part: Fraction of the step before the port comes to rest; one if it does not.
     """
 
-    reaction: Array
-    stuck: Array
-    stands: Array
-    part: Array
+    reaction: jax.Array
+    stuck: jax.Array
+    stands: jax.Array
+    part: jax.Array
 
 
 @dataclass(frozen=True)
@@ -155,8 +155,10 @@ class _Sliding:
         dry = picked(levels.dry, self.ports)
         held = picked(at_rest.dry, self.ports) + picked(at_rest.stick, self.ports)
         if levels.rises:
-            rising = [jnp.stack([picked(r, self.ports) for r in b.rising]) for b in (levels, at_rest)]
-            return _own_reaction(self.own, self.speed, self.before, dry, held, *rising, self.corner)
+            rising, resting = (
+                jnp.stack([picked(r, self.ports) for r in b.rising]) for b in (levels, at_rest)
+            )
+            return _own_reaction(self.own, self.speed, self.before, dry, held, rising, resting, self.corner)
         drag = -jnp.sign(self.before) * dry
         if self.mobility is None:
             after = self.speed + self.own * drag
@@ -165,8 +167,9 @@ class _Sliding:
             after = self.speed + jnp.sum(self.mobility * drag, axis=1)
 
             def general() -> _Answer:
-                own = self if anew is None else anew()
-                return _shared_reaction(own.mobility, own.speed, own.before, dry, held)
+                ports = self if anew is None else anew()
+                assert ports.mobility is not None, "as here, ports accelerate each other"
+                return _shared_reaction(ports.mobility, ports.speed, ports.before, dry, held)
 
         no = jnp.zeros(drag.shape, bool)
         # Nearly all steps only drag. A branch in place of a selection: the general case costs more.
@@ -241,6 +244,7 @@ def _own_reaction(
     turns = before * slid < 0.0
     part = jnp.where(turns, before / jnp.where(turns, before - slid, 1.0), 1.0)
     if rising is not None:
+        assert rising_at_rest is not None, "given with rising"
         hold = hold + jnp.where(speed > before, rising_at_rest[0], rising_at_rest[1])
     stuck = (starts | turns) & (jnp.abs(speed - before) <= own * hold)
     stands, reaction = starts & stuck, (1.0 - 2.0 * part) * drag

@@ -63,9 +63,9 @@ def natural_frequencies(
     a, slopes = (np.asarray(x) for x in _matrix(plant, places, np.asarray(theta), held))
     if not (a.size and np.all(np.isfinite(a))):
         return Modes(np.zeros(0), np.zeros((0, len(theta))))
-    values, left, right = scipy.linalg.eig(a, left=True)
+    values, left, right = (np.asarray(x) for x in scipy.linalg.eig(a, left=True))
     size = np.abs(values)
-    swings = values.imag > np.abs(values.real)
+    swings = np.imag(values) > np.abs(np.real(values))
     swings &= size**2 > _RIGID * np.max(size[swings] ** 2, initial=0.0)
     at = np.flatnonzero(swings)[np.argsort(size[swings])]
     y, x, direction = left[:, at].conj(), right[:, at], values[at].conj() / size[at]
@@ -95,8 +95,8 @@ def _state_matrix(plant: Plant, held: tuple[int, ...]) -> Float[Array, "s s"]:
     no_friction = jnp.zeros_like(plant.ports(jnp.zeros(plant.joints)))
 
     def balance(q: Array, v: Array, a: Array, own: Array) -> tuple[Array, Array]:
-        whole = (jnp.zeros(plant.joints).at[free].set(x) for x in (q, v, a))
-        b = plant.balance(*whole, u, jnp.zeros(()), back(own), no_friction)
+        q, v, a = (jnp.zeros(plant.joints).at[free].set(x) for x in (q, v, a))
+        b = plant.balance(q, v, a, u, jnp.zeros(()), back(jnp.asarray(own)), no_friction)
         return b.residual[free], ravel_pytree(b.rates)[0]
 
     zero = jnp.zeros(n)

@@ -7,6 +7,7 @@ stays at its joint here.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -22,6 +23,7 @@ from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial
 from jaxid.model.balance import Balance
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import Smoothing
+from jaxid.numerics.affine import Affine
 
 Motion = tuple[Array, Array, Array]
 
@@ -61,16 +63,16 @@ class HiddenJoints(Plant):
         n = len(self.measured) + q.size
         declared, known = jnp.split(u, [u.size - 3 * len(self.measured)])
         pairs = zip(known.reshape(3, -1), (q, qd, qdd), strict=True)
-        motion = (spread(a, self.measured, n) + spread(b, self.hidden, n) for a, b in pairs)
+        q, qd, qdd = (spread(a, self.measured, n) + spread(b, self.hidden, n) for a, b in pairs)
         if reaction is not None:
             reaction = spread(reaction, self.hidden, self.plant.ports(jnp.zeros(n)).size)
-        whole = self.plant.balance(*motion, declared, t, states, reaction)
-        rows = (picked(a, self.hidden) for a in (whole.residual, whole.dry, whole.stick))
+        whole = self.plant.balance(q, qd, qdd, declared, t, states, reaction)
+        residual, dry, stick = (picked(a, self.hidden) for a in (whole.residual, whole.dry, whole.stick))
         rising = jnp.stack([picked(r, self.hidden) for r in whole.rising])
         slides, rises = (
             tuple(k for k, i in enumerate(self.hidden) if i in ports) for ports in (whole.slides, whole.rises)
         )
-        return Balance(*rows, rising, whole.rates, whole.drive, slides, rises)
+        return Balance(residual, dry, stick, rising, whole.rates, whole.drive, slides, rises)
 
 
 def _of_joints(smoothing: Smoothing, joints: tuple[int, ...]) -> Smoothing:
@@ -107,7 +109,7 @@ def complete_motion(
         return q, qd, qdd
     visible, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
     carried = HiddenJoints(plant, tuple(visible.tolist()), tuple(hidden.tolist()))
-    known = tuple(a[:, visible] for a in (q, qd, qdd))
+    known = (q[:, visible], qd[:, visible], qdd[:, visible])
     period = times[1] - times[0]
     h = period / steps
     # Force of the carried plant at the start, in the middle and at the end of every step.
@@ -117,18 +119,18 @@ def complete_motion(
     ).reshape((len(u) - 1) * steps, 3, -1)
     starts = (times[:-1, None] + h * np.arange(steps)).ravel()
 
-    together = [jnp.broadcast_to(jnp.mean(a[0]), hidden.shape) for a in known]
+    q0, qd0, qdd0 = (jnp.broadcast_to(jnp.mean(a[0]), hidden.shape) for a in known)
     memory, none = plant.initial_states(u[0]), jnp.zeros(hidden.size)
     relaxed = _relaxed(
-        lambda q: carried.balance(q, *together[1:], force[0, 0], times[0], memory, none).residual,
-        together[0],
+        lambda q: carried.balance(q, qd0, qdd0, force[0, 0], times[0], memory, none).residual,
+        q0,
     )
-    x0 = State(relaxed, together[1], memory)
+    x0 = State(relaxed, qd0, memory)
     flow = affine_flow(carried, x0, tuple(force[0]), times[0], h)
 
     def advance(x: State, now: tuple) -> tuple[State, tuple]:
         values, t = tuple(now[0]), now[1]
-        bound = None if flow is None else lambda x, *reaction: flow(x, values, *reaction)
+        bound = None if flow is None else functools.partial(_under, flow, values)
         x, reaction = set_valued_step(carried, x, hold_polynomial(values), t, h, bound)
         return x, (x, reaction)
 
@@ -137,8 +139,14 @@ def complete_motion(
     x, reaction = jax.tree.map(lambda a: a[last], later)
     solved = jax.vmap(lambda *now: acceleration(carried, *now))
     motion = (x.q, x.qd, solved(x, force[last, 2], times[1:], reaction))
-    filled = [jnp.concatenate([a[None], b]) for a, b in zip((relaxed, *together[1:]), motion, strict=True)]
-    return tuple(a.at[:, hidden].set(b) for a, b in zip((q, qd, qdd), filled, strict=True))
+    filled = [jnp.concatenate([a[None], b]) for a, b in zip((relaxed, qd0, qdd0), motion, strict=True)]
+    q, qd, qdd = (jnp.asarray(a).at[:, hidden].set(b) for a, b in zip((q, qd, qdd), filled, strict=True))
+    return q, qd, qdd
+
+
+def _under(flow: Affine, values: tuple[Array, ...], x: State, *reaction: Array) -> State:
+    """Apply a flow under a force, given as `hold_polynomial` takes it."""
+    return flow(x, values, *reaction)
 
 
 def resting(
@@ -160,7 +168,8 @@ def resting(
         return q, np.eye(q.size)
     visible, hidden = (np.flatnonzero(np.equal(measured, side)) for side in (True, False))
     carried = HiddenJoints(plant, tuple(visible.tolist()), tuple(hidden.tolist()))
-    return tuple(np.asarray(a) for a in _resting(carried, q[visible], drives))
+    rest, follow = _resting(carried, q[visible], drives)
+    return np.asarray(rest), np.asarray(follow)
 
 
 @eqx.filter_jit

@@ -222,7 +222,7 @@ def step(
 
     def rest(y: Split, u: Array, t: Array) -> Split:
         q, v, z = y
-        rate = _derivative(plant, State(q, v, back(z)), u, t, reaction)
+        rate = _derivative(plant, State(q, v, back(jnp.asarray(z))), u, t, reaction)
         return v, rate.qd - jnp.sum(push * z, axis=1), ravel_pytree(rate.own)[0] - decay * z
 
     half = 0.5 * h
@@ -243,7 +243,7 @@ def step(
         linear(_sum(na, nb), h / 3, h * (2 * p2 - 4 * p3), h**2 * (2 * p3 - 4 * p4)),
         linear(nc, h / 6, h * (4 * p3 - p2), h**2 * (4 * p4 - p3)),
     )
-    return State(q, v, back(z))
+    return State(q, v, back(jnp.asarray(z)))
 
 
 def _sum(*terms: Split) -> Split:
@@ -255,7 +255,7 @@ def _own_push(plant: Plant, x: State, u: Array, t: Array, reaction: Array | None
     flat, back = ravel_pytree(x.own)
 
     def acc(own: Array) -> Array:
-        return acceleration(plant, State(x.q, x.qd, back(own)), u, t, reaction)
+        return acceleration(plant, State(x.q, x.qd, back(jnp.asarray(own))), u, t, reaction)
 
     return jax.jacfwd(acc)(flat)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -134,7 +135,8 @@ class _Sums:
 
     @classmethod
     def of(cls, plant: Plant, ports: int, u: Array, t: Array) -> _Sums:
-        force, dry, stick, forth, back = ([0.0] * ports for _ in range(5))
+        none: list[Sum] = [0.0] * ports
+        force, dry, stick, forth, back = (list(none) for _ in range(5))
         scale: list[Sum] = [1.0] * ports
         for e in plant.effects:
             scale[e.port] = scale[e.port] + e.dry_drift(t)
@@ -219,6 +221,6 @@ def _pull_back(plant: Plant, q: Array, force: Array) -> Array:
     return force if plant.ports_are_joints else jax.vjp(plant.ports, q)[1](force)[0]
 
 
-def stacked(parts: list[Sum]) -> Float[Array, " k"]:
+def stacked(parts: Sequence[Sum]) -> Float[Array, " k"]:
     """Stack numbers and scalars as a float64 vector."""
     return jnp.stack([jnp.asarray(p, dtype=jnp.float64) for p in parts])

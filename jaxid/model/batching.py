@@ -62,7 +62,7 @@ def act_batched(effects: list[Effect], signals: list[Signals], states: list) -> 
     treedef = jax.tree.structure(effects[0])
     omitted: list[Any] = []
 
-    def act(leaves: list[Array], x: Signals, state: Array | None) -> Action:
+    def act(leaves: Sequence[Array], x: Signals, state: Array | None) -> Action:
         action = jax.tree.unflatten(treedef, leaves).act(x, state)
         # An omitted entry stays a plain number, which lets `balance` skip it.
         arrays, numbers = eqx.partition(action, eqx.is_array)

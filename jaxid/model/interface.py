@@ -124,6 +124,6 @@ class PlantInterface(SearchHints):
         """Acceleration of gravity in the base's frame [m/s^2]."""
         return jnp.asarray((0.0, 0.0, -9.81))
 
-    def joint_positions(self, tool: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"] | None:
+    def joint_positions(self, tool: Float[np.ndarray, " k"]) -> Float[Array, " n"] | None:
         """Return the joint positions for a position of the tool; NaN out of reach, None if not available."""
         return None

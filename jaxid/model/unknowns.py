@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -122,7 +123,7 @@ class Parameters:
 
 def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
     """Return the leaf at the end of a path of attributes and indices."""
-    node = plant
+    node: Any = plant
     for step in path:
         node = node[step] if isinstance(step, int) else getattr(node, step)
     return node
@@ -147,7 +148,7 @@ def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
     return jax.tree.unflatten(structure, leaves)
 
 
-def _with_entry(values: Array, index: int | tuple[int, int], value: float) -> np.ndarray:
+def _with_entry(values: Array, index: int | tuple[int, int], value: Array | float) -> np.ndarray:
     out = np.array(values)
     out[index] = value
     return out

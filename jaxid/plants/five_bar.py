@@ -162,7 +162,7 @@ class FiveBar(WithLinks):
         lengths = f"elbows {apart:.4g} m apart, distal links of {reach[0]:.4g} and {reach[1]:.4g} m"
         return row, f"joints at [{shown}] rad are out of reach: {lengths}"
 
-    def joint_positions(self, tool: Array) -> Array:
+    def joint_positions(self, tool: Float[np.ndarray, " 2"]) -> Float[Array, " 2"]:
         return self.inverse(tool)
 
     @classmethod
