@@ -37,7 +37,7 @@ def drive_gains(plant: Plant, drives: int) -> Float[Array, " m"]:
     for e in plant.effects:
         j = plant.drive_of(e.port, drives)
         if e.kind == "actuator_gain" and j is not None:
-            out[j] = out[j] * e.gain  # pyright: ignore[reportAttributeAccessIssue]  # a field of that kind
+            out[j] = out[j] * e.gain
     return jnp.stack(out)
 
 
