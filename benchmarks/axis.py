@@ -16,6 +16,7 @@ from jaxid.controllers import CascadePD
 from jaxid.effects import EFFECTS
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
 from jaxid.estimators.output_error import _fit
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
 from jaxid.sensors.encoder import Sensor
@@ -51,7 +52,7 @@ def plant(theta: np.ndarray, sharpness: float = 1e-3) -> Axis:
         EFFECTS["coulomb_friction"](level=1.0),
         EFFECTS["constant_force"](level=1.0),
     )
-    return scatter(PLACES, Axis(1.0, effects=effects, sharpness=sharpness), jnp.asarray(theta))
+    return scatter(PLACES, Axis(1.0, effects=effects, smoothing=Smoothing(sharpness)), jnp.asarray(theta))
 
 
 def replay(reference: np.ndarray, numerics: Numerics) -> Replay:

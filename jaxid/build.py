@@ -16,11 +16,12 @@ from jaxid.case.declared import EffectEntry
 from jaxid.case.reference import info_of
 from jaxid.case.tables import ON_LINE
 from jaxid.case.values import Value
-from jaxid.controllers import CONTROLLERS, Controller
+from jaxid.controllers import CONTROLLERS, Controller, check_drives
 from jaxid.errors import InputError
 from jaxid.machine import Machine
 from jaxid.model.parameter import ParameterInfo, as_array, parameters_of
 from jaxid.model.plant import Plant
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import REFERENCE, Free, Parameters, effect_name, label
 from jaxid.references import REFERENCES
 from jaxid.references.unknown import UnknownReference
@@ -164,7 +165,8 @@ def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
     """The plant without effects, and its own unknowns."""
     entry = case.plant
     known: dict[str, Any] = {"gravity": entry.gravity, "vertical": entry.vertical}
-    known |= {"sharpness": case.simulation.get("sharpness"), "actuated": entry.actuated}
+    sharpness = case.simulation.get("sharpness")
+    known |= {"smoothing": None if sharpness is None else Smoothing(sharpness), "actuated": entry.actuated}
     options = {
         name: value
         for name, value in known.items()
@@ -259,19 +261,14 @@ def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controlle
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
     arrays = {k: v if k in static else as_array(v) for k, v in values.items()}
     period = case.controller.get("period") or _log_period(case, period)
-    if cls.every_drive and case.plant.drives < case.plant.joints:
-        raise InputError(
-            f"kind = '{case.controller['kind']}' needs a drive at every joint: no reference says how the "
-            "others move",
-            where=f"{case.path}, [controller]",
-            hint="take kind = 'flatness'",
-        )
+    plant, where = case.plant, f"{case.path}, [controller]"
+    check_drives(case.controller["kind"], plant.cls, plant.drives, plant.joints, where)
     if "model" in cls.of_machine:
         # The law knows what the case guesses, whatever the machine truly is.
-        plant, free = _plant(case, False)
-        arrays |= {"model": plant, "gain": as_array(gain.tolist())}
+        model, free = _plant(case, False)
+        arrays |= {"model": model, "gain": as_array(gain.tolist())}
         if "estimator" in cls.of_machine:
-            known = Machine(plant, Parameters(tuple(free)), gain, case.plant.units)
+            known = Machine(model, Parameters(tuple(free)), gain, plant.units)
             stated = {k: arrays.pop(k) for k in ON_LINE if k in arrays}
             arrays["estimator"] = _estimator(case, known, period, stated)
     return cls(period=period, **arrays)

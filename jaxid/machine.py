@@ -48,6 +48,26 @@ class Machine:
         """For how long the controller holds a command [s]; None where there is none."""
         return None if self.controller is None else self.controller.period
 
+    def unit(self, quantity: str, joint: int = 0) -> str:
+        """Return the unit of a quantity at a joint.
+
+        Args:
+            quantity: A dimension such as "position/time" (see `jaxid.model.units`).
+            joint: Joint, 0-based.
+        """
+        return self.units.label(quantity, self.plant.motion(joint))
+
+    def unit_by_joint(self, quantity: str, joints: Sequence[int] | None = None) -> str | list[str]:
+        """Return the unit of a quantity at some joints: one if they share it, else one for each.
+
+        Args:
+            quantity: A dimension such as "position/time".
+            joints: Joints, 0-based; None: all.
+        """
+        joints = range(self.plant.joints) if joints is None else joints
+        every = [self.unit(quantity, int(k)) for k in joints]
+        return every[0] if len(set(every)) == 1 else every
+
     def with_plant(self, plant: Plant, parameters: Parameters) -> Machine:
         """The same machine around another plant and its unknowns."""
         return replace(self, plant=plant, parameters=parameters)

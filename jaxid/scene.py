@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import equinox as eqx
@@ -299,7 +299,7 @@ def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
     speed = float(np.abs(np.diff(reference, axis=0)).max() / period)
     if speed == 0.0:
         return machine
-    plant = replace(machine.plant, velocity_scale=np.asarray(speed))
+    plant = machine.plant.smoothed(velocity_scale=np.asarray(speed))
     return machine.with_plant(plant, machine.parameters)
 
 

@@ -16,6 +16,7 @@ from jaxid.logs.log import Log, read_log, with_load
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine
+from jaxid.model.smoothing import typical_velocity
 from jaxid.references import make_reference
 from jaxid.simulation.step_size import needed_steps
 
@@ -201,12 +202,13 @@ def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
     """Findings on a log; held: by a prior, for which two positions are a movement."""
     limit = (case.controller or {}).get("limit")
     units, plant = machine.units, machine.plant
+    motions = [plant.motion(j) or units.motion for j in range(plant.joints)]
     driven = plant.at_drives(np.arange(plant.joints))
     stated = machine.sensor.position_resolution is not None
     findings = check_log(
         log,
         command_limit=limit,
-        motion=units.motion,
+        motion=motions,
         units={"position": units.position} if units.position else None,
         driven=driven,
         fewest_levels=2 if held else FEWEST_LEVELS,
@@ -219,7 +221,7 @@ def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
         findings.append(Finding("error", f"row {log.rows[0] + row}: {what}", f"{log.source}, position", hint))
     inertia = plant.own_inertia()
     if inertia is not None:
-        slip = plausible_inertia(log, np.asarray(inertia), machine.gain, motion=units.motion, driven=driven)
+        slip = plausible_inertia(log, np.asarray(inertia), machine.gain, motion=motions, driven=driven)
         findings += [slip] if slip is not None else []
     raise_on_error(findings)
     return findings
@@ -262,6 +264,6 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepare
 
 def _scaled(machine: Machine, data: Prepared) -> Machine:
     """The machine with the velocity scale of its log, which the smoothed sign multiplies."""
-    speed = float(np.sqrt(np.mean(data.qd**2)))
-    plant = replace(machine.plant, velocity_scale=np.asarray(speed))
+    speed = typical_velocity(machine.plant, data.qd, lambda v: float(np.sqrt(np.mean(v**2))))
+    plant = machine.plant.smoothed(velocity_scale=speed)
     return machine.with_plant(plant, machine.parameters)

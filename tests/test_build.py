@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +13,7 @@ from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
-from jaxid.model.effect import Effect
-from jaxid.model.parameter import as_array, parameter
+from jaxid.model.parameter import parameter
 from jaxid.model.plant import Plant
 from jaxid.plants import PLANTS
 from jaxid.simulation.disturbance import disturbance_at
@@ -91,7 +89,7 @@ def test_guesses_and_known_values_stand_in_the_plant(tmp_path):
     assert float(plant.inertia) == 80.0
     assert plant.vertical
     assert float(plant.gravity) == 9.7
-    assert float(plant.sharpness) == 1e-4
+    assert float(plant.smoothing.sharpness) == 1e-4
     assert float(plant.effects[1].period) == 0.1
     np.testing.assert_array_equal(built.parameters.extract(plant), built.parameters.guess)
     np.testing.assert_array_equal(built.gain, [-35.15])
@@ -167,9 +165,6 @@ class Pair(Plant):
     kind = "pair"
     joints: ClassVar[int] = 2
     mass: Array = parameter("inertia", "positive", "masses")
-    effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
-    sharpness: Array = eqx.field(converter=as_array, default=1e-3, kw_only=True)
-    velocity_scale: Array = eqx.field(converter=as_array, default=1.0, kw_only=True)
 
     def inertial(self, q, qd, qdd):
         return self.mass * qdd

@@ -24,12 +24,15 @@ from jaxid.case.schema import (
 )
 from jaxid.case.tables import PLANT
 from jaxid.case.user_effect import user_effect
+from jaxid.case.user_file import names_a_file
+from jaxid.case.user_plant import check_user_plant, user_plant
 from jaxid.case.values import Value, read_value, read_values
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.model.effect import Effect
+from jaxid.model.interface import PLACES
 from jaxid.model.parameter import ParameterInfo, parameters_of
-from jaxid.model.plant import PLACES, Plant
+from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.plants import PLANTS
 
@@ -55,7 +58,12 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         InputError: If it states what the plant cannot have, or not what it must.
     """
     spot = Spot(file, "[plant]")
-    cls = PLANTS[read_kind(table, PLANTS, spot)]
+    kind = str(table.get("kind", ""))
+    users = names_a_file(kind)
+    if users:
+        cls = user_plant(kind, Path(file).parent, spot.at("kind"))
+    else:
+        cls = PLANTS[read_kind(table, PLANTS, spot)]
     keys = {"kind": Key(lambda value, spot: value), **PLANT}
     if cls.linked:
         return _linked(table, cls, keys, spot)
@@ -77,7 +85,7 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         hint = 'leave orientation out, or set motion = "linear"; an unbalanced load is an effect'
         raise spot.at("orientation").refuse("vertical", "does not go with a rotary plant", hint)
     units = Units(motion, **given.get("units", {}))
-    return PlantEntry(
+    entry = PlantEntry(
         cls,
         given["parameters"],
         units,
@@ -86,6 +94,9 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         joints,
         given.get("actuated", cls.actuated),
     )
+    if users:
+        check_user_plant(entry, kind, spot.at("kind"))
+    return entry
 
 
 def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot) -> PlantEntry:
@@ -216,7 +227,7 @@ def read_effects(tables: list, plant: PlantEntry, path: Path) -> tuple[EffectEnt
 
 def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) -> EffectEntry:
     spot = Spot(str(path), f"[[effects]] {index}")
-    if ":" in str(table.get("kind", "")) or str(table.get("kind", "")).endswith(".py"):
+    if names_a_file(table.get("kind", "")):
         cls = user_effect(str(table["kind"]), path.parent, spot.at("kind"))
     else:
         cls = EFFECTS[read_kind(table, EFFECTS, spot)]

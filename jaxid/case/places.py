@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from jaxid.case.schema import Spot, count, several, whole
 from jaxid.errors import suggest
 from jaxid.model.effect import Effect
-from jaxid.model.plant import PLACES
+from jaxid.model.interface import PLACES
 
 if TYPE_CHECKING:
     from jaxid.case.declared import PlantEntry

@@ -111,7 +111,7 @@ def explore(
         progress("refitting in simulation")
         before = _refit(session.with_machine(before.machine), before)
         after = _refit(session.with_machine(after.machine), after) if effects else before
-    designs = not session.machine.plant.coupled if experiments is None else experiments
+    designs = session.machine.plant.designs_experiments if experiments is None else experiments
     separating = proposals(session, search, effects, progress) if designs else ()
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
     missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case, load_case
-from jaxid.controllers import Controller, Tick, base
+from jaxid.controllers import Controller, Tick, base, laws_with_model
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import Online, OnlineEstimate, OnlineMemory
 from jaxid.estimators.recursive.recursion import RecursiveEstimate
@@ -82,10 +82,11 @@ class Live:
             if "model" not in self._controller.of_machine or self.adapts:
                 kind = (case.controller or {})["kind"]
                 what = "identifies by itself" if self.adapts else "has no model to put what is found into"
+                laws = laws_with_model(self.machine.plant, case.plant.drives, case.plant.joints)
                 raise InputError(
                     f"a controller of kind {kind!r} {what}",
                     where=str(case.path),
-                    hint="leave identify out" if self.adapts else "take kind = 'flatness'",
+                    hint=f"take kind = '{laws[0]}'" if laws and not self.adapts else "leave identify out",
                 )
             self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
 

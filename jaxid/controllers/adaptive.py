@@ -16,19 +16,19 @@ from jaxid.controllers.computed_torque import FeedForward
 from jaxid.model.unknowns import scatter
 
 # A law is given its estimator, and imports none: `RealTime` of `jaxid.estimators.recursive.real_time`, with
-# the memory and what it tells of `jaxid.estimators.recursive.recursion`.
+# the memory and the estimate of `jaxid.estimators.recursive.recursion`.
 RealTime = RecursiveMemory = RecursiveEstimate = Any
 
-# Instants of the reference at which columns are looked at, at most.
-_LOOKS = 500
+# Largest number of instants of the reference at which columns are evaluated.
+_INSTANTS = 500
 
 
 class LearnedUnknowns(eqx.Module):
-    """What the law has found.
+    """The unknowns that the law has identified.
 
     Args:
         theta: Estimate of the unknowns.
-        closed: Whether it takes part in the command.
+        closed: Whether the estimate is used in the command.
     """
 
     theta: Float[Array, " p"]
@@ -36,18 +36,18 @@ class LearnedUnknowns(eqx.Module):
 
 
 class Learning(eqx.Module):
-    """What `Adaptive` keeps from tick to tick.
+    """The memory of `Adaptive` between ticks.
 
     Args:
-        feedback: Of the PD law.
-        recursion: Of the estimator.
-        information: Of its start (see `jaxid.estimators.recursive.recursion.Recursion`).
-        share: By how much an unknown's error of one moves the force, over the force: root mean squares along
-            the reference.
-        found: So far.
+        feedback: Memory of the PD law.
+        recursion: Memory of the estimator.
+        information: Information of its start (see `jaxid.estimators.recursive.recursion.Recursion`).
+        share: Change of the force by an error of one in each unknown, over the force: root mean squares
+            along the reference.
+        found: The unknowns identified so far.
         positions: Readings of the last 2 reach ticks, the newest first.
-        commands: Measured, of the intervals between them, likewise.
-        ticks: So far.
+        commands: Measured commands of the intervals between them, the newest first.
+        ticks: Number of ticks so far.
     """
 
     feedback: tuple
@@ -63,21 +63,21 @@ class Learning(eqx.Module):
 class Adaptive(FeedForward):
     """`FeedForward` of a model whose unknowns are identified in the loop.
 
-    Every tick with new readings gives the estimator a sample: measured motion, and measured command. Where
-    no sensor measures velocity and acceleration, they are differences of positions `reach` ticks apart, the
-    command is averaged with the weights that the second difference has (exact for a held command), and a
+    Every tick with new readings gives the estimator a sample: measured motion, and measured command. If no
+    sensor measures velocity and acceleration, they are differences of positions `reach` ticks apart, the
+    command is averaged with the weights of the second difference (exact for a held command), and a
     sample is taken every `reach` ticks.
 
-    Until all unknowns are told well enough, dynamics at the guesses are all that is fed forward (switches b
-    and c are open). An unknown is, where its standard deviation, times the root mean square of its column
-    along the reference, is below `tolerance` times that of the force, and its start has no more say in it.
-    From then on the command is that of the estimate at every tick, and never goes back.
+    Until all unknowns are precise enough, only the dynamics at the guesses are fed forward (switches b and c
+    are open). An unknown is precise enough if its standard deviation, times the root mean square of its
+    column along the reference, is below `tolerance` times that of the force, and its start no longer
+    determines it. From then on the command uses the estimate of every tick, and never the guesses again.
 
     Args:
-        estimator: Of the case's unknowns.
-        regularization: As how many samples the start counts.
-        tolerance: See above.
-        reach: In ticks; 0: `velocity_average`.
+        estimator: Estimator of the unknowns of the case.
+        regularization: Weight of the start, in samples.
+        tolerance: Relative precision at which the estimate is used, see above.
+        reach: Distance of differenced positions in ticks; 0: `velocity_average`.
         renewal: Ticks between new readings of inertial sensors.
 
     Source:
@@ -99,7 +99,8 @@ class Adaptive(FeedForward):
         return self.reach or self.velocity_average
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Learning:
-        path = jax.tree.map(lambda x: jnp.asarray(x)[None], tick.path) if path is None else path
+        path = path or jax.tree.map(lambda x: jnp.asarray(x)[None], tick.path)
+        assert path is not None, "a tick has a path"
         square, force = _along(self, path, tick.driven)
         back = self.period * jnp.arange(1, 2 * self.stride + 1)[:, None]
         start = jnp.asarray(self.estimator.recursion.start)
@@ -134,22 +135,22 @@ class Adaptive(FeedForward):
         return eqx.tree_at(kept, start, kept(saved))
 
     def learned(self, memory: Any) -> LearnedUnknowns:
-        """What has been found, of the memory that `command` returns."""
+        """Return the unknowns identified so far, from the memory that `command` returns."""
         return memory[1].found
 
     @eqx.filter_jit
     def estimate(self, memory: Any) -> RecursiveEstimate:
-        """What the estimator says, of the memory that `command` returns."""
+        """Return the estimate with its precision, from the memory that `command` returns."""
         return self._recursion(memory[1].information).estimate(memory[1].recursion)
 
     def _recursion(self, information: Array, ticks: int = 1) -> Any:
-        """The recursion with its start, of samples so many ticks apart: what it forgets is by time."""
+        """Return the recursion with its start, for samples that many ticks apart: it forgets by time."""
         recursion = self.estimator.recursion
         values = information, jnp.asarray(recursion.forgetting) ** ticks
         return eqx.tree_at(lambda r: (r.information, r.forgetting), recursion, values)
 
     def _learn(self, tick: Tick, memory: Learning) -> Learning:
-        """With this tick's sample; the newest of the commands is its own, until measured better."""
+        """Update the memory by the sample of this tick, with the newest command as given until measured."""
         if tick.measured is not None:
             newest = jnp.where(jnp.isnan(tick.measured), memory.commands[0], tick.measured)
             newest = jnp.concatenate([newest[None], memory.commands[1:]])
@@ -177,15 +178,15 @@ class Adaptive(FeedForward):
         )
 
     def _converged(self, recursion: Any, memory: RecursiveMemory, share: Array) -> Array:
-        told = recursion.estimate(memory)
-        # Rows enough that the residual tells the noise.
-        enough = told.effective > 10 * share.size
-        return enough & jnp.all(told.identifiable & (told.std * share < self.tolerance))
+        estimate = recursion.estimate(memory)
+        # Enough rows to estimate the noise from the residual.
+        enough = estimate.effective > 10 * share.size
+        return enough & jnp.all(estimate.identifiable & (estimate.std * share < self.tolerance))
 
     def _sample(self, tick: Tick, memory: Learning) -> tuple[tuple, Array]:
-        """Position, velocity, acceleration and command at one instant, and whether there is a new one."""
+        """Return position, velocity, acceleration and command at one instant, and whether they are new."""
         if tick.acceleration is not None:
-            # The command that the acceleration answers to is that of the interval just past.
+            # The acceleration belongs to the command of the interval just past.
             sample = (tick.joints, tick.velocity, tick.acceleration, memory.commands[0])
             return sample, (memory.ticks > 0) & tick.renewed
         d, now = self.stride, tick.joints
@@ -201,14 +202,14 @@ class Adaptive(FeedForward):
 
 @eqx.filter_jit
 def _along(law: Adaptive, path: Path, driven: tuple[int, ...]) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-    """Mean square of each unknown's column, and root mean square of the force, along a reference."""
-    step = max(1, -(-len(path.reference) // _LOOKS))
+    """Return the mean square of each unknown's column, and the RMS of the force, along a reference."""
+    step = max(1, -(-len(path.reference) // _INSTANTS))
     path = jax.tree.map(lambda x: jnp.asarray(x)[::step], path)
 
     def one(now: Path) -> tuple:
         tick = Tick(jnp.zeros(len(driven)), now, driven)
         u = law.fed(law.model, tick)[0]
-        motion = (tick.at_joints(x) for x in (now.reference, now.slope, now.curvature))
+        motion = (tick.at_joints(x) for x in (now.reference, *now.derivatives))
         return *law.estimator.rows(*motion, u)[::2], tick.at_joints(law.gain * u)
 
     return law.estimator.sizes(*jax.vmap(one)(path))

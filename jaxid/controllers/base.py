@@ -1,4 +1,4 @@
-"""What every sampled controller offers: a memory and a command per tick."""
+"""The interface of sampled controllers: a memory, and a command per tick."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from jaxid.numerics.smooth import sharp_clip
 
 
 class Path(eqx.Module):
-    """Where the driven joints should be: at one tick, or at all, one row each.
+    """The reference of the driven joints, at one tick or at all ticks, one row each.
 
     Args:
-        reference: Position [m or rad].
+        reference: Wanted position [m or rad].
         slope, curvature: Its derivatives; None for a controller that does not anticipate.
     """
 
@@ -24,19 +24,26 @@ class Path(eqx.Module):
     slope: Array | None = None
     curvature: Array | None = None
 
+    @property
+    def derivatives(self) -> tuple[Array, Array]:
+        """Slope and curvature, for a controller that anticipates."""
+        assert self.slope is not None, "the path of a controller that anticipates"
+        assert self.curvature is not None, "the path of a controller that anticipates"
+        return self.slope, self.curvature
+
 
 class Tick(eqx.Module):
-    """All that a controller sees at one tick.
+    """The inputs of a controller at one tick.
 
     Args:
         joints: Measured coordinates of all joints.
-        path: Where those that are driven should be.
-        driven: Which these are, 0-based, in the order of the drives.
+        path: Reference of the driven joints.
+        driven: Driven joints, 0-based, in the order of the drives.
         fresh: Whether the readings are new; else they are held from an earlier tick.
-        velocity, acceleration: Of all joints, where sensors measure them; acceleration is the mean since
-            the tick before. None: positions are to be differenced.
-        renewed: Whether these are new.
-        measured: Command that the drives report for the interval just past; None, or NaN: as it was given.
+        velocity, acceleration: Measured values of all joints, if sensors give them; acceleration is the mean
+            since the tick before. None: positions are to be differenced.
+        renewed: Whether these measurements are new.
+        measured: Command that the drives report for the interval just past; None, or NaN: as commanded.
     """
 
     joints: Float[Array, " n"]
@@ -49,12 +56,12 @@ class Tick(eqx.Module):
     renewed: Array | bool = True
 
     def at_drives(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Of a quantity by joint, the entries of the driven ones."""
+        """Pick the entries of the driven joints from a quantity by joint."""
         whole = self.driven == tuple(range(x.size))
         return x if whole else jnp.stack([x[i] for i in self.driven])
 
     def at_joints(self, x: Float[Array, " m"]) -> Float[Array, " n"]:
-        """A quantity by drive at its joints; zero at those that none drives."""
+        """Spread a quantity by drive over the joints; zero at joints without a drive."""
         n = self.joints.size
         if self.driven == tuple(range(n)):
             return x
@@ -68,7 +75,7 @@ class Tick(eqx.Module):
 
     @property
     def reference(self) -> Float[Array, " m"]:
-        """Where they should be."""
+        """Wanted coordinates of the driven joints."""
         return self.path.reference
 
 
@@ -77,8 +84,8 @@ class Controller(eqx.Module):
 
     Args:
         period: Sampling time [s].
-        limit: The command is clipped to plus or minus this; None: never.
-        velocity_average: Velocity is the backward difference of the mean of so many samples.
+        limit: Bound of the magnitude of the command; None: no bound.
+        velocity_average: Number of samples whose mean is differenced backwards for the velocity.
     """
 
     period: float = eqx.field(static=True, kw_only=True)
@@ -87,13 +94,15 @@ class Controller(eqx.Module):
 
     # Whether the law needs the reference's derivatives.
     anticipates: ClassVar[bool] = False
-    # Fields that no case states: the machine's own model, gain and estimator.
+    # Fields that no case states: model, gain and estimator of the machine.
     of_machine: ClassVar[tuple[str, ...]] = ()
-    # Whether it needs a drive at every joint.
+    # Whether the law needs a drive at every joint.
     every_drive: ClassVar[bool] = False
+    # Whether joints without a drive are allowed only if their accelerations enter no other joint's balance.
+    separate_drives: ClassVar[bool] = False
 
     def path(self, reference: Float[Array, "ticks m"]) -> Path:
-        """The reference as the law needs it, at every tick; differences are central."""
+        """Return the reference with the derivatives that the law needs, by central differences."""
         if not self.anticipates:
             return Path(reference)
         before = jnp.concatenate([2 * reference[:1] - reference[1:2], reference[:-1]])
@@ -102,35 +111,35 @@ class Controller(eqx.Module):
         return Path(reference, (after - before) / (2 * self.period), curvature)
 
     def start(self, tick: Tick, velocity: Float[Array, " n"], path: Path | None = None) -> Any:
-        """Memory of a controller that has watched the joints pass at constant velocity.
+        """Return the memory of a controller after joints have moved at constant velocity.
 
         Args:
-            tick: The first.
-            velocity: Of all joints.
-            path: The whole course, for a law that looks ahead on it.
+            tick: The first tick.
+            velocity: Velocity of all joints [m/s or rad/s].
+            path: The whole reference, for a law that uses its future.
         """
         ticks = range(1, self.velocity_average + 1)
         past = tuple(tick.joints - k * self.period * velocity for k in ticks)
         return past, self.start_law(tick, velocity, path)
 
     def start_law(self, tick: Tick, velocity: Float[Array, " n"], path: Path | None = None) -> Any:
-        """Memory of the law itself."""
+        """Return the initial memory of the law itself."""
         return None
 
     def resumed(self, start: Any, saved: Any) -> Any:
-        """A memory at the start of a new run with what was identified in an earlier one."""
+        """Return a memory for the start of a new run, with the unknowns identified in an earlier one."""
         return start
 
     def learned(self, memory: Any) -> Any:
-        """What a law that identifies has found so far; None of one that does not."""
+        """Return the unknowns that the law has identified so far; None for a law without an estimator."""
         return None
 
     def law(self, tick: Tick, velocity: Float[Array, " n"], memory: Any, disturbance: Array) -> tuple:
-        """Command before the limit, and the law's new memory; velocity is of all joints."""
+        """Compute the command before the limit, and the new memory; velocity is that of all joints."""
         raise NotImplementedError
 
     def command(self, tick: Tick, memory: Any, disturbance: Array) -> tuple[Array, Any]:
-        """Command of one tick, disturbance added and limit applied, and the new memory.
+        """Compute the command of one tick, disturbance added and limit applied, and the new memory.
 
         With p the mean of the last `velocity_average` positions, velocity is
         (p[k] - p[k-1]) / period, which telescopes to two positions.
@@ -143,5 +152,5 @@ class Controller(eqx.Module):
         return self.clipped(u + disturbance), ((tick.joints, *past[:-1]), inner)
 
     def clipped(self, u: Array) -> Array:
-        """The command within its limit."""
+        """Clip the command to its limit."""
         return u if self.limit is None else sharp_clip(u, self.limit)

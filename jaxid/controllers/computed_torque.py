@@ -19,10 +19,10 @@ _LEAST_GAIN = 0.1
 def inverse_dynamics(
     plant: Plant, q: Float[Array, " n"], qd: Float[Array, " n"], qdd: Float[Array, " n"], drives: int
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Forces that a motion takes: without friction, and for friction beside that [N or N m].
+    """Compute the forces for a motion: those without friction, and those for friction [N or N m].
 
-    Friction is what depends on the velocity and is not inertial; weight, springs, offsets and ripple are of
-    the first part, evaluated where nothing moves.
+    Friction is the part that depends on the velocity and is not inertial; weight, springs, offsets and ripple
+    belong to the first part, evaluated at rest.
     """
     none, now, still = jnp.zeros(drives), jnp.zeros(()), jnp.zeros_like(q)
     own = plant.initial_states(none)
@@ -32,7 +32,7 @@ def inverse_dynamics(
 
 
 def drive_gains(plant: Plant, drives: int) -> Float[Array, " m"]:
-    """Gain of each drive, applied over declared force: the product of its effects of that kind."""
+    """Return the gain of each drive, applied over declared force: the product of its effects of that kind."""
     out = [jnp.ones(())] * drives
     for e in plant.effects:
         j = plant.drive_of(e.port, drives)
@@ -42,19 +42,19 @@ def drive_gains(plant: Plant, drives: int) -> Float[Array, " m"]:
 
 
 class FeedForward(Controller):
-    """A PD law and what a model asks for along the reference, over the drives' gains. Abstract.
+    """A PD law with the forces of a model along the reference, over the drives' gains. Abstract.
 
         u = (kp (r - q) + kd (r' - q') + (dynamics + friction) / gain) / gains
 
-    r' is differenced as q' is, so that both are late by as much; where the velocity is measured, it is the
-    reference's own. Where readings are held, the parts of the PD law are held with them.
+    r' is differenced like q', so that both have the same delay; if the velocity is measured, it is the
+    derivative of the reference. If readings are held, the parts of the PD law are held with them.
 
     Args:
-        kp, kd: In units of the command, as those of `PD`.
-        model: What the law takes for the plant.
+        kp, kd: Gains in units of the command, as those of `PD`.
+        model: Model of the plant that the law uses.
         gain: Force per unit of the command, by drive.
         dynamics: Whether forces without friction are fed forward.
-        friction: Whether friction is.
+        friction: Whether friction is fed forward.
         gains: Whether the command is divided by the drives' gains.
         epsilon: Velocity of the reference over which dry friction changes its sign [m/s or rad/s].
 
@@ -76,16 +76,16 @@ class FeedForward(Controller):
     epsilon: Array = eqx.field(default=1e-3, kw_only=True)
 
     def start_feedback(self, tick: Tick) -> tuple[Array, Array]:
-        """Past references, and the PD law's last parts."""
+        """Return past references, and the last parts of the PD law."""
         back = self.period * jnp.arange(1, self.velocity_average + 1)[:, None]
-        return tick.reference - back * tick.path.slope, jnp.zeros((2, tick.reference.size))
+        return tick.reference - back * tick.path.derivatives[0], jnp.zeros((2, tick.reference.size))
 
     def feedback(self, tick: Tick, velocity: Array, memory: tuple) -> tuple[Array, tuple]:
-        """The PD law's command, and its memory."""
+        """Compute the command of the PD law, and its memory."""
         past, held = memory
         slope = (tick.reference - past[-1]) / (self.velocity_average * self.period)
         measured = tick.velocity is not None
-        slope = tick.path.slope if measured else slope
+        slope = tick.path.derivatives[0] if measured else slope
         error = tick.reference - tick.position
         parts = self.kp * error, self.kd * (slope - tick.at_drives(velocity))
         fresh = tick.fresh, tick.renewed if measured else tick.fresh
@@ -93,21 +93,19 @@ class FeedForward(Controller):
         return held[0] + held[1], (jnp.concatenate([tick.reference[None], past[:-1]]), held)
 
     def fed(self, model: Plant, tick: Tick) -> tuple[Array, Array]:
-        """What a model asks for along the reference, without friction and for it, in units of the command."""
-        width = (jnp.ones(()), jnp.asarray(self.epsilon))
-        model = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), model, width)
-        path = (tick.path.reference, tick.path.slope, tick.path.curvature)
-        motion = (tick.at_joints(x) for x in path)
-        forces = inverse_dynamics(model, *motion, len(tick.driven))
-        return tuple(tick.at_drives(f) / self.gain for f in forces)
+        """Compute the commands of a model along the reference, without friction and for friction."""
+        model = model.smoothed(jnp.ones(()), jnp.asarray(self.epsilon))
+        q, qd, qdd = (tick.at_joints(x) for x in (tick.path.reference, *tick.path.derivatives))
+        smooth, friction = inverse_dynamics(model, q, qd, qdd, len(tick.driven))
+        return tick.at_drives(smooth) / self.gain, tick.at_drives(friction) / self.gain
 
     def over_gains(self, u: Array, model: Plant) -> Array:
-        """The command that gives what is asked for, through the drives' gains."""
+        """Divide a command by the drives' gains."""
         return u / jnp.maximum(drive_gains(model, u.size), _LEAST_GAIN)
 
 
 class ComputedTorque(FeedForward):
-    """`FeedForward` of a model that stays as it is: the case's own, at its guesses."""
+    """`FeedForward` with a fixed model: that of the case, at its guesses."""
 
     of_machine: ClassVar[tuple[str, ...]] = ("model", "gain")
 

@@ -1,4 +1,4 @@
-"""Tracking by flatness: the plant's own balance gives the force for the acceleration asked of it."""
+"""Tracking by flatness: the balance of the plant gives the force for a wanted acceleration."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.controllers.base import Controller, Path, Tick
 from jaxid.dynamics.rhs import State, acceleration
-from jaxid.model.plant import Plant, port_motion
+from jaxid.model.balance import port_motion
+from jaxid.model.plant import Plant
 from jaxid.numerics.smooth import sharp_clip
 
 
 def flat_inputs(plant: Plant, path: Path, drives: int) -> Float[Array, "time m"]:
-    """Forces of the drives along a trajectory of the flat output, which is every joint's position.
+    """Compute the forces of the drives along a trajectory of the flat output, the position of all joints.
 
     Positions, velocities and accelerations are the trajectory and its derivatives; the balance gives the
-    rest. Where not every joint is driven, a trajectory that the others would not follow by themselves
-    asks for forces that no drive gives: these are left out.
+    forces. If a joint has no drive, a trajectory that it would not follow by itself needs a force that no
+    drive gives: such forces are left out.
 
     Args:
         plant: The plant; its dry friction is smoothed.
-        path: Of all joints, one row an instant.
-        drives: How many there are.
+        path: Trajectory of all joints, one row for each instant.
+        drives: Number of drives.
 
     Source:
         Wi, Ri, Ri & Ri, (3).
@@ -38,39 +39,40 @@ def flat_inputs(plant: Plant, path: Path, drives: int) -> Float[Array, "time m"]
         own = plant.initial_states(none)
         return plant.at_drives(plant.balance(q, v, a, none, jnp.zeros(()), own).residual)
 
-    return jax.vmap(forces)(path.reference, path.slope, path.curvature)
+    return jax.vmap(forces)(path.reference, *path.derivatives)
 
 
 class Flatness(Controller):
-    """u = force that the model's balance asks for at the measured positions and acceleration v.
+    """u = force of the model's balance at the measured positions and the acceleration v.
 
-    Every position is a flat output: it and two of its derivatives give all states and forces. With
+    Every position is a flat output: with two of its derivatives it gives all states and forces. With
     e = q - reference and the error's characteristic polynomial of the given poles,
 
         two poles:    v = reference'' - b1 e' - b0 e, e' from the measured velocity
         three poles:  v = reference'' - b2 e' - b1 e - b0 integral of e, e' from a reconstructed one
 
-    The reconstructed velocity is the integral of the model's own acceleration at the measured
-    positions under the command that was given; within `epsilon` it is the measured one, so that it
+    The reconstructed velocity is the integral of the acceleration of the model at the measured
+    positions under the given command; within `epsilon` it is the measured one, so that it
     does not drift while a joint sticks. The sign of dry friction is linear there.
 
-    The model is the case's own at its guesses, with what acts on the joints; what sits in the drive
-    (gain, lag, saturation) is not inverted. Joints without a drive follow as they will.
+    The model is that of the case at its guesses, with the effects on the joints; those in the drive
+    (gain, lag, saturation) are not inverted. Joints without a drive are not controlled.
 
     Args:
-        poles: Of the error, two or three negative reals [1/s].
+        poles: Poles of the error, two or three negative reals [1/s].
         epsilon: Velocity within which the sign of dry friction is linear [m/s or rad/s].
-        model: What the law takes for the plant.
+        model: Model of the plant that the law uses.
         gain: Force per unit of the command, by drive.
 
     Source:
         Wi, Ri, Ri & Ri, (4)-(5) and (9)-(12). As printed, (4) derives v once more and (5), (10) lack
         the reference's marks; (8) integrates -c y / m and the sign of a difference, and drifts by up
-        to mu g while sticking: here the balance is integrated as it stands, and reset at rest.
+        to mu g while sticking: here the whole balance is integrated, and reset at rest.
     """
 
     anticipates: ClassVar[bool] = True
     of_machine: ClassVar[tuple[str, ...]] = ("model", "gain")
+    separate_drives: ClassVar[bool] = True
 
     poles: tuple[float, ...] = eqx.field(static=True, converter=tuple)
     epsilon: Array
@@ -84,7 +86,7 @@ class Flatness(Controller):
 
     @property
     def reconstructs(self) -> bool:
-        """Whether the law sees a reconstructed velocity."""
+        """Whether the law uses a reconstructed velocity."""
         return len(self.poles) == 3
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Any:
@@ -94,16 +96,16 @@ class Flatness(Controller):
         return velocity, tick.joints, none, none, none
 
     def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
-        path, error = tick.path, tick.position - tick.reference
+        (slope, curvature), error = tick.path.derivatives, tick.position - tick.reference
         if not self.reconstructs:
             b1, b0 = self.gains
-            v = path.curvature - b1 * (tick.at_drives(velocity) - path.slope) - b0 * error
+            v = curvature - b1 * (tick.at_drives(velocity) - slope) - b0 * error
             return self._force(tick, velocity, v) / self.gain, None
         b2, b1, b0 = self.gains
         before, joints, force, integral, last = memory
         velocity = self._reconstructed(before, velocity, joints, tick.joints, force)
         integral = integral + 0.5 * self.period * (last + error)
-        v = path.curvature - b2 * (tick.at_drives(velocity) - path.slope) - b1 * error - b0 * integral
+        v = curvature - b2 * (tick.at_drives(velocity) - slope) - b1 * error - b0 * integral
         u = self._force(tick, velocity, v) / self.gain
         given = self.gain * self.clipped(u + disturbance)
         return u, (velocity, tick.joints, given, integral, error)
@@ -111,7 +113,7 @@ class Flatness(Controller):
     def _reconstructed(
         self, before: Array, measured: Array, joints: Array, now: Array, force: Array
     ) -> Array:
-        """Velocity a tick later: the midpoint rule on the model's acceleration."""
+        """Compute the velocity a tick later by the midpoint rule on the acceleration of the model."""
         first = before + 0.5 * self.period * self._acceleration(joints, before, force)
         moved = before + self.period * self._acceleration(0.5 * (joints + now), first, force)
         return jnp.where(jnp.abs(measured) < self.epsilon, measured, moved)
@@ -122,7 +124,7 @@ class Flatness(Controller):
         return acceleration(self.model, State(q, v, own), force, jnp.zeros(()), reaction)
 
     def _force(self, tick: Tick, velocity: Array, v: Array) -> Array:
-        """Force of the drives for accelerations v of the joints that are driven."""
+        """Compute the force of the drives for accelerations v of the driven joints."""
         q, v = tick.joints, jnp.broadcast_to(v, len(tick.driven))
         none = jnp.zeros_like(v)
         asked = dict(zip(tick.driven, v, strict=True))
@@ -132,7 +134,7 @@ class Flatness(Controller):
         return tick.at_drives(balance.residual)
 
     def _reaction(self, q: Array, velocity: Array, force: Array) -> Array:
-        """Dry friction by port, its sign linear within epsilon."""
+        """Compute dry friction by port, with a sign that is linear within epsilon."""
         own, ports = self.model.initial_states(force), jnp.zeros_like(self.model.ports(q))
         zero = jnp.zeros_like(q)
         level = self.model.balance(q, velocity, zero, force, jnp.zeros(()), own, ports).dry

@@ -40,8 +40,8 @@ class PD(Controller):
 class FrictionCompensation(Controller):
     """u = kp (r - q) + kd (r' - dq) + inertia r'' + viscous dq + coulomb sign(dq).
 
-    A PD law beside a model of one's own of each drive: inertia from the reference, friction from the measured
-    velocity. All in units of the command. Without kp and kd it lets a joint go as if it had no friction.
+    A PD law with a simple model of each drive fed forward: inertia from the reference, friction from the
+    measured velocity. All in units of the command. Without kp and kd a joint moves as if without friction.
 
     Source:
         "PA-10 traineeship", (5.6), (5.13) and (5.14).
@@ -56,15 +56,16 @@ class FrictionCompensation(Controller):
     anticipates = True
 
     def law(self, tick: Tick, velocity: Array, memory: None, disturbance: Array) -> tuple:
-        v, path = tick.at_drives(velocity), tick.path
-        fed = self.inertia * path.curvature + self.viscous * v + self.coulomb * jnp.sign(v)
-        return self.kp * (path.reference - tick.position) + self.kd * (path.slope - v) + fed, None
+        v, reference = tick.at_drives(velocity), tick.path.reference
+        slope, curvature = tick.path.derivatives
+        fed = self.inertia * curvature + self.viscous * v + self.coulomb * jnp.sign(v)
+        return self.kp * (reference - tick.position) + self.kd * (slope - v) + fed, None
 
 
 class PID(Controller):
     """u = kp e + ki sum(e) period + kd de, de low-passed with time constant `derivative_filter`.
 
-    With `anti_windup` the integral stands still while the command is at its limit and the error
+    With `anti_windup` the integral is held while the command is at its limit and the error
     would drive it further out.
     """
 

@@ -16,9 +16,10 @@ from jaxid.discovery.user_effects import check_user_effect, is_user_effect
 from jaxid.effects import EFFECTS
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.model.balance import port_motion
 from jaxid.model.effect import Effect, Scales, carries_force
 from jaxid.model.parameter import parameters_of
-from jaxid.model.plant import Plant, port_motion
+from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, Parameters, colours, free_effect, label
 from jaxid.simulation.force_balance import ForceData, sharpened, whole_motion
 

@@ -18,24 +18,24 @@ from jaxid.model.unknowns import scatter
 
 # Relative to the square of the highest frequency, below this one is that of a rigid motion.
 _RIGID = 1e-9
-# Of its largest term, what is left of a slope whose terms cancel.
+# Relative to its largest term, a slope below this is rounding of terms that cancel.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class Modes:
-    """Natural frequencies, lowest first; motions without stiffness left out.
+    """Natural frequencies, lowest first, without rigid motions.
 
     Args:
-        hz: [Hz], (modes,).
-        slopes: In the unknowns, (modes, p).
+        hz: The frequencies [Hz], (modes,).
+        slopes: Their derivatives in the unknowns, (modes, p).
     """
 
     hz: Float[np.ndarray, " modes"]
     slopes: Float[np.ndarray, "modes p"]
 
     def std(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " modes"]:
-        """Standard deviations [Hz]; NaN where an unknown in one has none."""
+        """Return the standard deviations [Hz]; NaN for a mode with an unknown that has none."""
         known = np.isfinite(np.diag(covariance))
         inner = np.where(np.outer(known, known), covariance, 0.0)
         std = np.sqrt(np.maximum(np.einsum("mi,ij,mj->m", self.slopes, inner, self.slopes), 0.0))
@@ -45,16 +45,16 @@ class Modes:
 def natural_frequencies(
     plant: Plant, places: tuple, theta: Float[np.ndarray, " p"], held: tuple[int, ...] = ()
 ) -> Modes:
-    """How fast a plant swings about rest without friction: the size of its eigenvalues.
+    """Compute the natural frequencies of a plant about rest without friction: the size of its eigenvalues.
 
-    Dry friction and what damps the joints are left out: with it the size of a weakly damped mode moves
-    in the second order only, but a strongly damped one is lost, and guesses of damping may be far off.
-    Damping among the effects' own states stays; beside a single spring it leaves the size as it is.
+    Dry friction and damping of the joints are left out: damping changes the size of a weakly damped mode
+    only in the second order, but a strongly damped mode would be lost, and guesses of damping may be far
+    off. Damping among the effects' internal states stays; beside a single spring it does not change the size.
 
     Args:
-        plant: The plant.
-        places: Where its unknowns are (`Parameters.places`).
-        theta: Their values.
+        plant: The plant with its effects.
+        places: Places of its unknowns (`Parameters.places`).
+        theta: Values of the unknowns.
         held: Joints that are held still.
 
     Source:
@@ -63,9 +63,9 @@ def natural_frequencies(
     a, slopes = (np.asarray(x) for x in _matrix(plant, places, np.asarray(theta), held))
     if not (a.size and np.all(np.isfinite(a))):
         return Modes(np.zeros(0), np.zeros((0, len(theta))))
-    values, left, right = scipy.linalg.eig(a, left=True)
+    values, left, right = (np.asarray(x) for x in scipy.linalg.eig(a, left=True))
     size = np.abs(values)
-    swings = values.imag > np.abs(values.real)
+    swings = np.imag(values) > np.abs(np.real(values))
     swings &= size**2 > _RIGID * np.max(size[swings] ** 2, initial=0.0)
     at = np.flatnonzero(swings)[np.argsort(size[swings])]
     y, x, direction = left[:, at].conj(), right[:, at], values[at].conj() / size[at]
@@ -77,7 +77,7 @@ def natural_frequencies(
 
 @eqx.filter_jit
 def _matrix(plant: Plant, places: tuple, theta: Array, held: tuple[int, ...]) -> tuple[Array, Array]:
-    """The state matrix, (s, s), and its slopes in the unknowns, (s, s, p)."""
+    """Compute the state matrix, (s, s), and its slopes in the unknowns, (s, s, p)."""
 
     def matrix(theta: Array) -> tuple[Array, Array]:
         a = _state_matrix(scatter(places, plant, theta), held)
@@ -88,15 +88,15 @@ def _matrix(plant: Plant, places: tuple, theta: Array, held: tuple[int, ...]) ->
 
 
 def _state_matrix(plant: Plant, held: tuple[int, ...]) -> Float[Array, "s s"]:
-    """Of positions and velocities of the free joints, and the effects' own states, at rest."""
+    """Compute the state matrix at rest: positions and velocities of the free joints, and internal states."""
     free = np.asarray([i for i in range(plant.joints) if i not in held], dtype=int)
     n, u = len(free), jnp.zeros(len(plant.driven(plant.joints)))
     own, back = ravel_pytree(plant.initial_states(u))
     no_friction = jnp.zeros_like(plant.ports(jnp.zeros(plant.joints)))
 
     def balance(q: Array, v: Array, a: Array, own: Array) -> tuple[Array, Array]:
-        whole = (jnp.zeros(plant.joints).at[free].set(x) for x in (q, v, a))
-        b = plant.balance(*whole, u, jnp.zeros(()), back(own), no_friction)
+        q, v, a = (jnp.zeros(plant.joints).at[free].set(x) for x in (q, v, a))
+        b = plant.balance(q, v, a, u, jnp.zeros(()), back(jnp.asarray(own)), no_friction)
         return b.residual[free], ravel_pytree(b.rates)[0]
 
     zero = jnp.zeros(n)

@@ -1,4 +1,4 @@
-"""A plant's balance along a measured motion: the effects' own states there, and what force is missing.
+"""The balance of a plant along a measured motion: internal states of effects, and the residual force.
 
 The residual's Jacobian is the regressor: there is no other set of columns.
 """
@@ -17,21 +17,21 @@ from jaxid.model.plant import Plant
 def integrate_internal_states(
     plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
 ) -> tuple:
-    """Drive the effects' own states along a measured motion.
+    """Integrate the effects' internal states along a measured motion.
 
-    The rate of an own state is affine in it, and depends on none but those of effects before it:
-    along a known motion, decay and push are known at every sample, and all that is left of the
-    equation is a linear recurrence.
+    The rate of an internal state is affine in it, and depends only on those of effects before it:
+    along a known motion, decay and push are known at every sample, and the equation reduces to a
+    linear recurrence.
 
     Args:
-        plant: The plant.
+        plant: The plant with its effects.
         q, qd, qdd: Motion, (time, n).
         u: Declared force at the samples, delay applied, (time, m).
         period: Sampling time [s].
         start: Time of the first sample [s].
 
     Returns:
-        The own states at every sample.
+        The internal states at every sample.
     """
     first = plant.initial_states(u[0])
     if not jax.tree.leaves(first):
@@ -72,8 +72,8 @@ def _recurrence(start: Array, decay: Array, push: Array, h: Array) -> Array:
     mean = 0.5 * (decay[:-1] + decay[1:])
     e, p1, p2, p3, p4 = phi(h * mean)
     add = h * (here * p1 + line * p2 + 2 * bend * p3 + 6 * turn * p4)
-    # What the decay differs from its mean acts as a push that is a line, in proportion to z at both
-    # ends: a friction that slips stays at its level however fast the speed changes.
+    # The deviation of the decay from its mean acts as a linear push, in proportion to z at both ends: a
+    # friction that slips stays at its level however fast the speed changes.
     gain = e + h * (p1 - p2) * (decay[:-1] - mean)
     scale = 1.0 / (1.0 - h * p2 * (decay[1:] - mean))
 
@@ -101,7 +101,7 @@ def _vector_recurrence(start: Array, slope: Array, push: Array, h: Array) -> Arr
 
 
 def _cubics(x: Array) -> tuple[Array, Array, Array, Array]:
-    """Coefficients, over the fraction of an interval, of the cubic through its ends and neighbours."""
+    """Return the coefficients, over the fraction of an interval, of the cubic through four samples."""
     before = jnp.concatenate([2 * x[:1] - x[1:2], x[:-2]])
     here, there = x[:-1], x[1:]
     after = jnp.concatenate([x[2:], 2 * x[-1:] - x[-2:-1]])
@@ -112,9 +112,9 @@ def _cubics(x: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _matrix_phi(x: Float[Array, "k k"]) -> list[Array]:
-    """`phi` of a matrix: the first row of blocks of the exponential of a shifted block matrix.
+    """Compute `phi` of a matrix: the first row of blocks of the exponential of a shifted block matrix.
 
-    By Taylor's series, halved and squared: LAPACK inside a batch of a study may wait for ever.
+    By Taylor's series with scaling and squaring: LAPACK inside a batch of a study may wait for ever.
     """
     k, halvings = x.shape[0], 16
     whole = jnp.eye(5 * k, k=k).at[:k, :k].set(x) / 2.0**halvings
@@ -130,10 +130,10 @@ def _matrix_phi(x: Float[Array, "k k"]) -> list[Array]:
 def balance_along(
     plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
 ) -> tuple[Float[Array, "time n"], Float[Array, "time m"]]:
-    """Residual of the balance along a motion, and force of the drives, both at the load [N or N m].
+    """Compute the residual of the balance and the force of the drives along a motion, at the load [N or N m].
 
     Args:
-        plant: The plant; its effects' own states are driven along the motion.
+        plant: The plant; internal states of its effects are integrated along the motion.
         q, qd, qdd: Motion, (time, n).
         u: Declared force at the samples, delay applied, (time, m).
         period: Sampling time [s].
@@ -152,7 +152,7 @@ def balance_along(
 def residual_along(
     plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
 ) -> Float[Array, "time n"]:
-    """Inverse dynamics minus declared force, over `drive_ratio` [N or N m, declared units].
+    """Compute inverse dynamics minus declared force, over `drive_ratio` [N or N m, declared units].
 
     Arguments are those of `balance_along`.
     """
@@ -163,11 +163,11 @@ def residual_along(
 def drive_ratio(
     plant: Plant, drive: Float[Array, "time m"], u: Float[Array, "time m"], joints: int
 ) -> Float[Array, " n"]:
-    """Force at the load over declared force, root mean squares over a log, by joint.
+    """Return the force at the load over the declared force, root mean squares over a log, by joint.
 
-    It turns a residual back into declared units. Left in units of the load, a drive gain of zero,
-    or a saturation at zero, would be a perfect fit to any log. Where no drive is, that of all drives
-    together counts: with a single one, all forces of the machine go in proportion to it.
+    It turns a residual back into declared units. In units of the load, a drive gain of zero, or a
+    saturation at zero, would fit any log perfectly. A joint without a drive takes the ratio of all drives
+    together: with a single one, all forces of the machine are in proportion to it.
     """
     tiny = 1e-300
     squares = [jnp.sum(x**2, axis=0) for x in (drive, u)]

@@ -1,4 +1,4 @@
-"""What is read from a plant's one balance at an instant, and over a step: accelerations, and motion.
+"""Accelerations from the balance of a plant at an instant, and its motion over a step.
 
 The step in which dry friction sticks exactly is in `jaxid.dynamics.dry_friction`; residuals along a measured
 motion, whose Jacobians are regressors, are in `jaxid.dynamics.residuals`.
@@ -18,19 +18,20 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.errors import InputError
-from jaxid.model.plant import Balance, Plant
+from jaxid.model.balance import Balance
+from jaxid.model.plant import Plant
 from jaxid.numerics.affine import Affine, affine
 from jaxid.numerics.smooth import ramp, sign
 
-# Traced once for all places of a step that read it: tracing is most of what a first answer waits for.
+# Traced once for all uses in a step: tracing takes most of the time until a first result.
 balance_of = eqx.filter_jit(lambda plant, *args: plant.balance(*args))
 
-# Coordinates, velocities, and own states in one array.
+# Coordinates, velocities, and internal states in one array.
 Split = tuple[Array, Array, Array]
 
 
 class State(eqx.Module):
-    """Motion and memory: coordinates, velocities, the effects' own states (None where none)."""
+    """Motion and memory: coordinates, velocities, and the effects' internal states (None without memory)."""
 
     q: Float[Array, " n"]
     qd: Float[Array, " n"]
@@ -68,7 +69,7 @@ def acceleration(
         plant: The plant.
         x: State.
         u: Declared force of each drive, delay applied [N or N m].
-        t: Time [s].
+        t: Time from the start of the log [s].
         reaction: Dry-friction force by port from a set-valued step; absent: smoothed.
     """
 
@@ -81,22 +82,23 @@ def acceleration(
         if plant.coupled:
             return _implicit(lambda qdd: residual(qdd)[0], solved(mass, -rest.residual))
         return solved(mass, -rest.residual)
-    # At rest in acceleration the balance has nothing of what acts while speed grows: that resists what
-    # is left of the force, as far as it goes.
+    # At zero acceleration the balance contains no friction of growing speed: up to its level, that resists
+    # the remaining force.
     each = need_apart(plant, mass, rest.rises)
-    way = sign(x.qd, plant.port_width(x.q)[: x.q.size])
+    direction = sign(x.qd, plant.port_width(x.q)[: x.q.size])
     forth, back = (spread(picked(r, rest.rises), rest.rises, each.size) for r in rest.rising)
-    left = -rest.residual
-    forth, back = 0.5 * (1 + way) * forth, 0.5 * (1 - way) * back
-    more = ramp(left, forth, plant.sharpness * forth) - ramp(-left, back, plant.sharpness * back)
-    return (left - more) / each
+    remaining = -rest.residual
+    forth, back = 0.5 * (1 + direction) * forth, 0.5 * (1 - direction) * back
+    corner = plant.smoothing.sharpness
+    more = ramp(remaining, forth, corner * forth) - ramp(-remaining, back, corner * back)
+    return (remaining - more) / each
 
 
 def _implicit(residual: Callable[[Array], Array], qdd: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Accelerations at which a residual that is affine in them is zero, differentiated as such.
+    """Return the accelerations that make an affine residual zero, with derivatives by the implicit function.
 
-    A tangent then takes one balance, and not those of all columns of the mass: of seven joints one for
-    eight, and the same through the elimination.
+    A tangent then takes one balance instead of those of all columns of the mass: one in place of eight for
+    seven joints, and likewise through the elimination.
     """
     none = jnp.zeros_like(qdd)
     return jax.lax.custom_root(
@@ -105,10 +107,10 @@ def _implicit(residual: Callable[[Array], Array], qdd: Float[Array, " n"]) -> Fl
 
 
 def need_apart(plant: Plant, mass: Array, ports: tuple[int, ...]) -> Array:
-    """Mass of each joint, where none pushes another and all of some ports are joints.
+    """Return the mass of each joint, if no joint accelerates another and the given ports are joints.
 
     Raises:
-        InputError: Elsewhere: friction that depends on the acceleration has no answer there.
+        InputError: Otherwise: friction that depends on the acceleration cannot be solved there.
     """
     apart = mass.ndim == 1 or mass.shape == (1, 1)
     if apart and max(ports) < mass.shape[0]:
@@ -122,7 +124,7 @@ def need_apart(plant: Plant, mass: Array, ports: tuple[int, ...]) -> Array:
 
 
 def mass_of(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple[Array, Any]:
-    """Derivative of a residual in the accelerations, (n, n), or (n,) where it is diagonal; and its aux."""
+    """Return the derivative of a residual in the accelerations, (n, n), or (n,) if diagonal; and its aux."""
     zero = jnp.zeros_like(q)
     if plant.diagonal:
         return jax.jvp(residual, (zero,), (jnp.ones_like(q),), has_aux=True)[1:]
@@ -130,23 +132,23 @@ def mass_of(plant: Plant, residual: Callable[[Array], tuple], q: Array) -> tuple
 
 
 def solved(mass: Array, force: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Accelerations that forces give a mass, which is a matrix or its diagonal."""
+    """Return the accelerations that forces give a mass, which is a matrix or its diagonal."""
     return force / mass if mass.ndim == 1 else small_solve(mass, force)
 
 
 def derivative(plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None) -> State:
-    """Time derivative of the state: the right-hand side."""
+    """Compute the time derivative of the state: the right-hand side."""
     qdd = acceleration(plant, x, u, t, reaction)
     rates = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction).rates
     return State(x.qd, qdd, rates)
 
 
-# Likewise, for all stages of a step.
+# Traced once for all stages of a step.
 _derivative = eqx.filter_jit(derivative)
 
 
 def vector_field(t: Array, x: State, args: tuple[Plant, Callable[[Array], Array]]) -> State:
-    """Right-hand side in diffrax's form: args are the plant and the force as function of time."""
+    """Compute the right-hand side in diffrax's form: args are the plant and the force as function of time."""
     plant, force = args
     drives = jax.eval_shape(force, t).size
     late = [force(t - d)[j] for j, d in enumerate(plant.command_delays(drives))]
@@ -154,11 +156,11 @@ def vector_field(t: Array, x: State, args: tuple[Plant, Callable[[Array], Array]
 
 
 def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
-    """Decay rate of each own state, as a tree like the state; zero for the motion.
+    """Return the decay rate of each internal state, as a tree like the state; zero for the motion.
 
-    The rate of an own state is affine in it, so that its slope is the decay; a lag far shorter
+    The rate of an internal state is affine in it, so that its slope is the decay; a lag far shorter
     than the step, or a presliding spring at speed, is then stepped exactly instead of blowing up.
-    Vectors (oscillators) are no single decays, and are left to the explicit part.
+    Vectors (oscillators) have no single decay, and belong to the explicit part.
     """
 
     def rates(own: tuple) -> tuple:
@@ -171,7 +173,7 @@ def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
 
 
 def phi(x: Array) -> list[Array]:
-    """e^x, (e^x - 1)/x and the next three of that family; series near zero, where they cancel."""
+    """Compute e^x, (e^x - 1)/x and the next three of that family; by series near zero, where they cancel."""
     small = jnp.abs(x) < 0.3
     safe = jnp.where(small, 1.0, x)
     closed = [jnp.expm1(safe) / safe]
@@ -191,20 +193,20 @@ def step(
     h: Array,
     reaction: Array | None = None,
 ) -> State:
-    """One fourth-order step: Runge-Kutta for the motion, its exponential form for own states.
+    """Advance one fourth-order step: Runge-Kutta for the motion, its exponential form for internal states.
 
     Args:
-        plant: The plant.
-        x: State at t.
+        plant: The plant with its effects.
+        x: State at time t.
         u: Declared force, delay applied, as a function of the fraction of the step in [0, 1].
-        t: Time [s].
-        h: Step [s].
+        t: Time at the start of the step [s].
+        h: Length of the step [s].
         reaction: Dry-friction force by port, constant over the step; absent: smoothed.
 
     Source:
-        Cox and Matthews (2002), J. Comput. Phys. 176, ETDRK4. The linear part is the decay of own
+        Cox and Matthews (2002), J. Comput. Phys. 176, ETDRK4. The linear part is the decay of internal
         states and their push on the velocities (without which a lag far shorter than the step
-        acts a sixth of a step late); where there are none it is the classical method.
+        acts a sixth of a step late); without internal states it is the classical method.
     """
     if not jax.tree.leaves(x.own):
         return _classical_step(plant, x, u, t, h, reaction)
@@ -214,13 +216,13 @@ def step(
     push = _own_push(plant, x, start, t, reaction)
 
     def linear(y: Split, motion: float | Array, own: Array, above: Array) -> Split:
-        """A function of the linear part, times y; `above` is its entry between own and speed."""
+        """Apply a function of the linear part to y; `above` is its entry from internal states to speed."""
         q, v, z = y
         return motion * q, motion * v + jnp.sum(push * (above * z), axis=1), own * z
 
     def rest(y: Split, u: Array, t: Array) -> Split:
         q, v, z = y
-        rate = _derivative(plant, State(q, v, back(z)), u, t, reaction)
+        rate = _derivative(plant, State(q, v, back(jnp.asarray(z))), u, t, reaction)
         return v, rate.qd - jnp.sum(push * z, axis=1), ravel_pytree(rate.own)[0] - decay * z
 
     half = 0.5 * h
@@ -241,7 +243,7 @@ def step(
         linear(_sum(na, nb), h / 3, h * (2 * p2 - 4 * p3), h**2 * (2 * p3 - 4 * p4)),
         linear(nc, h / 6, h * (4 * p3 - p2), h**2 * (4 * p4 - p3)),
     )
-    return State(q, v, back(z))
+    return State(q, v, back(jnp.asarray(z)))
 
 
 def _sum(*terms: Split) -> Split:
@@ -249,11 +251,11 @@ def _sum(*terms: Split) -> Split:
 
 
 def _own_push(plant: Plant, x: State, u: Array, t: Array, reaction: Array | None) -> Float[Array, "n own"]:
-    """Derivative of the accelerations with respect to the own states."""
+    """Return the derivative of the accelerations with respect to the internal states."""
     flat, back = ravel_pytree(x.own)
 
     def acc(own: Array) -> Array:
-        return acceleration(plant, State(x.q, x.qd, back(own)), u, t, reaction)
+        return acceleration(plant, State(x.q, x.qd, back(jnp.asarray(own))), u, t, reaction)
 
     return jax.jacfwd(acc)(flat)
 
@@ -287,7 +289,7 @@ def _classical_step(
 
 
 def _rolled(slope: Callable[..., Array], x: State, h: Array, parts: Array, forces: Array) -> State:
-    """The four stages as a loop: four copies of an arm compile four times as long."""
+    """Run the four stages as a loop: four copies of an arm compile four times as long."""
 
     def stage(carry: tuple, now: tuple) -> tuple[tuple, None]:
         v, a, q_sum, v_sum = carry
@@ -303,17 +305,17 @@ def _rolled(slope: Callable[..., Array], x: State, h: Array, parts: Array, force
 
 
 def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array) -> Affine | None:
-    """`step` under a given reaction as one matrix, where the plant's forces are affine.
+    """Return `step` under a given reaction as one matrix, if the plant's forces are affine.
 
     Args:
-        plant: The plant.
+        plant: The plant with its effects.
         x: Any state, for its shape.
         u: Declared force at the ends of the step, as `hold_polynomial` takes it; for its shape.
         t: Any time: a force that depends on it is not affine.
-        h: Step [s].
+        h: Length of the step [s].
 
     Returns:
-        For `set_valued_step`, a function of state, that force and reaction; or None.
+        A function of state, that force and reaction for `set_valued_step`; or None.
     """
 
     def flow(x: State, u: tuple[Array, ...], reaction: Array, t: Array) -> State:
@@ -323,7 +325,7 @@ def affine_flow(plant: Plant, x: State, u: tuple[Array, ...], t: Array, h: Array
 
 
 def hold_polynomial(values: tuple[Array, ...]) -> Callable[[Array], Array]:
-    """Held at one value, a line through two, a parabola through three; of the fraction in [0, 1]."""
+    """Interpolate over the fraction in [0, 1]: one value is held, two give a line, three a parabola."""
     if len(values) == 3:
         start, middle, end = values
         bend = 2.0 * (start - 2.0 * middle + end)
@@ -333,12 +335,12 @@ def hold_polynomial(values: tuple[Array, ...]) -> Callable[[Array], Array]:
 
 
 def picked(x: Array, ports: tuple[int, ...]) -> Array:
-    """Values of some ports."""
+    """Return the values of some ports."""
     return x if len(ports) == x.size else jnp.stack([x[i] for i in ports])
 
 
 def spread(x: Array, ports: tuple[int, ...], size: int) -> Array:
-    """Values of some ports among all; zero elsewhere."""
+    """Spread the values of some ports among all; zero elsewhere."""
     if len(ports) == size:
         return x
     zero = jnp.zeros((), x.dtype)

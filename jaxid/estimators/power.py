@@ -34,7 +34,8 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import linear_scale
 from jaxid.logs.prepare import Prepared, lasting
 from jaxid.machine import Machine
-from jaxid.model.plant import Balance, Plant
+from jaxid.model.balance import Balance
+from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import equinox as eqx
@@ -227,7 +227,7 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
     low, high = spread(case.limits["stroke"], (2,)).T
     speed = spread(case.limits["speed"])
     bounds = (low, high, speed, spread(setting.get("acceleration", np.inf)))
-    plant = replace(machine.plant, velocity_scale=jnp.asarray(speed.max()), sharpness=jnp.asarray(_SHARPNESS))
+    plant = machine.plant.smoothed(jnp.asarray(_SHARPNESS), jnp.asarray(speed.max()))
     machine = machine.with_plant(plant, machine.parameters)
     time = _instants(base_hz, harmonics)
     series = _Series.within(time, base_hz, harmonics, bounds)

@@ -161,7 +161,7 @@ class _DesignProblem:
         every = max(1, round(1 / (rate * period)))
         ticks = (round(duration * rate) - 1) * every + 1
         speed = float(limits.speed.max())
-        plant = replace(machine.plant, velocity_scale=np.asarray(speed), sharpness=np.asarray(_SHARPNESS))
+        plant = machine.plant.smoothed(np.asarray(_SHARPNESS), np.asarray(speed))
         machine = machine.with_plant(plant, machine.parameters)
         shapes, starts = _family(machine, limits, ticks, period)
         m, n = machine.gain.size, case.plant.joints
@@ -214,7 +214,7 @@ class _DesignProblem:
             self.weight,
             self.prior,
             self.on,
-            (np.asarray(self.machine.plant.sharpness),),
+            (np.asarray(self.machine.plant.smoothing.sharpness),),
             tuple(range(self.replay.position.size)),
         )
         if not rounds(self.machine, problem):

@@ -29,7 +29,7 @@ def check_log(
     log: Log,
     *,
     command_limit: ByJoint | None = None,
-    motion: str = "linear",
+    motion: str | Sequence[str] = "linear",
     units: dict[str, str] | None = None,
     path: str | Path | None = None,
     driven: Sequence[int] | np.ndarray | None = None,
@@ -41,7 +41,7 @@ def check_log(
     Args:
         log: The log.
         command_limit: Known saturation of the logged command, in its unit; a list by channel.
-        motion: "linear" (m) or "rotary" (rad).
+        motion: "linear" (m) or "rotary" (rad), of all joints or one for each.
         units: Labels of the case where the quantities are not mechanical; a foreign
             position unit leaves out the checks that need metres or radians.
         path: Name of the log in messages; its source where absent.

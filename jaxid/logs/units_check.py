@@ -73,17 +73,18 @@ _INERTIA = (
 
 
 def ratio_findings(
-    log: Log, motion: str, path: str, driven: Sequence[int] | np.ndarray | None = None
+    log: Log, motion: str | Sequence[str], path: str, driven: Sequence[int] | np.ndarray | None = None
 ) -> list[Finding]:
     """Compare the columns for velocity and reference with the position.
 
     Args:
         log: The log.
-        motion: "linear" or "rotary".
+        motion: "linear" or "rotary", of all joints or one for each.
         path: Name of the log in messages.
         driven: Joints with a drive, 0-based, in the order of the references; None: the first ones.
     """
     findings = []
+    motions = _by_joint(motion, log)
     references = 0 if log.reference is None else log.reference.shape[1]
     followed = range(references) if driven is None else driven
     reference_of = dict(zip(followed, range(references), strict=False))
@@ -93,11 +94,16 @@ def ratio_findings(
             continue
         if log.velocity is not None:
             where = f"{path}, velocity of joint {joint + 1}"
-            findings += _compare_velocity(log.velocity[:, joint], q, log.period, motion, where)
+            findings += _compare_velocity(log.velocity[:, joint], q, log.period, motions[joint], where)
         if joint in reference_of:
             where = f"{path}, reference of joint {joint + 1}"
-            findings += _compare_reference(log.reference[:, reference_of[joint]], q, motion, where)
+            findings += _compare_reference(log.reference[:, reference_of[joint]], q, motions[joint], where)
     return findings
+
+
+def _by_joint(motion: str | Sequence[str], log: Log) -> list[str]:
+    """Return the kind of motion of every joint of a log."""
+    return [motion] * log.position.shape[1] if isinstance(motion, str) else list(motion)
 
 
 def _compare_velocity(
@@ -139,12 +145,12 @@ def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: 
     return [Finding("warning", f"{told}, which should be 1", where, hint)]
 
 
-def magnitude_findings(log: Log, motion: str, path: str) -> list[Finding]:
+def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list[Finding]:
     """Strokes, speeds and sampling periods that no machine has.
 
     Args:
         log: The log, in mechanical units.
-        motion: "linear" (m) or "rotary" (rad).
+        motion: "linear" (m) or "rotary" (rad), of all joints or one for each.
         path: Name of the log in messages.
     """
     findings = []
@@ -152,6 +158,7 @@ def magnitude_findings(log: Log, motion: str, path: str) -> list[Finding]:
         severity = "error" if log.period > 10.0 else "warning"
         what = f"the sampling period is {log.period:.4g} s: time looks like milliseconds or rows"
         findings.append(Finding(severity, what, f"{path}, time", "give time in seconds"))
+    motions = _by_joint(motion, log)
     for joint, q in enumerate(log.position.T, start=1):
         if not log.measured[joint - 1]:
             continue
@@ -159,9 +166,9 @@ def magnitude_findings(log: Log, motion: str, path: str) -> list[Finding]:
         span = float(np.ptp(q))
         if span >= 100 and np.all(q == np.round(q)):
             what = f"position holds whole numbers only, {span:.0f} in all: encoder counts?"
-            hint = "convert position to " + ("m" if motion == "linear" else "rad")
+            hint = "convert position to " + ("m" if motions[joint - 1] == "linear" else "rad")
             findings.append(Finding("error", what, where, hint))
-        elif finding := _magnitude(q, log.period, motion, where):
+        elif finding := _magnitude(q, log.period, motions[joint - 1], where):
             findings.append(finding)
     return findings
 
@@ -191,7 +198,7 @@ def plausible_inertia(
     guess: ByJoint,
     gain: ByJoint = 1.0,
     *,
-    motion: str = "linear",
+    motion: str | Sequence[str] = "linear",
     driven: Sequence[int] | np.ndarray | None = None,
 ) -> Finding | None:
     """Compare the inertia that the log implies with the guess, by its order of magnitude.
@@ -203,7 +210,7 @@ def plausible_inertia(
         log: The log.
         guess: Inertia by joint [kg or kg m^2].
         gain: Force per unit of the logged command, by drive.
-        motion: "linear" or "rotary".
+        motion: "linear" or "rotary", of all joints or one for each.
         driven: Joint of each drive, 0-based; absent: all, in their order.
 
     Returns:
@@ -216,12 +223,13 @@ def plausible_inertia(
         return None
     guesses = np.broadcast_to(np.asarray(guess, dtype=np.float64), joints)
     forces = log.force * np.asarray(gain, dtype=np.float64)
+    motions = _by_joint(motion, log)
     for force, joint in zip(forces.T, driven, strict=True):
         others = np.delete(log.position, [joint, *np.flatnonzero(~np.array(log.measured))], axis=1)
         rough = implied_inertia(force, log.position[:, joint], log.period, others)
         where = f"{log.source}, joint {joint + 1}"
         span = float(np.ptp(log.position[:, joint]))
-        finding = _judge_inertia(rough, float(guesses[joint]), span, motion, where)
+        finding = _judge_inertia(rough, float(guesses[joint]), span, motions[joint], where)
         if finding is not None:
             return finding
     return None

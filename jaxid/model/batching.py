@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 
 def group_by_kind(effects: Sequence[Effect], drives: Sequence[int | None]) -> list[list[int]]:
-    """Indices of effects in runs of one kind, no two of a run on one port or one drive.
+    """Group the indices of effects in runs of one kind, no two of a run on one port or one drive.
 
     Args:
-        effects: In the order of the drive, which the runs keep.
-        drives: Drive of each; None where it has none.
+        effects: Effects in the order of the drive, which the runs keep.
+        drives: Drive of each effect; None if it has none.
     """
     runs: list[list[int]] = []
     for k, e in enumerate(effects):
@@ -36,7 +36,7 @@ def group_by_kind(effects: Sequence[Effect], drives: Sequence[int | None]) -> li
 
 
 def _same(one: Effect, two: Effect) -> bool:
-    """Whether two effects differ in nothing but port and values."""
+    """Return whether two effects differ only in port and values."""
     if type(one) is not type(two):
         return False
     for f in fields(one):
@@ -50,26 +50,26 @@ def _same(one: Effect, two: Effect) -> bool:
 
 
 def act_batched(effects: list[Effect], signals: list[Signals], states: list) -> list[Action]:
-    """What the effects of a run do; several are traced as one.
+    """Compute the actions of a run of effects; several are traced as one.
 
     Args:
-        effects: Of one kind.
-        signals: What each may look at.
-        states: Own state of each; None where the kind has none.
+        effects: Effects of one kind.
+        signals: Signals of each effect.
+        states: Internal state of each effect; None if the kind has none.
     """
     if len(effects) == 1:
         return [effects[0].act(signals[0], states[0])]
     treedef = jax.tree.structure(effects[0])
-    left_out: list[Any] = []
+    omitted: list[Any] = []
 
-    def act(leaves: list[Array], x: Signals, state: Array | None) -> Action:
+    def act(leaves: Sequence[Array], x: Signals, state: Array | None) -> Action:
         action = jax.tree.unflatten(treedef, leaves).act(x, state)
-        # What is left out stays a plain number, by which a balance knows that nothing is there.
+        # An omitted entry stays a plain number, which lets `balance` skip it.
         arrays, numbers = eqx.partition(action, eqx.is_array)
-        left_out.append(numbers)
+        omitted.append(numbers)
         return arrays
 
     leaves = [jnp.stack(column) for column in zip(*map(jax.tree.leaves, effects), strict=True)]
     together = [jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (signals, states)]
-    found = jax.vmap(act)(leaves, *together)
-    return [eqx.combine(jax.tree.map(lambda a, k=k: a[k], found), left_out[-1]) for k in range(len(effects))]
+    actions = jax.vmap(act)(leaves, *together)
+    return [eqx.combine(jax.tree.map(lambda a, k=k: a[k], actions), omitted[-1]) for k in range(len(effects))]

@@ -1,4 +1,4 @@
-"""Physical effects: the signals they see, what they do, and where a search for them starts."""
+"""Physical effects: their signals, their actions, and initial values for a search."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxid.model.parameter import ParameterInfo, parameters_of
 
 
 class Signals(eqx.Module):
-    """All that an effect may look at, in the coordinate of its port.
+    """The signals that an effect may use, in the coordinate of its port.
 
     Args:
         y: Coordinate [m or rad].
@@ -52,7 +52,7 @@ class Action(eqx.Module):
         stick: Level above `dry` that must be overcome to leave rest.
         rising: Level above `dry` while speed grows, forwards and backwards.
         drive: What leaves the actuator path in place of `Signals.u`.
-        rate: Time derivative of the effect's own state; affine in that state.
+        rate: Time derivative of the effect's internal state; affine in that state.
     """
 
     force: Array | float = 0.0
@@ -65,7 +65,7 @@ class Action(eqx.Module):
 
 @dataclass(frozen=True)
 class Scales:
-    """How large the quantities of a log are; where a search starts, never what it finds.
+    """The sizes of the quantities of a log. They set the start of a search, never its result.
 
     Args:
         position: Half the stroke. velocity, acceleration, force: root mean squares while moving.
@@ -84,7 +84,7 @@ class Scales:
     duration: float
 
     def natural(self, dimension: str) -> float:
-        """Size at which a parameter of this dimension would explain all of the force."""
+        """Return the size at which a parameter of this dimension would explain all of the force."""
         base = {
             "force": self.force,
             "position": self.position,
@@ -96,8 +96,9 @@ class Scales:
         value = 1.0
         for words, sign in ((over, 1), (under, -1)):
             for word in words.split("*") if words not in ("", "1") else ():
-                name, power = re.fullmatch(r"([a-z]+)(\d?)", word).groups()
-                value *= base[name] ** (sign * int(power or 1))
+                match = re.fullmatch(r"([a-z]+)(\d?)", word)
+                assert match is not None, f"{word!r} is no base quantity"
+                value *= base[match[1]] ** (sign * int(match[2] or 1))
         return value
 
 
@@ -113,22 +114,22 @@ class Effect(eqx.Module):
     port: int = eqx.field(static=True, default=0, kw_only=True)
 
     def act(self, x: Signals, state: Array | None) -> Action:
-        """What the effect does at one instant."""
+        """Compute the action of the effect at one instant."""
         raise NotImplementedError
 
     def initial_state(self, u: Array) -> Array | None:
-        """Own state at the start, where the drive has long been at `u`; None without memory.
+        """Return the internal state after the drive has long been at `u`; None without memory.
 
         A number, or a vector whose rate has constant coefficients (a linear oscillator).
         """
         return None
 
     def command_delay(self) -> Array | float:
-        """By how much the effect delays the command [s]."""
+        """Return the delay that the effect adds to the command [s]."""
         return 0.0
 
     def dry_drift(self, t: Array) -> Array | float:
-        """Relative change of every dry-friction level at time t."""
+        """Return the relative change of every dry-friction level at time t."""
         return 0.0
 
     # Whether the effect is a force beside the others, in proportion to those of its parameters
@@ -173,11 +174,11 @@ class Effect(eqx.Module):
 
 
 def carries_force(info: ParameterInfo) -> bool:
-    """Whether an added force is in proportion to a parameter."""
+    """Return whether an added force is in proportion to a parameter."""
     return info.dimension.startswith(("force", "inertia"))
 
 
 def scaled(cls: type[Effect], values: dict[str, float], factor: float) -> dict[str, float]:
-    """The same effect, factor times as strong."""
+    """Return the values of the same effect, factor times as strong."""
     infos = parameters_of(cls)
     return {n: v * factor if carries_force(infos[n]) else v for n, v in values.items()}

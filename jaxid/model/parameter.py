@@ -13,17 +13,17 @@ SIGNS = ("free", "nonnegative", "positive")
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """What is known of a parameter before any data.
+    """The declaration of a parameter, independent of any data.
 
     Args:
-        dimension: For example "force*time/position"; see `jaxid.model.units`.
-        sign: "free", "nonnegative" or "positive".
+        dimension: Product of base quantities, such as "force*time/position"; see `jaxid.model.units`.
+        sign: Constraint "free", "nonnegative" or "positive".
         doc: One line for the tables.
-        optional: May be absent (None).
-        more: Of a list that is as long as the plant has joints, and so many more; None: no list.
-        motion: "linear" or "rotary", of a machine that has both; None: as the case says.
-        width: Of a list whose entries are lists, of so many numbers; None: of numbers.
-        known: Must be a number: no log tells it from an effect in the drive.
+        optional: Whether it may be absent (None).
+        more: For a list, the number of entries beyond one for each joint; None: no list.
+        motion: "linear" or "rotary", in a machine that has both; None: as the case states.
+        width: For a list of lists, the length of its entries; None: entries are numbers.
+        known: Whether it must be a number: no log separates it from an effect in the drive.
     """
 
     dimension: str
@@ -59,7 +59,7 @@ def parameter(
 
 
 def as_array(value: Any) -> Any:
-    """A number or list as a float64 array; anything else as it is."""
+    """Convert a number or list to a float64 array; return anything else unchanged."""
     # Anything that is neither number nor list passes: JAX fills trees with markers of its own.
     if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool):
         return jnp.asarray(value, dtype=jnp.float64)
@@ -71,6 +71,6 @@ def _optional_array(value: Any) -> Any:
 
 
 def parameters_of(cls: type) -> dict[str, ParameterInfo]:
-    """Name to `ParameterInfo` of every parameter that a plant or effect class declares."""
+    """Return the `ParameterInfo` of every parameter of a plant or effect class, by name."""
     fields = cls.__dataclass_fields__.values()
     return {f.name: f.metadata["parameter"] for f in fields if "parameter" in f.metadata}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 _LABELS = {
@@ -17,7 +18,7 @@ class Units:
 
     Args:
         motion: "linear" (kg, m, N) or "rotary" (kg m^2, rad, N m).
-        position: Label in place of m or rad, where the quantity is not mechanical.
+        position: Label in place of m or rad, if the quantity is not mechanical.
         force: Label in place of N or N m.
     """
 
@@ -29,8 +30,8 @@ class Units:
         """Turn a dimension such as "force*time/position" into a label such as "N s/m".
 
         Args:
-            dimension: Of force, position, time, inertia.
-            motion: Of a joint that is not like the others.
+            dimension: Product of force, position, time and inertia.
+            motion: Motion of a joint that differs from the others; None: that of the machine.
         """
         labels = dict(_LABELS[motion or self.motion])
         if self.position is not None or self.force is not None:
@@ -46,6 +47,11 @@ class Units:
         if not below:
             return over
         return f"{over}/({below})" if " " in below else f"{over}/{below}"
+
+
+def joined(unit: str | Sequence[str]) -> str:
+    """Return one label as it is, and labels by joint as text."""
+    return unit if isinstance(unit, str) else ", ".join(unit)
 
 
 def _power(word: str, labels: dict[str, str]) -> str:

@@ -1,9 +1,10 @@
-"""Which leaves of a plant are unknown, and how a vector of them goes in and comes out."""
+"""The unknown leaves of a plant, and their exchange with a vector."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +17,10 @@ from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 
-# Lower bound of what must be positive, relative to its guess: keeps a solver off zero, far below
-# anything that a log can tell.
+# Lower bound of a positive unknown, relative to its guess: it keeps a solver off zero, far below
+# any value that a log can resolve.
 _POSITIVE_FLOOR = 1e-9
-# First step of the path of what is unknown of a reference, and of no plant.
+# First step of the path of an unknown of the reference, which belongs to no plant.
 REFERENCE = "reference"
 
 
@@ -28,14 +29,14 @@ class Free:
     """One unknown number.
 
     Args:
-        name: As in results: `inertia`, `viscous_friction.coefficient`.
+        name: Name in results: `inertia`, `viscous_friction.coefficient`.
         path: Attributes and indices from the plant to the leaf.
-        unit: Label.
-        sign: "free", "nonnegative" or "positive".
-        guess: Where a fit starts.
-        lower, upper: Bounds.
-        index: Entry of the leaf, where the leaf is a list; row and entry, of a list of lists.
-        true: Value for simulation and studies, where it differs from the guess.
+        unit: Label of its unit.
+        sign: Constraint "free", "nonnegative" or "positive".
+        guess: Initial value of a fit.
+        lower, upper: Bounds that the case states.
+        index: Entry of the leaf if it is a list; row and entry if it is a list of lists.
+        true: Value for simulation and studies, if it differs from the guess.
     """
 
     name: str
@@ -49,16 +50,16 @@ class Free:
     true: float | None = None
 
     def get(self, plant: Plant) -> Array:
-        """The leaf that holds this unknown."""
+        """Return the leaf that holds this unknown."""
         return leaf(plant, self.path)
 
 
 @dataclass(frozen=True)
 class Body:
-    """Unknowns that are the ten parameters of a body, and are fitted as such.
+    """Unknowns that are the ten inertial parameters of a body, and are fitted as such.
 
     Args:
-        places: Of each among the unknowns, in the order of `jaxid.arms.pseudo_inertia.TEN`.
+        places: Index of each among the unknowns, in the order of `jaxid.arms.pseudo_inertia.TEN`.
         lower, upper: Bounds on the coordinates of `jaxid.arms.pseudo_inertia.log_cholesky`.
     """
 
@@ -69,11 +70,11 @@ class Body:
 
 @dataclass(frozen=True)
 class Parameters:
-    """The unknowns of a plant, in a fixed order: one scatter, one gather.
+    """The unknowns of a plant, in a fixed order.
 
     Args:
-        free: The unknowns.
-        bodies: Those of them that must be what bodies can have.
+        free: The unknowns, in their order.
+        bodies: Groups of them that must be physically consistent.
     """
 
     free: tuple[Free, ...]
@@ -86,18 +87,18 @@ class Parameters:
 
     @property
     def guess(self) -> Float[np.ndarray, " p"]:
-        """Where a fit starts."""
+        """Initial values of a fit."""
         return np.asarray([f.guess for f in self.free], dtype=np.float64)
 
     @property
     def bounds(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-        """Lower and upper bounds: the user's, and what the signs demand."""
+        """Lower and upper bounds: those of the user, and those that the signs demand."""
         lower = [max(f.lower, _sign_floor(f)) for f in self.free]
         upper = [f.upper for f in self.free]
         return np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
 
     def insert(self, plant: Plant, theta: Float[Array, " p"]) -> Plant:
-        """The plant with the unknowns set."""
+        """Return the plant with the unknowns set."""
         return scatter(self.places, plant, theta)
 
     @property
@@ -106,32 +107,32 @@ class Parameters:
         return tuple((f.path, f.index) for f in self.free)
 
     def extract(self, plant: Plant) -> Float[Array, " p"]:
-        """The unknowns' values in a plant."""
+        """Return the values of the unknowns in a plant."""
         values = [f.get(plant) if f.index is None else f.get(plant)[f.index] for f in self.free]
         return jnp.asarray(values, dtype=jnp.float64)
 
     def with_guess(self, theta: Sequence[float]) -> Parameters:
-        """The same unknowns, starting elsewhere."""
+        """Return the same unknowns with other initial values."""
         free = tuple(replace(f, guess=float(v)) for f, v in zip(self.free, theta, strict=True))
         return Parameters(free, self.bodies)
 
     def extended(self, more: Sequence[Free]) -> Parameters:
-        """These unknowns and more."""
+        """Return these unknowns and more behind them."""
         return Parameters((*self.free, *more), self.bodies)
 
 
 def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
-    """The leaf at the end of a path of attributes and indices."""
-    node = plant
+    """Return the leaf at the end of a path of attributes and indices."""
+    node: Any = plant
     for step in path:
         node = node[step] if isinstance(step, int) else getattr(node, step)
     return node
 
 
 def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
-    """The plant with theta[k] at places[k], each a path and, where the leaf is a list, an index.
+    """Return the plant with theta[k] at places[k], each a path and, if the leaf is a list, an index.
 
-    What is unknown of a reference stands in no plant, and is passed over.
+    Unknowns of a reference belong to no plant, and are skipped.
     """
     leaves, structure = jax.tree.flatten(plant)
     numbers = jax.tree.unflatten(structure, range(len(leaves)))
@@ -147,7 +148,7 @@ def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
     return jax.tree.unflatten(structure, leaves)
 
 
-def _with_entry(values: Array, index: int | tuple[int, int], value: float) -> np.ndarray:
+def _with_entry(values: Array, index: int | tuple[int, int], value: Array | float) -> np.ndarray:
     out = np.array(values)
     out[index] = value
     return out
@@ -160,9 +161,9 @@ def _sign_floor(f: Free) -> float:
 
 
 def colours(enters: Bool[np.ndarray, "n p"]) -> tuple[int, ...]:
-    """A number for each unknown, such that no two of one number stand in one balance.
+    """Number the unknowns such that no two with the same number enter the same balance.
 
-    Each takes the first that is free in all balances in which it stands.
+    Each takes the first number that is free in all balances that it enters.
     """
     taken: list[np.ndarray] = []
     out = []
@@ -176,7 +177,7 @@ def colours(enters: Bool[np.ndarray, "n p"]) -> tuple[int, ...]:
 
 
 def seeds(colours: tuple[int, ...]) -> Float[np.ndarray, "p c"]:
-    """Directions in which a derivative is taken, one a colour."""
+    """Return the directions in which a derivative is taken, one for each colour."""
     out = np.zeros((len(colours), max(colours, default=-1) + 1))
     out[np.arange(len(colours)), list(colours)] = 1.0
     return out
@@ -204,19 +205,19 @@ def free_effect(
 
 
 def effect_name(plant: Plant, effect: Effect) -> str:
-    """Key of an effect in results: kind and place, numbered where the plant already has one there."""
+    """Return the key of an effect in results: kind and place, numbered if the plant already has one there."""
     same = sum(e.kind == effect.kind and e.port == effect.port for e in plant.effects)
     return label(plant, effect.kind, effect.port) + ("" if same == 0 else f"#{same + 1}")
 
 
 def label(plant: Plant, kind: str, port: int) -> str:
-    """A kind with its place, which on a machine of one joint says nothing: `cogging[2]`, `[spring 3]`."""
+    """Return a kind with its place, left out on a machine of one joint: `cogging[2]`, `[spring 3]`."""
     if not several_places(plant):
         return kind
-    what, k = plant.place(port)
-    return f"{kind}[{k}]" if what == "joint" else f"{kind}[{what} {k}]"
+    place, k = plant.place(port)
+    return f"{kind}[{k}]" if place == "joint" else f"{kind}[{place} {k}]"
 
 
 def several_places(plant: Plant) -> bool:
-    """Whether effects need a place to be told apart."""
+    """Return whether effects need a place to be distinguished."""
     return plant.bodies(plant.joints) + plant.springs(plant.joints) > 1

@@ -1,6 +1,6 @@
 """The plants, by the names of the case file.
 
-To add one: write its class in a file of its own and register it here.
+A new plant is one file here and one name in `PLANTS`; docs/adding_a_plant.md shows how to write it.
 """
 
 from jaxid.model.plant import Plant

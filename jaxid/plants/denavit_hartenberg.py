@@ -15,7 +15,7 @@ from jaxid.plants.geometry import Geometry
 
 
 class DenavitHartenberg(Geometry):
-    """Frame of each link in the one before it.
+    """The frame of each link in the one before it.
 
     Frame j is fixed to link j, z_j along the axis of joint j. From frame j - 1 it is reached by turning
     alpha about x, moving a along x, turning theta about z and moving d along z.
@@ -48,10 +48,10 @@ class DenavitHartenberg(Geometry):
 
     @classmethod
     def of_rows(cls, rows: Sequence[Sequence]) -> DenavitHartenberg:
-        """From a table: joint, alpha [rad], a [m], d [m], theta [rad], a row for each joint.
+        """Build it from a table with a row for each joint: joint, alpha [rad], a [m], d [m], theta [rad].
 
         Raises:
-            ValueError: If a row has another number of columns, or holds what it cannot.
+            ValueError: If a row has another number of columns, or an invalid entry.
         """
         for k, row in enumerate(rows, start=1):
             if len(row) != 5:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,11 +11,11 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.model.effect import Effect
-from jaxid.model.parameter import as_array, parameter
-from jaxid.model.plant import Plant
+from jaxid.model.links import WithLinks
+from jaxid.model.parameter import parameter
 
 # Sine of the angle between the distal links below which they count as one line. Chosen: the tool then moves a
-# hundred times as fast as the elbows, and what it weighs at the joints has grown ten thousandfold.
+# hundred times as fast as the elbows, and its inertia at the joints has grown ten thousandfold.
 SINGULAR = 1e-2
 # Fixed joints, in parts of l_f from the origin between them.
 _SIDES = np.array([-0.5, 0.5])
@@ -27,13 +26,13 @@ _PLACES = {0: "joint", 2: "passive", _TOOL: "tool"}
 
 
 class Pose(NamedTuple):
-    """Where the five bars are; rows are arms 1 and 2.
+    """The positions of the five bars; rows are arms 1 and 2.
 
     Args:
-        elbow: e, (2, 2) [m].
-        tool: p, (2,) [m].
-        proximal: From the fixed joint to the elbow, (2, 2) [m].
-        distal: From the elbow to the tool, (2, 2) [m].
+        elbow: Positions e of the elbows, (2, 2) [m].
+        tool: Position p of the tool, (2,) [m].
+        proximal: Vectors from the fixed joint to the elbow, (2, 2) [m].
+        distal: Vectors from the elbow to the tool, (2, 2) [m].
     """
 
     elbow: Array
@@ -42,41 +41,37 @@ class Pose(NamedTuple):
     distal: Array
 
 
-class FiveBar(Plant):
+class FiveBar(WithLinks):
     """iota tau = M(q) qdd + C(q, qd) qd - effects, M = D' M* D, of two arms that hold one tool.
 
     q1 and q2 are the angles of the proximal links from the x axis, which runs from fixed joint 1 through
-    fixed joint 2, the origin halfway; nothing weighs, the plane is horizontal. The tool lies left of the way
+    fixed joint 2, the origin halfway; the plane is horizontal, without weight. The tool lies left of the line
     from elbow 1 to elbow 2. Kinetic energy is that of chi = (q, angles and centres of mass of the distal
-    links, tool), each with its own mass, and all of D, its rate and the passive angles are derivatives of
-    the closure.
+    links, tool), each with its mass; D, its rate and the passive angles are derivatives of the closure.
 
     Ports are the two joints, behind them the passive angles psi_3 = pi - phi_2 + q_2 (elbow 2), psi_4 =
     phi_2 - phi_1 (tool joint) and psi_5 = pi - q_1 + phi_1 (elbow 1), which results call passive 1 to 3, and
     the tool, by its two coordinates.
 
-    Where the distal links stand in one line (parallel singularity, `SINGULAR`), and where they do not reach
-    each other, nothing here is a number; `impossible` says so of any configurations.
+    If the distal links are in one line (parallel singularity, `SINGULAR`) or do not reach each other, all
+    results are NaN; `impossible` finds such configurations.
 
     Args:
         length: l_f between the fixed joints, proximal l_p1, l_p2, distal l_d1, l_d2, (5,) [m].
         center: Centres of mass of the distal links, along the link from its elbow and to the left of that,
             (2, 2) [m].
-        mass: Of the distal links, (2,) [kg].
-        inertia: Of the proximal links about their fixed joints, with all that turns or moves with them
-            (motors, gears, what sits at the elbows), and of the distal links about their centres of mass,
+        mass: Masses of the distal links, (2,) [kg].
+        inertia: Inertias of the proximal links about their fixed joints, with all that moves with them
+            (motors, gears, parts at the elbows), and of the distal links about their centres of mass,
             (4,) [kg m^2].
-        tip_mass: At the tool [kg].
+        tip_mass: Mass at the tool [kg].
         reduction: iota, turns of each motor for one of its joint, (2,), or None for ones. The torque of a
             log is the motor's, its position the joint's: `gearing` turns one into the other.
-        effects: Forces beside these, in the order of the drive.
-        sharpness: Width of the smoothed sign over `velocity_scale`, dimensionless.
-        velocity_scale: A typical velocity [rad/s].
 
     Source:
         Righettini et al. (2025), Robotics 14(4), 36, (24)-(46). As printed, (16)-(18) want D_m^-T; (30), (31)
-        are atan2; (45), (46) are D' M* D and D' M* dD/dt. It selects the greater p_2, which is the same where
-        elbow 2 is to the right of elbow 1, and jumps where it is not.
+        are atan2; (45), (46) are D' M* D and D' M* dD/dt. It selects the greater p_2, which is the same if
+        elbow 2 is to the right of elbow 1, and jumps otherwise.
     """
 
     kind = "five_bar"
@@ -102,36 +97,33 @@ class FiveBar(Plant):
     reduction: Array | None = parameter(
         "1", "positive", "turns of each motor for one of its joint", optional=True, more=0, known=True
     )
-    effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
-    sharpness: Array = eqx.field(converter=as_array, default=1e-3, kw_only=True)
-    velocity_scale: Array = eqx.field(converter=as_array, default=1.0, kw_only=True)
 
     def pose(self, q: Float[Array, " 2"]) -> Pose:
-        """The closure: two circles about the elbows meet in the tool; not a number where they do not."""
+        """Solve the closure: two circles about the elbows meet in the tool; NaN if they do not."""
         proximal, elbow = self._elbows(q)
         tool = _meeting(elbow, self.length[3:])
         return Pose(elbow, tool, proximal, tool - elbow)
 
     def _elbows(self, q: Array) -> tuple[Array, Array]:
-        """Proximal links and where they end."""
+        """Return the proximal links and the elbows at their ends."""
         proximal = self.length[1:3, None] * jnp.stack([jnp.cos(q), jnp.sin(q)], axis=1)
         return proximal, proximal + self.length[0] * _SIDES[:, None] * _X
 
     def tool(self, q: Float[Array, " 2"]) -> Float[Array, " 2"]:
-        """p, where the tool is [m]."""
+        """Return p, the position of the tool [m]."""
         return self.pose(q).tool
 
     def angles(self, q: Float[Array, " 2"]) -> Float[Array, " 2"]:
-        """phi, angles of the distal links from the x axis, within (-pi, pi] [rad]; (31)."""
+        """Return phi, the angles of the distal links from the x axis, within (-pi, pi] [rad]; (31)."""
         distal = self.pose(q).distal
         return jnp.arctan2(distal[:, 1], distal[:, 0])
 
     def inverse(self, tool: Float[Array, " 2"]) -> Float[Array, " 2"]:
-        """Angles for a tool's position [m], (28)-(30): elbow 1 left of its way from ground, elbow 2 right.
+        """Return the angles for a position of the tool [m], (28)-(30): elbow 1 on the left, elbow 2 right.
 
-        For tools above the x axis these are the lowest x of elbow 1 and the highest of elbow 2. Not a number
-        where an arm does not reach, or only stretched or folded, or where the tool would lie to the right of
-        the way between such elbows, or on it.
+        For tools above the x axis these are the lowest x of elbow 1 and the highest of elbow 2. NaN if an
+        arm does not reach, or only stretched or folded, or if the tool would not lie left of the line from
+        elbow 1 to elbow 2.
         """
         proximal, distal = self.length[1:3], self.length[3:]
         way = tool - self.length[0] * _SIDES[:, None] * _X
@@ -146,7 +138,7 @@ class FiveBar(Plant):
         return jnp.where(apart, jnp.arctan2(arm[:, 1], arm[:, 0]), jnp.nan)
 
     def condition(self, q: Float[Array, " 2"]) -> Float[Array, ""]:
-        """Least over greatest eigenvalue of D_p' D_p: one where the tool moves alike in all directions."""
+        """Return the least over the greatest eigenvalue of D_p' D_p: one for an isotropic tool."""
         jacobian = jax.jacfwd(self.tool)(q)
         half = 0.5 * jnp.sum(jacobian**2)
         det = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
@@ -163,14 +155,14 @@ class FiveBar(Plant):
         row = int(rows[0])
         shown = ", ".join(f"{float(x):.4g}" for x in np.asarray(q)[row])
         if sine[row] >= 0:
-            what = "bring the distal links into one line, a singular configuration"
-            return row, f"joints at [{shown}] rad {what}"
+            fault = "bring the distal links into one line, a singular configuration"
+            return row, f"joints at [{shown}] rad {fault}"
         elbow = np.asarray(self._elbows(every[row])[1])
         apart = float(np.linalg.norm(elbow[1] - elbow[0]))
-        what = f"elbows {apart:.4g} m apart, distal links of {reach[0]:.4g} and {reach[1]:.4g} m"
-        return row, f"joints at [{shown}] rad are out of reach: {what}"
+        lengths = f"elbows {apart:.4g} m apart, distal links of {reach[0]:.4g} and {reach[1]:.4g} m"
+        return row, f"joints at [{shown}] rad are out of reach: {lengths}"
 
-    def joint_positions(self, tool: Array) -> Array:
+    def joint_positions(self, tool: Float[np.ndarray, " 2"]) -> Float[Array, " 2"]:
         return self.inverse(tool)
 
     @classmethod
@@ -178,7 +170,7 @@ class FiveBar(Plant):
         return 4
 
     def frame(self, link: int, q: Array) -> tuple[Array, Array]:
-        """Of proximal links 1 and 2 at their fixed joints, of distal ones at their elbows; z up."""
+        """Return the frame of a link, z up: proximal ones at their fixed joints, distal ones at elbows."""
         at = self.pose(q)
         ground = self.length[0] * _SIDES[:, None] * _X
         along = jnp.concatenate([at.proximal, at.distal])[link] / self.length[1 + link]
@@ -188,7 +180,7 @@ class FiveBar(Plant):
         return axes, jnp.concatenate([origin, jnp.zeros(1)])
 
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """D' M* (D qdd + dD/dt qd): the motion of every mass, times it, pulled back to the joints."""
+        """Return D' M* (D qdd + dD/dt qd): inertial forces of all masses, pulled back to the joints."""
 
         def velocity(q: Array) -> Array:
             return jax.jvp(self._moved, (q,), (qd,))[1]
@@ -200,7 +192,7 @@ class FiveBar(Plant):
         return jnp.sum(slope * (masses * acceleration)[:, None], axis=0)
 
     def _moved(self, q: Array) -> Float[Array, " 10"]:
-        """chi: what has mass moves along these, in the order of M*."""
+        """Return chi, the coordinates of all masses, in the order of M*."""
         at = self.pose(q)
         along = at.distal / self.length[3:, None]
         left = jnp.stack([-along[:, 1], along[:, 0]], axis=1)
@@ -210,7 +202,7 @@ class FiveBar(Plant):
     def ports(self, q: Array) -> Array:
         at = self.pose(q)
         turn = _turn(at.proximal, at.distal)
-        # Each an angle between two links: none jumps by a turn where a link passes the x axis.
+        # Angles between two links do not jump by a turn if a link passes the x axis.
         between = _turn(at.distal[:1], at.distal[1:])[0]
         return jnp.concatenate([q, jnp.stack([np.pi - turn[1], between, np.pi + turn[0]]), at.tool])
 
@@ -231,7 +223,7 @@ class FiveBar(Plant):
     def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
         if port >= _TOOL:  # a payload
             return effect.kind == "added_mass" and port == _TOOL
-        # Nothing that has inertia turns with a passive angle alone.
+        # No inertia turns with a passive angle alone.
         alone = port < self.joints or effect.kind not in ("added_mass", "joint_flexibility")
         return alone and super().accepts(effect, port, drives)
 
@@ -242,7 +234,7 @@ class FiveBar(Plant):
 
 
 def _sine(elbow: Float[Array, "2 2"], reach: Float[Array, " 2"]) -> Array:
-    """Of the angle from distal link 1 to distal link 2; not a number where they do not reach each other."""
+    """Return the sine of the angle from distal link 1 to distal link 2; NaN if they do not meet."""
     square = jnp.sum((elbow[1] - elbow[0]) ** 2)
     cosine = 0.5 * (jnp.sum(reach**2) - square) / (reach[0] * reach[1])
     return jnp.sqrt(1.0 - cosine**2)
@@ -250,7 +242,7 @@ def _sine(elbow: Float[Array, "2 2"], reach: Float[Array, " 2"]) -> Array:
 
 @jax.custom_jvp
 def _meeting(elbow: Float[Array, "2 2"], reach: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    """Where circles about the elbows meet, left of the way from the first to the second."""
+    """Return the intersection of circles about the elbows, left of the line from the first to the second."""
     across, sine = elbow[1] - elbow[0], _sine(elbow, reach)
     square = jnp.sum(across**2)
     along = 0.5 + 0.5 * (reach[0] ** 2 - reach[1] ** 2) / square
@@ -260,7 +252,7 @@ def _meeting(elbow: Float[Array, "2 2"], reach: Float[Array, " 2"]) -> Float[Arr
 
 @_meeting.defjvp
 def _meeting_moves(at: tuple[Array, Array], by: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The closure differentiated, (34): (p - e_i) (dp - de_i) = l_i dl_i. It takes fewer operations."""
+    """Differentiate the closure by (34): (p - e_i) (dp - de_i) = l_i dl_i. It takes fewer operations."""
     tool = _meeting(*at)
     one, two = tool - at[0]
     rows = jnp.sum((tool - at[0]) * by[0], axis=1) + at[1] * by[1]
@@ -269,6 +261,6 @@ def _meeting_moves(at: tuple[Array, Array], by: tuple[Array, Array]) -> tuple[Ar
 
 
 def _turn(one: Float[Array, "k 2"], two: Float[Array, "k 2"]) -> Float[Array, " k"]:
-    """Angle from one vector to another, within (-pi, pi]."""
+    """Return the angle from one vector to another, within (-pi, pi]."""
     cross = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
     return jnp.arctan2(cross, jnp.sum(one * two, axis=1))

@@ -1,4 +1,4 @@
-"""Geometry of an open chain of joints: what every description of it tells, and the most general one."""
+"""Geometry of an open chain of joints: the common interface, and the most general description."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ JOINTS = ("revolute", "prismatic")
 
 
 class Geometry(eqx.Module):
-    """Frame of each link in the one before it: frame j is fixed to link j, z_j along the axis of joint j."""
+    """The frame of each link in the one before: frame j is fixed to link j, z_j along the axis of joint j."""
 
     joints: eqx.AbstractVar[tuple[str, ...]]
 
@@ -24,7 +24,7 @@ class Geometry(eqx.Module):
         return np.asarray([float(joint == "revolute") for joint in self.joints])
 
     def frames(self, q: Float[Array, " n"]) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:
-        """Each frame in the one before: its axes, as columns, and its origin [m].
+        """Return each frame in the one before: its axes, as columns, and its origin [m].
 
         Args:
             q: Joint coordinates [rad or m].
@@ -39,17 +39,17 @@ class Geometry(eqx.Module):
                 raise ValueError(f"joint {k} is {joint!r}; take one of {', '.join(JOINTS)}.")
 
     def _check_shape(self, name: str, one: tuple[int, ...]) -> None:
-        """Refuse a field that has not an entry of shape `one` for each joint."""
+        """Refuse a field without an entry of shape `one` for each joint."""
         value, wanted = getattr(self, name), (len(self.joints), *one)
         # Trees that JAX fills with markers of its own pass; arrays count, with axes of a batch before.
         if isinstance(value, (np.ndarray, Array)) and np.shape(value)[-len(wanted) :] != wanted:
-            told = " x ".join(map(str, one)) + " each, " if one else ""
+            entry = " x ".join(map(str, one)) + " each, " if one else ""
             shape = np.shape(value)
-            raise ValueError(f"{name} has shape {shape}; give {told}{len(self.joints)}, one a joint.")
+            raise ValueError(f"{name} has shape {shape}; give {entry}{len(self.joints)}, one a joint.")
 
 
 class JointFrames(Geometry):
-    """Frames that stand anywhere in the one before them, as in a URDF file.
+    """Frames at any place in the one before them, as in a URDF file.
 
     Frame j is reached from frame j - 1 by a fixed motion and then by the joint: a turn about z_j, or a
     slide along it.
@@ -57,7 +57,7 @@ class JointFrames(Geometry):
     Args:
         joints: "revolute" or "prismatic", from the base to the tip, n of them.
         axes: Axes of each frame along those of the one before, as columns, joints at zero; (n, 3, 3).
-        origins: Its origin there [m], (n, 3).
+        origins: Origin of each frame in the one before [m], (n, 3).
 
     Raises:
         ValueError: If there is no joint, one of another kind, or an array of another shape.

@@ -16,10 +16,10 @@ WRIST_TO_FLANGE = 0.08
 def pa10(
     d3: float = SHOULDER_TO_ELBOW, d5: float = ELBOW_TO_WRIST, d7: float = WRIST_TO_FLANGE
 ) -> DenavitHartenberg:
-    """Seven revolute joints, z of the base upwards.
+    """Return the geometry of seven revolute joints, z of the base upwards.
 
     Args:
-        d3, d5, d7: Offsets of joints 3, 5 and 7 [m].
+        d3, d5, d7: Offsets of joints 3, 5 and 7 along their axes [m].
 
     Source:
         "PA-10 traineeship", table 2.1; its rows list a_{i-1} and alpha_{i-1}, and row 7 is theta_7.

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.model.effect import Effect
+from jaxid.model.links import WithLinks
 from jaxid.model.parameter import as_array, parameter
-from jaxid.model.plant import Plant
 from jaxid.plants.geometry import Geometry
 
 _FIRST = ("inertia*position", "free")
@@ -21,27 +21,24 @@ _SECOND = ("inertia", "free")
 _Z = np.array([0.0, 0.0, 1.0])
 
 
-class SerialArm(Plant):
+class SerialArm(WithLinks):
     """tau = M(q) qdd + h(q, qd), of links by ten inertial parameters each.
 
-    What stands in `inertial` is linear in the parameters: mass, first moments and inertia of a link
-    count about the origin of its frame and along its axes. Which of their combinations the torques
-    tell is for `jaxid.arms.base_parameters` to say. Ports are the joints, and behind them the shafts: drives
-    that turn with several joints, as where a belt to the last joint of a wrist runs over the one before.
+    `inertial` is linear in the parameters: mass, first moments and inertia of a link are about the origin of
+    its frame and along its axes. `jaxid.arms.base_parameters` gives the identifiable combinations. Ports are
+    the joints, and behind them the shafts: drives that turn with several joints, such as a belt to the last
+    joint of a wrist that runs over the one before.
 
     Args:
         mass: m, (n,) [kg].
         first_moment_x, first_moment_y, first_moment_z: Mass times centre of mass, (n,) [kg m].
         inertia_xx, inertia_xy, inertia_xz, inertia_yy, inertia_yz, inertia_zz: Inertia tensor about the
             frame's origin, (n,); off its diagonal -sum of m x y and so on [kg m^2].
-        rotor_inertia: Of each drive, seen at the joint, (n,) [kg m^2, or kg at a prismatic joint], or None
-            for none.
-        geometry: Frames of the links; the first one's predecessor is the base.
-        shafts: By how much each turns with every joint, a row of n ratios a shaft.
+        rotor_inertia: Inertia of each drive, reflected to the joint, (n,) [kg m^2, or kg at a prismatic
+            joint], or None for none.
+        geometry: Frames of the links, the first one in the base.
+        shafts: Ratios by which each shaft turns with the joints, a row of n for each shaft.
         gravity_vector: Acceleration of gravity in the base's frame, (3,) [m/s^2].
-        effects: Forces beside these, in the order of the drive.
-        sharpness: Width of the smoothed sign over `velocity_scale`, dimensionless.
-        velocity_scale: A typical velocity [rad/s or m/s].
 
     Source:
         Luh, Walker & Paul (1980) for the recursion; Khalil & Kleinfinger (1987) for its form about the
@@ -52,7 +49,7 @@ class SerialArm(Plant):
     linked = True
     coupled = True
     usual_motion = "rotary"
-    # Beside each link's others these are the ones to leave out where columns depend on each other.
+    # Parameters of a link to leave out first if columns depend on each other.
     regrouped: ClassVar[tuple[str, ...]] = ("first_moment_z", "mass", "inertia_yy")
 
     mass: Array = parameter("inertia", "nonnegative", "masses, one a link", more=0, motion="linear")
@@ -71,9 +68,6 @@ class SerialArm(Plant):
     geometry: Geometry = eqx.field(kw_only=True)
     shafts: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
     gravity_vector: Array = eqx.field(converter=as_array, default=(0.0, 0.0, -9.81), kw_only=True)
-    effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
-    sharpness: Array = eqx.field(converter=as_array, default=1e-3, kw_only=True)
-    velocity_scale: Array = eqx.field(converter=as_array, default=1.0, kw_only=True)
 
     @property
     def joints(self) -> int:
@@ -99,6 +93,10 @@ class SerialArm(Plant):
 
     def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
         return ("rotor_inertia", port) if effect.kind == "added_mass" and port < self.joints else None
+
+    @property
+    def base_gravity(self) -> Array:
+        return jnp.asarray(self.gravity_vector)
 
     @classmethod
     def links(cls, joints: int) -> int:
@@ -127,7 +125,7 @@ class SerialArm(Plant):
 
         def out(carry: tuple, link: tuple) -> tuple[tuple, tuple]:
             # Angular velocity and acceleration of the link, and the acceleration of its origin: gravity is
-            # a base that accelerates upwards.
+            # an upward acceleration of the base.
             w, dw, dv = carry
             r, p, turn, v, a, (m, ms, tensor) = link
             dv = _into(r, dv + jnp.cross(dw, p) + jnp.cross(w, jnp.cross(w, p)))
@@ -165,10 +163,10 @@ class SerialArm(Plant):
 
 
 def _times(matrix: Float[Array, "3 3"], x: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """Matrix times vector, without a call to a matrix library: these stand in loops."""
+    """Multiply a matrix and a vector without a call to a matrix library, since it is used in loops."""
     return jnp.sum(matrix * x, axis=1)
 
 
 def _into(axes: Float[Array, "3 3"], x: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """Components of a vector along a frame's axes."""
+    """Return the components of a vector along the axes of a frame."""
     return jnp.sum(axes * x[:, None], axis=0)

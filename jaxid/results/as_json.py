@@ -84,16 +84,16 @@ def _pick(gap: Gap, what: str) -> np.ndarray | None:
 def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[str, Any]:
     """The `gap` object of result.json."""
     fit, others = gaps[0], gaps[1:]
-    units = session.machine.units
+    unit, measured = session.machine.unit_by_joint, np.flatnonzero(session.fit.log.measured)
     out: dict[str, Any] = {
-        "unit": units.label("force"),
+        "unit": unit("force"),
         "band_hz": session.recipe.band_hz(session.fit.log.rate_hz),
         "fit": _one(fit.force.rms),
         "validation": _worst(others, "force.rms"),
         "noise_floor": _one(floor),
         "relative": {"fit": _one(fit.force.relative), "validation": _worst(others, "force.relative")},
         "simulation": {
-            "unit": units.label("position"),
+            "unit": unit("position", None if len(measured) > 1 else measured),
             "fit": _one(_pick(fit, "simulation.rms")),
             "validation": _worst(others, "simulation.rms"),
             "relative": {
@@ -219,13 +219,14 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
     before, after = result.gaps_before, result.gaps_after
     on = "validation" if len(after) > 1 else "fit"
     judged = slice(1, None) if len(after) > 1 else slice(0, 1)
-    units = result.session.machine.units
+    machine = result.session.machine
+    measured = np.flatnonzero(result.session.fit.log.measured)
     return {
         "verdict": result.verdict,
         "converged": result.converged,
         "where": where_json(result),
         "effects": [effect_json(e, result.after) for e in result.effects],
-        "experiments": [proposal_json(p, units) for p in result.proposals],
+        "experiments": [proposal_json(p, machine) for p in result.proposals],
         "steps": [
             step_json(r, result.session.machine.plant)
             for k, r in enumerate(result.rounds)
@@ -233,7 +234,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
             if k == 0 or r.step.added or r.step.dropped
         ],
         "gap": {
-            "unit": units.label("force"),
+            "unit": machine.unit_by_joint("force"),
             "band_hz": result.session.recipe.band_hz(result.session.fit.log.rate_hz),
             "before": _worst(before[judged], "force.rms"),
             "after": _worst(after[judged], "force.rms"),
@@ -244,7 +245,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
                 "after": _worst(after[judged], "force.relative"),
             },
             "simulation": {
-                "unit": units.label("position"),
+                "unit": machine.unit_by_joint("position", None if len(measured) > 1 else measured),
                 "before": _worst(before[judged], "simulation.rms"),
                 "after": _worst(after[judged], "simulation.rms"),
             },
@@ -285,7 +286,7 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
     for score in left[:most]:
         name, nats = score.candidate.label, score.evidence
         lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
-    if session.machine.plant.coupled and not result.proposals:
+    if not session.machine.plant.designs_experiments and not result.proposals:
         tied = [e.label for e in result.effects if e.alternatives]
         told = f"no experiment was designed that tells {', '.join(tied)} from rivals"
         lines += [f"{told}: --experiments does, in minutes"] if tied else []

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.report.numbers import with_std
 from jaxid.results.report.words import SLIGHT, place_words, within_prior_words
@@ -56,14 +57,14 @@ def identification_table(result: Identification) -> str:
     simulation = gap["simulation"]
     rows = [
         ["gap", "fit", "validation", "unit"],
-        ["force", _number(gap["fit"]), _number(gap["validation"]), gap["unit"]],
+        ["force", _number(gap["fit"]), _number(gap["validation"]), joined(gap["unit"])],
         ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
-        ["noise floor", _number(gap["noise_floor"]), "", gap["unit"]],
+        ["noise floor", _number(gap["noise_floor"]), "", joined(gap["unit"])],
         [
             "simulated position",
             _number(simulation["fit"]),
             _number(simulation["validation"]),
-            simulation["unit"],
+            joined(simulation["unit"]),
         ],
     ]
     told = parameter_lines(estimate, results.derived(result.session, result.estimate))
@@ -112,14 +113,14 @@ def discovery_table(result: Discovery) -> str:
         if "dropped" in step:
             name = (f"{name}, " if step["added"] else "") + f"- {step['dropped']}"
             name += "" if step["added"] else where
-        rows.append([name, f"{_number(step['fit'])} {gap['unit']}", _number(step["validation"])])
+        rows.append([name, f"{_number(step['fit'])} {joined(gap['unit'])}", _number(step["validation"])])
     told = parameter_lines(result.after, results.derived(result.session, result.after))
     lines += ["", aligned(rows), "", told, *_blind(result.after), ""]
     lines.append(
-        f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {gap['unit']} "
+        f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {joined(gap['unit'])} "
         f"(noise floor {_number(gap['noise_floor'])}); simulated position "
         f"{_number(gap['simulation']['before'])} -> {_number(gap['simulation']['after'])} "
-        f"{gap['simulation']['unit']}"
+        f"{joined(gap['simulation']['unit'])}"
     )
     return "\n".join([*lines, *_notes(content["notes"])])
 
@@ -150,13 +151,15 @@ def _notes(lines: Sequence[str]) -> list[str]:
 def check_table(result: Any) -> str:
     """What `check` prints."""
     content = result.json()
-    log, unit = content["log"], result.session.machine.units.label
+    log, machine = content["log"], result.session.machine
+    driven = machine.plant.driven(machine.plant.joints)
+    unit = lambda quantity, joints=None: joined(machine.unit_by_joint(quantity, joints))
     one = results._one
     head = (
         f"{log['samples']} samples at {log['rate_hz']:.6g} Hz, {log['duration_s']:.4g} s; stroke "
         f"{_number(one(log['stroke']))} {unit('position')}, up to "
         f"{_number(one(log['peak_velocity']))} {unit('position/time')} and "
-        f"{_number(one(log['peak_force']))} {unit('force')}; {100 * log['moving']:.0f} % moving"
+        f"{_number(one(log['peak_force']))} {unit('force', driven)}; {100 * log['moving']:.0f} % moving"
     )
     recipe = content["preprocess"]
     what = f"{recipe['cutoff_hz']:.4g} Hz"

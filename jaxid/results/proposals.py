@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.model.plant import PLACES
-from jaxid.model.units import Units
+from jaxid.model.interface import PLACES
+from jaxid.model.units import joined
 
 if TYPE_CHECKING:
     from jaxid.discovery.separating.propose import Proposal
     from jaxid.experiment_design.limits import Limits, Peaks
+    from jaxid.machine import Machine
 
 
-def sentence(proposal: Proposal, units: Units) -> str:
+def sentence(proposal: Proposal, machine: Machine) -> str:
     """What to do, and what is to be expected of it, in one line."""
     p = proposal
     if not p.separates:
@@ -28,7 +29,7 @@ def sentence(proposal: Proposal, units: Units) -> str:
     speaks = "" if p.present >= 0 else f" for {p.rival}"
     return (
         f"to separate {p.named} from {p.rival} run {p.file} as the {p.signal}: "
-        f"{p.time[-1]:.3g} s, from rest at {start} {units.label('position')}; "
+        f"{p.time[-1]:.3g} s, from rest at {start} {joined(machine.unit_by_joint('position'))}; "
         f"expected {_nats(p.expected)} nats, {_nats(p.needed)} wanted, this log has {_nats(abs(p.present))}"
         f"{speaks}"
     )
@@ -38,7 +39,7 @@ def _nats(value: float) -> str:
     return f"{value:.1f}" if abs(value) < 10 else f"{value:.0f}"
 
 
-def proposal_json(proposal: Proposal, units: Units) -> dict[str, Any]:
+def proposal_json(proposal: Proposal, machine: Machine) -> dict[str, Any]:
     """One entry of `experiments` in discovery.json."""
     p = proposal
     period = float(p.time[1] - p.time[0])
@@ -46,7 +47,7 @@ def proposal_json(proposal: Proposal, units: Units) -> dict[str, Any]:
         "separates": [p.named, p.rival],
         **{f"{place}s": [k if what == place else None for what, k in p.places] for place in PLACES},
         "possible": p.separates,
-        "text": sentence(p, units),
+        "text": sentence(p, machine),
         "nats": {"present": p.present, "expected": p.expected, "needed": p.needed},
         "file": p.file if p.separates else None,
         "signal": p.signal,

@@ -1,4 +1,4 @@
-"""What the log and the controller see of the motion: quantised, noisy readings."""
+"""The readings of the motion in log and controller: quantised and noisy."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 from jaxid.arrays import Array
 from jaxid.sensors.inertial import InertialSensors
 
-# Noise of so many counts leaves of the rounding's error nothing that goes with the signal
+# Noise of this many counts makes the rounding error independent of the signal
 # (Schuchman 1964; Gaussian noise, to 1 %).
 _DITHERS = 0.5
 
 
 class Sensor(eqx.Module):
-    """An encoder and a force reading; None where a figure is not known.
+    """An encoder and a force reading; None for figures that are not known.
 
     Args:
-        position_resolution: One count [m or rad].
+        position_resolution: Size of one count [m or rad].
         position_noise: Standard deviation of white noise before rounding [m or rad].
         force_noise: Standard deviation on the logged command, in its units.
         hold: Ticks of the loop for which a reading of a position is held.
-        inertial: Gyroscopes and accelerometers; None where there are none.
+        inertial: Gyroscopes and accelerometers; None if there are none.
     """
 
     position_resolution: Array | None = None
@@ -35,7 +35,7 @@ class Sensor(eqx.Module):
     inertial: InertialSensors | None = None
 
     def read(self, q: Array, noise: Array | None = None) -> Array:
-        """Reading of a position; rounded with a straight-through gradient.
+        """Return the reading of a position, rounded with a straight-through gradient.
 
         The true derivative of rounding is zero almost everywhere and infinite in between: through
         a loop it makes sensitivities useless. The straight-through one is that of the mean.
@@ -48,15 +48,15 @@ class Sensor(eqx.Module):
         return q + jax.lax.stop_gradient(counts - q)
 
     def read_command(self, u: Array, noise: Array | None = None) -> Array:
-        """Reading of a command, in its units."""
+        """Return the reading of a command, in its units."""
         return u if noise is None or self.force_noise is None else u + self.force_noise * noise
 
     @property
     def mean(self) -> Sensor:
-        """What it reads on average: without rounding, where noise of half a count or more dithers it.
+        """The sensor of mean readings: without rounding, if noise of half a count or more dithers it.
 
-        Rounding is then one more white noise, and whether a simulated reading falls on this side of a
-        count or that says nothing of a log in which noise decided it; of a cost it makes a rough one.
+        Rounding is then one more white noise. The side of a count on which a simulated reading falls is
+        unrelated to that of a noisy log, and would only make a cost rough.
         """
         noise, count = self.position_noise, self.position_resolution
         if noise is None or count is None or not np.all(np.asarray(noise) >= _DITHERS * np.asarray(count)):
@@ -65,7 +65,7 @@ class Sensor(eqx.Module):
 
     @property
     def position_std(self) -> Array | None:
-        """Standard deviation of the reading, rounding included; None where nothing is known."""
+        """Standard deviation of the reading, rounding included; None if it is not known."""
         parts = []
         if self.position_noise is not None:
             parts.append(jnp.square(self.position_noise))

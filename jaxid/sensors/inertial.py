@@ -1,8 +1,8 @@
-"""Gyroscopes and accelerometers on links: what they read, and what the joints do by their readings.
+"""Gyroscopes and accelerometers on links: their readings, and the motion of the joints from these.
 
-A reading is scale times the quantity along the sensor's own axes, plus bias and noise, clipped to its range.
+A reading is scale times the quantity along the axes of the sensor, plus bias and noise, clipped to its range.
 Gyroscopes read the angular velocity of their link, accelerometers the acceleration of their place less
-that of gravity. Both follow from the place of the link's frame alone, differentiated.
+that of gravity. Both are derivatives of the frame of the link.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from jaxid.model.plant import Plant
 
 KINDS = ("gyroscope", "accelerometer")
 AXES = ("x", "y", "z")
-# What is held from before counts as so much of the readings' weight: only where these say nothing.
+# Weight of the held value relative to the readings: it matters only if these do not determine a motion.
 _HELD = 1e-9
-# And of a joint's variance by that alone, more than this is left only where some motion is not told.
-_SAYS = 1e-3
+# A motion is determined if less than this fraction of its variance by the held value alone remains.
+_DETERMINED = 1e-3
 
 
 class Inertial(eqx.Module):
@@ -33,14 +33,14 @@ class Inertial(eqx.Module):
 
     Args:
         kind: One of `KINDS`.
-        link: 0-based.
-        axes: Of its own that it reads, 0-based.
-        position: Of an accelerometer in the link's frame, (3,) [m].
-        rotation: From the link's axes to its own, a rotation vector, (3,) [rad].
-        scale: Reading over quantity, by axis it reads.
-        bias: Reading at nothing, likewise [rad/s or m/s^2].
+        link: Index of its link, 0-based.
+        axes: Axes of the sensor that it reads, 0-based.
+        position: Place of an accelerometer in the link's frame, (3,) [m].
+        rotation: Rotation vector from the axes of the link to those of the sensor, (3,) [rad].
+        scale: Reading over quantity, for each axis.
+        bias: Reading at zero, for each axis [rad/s or m/s^2].
         noise: Standard deviation of a reading [rad/s or m/s^2].
-        range: Largest absolute reading; infinite: none.
+        range: Largest absolute reading; infinite: no limit.
     """
 
     kind: str = eqx.field(static=True)
@@ -54,26 +54,26 @@ class Inertial(eqx.Module):
     range: Array = eqx.field(converter=as_array, default=np.inf)
 
     def along(self, x: Float[Array, "3 ..."]) -> Float[Array, "axes ..."]:
-        """Of a vector in its link's axes, what it measures."""
-        own = _turned(self.rotation)
-        return jnp.stack([jnp.tensordot(own[:, k], x, 1) for k in self.axes])
+        """Project a vector in link coordinates onto the axes of the sensor."""
+        turned = _turned(self.rotation)
+        return jnp.stack([jnp.tensordot(turned[:, k], x, 1) for k in self.axes])
 
     @property
     def gyroscope(self) -> bool:
-        """Whether it is one."""
+        """Whether it is a gyroscope."""
         return self.kind == "gyroscope"
 
 
 class InertialSensors(eqx.Module):
-    """All of a machine's, and how they are fused.
+    """The inertial sensors of a machine, and their fusion.
 
     Velocity by the gyroscopes, then acceleration by the accelerometers, are weighted least squares of their
     readings at the measured position; readings at the end of their range have no weight.
 
     Args:
-        sensors: As they are.
-        known: As they are taken to be: with bias, scale and rotation where calibrated, else without.
-        hold: Ticks of the loop for which what is fused is held.
+        sensors: The sensors with their true errors.
+        known: The sensors as the fusion knows them: bias, scale and rotation only if calibrated.
+        hold: Ticks of the loop for which the fused motion is held.
     """
 
     sensors: tuple[Inertial, ...]
@@ -82,7 +82,7 @@ class InertialSensors(eqx.Module):
 
     @property
     def count(self) -> int:
-        """Readings in all."""
+        """Number of readings."""
         return sum(len(s.axes) for s in self.sensors)
 
     @property
@@ -93,7 +93,7 @@ class InertialSensors(eqx.Module):
     def read(
         self, plant: Plant, q: Array, qd: Array, qdd: Array, noise: Float[Array, " count"] | None = None
     ) -> Float[Array, " count"]:
-        """Readings of all; `noise` are standard normal numbers."""
+        """Return the readings of all sensors; `noise` are standard normal numbers."""
         out, at = [], 0
         for s, x in zip(self.sensors, _quantities(self.sensors, plant, q, qd, qdd), strict=True):
             x = s.scale * x + s.bias
@@ -110,13 +110,13 @@ class InertialSensors(eqx.Module):
         velocity: Float[Array, " n"],
         acceleration: Float[Array, " n"],
     ) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, ""]]:
-        """Velocity and acceleration of all joints, and whether the readings tell them.
+        """Compute velocity and acceleration of all joints, and whether the readings determine them.
 
         Args:
-            plant: Whose frames the sensors are on.
-            q: Measured position.
-            readings: Of all sensors, in their order.
-            velocity, acceleration: What they are taken to be where readings are out of range.
+            plant: Plant with the links that carry the sensors.
+            q: Measured position of all joints.
+            readings: Readings of all sensors, in their order.
+            velocity, acceleration: Values for motions that no reading within its range determines.
         """
         zero, rows = jnp.zeros_like(q), _slopes(self.known, plant, q)
         velocity, sound = self._solved(True, rows, [0.0] * len(rows), readings, velocity)
@@ -129,28 +129,28 @@ class InertialSensors(eqx.Module):
     def _solved(
         self, gyroscopes: bool, rows: list[Array], rest: list, readings: Array, held: Array
     ) -> tuple[Array, Array]:
-        """What gyroscopes, or accelerometers, say of a quantity in which they are affine."""
+        """Solve the readings of gyroscopes, or accelerometers, for a quantity in which they are affine."""
         ends = np.cumsum([0, *(len(s.axes) for s in self.known)])
-        own = [k for k, s in enumerate(self.known) if s.gyroscope == gyroscopes]
-        seen, weight, inside = [], [], []
-        for k in own:
+        chosen = [k for k, s in enumerate(self.known) if s.gyroscope == gyroscopes]
+        values, weights, within = [], [], []
+        for k in chosen:
             s, x = self.known[k], readings[ends[k] : ends[k + 1]]
-            seen.append((x - s.bias) / s.scale - rest[k])
-            weight.append(jnp.broadcast_to((s.scale / s.noise) ** 2, x.shape))
-            inside.append(jnp.abs(x) < s.range)
-        seen, weight, inside = (jnp.concatenate(x) for x in (seen, weight, inside))
-        rows = jnp.concatenate([rows[k] for k in own])
-        prior = _HELD * jnp.sum(weight[:, None] * rows**2) / held.size
+            values.append((x - s.bias) / s.scale - rest[k])
+            weights.append(jnp.broadcast_to((s.scale / s.noise) ** 2, x.shape))
+            within.append(jnp.abs(x) < s.range)
+        value, weight, inside = (jnp.concatenate(x) for x in (values, weights, within))
+        slope = jnp.concatenate([rows[k] for k in chosen])
+        prior = _HELD * jnp.sum(weight[:, None] * slope**2) / held.size
         weight = jnp.where(inside, weight, 0.0)
-        normal = jnp.sum((weight[:, None] * rows)[:, :, None] * rows[:, None, :], axis=0)
+        normal = jnp.sum((weight[:, None] * slope)[:, :, None] * slope[:, None, :], axis=0)
         normal = normal + prior * jnp.eye(held.size)
-        moment = jnp.sum((weight * seen)[:, None] * rows, axis=0) + prior * held
+        moment = jnp.sum((weight * value)[:, None] * slope, axis=0) + prior * held
         inverse = jax.vmap(small_solve, (None, 0))(normal, jnp.eye(held.size))
-        return jnp.sum(inverse * moment, axis=1), jnp.all(prior * jnp.diagonal(inverse) < _SAYS)
+        return jnp.sum(inverse * moment, axis=1), jnp.all(prior * jnp.diagonal(inverse) < _DETERMINED)
 
 
 def _places(sensors: tuple[Inertial, ...], plant: Plant) -> Callable[[Array], tuple[Array, Array]]:
-    """Axes of the sensors' links, and the sensors' places, as functions of the position."""
+    """Return a function from positions to the axes of the sensors' links and the places of the sensors."""
 
     def places(q: Array) -> tuple[Array, Array]:
         frames = {link: plant.frame(link, q) for link in sorted({s.link for s in sensors})}
@@ -164,7 +164,7 @@ def _places(sensors: tuple[Inertial, ...], plant: Plant) -> Callable[[Array], tu
 def _quantities(
     sensors: tuple[Inertial, ...], plant: Plant, q: Array, qd: Array, qdd: Array
 ) -> list[Float[Array, " axes"]]:
-    """What each measures, along its axes [rad/s or m/s^2]."""
+    """Compute the quantity that each sensor measures, along its axes [rad/s or m/s^2]."""
     places = _places(sensors, plant)
 
     def rate(q: Array, qd: Array) -> tuple:
@@ -177,7 +177,7 @@ def _quantities(
 
 
 def _slopes(sensors: tuple[Inertial, ...], plant: Plant, q: Array) -> list[Float[Array, "axes n"]]:
-    """Derivative of what each measures in the joints' velocities, or accelerations."""
+    """Compute the derivative of each measured quantity in the joints' velocities, or accelerations."""
     places = _places(sensors, plant)
     turn, move = jax.jacfwd(places)(q)
     axes = places(q)[0]
@@ -187,13 +187,13 @@ def _slopes(sensors: tuple[Inertial, ...], plant: Plant, q: Array) -> list[Float
 
 
 def _vector(axes: Float[Array, "s 3 3"], turn: Float[Array, "s 3 3 n"]) -> Float[Array, "s 3 n"]:
-    """Angular velocities in the turning axes, of the derivatives of these."""
+    """Return the angular velocities in the turning axes from the derivatives of these axes."""
     across = jnp.sum(axes[:, :, :, None, None] * turn[:, :, None, :, :], axis=1)
     return jnp.stack([across[:, 2, 1], across[:, 0, 2], across[:, 1, 0]], axis=1)
 
 
 def _turned(rotation: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """A sensor's axes, as columns, in those of its link, by Rodrigues' formula."""
+    """Return the axes of a sensor, as columns, in those of its link, by Rodrigues' formula."""
     angle = jnp.sqrt(jnp.sum(rotation**2) + 1e-300)
     x, y, z = rotation / angle
     cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -202,9 +202,9 @@ def _turned(rotation: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def scale_factor(raw: Float[np.ndarray, " time"], known: Float[np.ndarray, " time"]) -> float:
-    """What raw readings are multiplied by to match a known motion, by least squares.
+    """Compute the factor of raw readings that matches a known motion, by least squares.
 
-    Noise of the readings lowers it, by the square of its part in them; `calibrate` has no such bias.
+    Noise lowers it, by its share of the mean square of the readings; `calibrate` has no such bias.
 
     Source:
         Righettini et al. (2025), Robotics 14, 36, (47) and (48).
@@ -215,28 +215,28 @@ def scale_factor(raw: Float[np.ndarray, " time"], known: Float[np.ndarray, " tim
 def calibrate(
     raw: Float[np.ndarray, "time axes"], known: Float[np.ndarray, "time 3"]
 ) -> tuple[Float[np.ndarray, "axes 3"], Float[np.ndarray, " axes"], Float[np.ndarray, "axes 4"]]:
-    """Scale, mounting and bias of a sensor from a known motion, by least squares.
+    """Compute scale, mounting and bias of a sensor from a known motion, by least squares.
 
     Args:
-        raw: Its readings.
-        known: What it should have read along its link's axes.
+        raw: Raw readings of the sensor.
+        known: True quantity along the axes of its link.
 
     Returns:
-        Matrix from the one to the other (scale times mounting, without a demand that axes be at right
-        angles), bias, and the standard deviations of both, for white noise.
+        Matrix from the quantity to the readings (scale times mounting, not constrained to right angles),
+        bias, and the standard deviations of both, for white noise.
 
     Raises:
-        ValueError: If the motion does not excite all that is asked, or is too short.
+        ValueError: If the motion does not excite all unknowns, or is too short.
     """
     columns = np.concatenate([known, np.ones((len(known), 1))], axis=1)
     if len(columns) <= 4:
-        raise ValueError(f"{len(columns)} samples do not tell 4 numbers an axis; take more.")
+        raise ValueError(f"{len(columns)} samples do not determine 4 numbers for each axis; take more.")
     size = np.sqrt(np.mean(columns**2, axis=0))
     values = np.linalg.svd(columns / np.where(size > 0, size, 1.0), compute_uv=False)
     if not np.all(size > 0) or values[-1] < 1e-9 * values[0]:
         raise ValueError("the motion does not turn (or accelerate) along three axes, at several rates.")
-    found, *_ = np.linalg.lstsq(columns, raw, rcond=None)
-    left = raw - columns @ found
-    variance = np.sum(left**2, axis=0) / (len(columns) - 4)
+    solution, *_ = np.linalg.lstsq(columns, raw, rcond=None)
+    residual = raw - columns @ solution
+    variance = np.sum(residual**2, axis=0) / (len(columns) - 4)
     std = np.sqrt(variance[:, None] * np.diagonal(np.linalg.inv(columns.T @ columns)))
-    return found[:3].T, found[3], std
+    return solution[:3].T, solution[3], std

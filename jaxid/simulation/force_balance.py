@@ -13,6 +13,7 @@ from jaxid.dynamics.hidden_joints import complete_motion
 from jaxid.dynamics.residuals import residual_along
 from jaxid.logs.prepare import Prepared
 from jaxid.model.plant import Plant
+from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 
@@ -107,11 +108,8 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
     The width is a third of the rest velocity: samples nearer to zero are left out, so that the
     smoothing biases nothing.
     """
-    return eqx.tree_at(
-        lambda p: (p.sharpness, p.velocity_scale),
-        plant,
-        (np.asarray(1 / 3), np.asarray(min(data.recipe.rest_velocity))),
-    )
+    rest_velocity = np.asarray(data.recipe.rest_velocity)[None]
+    return plant.smoothed(np.asarray(1 / 3), typical_velocity(plant, rest_velocity, np.min))
 
 
 def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:

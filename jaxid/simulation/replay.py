@@ -188,7 +188,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
 def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: str) -> Drive:
     solver = None
     if numerics.solver is not None:
-        sizes = float(np.std(log.filled, axis=0).max()), float(machine.plant.velocity_scale)
+        sizes = float(np.std(log.filled, axis=0).max()), float(np.max(machine.plant.smoothing.velocity_scale))
         solver = AdaptiveStep.sized(numerics.solver, *sizes)
     return Drive(
         machine.gain,

@@ -15,9 +15,11 @@ import scipy.stats
 import xarray as xr
 
 from jaxid.files import ready_folder, write_json, write_whole
+from jaxid.model.units import joined
 from jaxid.studies.settings import SETTINGS
 
 if TYPE_CHECKING:
+    from jaxid.machine import Machine
     from jaxid.studies.plan import Plan
     from jaxid.studies.runs import Arrays
 
@@ -69,7 +71,9 @@ class Study:
                 used = np.isfinite(rms.values[:, k])
                 if used.any():
                     both = {"rms": sizes(rms.values[used, k]), "peak": sizes(peak.values[used, k])}
-                    unit = str(rms.attrs["unit"])
+                    # One label for all drives, or one for each (see `_tracking_unit`).
+                    units = str(rms.attrs["unit"]).split(", ")
+                    unit = units[k % len(units)]
                     rows.append({**setting, "drive": k + 1, "unit": unit, "runs": int(used.sum()), **both})
         return rows
 
@@ -182,12 +186,17 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
     )
     tracking = by_run("tracking")[0]
     if tracking.shape[-2]:
-        own, unit = (*settings, "run", "drive"), {"unit": plan.machine.units.label("position")}
+        own, unit = (*settings, "run", "drive"), {"unit": _tracking_unit(plan.machine)}
         for k, name in enumerate(("tracking_rms", "tracking_peak")):
             table[name] = own, tracking[..., k], unit
         table = table.assign_coords(drive=np.arange(1, tracking.shape[-2] + 1, dtype=np.int32))
     seconds = float(sum(c["seconds"] for c in chunks))
     return Study(table, seconds, plan.case.path.stem)
+
+
+def _tracking_unit(machine: Machine) -> str:
+    """Return the unit of the tracking error, or one for each drive, separated by commas."""
+    return joined(machine.unit_by_joint("position", machine.plant.driven(machine.plant.joints)))
 
 
 def _why(run: xr.Dataset) -> str:

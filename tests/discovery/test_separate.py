@@ -15,7 +15,10 @@ from jaxid.errors import InputError
 from jaxid.experiment_design.improve import improved
 from jaxid.experiment_design.shapes import Shapes, basis
 from jaxid.files import signal_csv
+from jaxid.machine import Machine
 from jaxid.model.units import Units
+from jaxid.model.unknowns import Parameters
+from jaxid.plants import Axis
 from jaxid.references import make_reference
 from jaxid.results.proposals import proposal_json, sentence
 from tests.support.axis_log import log_of
@@ -25,6 +28,7 @@ from truth.axis import ambiguous as setups
 from truth.axis.cases import case_text, write_case
 from truth.axis.stepper import write_csv
 
+AXIS = Machine(Axis(1.0), Parameters(()), np.ones(1), Units())
 SPRINGS = ("cubic_stiffness", "quadratic_stiffness")
 
 
@@ -103,7 +107,7 @@ def test_the_csv_is_read_back_as_the_reference(springs, tmp_path):
     table = {"kind": "csv", "file": proposal.file, "time": "t", "column": "reference"}
     read = make_reference(table, 1000.0, len(proposal.time) / 1000.0, tmp_path)
     np.testing.assert_allclose(read, proposal.values, atol=1e-12)
-    told = proposal_json(proposal, Units())
+    told = proposal_json(proposal, AXIS)
     assert told["file"] == proposal.file == "separate_cubic_stiffness_from_quadratic_stiffness.csv"
     assert told["start"] == proposal.values[0, 0]
     assert told["limits"]["stroke"] == [0.0, 0.25]
@@ -117,9 +121,9 @@ def test_what_is_one_by_another_name_is_told_so(tmp_path):
     proposal = proposed_for(setup, declared, kinds, tmp_path, inertia_known=True)
     assert not proposal.separates
     assert proposal.expected < proposal.needed
-    told = sentence(proposal, Units())
+    told = sentence(proposal, AXIS)
     assert told.startswith("no experiment within these limits separates added_mass from actuator_gain (exp")
-    assert proposal_json(proposal, Units())["file"] is None
+    assert proposal_json(proposal, AXIS)["file"] is None
 
 
 @pytest.mark.slow

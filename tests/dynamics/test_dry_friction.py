@@ -8,6 +8,7 @@ from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, hold_polynomial
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
+from jaxid.model.smoothing import Smoothing
 from jaxid.plants import Axis, Chain
 from jaxid.simulation.loops import Drive, open_loop
 from truth.axis import stepper
@@ -102,7 +103,7 @@ def test_a_velocity_stands_just_where_the_force_lies_between_both_frictions():
         EFFECTS["viscous_friction"](coefficient=damping),
         EFFECTS["velocity_hysteresis"](level=rising, velocity=1e3),
     )
-    plant = Axis(MASS, effects=effects, sharpness=1e-6)
+    plant = Axis(MASS, effects=effects, smoothing=Smoothing(1e-6))
     for left in (0.01, 2.0, 3.99):
         way, end = stepped(plant, speed, dry + damping * speed + left)
         assert (way, end) == (speed / RATE, speed)

@@ -11,6 +11,7 @@ from jaxid.dynamics.residuals import _recurrence, residual_along
 from jaxid.dynamics.rhs import State, small_solve, step
 from jaxid.effects import EFFECTS
 from jaxid.estimators.algebraic.windows import iterated_integral, weak_motion
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
 from jaxid.simulation.loops import Drive, open_loop
@@ -74,7 +75,7 @@ def test_order_is_four_with_memory_too():
         EFFECTS["actuator_lag"](time_constant=0.05),
         EFFECTS["hysteresis"](stiffness=300.0, level=4.0),
     )
-    plant, runs = Axis(MASS, effects=effects, sharpness=0.3), []
+    plant, runs = Axis(MASS, effects=effects, smoothing=Smoothing(0.3)), []
     start = (jnp.asarray(0.05), jnp.asarray(0.5))
     for period in (8e-3, 4e-3, 2.5e-4):
         command = 20.0 * period * jnp.arange(round(0.8 / period))
@@ -115,7 +116,7 @@ def test_stopping_time_and_distance_tend_to_the_sharp_ones():
     exact, errors = MASS * speed**2 / (2 * level), []
     for sharpness in (0.1, 0.03, 0.01):
         friction = EFFECTS["coulomb_friction"](level=level)
-        plant = Axis(MASS, effects=(friction,), sharpness=sharpness)
+        plant = Axis(MASS, effects=(friction,), smoothing=Smoothing(sharpness))
         q, _ = coast(plant, 600, period, speed)
         errors.append(q[-1] - exact)
     # slower by tanh: the distance past the sharp stop is (pi^2 / 12) m width^2 / F, up to the end
@@ -149,7 +150,7 @@ def test_sticks_exactly_under_any_force_below_the_level():
 def test_energy_is_what_the_drive_gave_less_what_friction_took(set_valued):
     level, samples, period = 3.0, 4000, 2.5e-4
     effects = (*OSCILLATOR, EFFECTS["coulomb_friction"](level=level))
-    plant = Axis(MASS, effects=effects, sharpness=1e-3)
+    plant = Axis(MASS, effects=effects, smoothing=Smoothing(1e-3))
     t = period * np.arange(samples)
     force = 20.0 * np.sin(9.0 * t)  # far below the resonance at 20 rad/s
     out = run(
@@ -174,7 +175,7 @@ def simulated_motion() -> tuple[Axis, list[jax.Array], float]:
     """A smooth run, with the accelerations that its balance gave, at 1 kHz."""
     friction = EFFECTS["coulomb_friction"](level=3.0)
     effects = (*OSCILLATOR, friction, EFFECTS["cubic_friction"](coefficient=0.7))
-    plant, period = Axis(MASS, effects=effects, sharpness=0.02), 1e-3
+    plant, period = Axis(MASS, effects=effects, smoothing=Smoothing(0.02)), 1e-3
     t = period * np.arange(800)
     u = 40.0 * np.sin(20.0 * t) + 15.0 * np.cos(57.0 * t)
     out = run(plant, period, jnp.asarray(u), (jnp.zeros(()), jnp.asarray(0.3)), hold="linear")
@@ -226,7 +227,7 @@ def test_own_states_driven_along_a_motion_are_those_of_the_simulation():
         EFFECTS["actuator_lag"](time_constant=0.01),
         EFFECTS["hysteresis"](stiffness=2e3, level=5.0),
     )
-    plant, errors = Axis(MASS, effects=effects, sharpness=1e-3), []
+    plant, errors = Axis(MASS, effects=effects, smoothing=Smoothing(1e-3)), []
     start = (jnp.zeros(()), jnp.asarray(0.3))
     for period in (1e-3, 5e-4):
         u = 40.0 * np.sin(20.0 * period * np.arange(round(0.6 / period)))
@@ -258,7 +259,7 @@ def test_what_sits_behind_a_spring_is_driven_along_the_motion_of_the_joint():
     )
 
     def rms(*effects) -> float:
-        plant = Axis(inertia, effects=(*friction, *effects), sharpness=1e-6)
+        plant = Axis(inertia, effects=(*friction, *effects), smoothing=Smoothing(1e-6))
         e = jax.jit(residual_along)(plant, *map(jnp.asarray, (q, v, a, u)), 1 / axes.RATE)
         return float(np.sqrt(np.mean(np.square(np.asarray(e)[moving]))))
 

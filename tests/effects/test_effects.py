@@ -10,6 +10,7 @@ from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.residuals import residual_along
 from jaxid.dynamics.rhs import State
 from jaxid.effects import EFFECTS
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.filters import Decimator
 from jaxid.plants import Axis
@@ -21,7 +22,7 @@ each_row = pytest.mark.parametrize("row", ROWS.values(), ids=[*ROWS])
 
 def plant_of(effects: tuple, sharpness: float = 1e-3, **options) -> Axis:
     made = tuple(EFFECTS[kind](**values) for kind, values in effects)
-    return Axis(MASS, effects=made, sharpness=sharpness, **options)
+    return Axis(MASS, effects=made, smoothing=Smoothing(sharpness), **options)
 
 
 def places_of(row: Row) -> tuple:

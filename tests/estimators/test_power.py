@@ -3,7 +3,6 @@
 import dataclasses
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from jaxid.estimators.power import power
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, Recipe
 from jaxid.machine import Machine
-from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameter
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
@@ -109,9 +107,6 @@ class Arm(Plant):
     a: Array = parameter("inertia", "positive", "of both links, about the first joint")
     b: Array = parameter("inertia", "positive", "coupling")
     d: Array = parameter("inertia", "positive", "of the second link")
-    effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
-    sharpness: Array = eqx.field(default_factory=lambda: jnp.asarray(1e-3), kw_only=True)
-    velocity_scale: Array = eqx.field(default_factory=lambda: jnp.asarray(1.0), kw_only=True)
 
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         c, s = self.b * jnp.cos(q[1]), self.b * jnp.sin(q[1])

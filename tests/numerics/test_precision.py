@@ -10,6 +10,7 @@ import scipy.signal
 
 from jaxid.dynamics.residuals import residual_along
 from jaxid.effects import EFFECTS
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.precision import NoiseModel, assess, full_hessian, sandwich
 from jaxid.plants import Axis
@@ -143,7 +144,7 @@ def axis_regressor() -> np.ndarray:
         EFFECTS["coulomb_friction"](level=1.0),
         EFFECTS["friction_drift"](rate=0.0),
     )
-    plant = Axis(2.0, effects=effects, sharpness=0.01)
+    plant = Axis(2.0, effects=effects, smoothing=Smoothing(0.01))
     leaves = [("inertia",), ("effects", 0, "mass"), ("effects", 1, "level")]
     places = tuple((path, None) for path in leaves)
 

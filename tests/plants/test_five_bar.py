@@ -12,7 +12,8 @@ from jaxid.arms.base_parameters import base_parameters, inertial_regressor
 from jaxid.dynamics.rhs import State, acceleration
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.model.plant import port_motion
+from jaxid.model.balance import port_motion
+from jaxid.model.smoothing import Smoothing
 from jaxid.plants import FiveBar, righettini_five_bar
 from jaxid.simulation.loops import with_diffrax
 from truth.five_bar import oracle
@@ -174,7 +175,7 @@ def test_ports_are_the_angles_between_links():
 @pytest.mark.parametrize("robot", [Robot(), UNEVEN], ids=["tables", "uneven"])
 def test_inverse_dynamics_is_that_of_the_multipliers(robot):
     robot = Robot(**{**robot.__dict__, "friction": FRICTION})
-    plant = plant_of(robot, sharpness=1e-12)
+    plant = plant_of(robot, smoothing=Smoothing(1e-12))
     states = possible_states(robot, 200)
     none, now = (None,) * len(plant.effects), jnp.zeros(())
     ask = jax.jit(jax.vmap(lambda q, v, a: plant.balance(q, v, a, jnp.zeros(2), now, none).residual))
@@ -234,7 +235,7 @@ def test_energy_stays_without_friction():
 
 def test_friction_takes_what_the_hinges_turn():
     robot = Robot(friction=FRICTION)
-    plant = plant_of(robot, sharpness=1e-12)
+    plant = plant_of(robot, smoothing=Smoothing(1e-12))
     none = (None,) * len(plant.effects)
     for q, qd, _ in possible_states(robot, 10).transpose(1, 0, 2):
         zero = jnp.zeros(2)

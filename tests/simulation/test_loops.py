@@ -9,6 +9,7 @@ import pytest
 
 from jaxid.controllers.linear import CascadePD
 from jaxid.effects import EFFECTS
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
 from jaxid.sensors.encoder import Sensor
@@ -45,7 +46,7 @@ SMOOTH = {
 
 def smooth_plant(case: str) -> Axis:
     effects = tuple(EFFECTS[kind](**values) for kind, values in SMOOTH[case].items())
-    return Axis(MASS, effects=effects, sharpness=0.3)
+    return Axis(MASS, effects=effects, smoothing=Smoothing(0.3))
 
 
 def forces(hold: str):
@@ -155,7 +156,7 @@ def test_gradient_in_the_delay_is_there(closed):
 
 
 # F h / (m width) = 3 * 1e-2 / (2 * 1e-3) = 15: RK4 leaves its stability at 2.8.
-STIFF = Axis(MASS, effects=(EFFECTS["coulomb_friction"](level=3.0),), sharpness=1e-3)
+STIFF = Axis(MASS, effects=(EFFECTS["coulomb_friction"](level=3.0),), smoothing=Smoothing(1e-3))
 
 
 @pytest.mark.parametrize("seen", ["at rest", "passing through rest between samples"])
@@ -168,7 +169,7 @@ def test_needed_substeps_counts_the_smoothed_sign(seen):
 
 def test_too_coarse_a_step_has_a_garbage_gradient_and_is_flagged():
     """The trajectory looks plausible; only the count of substeps tells."""
-    sharp = eqx.tree_at(lambda p: p.sharpness, STIFF, jnp.asarray(2e-4))
+    sharp = STIFF.smoothed(jnp.asarray(2e-4))
     zero = jnp.zeros((1, 1))
     needed = needed_substeps(sharp, Drive(jnp.ones(1), PERIOD), zero, zero, zero)
     assert needed == 75

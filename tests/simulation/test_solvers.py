@@ -17,6 +17,7 @@ from jaxid.effects import EFFECTS
 from jaxid.estimators.output_error import choose_numerics, output_error
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.model.smoothing import Smoothing
 from jaxid.model.units import Units
 from jaxid.model.unknowns import Free, Parameters
 from jaxid.plants import Axis
@@ -50,7 +51,7 @@ def plant() -> Axis:
         EFFECTS["input_delay"](delay=value["delay"]),
     )
     # Smooth enough for fixed steps to be the reference: 16 a sample then leave 1e-8.
-    return Axis(value["inertia"], effects=effects, sharpness=0.2)
+    return Axis(value["inertia"], effects=effects, smoothing=Smoothing(0.2))
 
 
 def machine(closed: bool, unknown: tuple = tuple(TRUTH)) -> Machine:

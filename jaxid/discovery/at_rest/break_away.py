@@ -186,7 +186,7 @@ def _unknown(machine: Machine, log: Log) -> str:
     """What of the moment of a start is not known; empty where all is."""
     if not any(e.kind == CoulombFriction.kind for e in machine.plant.effects):
         return "there is no sliding friction that it could stand above"
-    if machine.plant.coupled:
+    if not machine.plant.starts_alone:
         return "the joints push one another, by more than what keeps one from starting"
     for e in machine.plant.effects:
         if e.adds_force and e.initial_state(jnp.zeros(())) is not None:

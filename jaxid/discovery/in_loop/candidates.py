@@ -236,7 +236,7 @@ class Loop:
         directions[c.index, np.arange(len(c.index))] = 1.0
         p, log = self.problem, self.session.fit.log
         plant = with_numerical_damping(self.union.machine.plant, jnp.asarray(log.filled[0]), log.period)
-        plant = replace(plant, sharpness=p.ladder[-1])
+        plant = plant.smoothed(p.ladder[-1])
         args = (p.replay, self.union.machine.parameters.places, plant, p.measured, p.weight, p.on)
         e, columns = _columns(*args, theta, directions)
         slope = np.zeros((self.residual.size, len(c.index)))

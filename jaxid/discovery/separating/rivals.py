@@ -90,8 +90,7 @@ class Pair:
 
     def rounder(self, factor: float) -> Pair:
         """The same with a sign so many times as wide."""
-        plant = eqx.tree_at(lambda p: p.sharpness, self.plant, factor * self.plant.sharpness)
-        return replace(self, plant=plant)
+        return replace(self, plant=self.plant.smoothed(factor * self.plant.smoothing.sharpness))
 
     def model(self, which: int) -> Plant:
         """The plant of one of them."""

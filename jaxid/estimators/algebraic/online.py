@@ -31,6 +31,7 @@ from jaxid.estimators.algebraic.windows import first_by_parts, second_by_parts
 from jaxid.estimators.inverse_dynamics import linear_unknowns
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import Parameters, colours, scatter, seeds
 
 # Adams-Moulton weights on the newest sample and up to three before it, by how many there are.
@@ -156,8 +157,9 @@ class Online(eqx.Module):
         # A joint that never moves has no velocity of its own.
         fast = np.where(fast > 0, fast, np.max(fast))
         rest_velocity = np.maximum(rest_velocity, _LEAST * fast)
-        sharp = (np.asarray(1 / 3), np.asarray(np.min(rest_velocity)))
-        plant = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), machine.plant, sharp)
+        plant = machine.plant.smoothed(
+            np.asarray(1 / 3), typical_velocity(machine.plant, rest_velocity[None], np.min)
+        )
         enters = _enters(plant, machine.parameters, len(fast), machine.gain.size)
         numbers = colours(enters)
         owner = np.full((len(fast), max(numbers, default=-1) + 1), len(numbers))

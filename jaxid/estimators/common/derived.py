@@ -59,7 +59,8 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
             continue
         part = np.asarray(slope)[used]
         covariance = estimate.precision.covariance[np.ix_(used, used)]
-        field, unit = ("friction_coefficient", "1") if by_level else ("level", machine.units.label("force"))
+        force = machine.units.label("force", plant.motion(plant.effects[k].port))
+        field, unit = ("friction_coefficient", "1") if by_level else ("level", force)
         std = float(np.sqrt(part @ covariance @ part))
         out.append(Derived(f"{name}.{field}", float(value), std, unit))
     return out

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.estimators.minimal.polynomials import Matrix
+from jaxid.model.balance import Balance
 from jaxid.model.effect import Effect
-from jaxid.model.plant import Balance, Plant
+from jaxid.model.plant import Plant
 from jaxid.model.unknowns import effect_name
 from jaxid.numerics.affine import depends, is_affine
 

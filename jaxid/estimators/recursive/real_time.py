@@ -20,6 +20,7 @@ from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, R
 from jaxid.estimators.recursive.rows import check_proportion, elsewhere
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
 
 
@@ -104,8 +105,9 @@ class RealTime(eqx.Module):
         velocity, acceleration = (
             np.broadcast_to(np.asarray(x, float), (n,)) for x in (gate_velocity, gate_acceleration)
         )
-        sharp = (np.asarray(1 / 3), np.asarray(np.min(velocity)))
-        plant = eqx.tree_at(lambda p: (p.sharpness, p.velocity_scale), machine.plant, sharp)
+        plant = machine.plant.smoothed(
+            np.asarray(1 / 3), typical_velocity(machine.plant, velocity[None], np.min)
+        )
         random, guess = np.random.default_rng(0), machine.parameters.guess
         motion, u = plant.any_motion(random), random.uniform(0.5, 1.5, machine.gain.size)
         here, there = (np.asarray(slopes(plant, places, x, motion, u)) for x in (guess, elsewhere(guess)))

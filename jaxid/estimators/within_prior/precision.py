@@ -30,7 +30,7 @@ _BELOW = 0.1
 def hessian_of(*args: Any) -> Array:
     """Of the cost, in the directions' coordinates, at a sharpness."""
     replay, places, plant, *rest, sharpness, vectors, z = args
-    return full_hessian(residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors), z)
+    return full_hessian(residual_of(replay, places, plant.smoothed(sharpness), *rest, vectors), z)
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ class Problem:
         whole = Prior.of(machine, prior, start, widths)
         weight = np.tile(counts.astype(float), (len(measured), 1))
         m = log.force.shape[1]
-        ladder = _LADDER if _rises(plant, np.zeros(n), np.zeros(m)) else (plant.sharpness,)
+        ladder = _LADDER if _rises(plant, np.zeros(n), np.zeros(m)) else (plant.smoothing.sharpness,)
         sharp = tuple(np.asarray(s) for s in ladder)
         places = machine.parameters.places
         return cls(replay, places, plant, measured, weight, whole, on, sharp, encoders)
@@ -197,7 +197,7 @@ def residual_at_each(*args: Any) -> Array:
     """Residuals at many points in units of the prior, from as many starts; `Problem.args` first."""
     *problem, sharpness, w, starts = args
     replay, places, plant, *rest = problem
-    plant = replace(plant, sharpness=sharpness)
+    plant = plant.smoothed(sharpness)
     at = lambda w, start: residual_of(replay.started(start), places, plant, *rest, jnp.eye(w.size))(w)
     return eqx.filter_vmap(at)(w, starts)
 
@@ -231,7 +231,7 @@ def _goes_on(*args: Any) -> Progress:
     """Down the cost; `pull`, the noise that a prior is held against, keeps the way near the guesses."""
     replay, places, plant, *rest, sharpness, pull, origin, vectors, active, tolerance, stop, progress = args
     bound = jnp.full(active.shape, FAR)
-    compared = residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors, origin)
+    compared = residual_of(replay, places, plant.smoothed(sharpness), *rest, vectors, origin)
     residual = jax.jit(lambda z: jnp.concatenate([compared(z).ravel(), pull * z]))
     return descend(residual, progress, (-bound, bound), stop, active, tolerance)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxid.estimators.minimal.report import minimal_rows
+from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.proposals import sentence
 from jaxid.results.report.data import (
@@ -115,13 +116,23 @@ def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
 
 
 def units_of(session: Session) -> dict[str, str]:
-    """Labels of position, velocity, force and time."""
-    units = session.machine.units
+    """Return the labels of position, velocity, force and time, of all joints."""
+    unit = session.machine.unit_by_joint
     return {
-        "position": units.label("position"),
-        "velocity": units.label("position/time"),
-        "force": units.label("force"),
+        "position": joined(unit("position")),
+        "velocity": joined(unit("position/time")),
+        "force": joined(unit("force")),
         "time": "s",
+    }
+
+
+def _units_at(session: Session, joint: int) -> dict[str, str]:
+    """Return the labels of position, velocity and force at a joint."""
+    unit = session.machine.unit
+    return {
+        "position": unit("position", joint),
+        "velocity": unit("position/time", joint),
+        "force": unit("force", joint),
     }
 
 
@@ -153,7 +164,11 @@ def _views(
     joints = np.flatnonzero(session.fit.log.measured).tolist()
     driven = _driven if drives else lambda *of: {}
     return tuple(
-        replace(_view(run, old, new, joint, len(joints)), **driven(session, run, new, joint))
+        replace(
+            _view(run, old, new, joint, len(joints)),
+            units=_units_at(session, joint),
+            **driven(session, run, new, joint),
+        )
         for run, old, new in zip(session.runs, earlier, after, strict=True)
         for joint in joints
     )
@@ -209,16 +224,18 @@ def _step(r: Round) -> SearchStep:
 
 
 def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
-    units, limits = session.machine.units, proposal.limits
+    machine, limits = session.machine, proposal.limits
+    joints = machine.plant.driven(machine.plant.joints)
     loop = proposal.signal == "reference"
-    driven = session.machine.plant.at_drives
+    driven = machine.plant.at_drives
     # A command has no unit of its own where the gain turns it into a force.
-    own = np.all(session.machine.gain == 1.0)
+    own = np.all(machine.gain == 1.0)
+    signal_unit = joined(machine.unit_by_joint("position" if loop else "force", joints))
     ends = (driven(limits.low), driven(limits.high)) if loop else (-limits.force, limits.force)
     return ExperimentView(
-        text=sentence(proposal, units),
+        text=sentence(proposal, machine),
         signal=proposal.signal,
-        unit=units.label("position") if loop else units.label("force") if own else "command",
+        unit=signal_unit if loop or own else "command",
         time=proposal.time,
         values=proposal.values if proposal.separates else None,
         limits=np.stack(ends, axis=1),
@@ -230,11 +247,11 @@ def _where_plot(result: Discovery) -> WherePlot | None:
     w = result.where
     if w is None:
         return None
-    label = result.session.machine.units.label
     unit = {
-        "velocity": label("position/time"),
-        "position": label("position"),
-        "acceleration": label("position/time2"),
-        "force": label("force"),
-    }.get(w.variable, label("position") if w.variable.startswith("elongation") else "s")
-    return WherePlot(w.variable, unit, w.x, w.mean, w.low, w.high)
+        "velocity": "position/time",
+        "position": "position",
+        "acceleration": "position/time2",
+        "force": "force",
+    }.get(w.variable, "position" if w.variable.startswith("elongation") else "time")
+    label = result.session.machine.unit(unit, w.joint - 1)
+    return WherePlot(w.variable, label, w.x, w.mean, w.low, w.high)

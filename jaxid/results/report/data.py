@@ -31,6 +31,7 @@ class LogView:
         joint: Which joint, 0-based.
         drive_measured: Declared force of its drive as it was logged, (N,), where that is to be compared.
         drive_simulated: The same as the simulated loop commands it, (N,).
+        units: Labels at this joint that differ from those of the page, by quantity.
     """
 
     name: str
@@ -47,6 +48,7 @@ class LogView:
     joint: int = 0
     drive_measured: np.ndarray | None = None
     drive_simulated: np.ndarray | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ def filled(template: str, **entries: object) -> str:
 
 
 def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
-    units = data.units
+    units = {**data.units, **view.units}
     floor = data.gap.get("noise_floor")
     floor = floor[view.joint] if isinstance(floor, list) else floor
     floor = floor if is_number(floor) else None

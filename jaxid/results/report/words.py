@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from jaxid.model.plant import PLACES
+from jaxid.model.interface import PLACES
 from jaxid.results.report.data import ParameterRow, ReportData, SearchStep
 from jaxid.results.report.numbers import (
     ABSENT,

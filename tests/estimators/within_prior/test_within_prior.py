@@ -1,6 +1,5 @@
 """Output error in the directions that a log tells: a hundred samples, eleven unknowns."""
 
-import dataclasses
 import json
 from types import SimpleNamespace
 
@@ -203,7 +202,7 @@ def test_sensitivities_are_those_of_finite_differences(folder):
     """Through sticking, breaking loose, and a velocity that stands."""
     session = open_session(folder / "case.toml", logged(0))
     replay = make_replay(session.machine, session.fit.log, Numerics(substeps=2))
-    plant = dataclasses.replace(session.machine.plant, sharpness=jnp.asarray(0.1))
+    plant = session.machine.plant.smoothed(jnp.asarray(0.1))
     unknown = session.machine.parameters
 
     @jax.jit

@@ -1,0 +1,58 @@
+"""Hints of a plant to the search for missing effects."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from jaxid.model.drives import Drives
+from jaxid.model.effect import Effect
+
+
+class SearchHints(Drives):
+    """The part of every plant that guides a search. Its answers hold for any plant.
+
+    A plant overrides them to leave out candidates that its motion cannot tell apart, or to name the
+    parameter that an effect would duplicate.
+    """
+
+    # Whether the mass matrix varies with the position, and joints accelerate each other through it.
+    coupled: ClassVar[bool] = False
+    # Whether the plant is a positioning stage (see `Effect.of_stages`).
+    stage: ClassVar[bool] = False
+
+    @property
+    def starts_alone(self) -> bool:
+        """Whether starts from rest show break-away friction: no joint is pushed by more than its drive."""
+        return not self.coupled
+
+    @property
+    def designs_experiments(self) -> bool:
+        """Whether `discover` designs experiments unasked; for coupled joints that compiles for minutes."""
+        return not self.coupled
+
+    @classmethod
+    def bodies(cls, joints: int) -> int:
+        """Return the number of ports that are called joints, those of rigidly geared parts included."""
+        return joints
+
+    @classmethod
+    def springs(cls, joints: int) -> int:
+        """Return the number of ports behind the bodies that are elongations of springs."""
+        return 0
+
+    def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
+        """Return whether a search may name such an effect on a port."""
+        springs = self.springs(self.joints) > 0
+        if effect.with_springs not in (None, springs) or (effect.of_stages and not self.stage):
+            return False
+        if springs and effect.of_spring != (port >= self.bodies(self.joints)):
+            return False
+        return not effect.in_drive or self.drive_of(port, drives) is not None
+
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
+        """Return the parameter, and its entry if it is a list, that an effect on a port duplicates."""
+        return None
+
+    def joints_loaded_by(self, port: int, joints: int) -> tuple[int, ...]:
+        """Return the joints whose balance contains a force on a port; all by default."""
+        return tuple(range(joints))
