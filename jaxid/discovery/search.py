@@ -59,7 +59,7 @@ class Search:
     """State of a search: the union, the logs, and what has been added so far.
 
     Args:
-        union: Machine with all candidates.
+        superset: Machine with all candidates.
         data: The log to fit, prepared.
         floor: RMS force that the sensors' noise alone leaves, by joint.
         colour: Of that noise, by joint.
@@ -69,7 +69,7 @@ class Search:
         barred: Effects taken out for good.
     """
 
-    union: cand.CandidateModel
+    superset: cand.CandidateModel
     data: Prepared
     floor: np.ndarray
     colour: tuple[NoiseModel, ...]
@@ -79,10 +79,10 @@ class Search:
     barred: list[cand.Candidate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.worth = Acceptance(self.union, self.data, self.validation, self.floor, self.colour)
-        self.samples = self.worth.samples
-        self.theta = self.union.neutral
-        self._many: dict[tuple[str, int], list[cand.Point]] = {}
+        self.acceptance = Acceptance(self.superset, self.data, self.validation, self.floor, self.colour)
+        self.samples = self.acceptance.samples
+        self.theta = self.superset.neutral
+        self._grid_points: dict[tuple[str, int], list[cand.Point]] = {}
         self._limit = 0.0
         # All unknowns where nothing is added.
         self._alone = self.theta
@@ -93,19 +93,19 @@ class Search:
         return self._active(self.added)
 
     def _active(self, effects: Sequence[cand.Candidate]) -> np.ndarray:
-        return np.concatenate([self.union.base, *[c.index for c in effects]]).astype(int)
+        return np.concatenate([self.superset.base, *[c.index for c in effects]]).astype(int)
 
     def rest(self) -> list[cand.Candidate]:
         """Candidates not added yet."""
         gone = [*self.added, *self.barred]
-        return [c for c in self.union.candidates if all(c is not g for g in gone)]
+        return [c for c in self.superset.candidates if all(c is not g for g in gone)]
 
-    def many(self, candidate: cand.Candidate) -> list[cand.Point]:
+    def grid_points(self, candidate: cand.Candidate) -> list[cand.Point]:
         """A candidate at its many starts, computed once."""
         key = (candidate.kind, candidate.port)
-        if key not in self._many:
-            self._many[key] = cand.grid_points(self.union, candidate, self.samples)
-        return self._many[key]
+        if key not in self._grid_points:
+            self._grid_points[key] = cand.grid_points(self.superset, candidate, self.samples)
+        return self._grid_points[key]
 
     def run(self, most: int) -> list[Step]:
         """Add effects until none is worth it; drop what becomes superfluous on the way."""
@@ -128,13 +128,13 @@ class Search:
         active = self._active([a for a in self.added if a is not c])
         theta = self._neutral(self.theta, c)
         found = self._fit(theta, active)
-        now, alone = np.abs(theta[self.union.base]), np.abs(self._alone[self.union.base])
+        now, alone = np.abs(theta[self.superset.base]), np.abs(self._alone[self.superset.base])
         if np.all(now > _GONE * alone):
             return found
         # An effect that took over from what the case has, as a limit that all of the force exceeds: from
         # next to nothing that does not come back.
-        theta[self.union.base] = self._alone[self.union.base]
-        return min((found, self._fit(theta, active)), key=self.worth.squares)
+        theta[self.superset.base] = self._alone[self.superset.base]
+        return min((found, self._fit(theta, active)), key=self.acceptance.squares)
 
     def _grow(self, most: int) -> list[Step]:
         steps: list[Step] = []
@@ -166,7 +166,7 @@ class Search:
                 or of `own`'s.
             own: The effect that is to be replaced.
         """
-        if self.worth.at_floor(self.theta):
+        if self.acceptance.at_floor(self.theta):
             return (), (), 0.0
         self.progress(f"screening {len(self.rest())} effects")
         screened = screen_candidates(self, ahead=ahead)
@@ -195,7 +195,7 @@ class Search:
         """Two effects to add at once, where they explain far more than one with any partner."""
         c = one.candidate if one else None
         reached = screened.pairs.with_partner(c.kind, c.port) if c else screened.threshold
-        e, jacobian = cand.evaluate(self.union, self.samples, self.theta, self.active)
+        e, jacobian = cand.evaluate(self.superset, self.samples, self.theta, self.active)
         for *pair, gained in screened.pairs.best(broken):
             if gained < reached + max(_CLEARLY * screened.threshold, _MUCH * gained):
                 return ()
@@ -205,8 +205,10 @@ class Search:
             self.progress("refitting with " + " and ".join(p.candidate.label for p in pair))
             first, second = (Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True))
             both = self._refit(second, screened, beside=first)
-            old, new = (self.worth.residual(t) for t in (self.theta, both.theta))
-            enough = self.worth.closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
+            old, new = (self.acceptance.residual(t) for t in (self.theta, both.theta))
+            enough = self.acceptance.closed(old, new) > _MOST_OF_IT and (
+                one is None or both.total > one.total
+            )
             if enough and not both.reason:
                 left = replace(self._refit(first, screened), reason="")
                 right = self._refit(second, screened)
@@ -256,19 +258,19 @@ class Search:
         more = len(best.candidate.index) - len(own.index)
         if more > 0 or self._equal(mine, best):
             return more < 0
-        now, then = self.worth.residual(self.theta), self.worth.residual(best.theta)
-        return self.worth.closed(now, then) > RELEVANT
+        now, then = self.acceptance.residual(self.theta), self.acceptance.residual(best.theta)
+        return self.acceptance.closed(now, then) > RELEVANT
 
     def _undecided(self, one: Score, two: Score) -> float:
         """Difference in evidence of two fits that chance may make [nats]: two deviations of it."""
         # Where one is true, its gain scatters about what is expected with twice that as variance.
-        return 2 * np.sqrt(2 * self.worth.apart(one.theta, two.theta))
+        return 2 * np.sqrt(2 * self.acceptance.divergence(one.theta, two.theta))
 
     def _equal(self, mine: Score, best: Score) -> bool:
         return mine.total > best.total - max(margin(best), self._undecided(best, mine))
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
-        return cand.refine(self.union, self.samples, theta, active)[0]
+        return cand.refine(self.superset, self.samples, theta, active)[0]
 
     def _neutral(self, theta: np.ndarray, c: cand.Candidate) -> np.ndarray:
         theta = theta.copy()
@@ -284,16 +286,16 @@ class Search:
             for s, guess in zip(new, guesses, strict=True):
                 theta[s.candidate.index] = guess
             fits.append(self._fit(theta, active))
-        theta = min(fits, key=self.worth.squares)
-        e, jacobian = cand.evaluate(self.union, self.samples, theta, active)
+        theta = min(fits, key=self.acceptance.squares)
+        e, jacobian = cand.evaluate(self.superset, self.samples, theta, active)
         after = screened.held_out(e, jacobian[..., active])
         drive = any(not s.candidate.amplitude.any() for s in new)
         if drive:
-            after = after / (1 - self.worth.swallowed(self.samples, self.theta, theta))
+            after = after / (1 - self.acceptance.absorbed_noise(self.samples, self.theta, theta))
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
-        validation, confirmed = self.worth.confirmed(self.theta, theta, drive=drive)
+        validation, confirmed = self.acceptance.confirmed(self.theta, theta, drive=drive)
         index = np.concatenate([s.candidate.index for s in new])
-        reason = self.worth.objection(index, self.theta, theta, validation, confirmed, len(active))
+        reason = self.acceptance.objection(index, self.theta, theta, validation, confirmed, len(active))
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
 
     def _drop_superfluous(self, limit: float, of: Sequence[cand.Candidate]) -> list[Step]:
@@ -309,12 +311,12 @@ class Search:
 
     def _costs(self, theta: np.ndarray, active: np.ndarray, limit: float) -> bool:
         """Whether a smaller model is worse by more than noise and by what is relevant."""
-        e, jacobian = cand.evaluate(self.union, self.samples, self.theta, self.active)
+        e, jacobian = cand.evaluate(self.superset, self.samples, self.theta, self.active)
         now = Screen.of(ev.Whitener.of(e, self.samples.moving, self.colour), e, jacobian[..., self.active])
-        less, jacobian = cand.evaluate(self.union, self.samples, theta, active)
+        less, jacobian = cand.evaluate(self.superset, self.samples, theta, active)
         after = now.held_out(less, jacobian[..., active])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
-        return lost > limit and self.worth.closed(less, e) > _SUPERFLUOUS
+        return lost > limit and self.acceptance.closed(less, e) > _SUPERFLUOUS
 
 
 def _starts(score: Score) -> list[np.ndarray]:

@@ -141,7 +141,7 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
     pair = Pair.of(search, own, rival)
     log, data = session.fit.log, session.fit.data
     limits = Limits.of(session.case.limits, session.machine, log, data)
-    present = compared(search.union, pair, search.samples, refit=False)
+    present = compared(search.superset, pair, search.samples, refit=False)
     rounded, bench = _bench(session, search, pair)
     stage = _stage(session, search, pair, bench)
     shapes, starts = _family(session, limits, bench)
@@ -151,7 +151,7 @@ def propose(session: Session, search: Search, own: cand.Candidate, rival: Score)
         if fitting is None:
             continue
         _, signal, reached = fitting
-        now = min(stage.outcomes(search.union, pair, signal), key=lambda o: o.short)
+        now = min(stage.outcomes(search.superset, pair, signal), key=lambda o: o.short)
         if outcome is None or now.short > outcome.short:
             best, outcome, peaks = signal, now, reached
     if outcome is None:
@@ -190,7 +190,7 @@ def _bench(session: Session, search: Search, pair: Pair) -> tuple[Pair, Experime
     q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)
     asked = lambda of: max(needed_substeps(of.model(k), drive, q, jnp.zeros_like(q), u) for k in range(2))
     rounded = pair.rounder(max(1.0, asked(pair) / _SMOOTH))
-    e, _ = cand.evaluate(search.union, search.samples, pair.thetas[0], ())
+    e, _ = cand.evaluate(search.superset, search.samples, pair.thetas[0], ())
     noise = [NoiseModel.fit(x, c, _ORDER) for x, c in zip(e.T, search.samples.moving.T, strict=True)]
     whiten = np.zeros((len(noise), 1 + max(len(n.coefficients) for n in noise)))
     for row, n in zip(whiten, noise, strict=True):
@@ -217,7 +217,7 @@ def _stage(session: Session, search: Search, pair: Pair, bench: Experiment) -> P
     if sensor.position_std is None:
         noise = jnp.asarray(position_noise(machine, log))
         sensor = Sensor(position_noise=noise, force_noise=sensor.force_noise)
-    e, _ = cand.evaluate(search.union, search.samples, search.theta, ())
+    e, _ = cand.evaluate(search.superset, search.samples, search.theta, ())
     counts = search.samples.moving
     rms = np.sqrt(np.nanmean(np.where(counts, e, np.nan) ** 2, axis=0))
     more = machine.plant.at_drives(np.sqrt(np.maximum(rms**2 - search.floor**2, 0.0)))

@@ -65,7 +65,7 @@ class Pair:
             own: The effect added.
             rival: The alternative, refitted.
         """
-        union = search.union
+        union = search.superset
         rest = [c for c in search.added if c is not own]
         base = union.base
         active = [
