@@ -13,7 +13,7 @@ from stepper_machines import Setup
 from jaxid.commands.discover import start_search
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.score import Score
-from jaxid.discovery.search import Search
+from jaxid.discovery.search import Model, Search
 from jaxid.discovery.separating.propose import Proposal, propose
 from jaxid.session import open_session
 
@@ -91,7 +91,7 @@ def proposed(
     session = open_session(case, log_of(setup, initial_position=started(setup)), align_hold=True)
     _, search = start_search(session)
     own, rival = (next(c for c in search.superset.candidates if c.kind == kind) for kind in kinds)
-    search.theta, search.added = _fitted(search, own), [own]
+    search.model = Model((own,), _fitted(search, own))
     score = Score(rival, 0, rival.starts[0], 0.0, theta=_fitted(search, rival))
     return propose(session, search, own, score)
 

@@ -16,7 +16,8 @@ from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import _has_influence
-from jaxid.discovery.where import _between
+from jaxid.discovery.search import Model
+from jaxid.discovery.where import _bin_offset
 from jaxid.gap import noise_density
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import open_session
@@ -36,7 +37,7 @@ def axis(tmp_path_factory):
     """A search on an axis that lacks nothing, its force noise stated."""
     session = opened(tmp_path_factory.mktemp("axis"), machines.emps_like(3, 1.0, 6.0))
     search = start_search(session)[1]
-    search.theta = fitted(search)
+    search.model = Model((), fitted(search))
     return session, search
 
 
@@ -115,7 +116,8 @@ def test_a_lag_swallows_noise_of_the_force_and_a_delay_does_not(tmp_path):
     sensor = Sensor(position_resolution=1e-10, position_noise=1e-10, force_noise=0.02)
     session = opened(tmp_path, dataclasses.replace(setup, sensor=sensor))
     search = start_search(session)[1]
-    search.theta, lag = fitted(search), 2e-3
+    search.model = Model((), fitted(search))
+    lag = 2e-3
     lagging, delayed = with_values(search, LAG, lag), with_values(search, DELAY, 3e-3)
     swallowed = [
         search.acceptance.absorbed_noise(search.samples, search.theta, t) for t in (lagging, delayed)
@@ -219,15 +221,15 @@ def test_a_line_is_placed_between_the_bins(true):
     series = np.cos(2 * np.pi * true * np.arange(n) / n + 0.4)
     power = np.abs(np.fft.rfft(series * np.hanning(n))) ** 2
     k = int(np.argmax(power))
-    assert k + _between(power, k) == pytest.approx(true, abs=0.03)
-    assert _between(power, 0) == 0.0
+    assert k + _bin_offset(power, k) == pytest.approx(true, abs=0.03)
+    assert _bin_offset(power, 0) == 0.0
 
 
 def test_a_limit_that_no_sample_reaches_is_not_has_influence(tmp_path):
     """Its column is the residual itself, faintly: at length one it would whiten the missing effect away."""
     hidden = machines.emps_like(3, 1.0, 6.0).with_effect("quadratic_drag", coefficient=800.0)
     search = start_search(opened(tmp_path, hidden))[1]
-    search.theta = fitted(search)
+    search.model = Model((), fitted(search))
     e, _ = cand.evaluate(search.superset, search.samples, search.theta)
     counts, scale = search.samples.moving, np.array([c.innovation for c in search.colour])
     saturation = next(c for c in search.superset.candidates if c.kind == "saturation")

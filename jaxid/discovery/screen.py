@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from jaxid.discovery.pairs import Pairs, score_pairs
 from jaxid.discovery.score import Score
 
 if TYPE_CHECKING:
-    from jaxid.discovery.search import Search
+    from jaxid.discovery.search import Model, Search
 
 # Number of surrogates from which the threshold is estimated.
 _SURROGATES = 200
@@ -69,20 +69,22 @@ class Screen:
         return ev.held_out(ev.grams(columns, self.blocks), mixed, squares)
 
 
-def screen_candidates(search: Search, *, ahead: bool = False) -> Screen:
+def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> Screen:
     """Evaluate every candidate at every start, whiten, score, and calibrate the threshold.
 
     Args:
-        search: State of the search, with the current model.
+        search: The search, with superset, samples and noise.
+        model: The model to extend.
         ahead: True to score every two candidates together too.
     """
-    e, jacobian = cand.evaluate(search.superset, search.samples, search.theta, search.active)
-    base = jacobian[..., search.active]
+    active = search.fitted_by(model.added)
+    e, jacobian = cand.evaluate(search.superset, search.samples, model.theta, active)
+    base = jacobian[..., active]
     counts = search.samples.moving
     scale = np.array([c.innovation for c in search.colour])
 
-    rest = search.rest()
-    points = cand.points(search.superset, rest, search.samples, search.theta, e)
+    rest = search.rest(model)
+    points = cand.points(search.superset, rest, search.samples, model.theta, e)
     for c in rest:
         if c.has_grid:
             points.extend(search.grid_points(c))
@@ -131,7 +133,7 @@ def _points_to_pair(out: Screen, points: list[cand.Point], base: np.ndarray) -> 
 
 
 def guess_pair(
-    pair: tuple[cand.Point, cand.Point], out: Screen, base: np.ndarray, e: np.ndarray, search: Search
+    pair: Sequence[cand.Point], out: Screen, base: np.ndarray, e: np.ndarray, search: Search
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the start of a refit of two candidates: their shapes, with the strengths of a joint linear fit.
 
