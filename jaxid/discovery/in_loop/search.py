@@ -70,22 +70,17 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
         if len(effects) >= max_effects:
             break
 
-        refitted = []
         least = _PROMISING[0 if noisy else 1] * threshold
-        for score in [s for s in screened if s.evidence > least][:_FEW]:
-            progress(f"refitting with {score.candidate.label}")
-            refitted.append(_refitted(loop, after, score, trials))
-        good = sorted((r for r in refitted if r[0].evidence > threshold), key=lambda r: -r[0].evidence)
-        if not good:
+        promising = [s for s in screened if s.evidence > least][:_FEW]
+        addition = _best_addition(loop, after, promising, threshold, trials, progress)
+        if addition is None:
             break
-
-        best, after, effect = good[0]
         # Fits for the comparison were made without draws about them.
+        fit, effect = addition
         drawn = session.case.output_error.get("drawn", True)
-        after = _fit(session, after.machine, after.widths, after.estimate.theta, drawn=drawn)
-        near = [s for s, *_ in good[1:] if s.evidence > best.evidence - _AS_GOOD]
-        effects.append(replace(effect, alternatives=tuple(near)))
-        added = best
+        after = _fit(session, fit.machine, fit.widths, fit.estimate.theta, drawn=drawn)
+        effects.append(effect)
+        added = effect.score
     verdict = "found" if effects else "nothing_missing" if noisy else "unexplained"
     progress("simulating")
     last = after.estimate
@@ -105,6 +100,27 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
         noise_floor=floor,
         unseen=UNSEEN,
     )
+
+
+def _best_addition(
+    loop: Loop,
+    base: LoopFit,
+    promising: list[Score],
+    threshold: float,
+    trials: list[LinearTrial],
+    progress: Callable[[str], None],
+) -> tuple[LoopFit, NamedEffect] | None:
+    """Refit promising candidates; return the best fit and its effect, or None if none is accepted."""
+    refitted = []
+    for score in promising:
+        progress(f"refitting with {score.candidate.label}")
+        refitted.append(_refitted(loop, base, score, trials))
+    good = sorted((r for r in refitted if r[0].evidence > threshold), key=lambda r: -r[0].evidence)
+    if not good:
+        return None
+    best, fit, effect = good[0]
+    near = [s for s, *_ in good[1:] if s.evidence > best.evidence - _AS_GOOD]
+    return fit, replace(effect, alternatives=tuple(near))
 
 
 def _refitted(
