@@ -1,4 +1,4 @@
-"""Base parameters of an arm by closed rules: which parameters have no effect, and which join others'."""
+"""Base parameters of an arm by closed rules: parameters without effect, and parameters to regroup."""
 
 from __future__ import annotations
 
@@ -19,50 +19,54 @@ _TENSOR = (_XX, _XY, _XZ, _YY, _YZ, _ZZ)
 def base_parameters_by_rules(plant: SerialArm, tolerance: float = 1e-9) -> BaseParameters:
     """Find the base parameters of an arm without its regressor, link by link from the tip to the base.
 
-    Elimination, after (2.14)-(2.16) of the PA-10 report: what changes neither kinetic energy nor, but for a
-    constant, potential energy. Regrouping, after (2.17)-(2.18): a body that looks the same however its joint
-    stands may as well be part of the link before. About a revolute joint such are a mass on its axis, its
-    first moment along it, and equal moments about x and y; on a prismatic one whatever only resists rotation.
-    Up to the second axis that is not parallel to the first, links turn about one direction only, and more
-    is without effect.
+    Elimination, after (2.14)-(2.16) of the PA-10 report: a parameter goes if it changes neither the kinetic
+    energy nor, except for a constant, the potential energy. Regrouping, after (2.17)-(2.18): a body whose
+    inertia does not depend on the position of its joint may as well be part of the link before. For a
+    revolute joint these are a mass on its axis, its first moment along it, and equal moments about x and y;
+    for a prismatic one every part that only resists rotation. Up to the second axis that is not parallel to
+    the first, links turn about one direction only, and more parameters are without effect.
 
     Args:
-        plant: The arm; only its geometry, direction of gravity and whether it has rotors matter.
+        plant: The arm; only its geometry, its direction of gravity and the presence of rotors matter.
         tolerance: Sines of angles, and lengths [m], below it count as zero. Rounding of right angles is
-            1e-16; angles given to five digits ask for 1e-4.
+            1e-16; angles given to five digits require 1e-4.
 
     Returns:
-        The same as `jaxid.arms.base_parameters.base_parameters` finds, without singular values.
+        The result of `jaxid.arms.base_parameters.base_parameters`, without singular values.
 
     Raises:
-        ValueError: If the arm is without weight: what does not move its own origin then has no first
-            moment, which these rules do not follow; take `base_parameters`.
+        ValueError: If the arm is without weight: a link that does not move its origin then has no first
+            moment, which these rules do not cover; use `base_parameters`.
 
     Source:
         Gautier & Khalil (1990), IEEE Trans. Robotics and Automation 6(3); Khalil & Dombre (2002), chapter 9,
-        for the rules, here for frames that stand anywhere and with rotors. "PA-10 traineeship", (2.14)-(2.18)
+        for the rules, here for frames in any position and with rotors. "PA-10 traineeship", (2.14)-(2.18)
         and Appendix A, corrected: (A.1) I_yy7 + 2 d_7 mZ_7 + d_7^2 m_7; (A.2)-(A.4) with m_7 in every mass.
     """
     weight = np.asarray(plant.gravity_vector)
     if not np.linalg.norm(weight) > 0:
-        raise ValueError("the closed rules need weight: give gravity_vector, or take base_parameters.")
+        raise ValueError("the closed rules need weight: give gravity_vector, or use base_parameters.")
     n, places = plant.joints, standard_places(plant)
     chain = _Chain.of(plant, tolerance)
-    # Each parameter of each link as a sum of standard ones; those without effect and those regrouped vanish.
+
+    # Each parameter of each link as a sum of standard ones; a sum without effect or regrouped becomes zero.
     sums = [np.zeros((10, len(places))) for _ in range(n)]
     rotors = np.zeros((n, len(places)))
     for column, (name, k) in enumerate(places):
+        assert k is not None, "parameters of an arm have one value a link"
         if name in TEN:
             sums[k][TEN.index(name), column] = 1.0
         else:
             rotors[k, column] = 1.0
+
     kept = np.ones((n, 11), dtype=bool)
     kept[:, 10] = plant.rotor_inertia is not None
     for k in reversed(range(n)):
         before = sums[k - 1] if k else np.zeros((10, len(places)))
         _regroup(k, chain, sums[k], before, rotors[k], kept[k])
+
     rows = np.concatenate([np.vstack([s, r]) for s, r in zip(sums, rotors, strict=True)])
-    names = [(name, k) for k in range(n) for name in (*TEN, "rotor_inertia")]
+    names: list[tuple[str, int | None]] = [(name, k) for k in range(n) for name in (*TEN, "rotor_inertia")]
     index = {place: row for row, (place, keep) in enumerate(zip(names, kept.ravel(), strict=True)) if keep}
     chosen = tuple(column for column, place in enumerate(places) if place in index)
     return BaseParameters(places, chosen, tidied(rows[[index[places[c]] for c in chosen]]))
@@ -70,18 +74,18 @@ def base_parameters_by_rules(plant: SerialArm, tolerance: float = 1e-9) -> BaseP
 
 @dataclass(frozen=True)
 class _Chain:
-    """What the rules ask of the geometry; joints count from 0.
+    """Geometry of an arm as the rules need it; joints count from 0.
 
     Args:
-        revolute: Whether each joint is.
-        axis: z of each frame in the base's, joints at zero, (n, 3).
-        turns: z of the first revolute joint there; None where there is none.
-        first, second: The first revolute joint, and the first one not parallel to it; n where there is none.
-        weight: Direction of gravity.
-        on_axis: Whether the origin of each link stays on the axis of the first revolute joint whatever turns.
-        into: Of each link's parameters into those of the link before, joint at zero.
-        direction: `turns` in each frame.
-        zero: What counts as zero.
+        revolute: Mask of the revolute joints.
+        axis: z axis of each frame in the base frame, joints at zero, (n, 3).
+        turns: z axis of the first revolute joint in the base frame; None without one.
+        first, second: The first revolute joint, and the first one not parallel to it; n without one.
+        weight: Direction of gravity in the base frame.
+        on_axis: Mask of the links whose origin stays on the axis of the first revolute joint.
+        into: Matrices from each link's parameters into those of the link before, joint at zero.
+        direction: `turns` in each frame, (n, 3).
+        zero: Tolerance below which a number counts as zero.
     """
 
     revolute: np.ndarray
@@ -97,79 +101,96 @@ class _Chain:
 
     @classmethod
     def of(cls, plant: SerialArm, zero: float) -> _Chain:
+        """Compute the geometry of an arm with its joints at zero."""
         n, revolute = plant.joints, plant.geometry.revolute > 0
         axes, origins = (np.asarray(x) for x in plant.geometry.frames(jnp.zeros(n)))
-        whole, at, frames, points = np.eye(3), np.zeros(3), [], []
+        whole, at = np.eye(3), np.zeros(3)
+        frame_list, point_list = [], []
         for turn, origin in zip(axes, origins, strict=True):
-            at, whole = at + whole @ origin, whole @ turn
-            frames.append(whole)
-            points.append(at)
-        frames, points = np.array(frames), np.array(points)
+            at = at + whole @ origin
+            whole = whole @ turn
+            frame_list.append(whole)
+            point_list.append(at)
+        frames, points = np.array(frame_list), np.array(point_list)
+
         axis, turning = frames[:, :, 2], np.flatnonzero(revolute)
         first = int(turning[0]) if turning.size else n
-        turns = axis[first] if turning.size else None
-        other = [k for k in turning if np.linalg.norm(np.cross(axis[k], turns)) >= zero]
+        turns, other = None, []
         on_axis = np.zeros(n, dtype=bool)
         if turning.size:
+            turns = axis[first]
+            other = [k for k in turning if np.linalg.norm(np.cross(axis[k], turns)) >= zero]
             offset = np.linalg.norm(np.cross(points - points[first], turns), axis=1)
             away = revolute & (offset >= zero)
             on_axis = np.array([not np.any(away[first : k + 1]) for k in range(n)])
+
         weight = np.asarray(plant.gravity_vector)
-        direction = np.zeros((n, 3)) if turns is None else np.einsum("kij,i->kj", frames, turns)
         return cls(
-            revolute,
-            axis,
-            turns,
-            first,
-            int(other[0]) if other else n,
-            weight / np.linalg.norm(weight),
-            on_axis,
-            [moved(a, o) for a, o in zip(axes, origins, strict=True)],
-            direction,
-            zero,
+            revolute=revolute,
+            axis=axis,
+            turns=turns,
+            first=first,
+            second=int(other[0]) if other else n,
+            weight=weight / np.linalg.norm(weight),
+            on_axis=on_axis,
+            into=[moved(a, o) for a, o in zip(axes, origins, strict=True)],
+            direction=np.zeros((n, 3)) if turns is None else np.einsum("kij,i->kj", frames, turns),
+            zero=zero,
         )
 
     def along(self, axis: np.ndarray) -> bool:
-        """Whether a direction is that of the first revolute joint."""
+        """Check that a direction is that of the first revolute joint."""
+        assert self.turns is not None, "asked of links that turn only"
         return bool(np.linalg.norm(np.cross(axis, self.turns)) < self.zero)
 
     def slides_across(self, k: int) -> bool:
-        """Whether a prismatic joint up to the k-th moves links across the only direction of rotation."""
+        """Check that a prismatic joint up to the k-th moves links across the only direction of rotation."""
         return any(not self.revolute[i] and not self.along(self.axis[i]) for i in range(k + 1))
 
     def without_first_moment(self, k: int) -> bool:
-        """Whether the centre of mass of a link that turns about one direction can be anywhere."""
+        """Check that the centre of mass of a link that turns about one direction has no effect."""
         return self.along(self.weight) and bool(self.on_axis[k]) and not self.slides_across(k)
 
     def moves_alone_along(self, k: int) -> bool:
-        """Whether a link moves along its prismatic joint by that joint only, and without weight."""
+        """Check that a link moves along its prismatic joint by that joint only, and without weight."""
         fixed = k < self.first or (k < self.second and self.along(self.axis[k]))
         others = [self.axis[i] for i in range(k) if not self.revolute[i]]
         return fixed and all(abs(self.axis[k] @ a) < self.zero for a in (*others, self.weight))
 
     def turns_alone(self, k: int) -> bool:
-        """Whether a link turns about its revolute joint's axis by that joint only."""
-        return k == self.first or (k == self.second and abs(self.axis[k] @ self.turns) < self.zero)
+        """Check that a link turns about its revolute joint's axis by that joint only."""
+        if k == self.first:
+            return True
+        return k == self.second and self.turns is not None and abs(self.axis[k] @ self.turns) < self.zero
 
 
 def _regroup(
     k: int,
     chain: _Chain,
-    own: Float[np.ndarray, "10 standard"],
+    link: Float[np.ndarray, "10 standard"],
     before: Float[np.ndarray, "10 standard"],
     rotor: Float[np.ndarray, " standard"],
     kept: np.ndarray,
 ) -> None:
-    """Take from a link what has no effect, or the same as part of the link before or of the rotor."""
+    """Remove parameters of a link that have no effect, or the same effect in the link before or the rotor.
+
+    Args:
+        k: Index of the link.
+        chain: Geometry of the arm.
+        link: Parameters of the link as sums of standard ones; changed in place.
+        before: Parameters of the link before; changed in place.
+        rotor: Rotor inertia of the joint; changed in place.
+        kept: Mask of the link's ten parameters and its rotor that remain; changed in place.
+    """
     into = chain.into[k]
 
     def move(*parameters: int) -> None:
         for p in parameters:
-            before[:] += np.outer(into[:, p], own[p])
+            before[:] += np.outer(into[:, p], link[p])
         drop(*parameters)
 
     def drop(*parameters: int) -> None:
-        own[list(parameters)] = 0.0
+        link[list(parameters)] = 0.0
         kept[list(parameters)] = False
 
     alone = chain.first <= k < chain.second
@@ -179,14 +200,15 @@ def _regroup(
             if chain.without_first_moment(k):
                 drop(_X, _Y)
         else:
-            before[:] += np.outer(into[:, _XX] + into[:, _YY], own[_YY])
-            own[_XX] -= own[_YY]
+            before[:] += np.outer(into[:, _XX] + into[:, _YY], link[_YY])
+            link[_XX] -= link[_YY]
             drop(_YY)
         move(_Z, _MASS)
         if kept[10] and chain.turns_alone(k):
-            own[_ZZ] += rotor
+            link[_ZZ] += rotor
             kept[10] = False
         return
+
     move(*_TENSOR)
     if k < chain.first:
         drop(_X, _Y, _Z)
@@ -194,12 +216,12 @@ def _regroup(
         move(_X, _Y)
         drop(_Z)
     elif alone:
-        # The first moment along the only direction of rotation tells nothing: one component joins the others.
+        # The first moment along the only direction of rotation has no effect: one component joins the others.
         u = chain.direction[k]
         last = max(i for i in range(3) if abs(u[i]) > chain.zero)
         for i in range(last):
-            own[_X + i] -= u[i] / u[last] * own[_X + last]
+            link[_X + i] -= u[i] / u[last] * link[_X + last]
         drop(_X + last)
     if kept[10] and chain.moves_alone_along(k):
-        rotor += own[_MASS]
+        rotor += link[_MASS]
         move(_MASS)

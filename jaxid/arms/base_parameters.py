@@ -1,4 +1,4 @@
-"""Base parameters: the combinations of a plant's inertial parameters that its forces can tell."""
+"""Base parameters: the combinations of a plant's inertial parameters that its forces identify."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from jaxid.model.effect import carries_force
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 
-# What is left of a column beside those chosen counts as rounding below this part of it; chosen: columns of
-# real arms part by 1e-3 and more (a squared length of 3 cm), rounding is 1e-14.
+# A column counts as dependent if its remainder beside the chosen ones is below this part of it. Chosen:
+# columns of real arms differ by 1e-3 and more (a squared length of 3 cm), rounding is 1e-14.
 _DEPENDENT = 1e-9
-# States for each unknown and row; chosen: random states are in general position from one on.
+# States for each unknown and row. Chosen: one random state would be enough for general position.
 _STATES = 3
 
 
@@ -29,11 +29,11 @@ class BaseParameters:
     """The base parameters of a plant.
 
     Args:
-        standard: Its standard parameters: field of the plant, and entry from 0 (None: it is one number).
-        chosen: Which of them stand for a base parameter; the others are regrouped into these.
-        mapping: From standard to base parameters, (base, standard): base = mapping @ standard.
-        singular_values: Of the regressor on the random states, its columns normed, largest first; None
-            where the base parameters come from rules.
+        standard: Standard parameters: field of the plant, and entry from 0 (None for a single number).
+        chosen: Indices of those that represent a base parameter; the others are regrouped into these.
+        mapping: Matrix from standard to base parameters, (base, standard): base = mapping @ standard.
+        singular_values: Singular values of the regressor on the random states, its columns of norm one, the
+            largest first; None if the base parameters come from rules.
     """
 
     standard: tuple[tuple[str, int | None], ...]
@@ -48,12 +48,12 @@ class BaseParameters:
 
     @property
     def chosen_names(self) -> tuple[str, ...]:
-        """Names of the standard parameters that stand for a base parameter."""
+        """Names of the standard parameters that represent a base parameter."""
         return tuple(self.names[k] for k in self.chosen)
 
     @property
     def places(self) -> tuple[tuple[str, int | None], ...]:
-        """Field of the plant and entry of those that stand for a base parameter."""
+        """Field of the plant and entry of those that represent a base parameter."""
         return tuple(self.standard[k] for k in self.chosen)
 
     @property
@@ -62,11 +62,11 @@ class BaseParameters:
         return tuple(n for n, column in zip(self.names, self.mapping.T, strict=True) if not np.any(column))
 
     def of(self, plant: Plant) -> Float[np.ndarray, " base"]:
-        """Base parameters of a plant of this structure, in the units of those that stand for them."""
+        """Compute the base parameters of a plant of this structure, in the units of their representatives."""
         return self.mapping @ _values(plant, self.standard)
 
     def text(self, digits: int = 6) -> list[str]:
-        """Each base parameter as a sum of standard ones, one line each."""
+        """Write each base parameter as a sum of standard ones, one line each."""
         lines = []
         for k, row in zip(self.chosen, self.mapping, strict=True):
             terms = [
@@ -79,23 +79,25 @@ class BaseParameters:
 
 
 def standard_parameters(plant: Plant) -> tuple[tuple[str, ...], Float[np.ndarray, " standard"]]:
-    """Names and values of all parameters of a plant that carry force, joint by joint from the base out."""
+    """Return names and values of all parameters of a plant that carry force, from the base to the tip."""
     places = standard_places(plant)
     return tuple(_name(place) for place in places), _values(plant, places)
 
 
 def _name(place: tuple[str, int | None]) -> str:
+    """Return the name of a parameter in results; entries count from 1."""
     name, k = place
     return name if k is None else f"{name}[{k + 1}]"
 
 
 def _values(plant: Plant, places: Iterable[tuple[str, int | None]]) -> Float[np.ndarray, " standard"]:
+    """Return the values of some parameters of a plant."""
     values = [(np.asarray(getattr(plant, name)), k) for name, k in places]
     return np.asarray([v if k is None else v[k] for v, k in values], dtype=np.float64)
 
 
 def standard_places(plant: Plant) -> tuple[tuple[str, int | None], ...]:
-    """Field and entry of each such parameter, those to leave out behind the others of their joint."""
+    """List field and entry of each such parameter; those to be regrouped come last in their joint."""
     infos = {
         name: info
         for name, info in parameters_of(type(plant)).items()
@@ -104,30 +106,28 @@ def standard_places(plant: Plant) -> tuple[tuple[str, int | None], ...]:
     last = getattr(plant, "regrouped", ())
     order = [*(n for n in infos if n not in last), *(n for n in last if n in infos)]
     single = [(name, None) for name in order if infos[name].more is None]
-    longest = max((plant.joints + i.more for i in infos.values() if i.more is not None), default=0)
-    listed = (
-        (name, k)
-        for k in range(longest)
-        for name in order
-        if infos[name].more is not None and k < plant.joints + infos[name].more
-    )
+    # A list may have more entries than the plant has joints.
+    counts = {name: plant.joints + info.more for name, info in infos.items() if info.more is not None}
+    longest = max(counts.values(), default=0)
+    listed = ((name, k) for k in range(longest) for name in order if name in counts and k < counts[name])
     return (*single, *listed)
 
 
 def inertial_regressor(
     plant: Plant, q: Float[Array, "time n"], qd: Float[Array, "time n"], qdd: Float[Array, "time n"]
 ) -> Float[Array, "time n standard"]:
-    """Derivative of M qdd + h in `standard_parameters`, at every state.
+    """Differentiate M qdd + h in the `standard_parameters`, at every state.
 
     Args:
-        plant: The plant; `inertial` must be linear in them.
-        q, qd, qdd: States [rad or m, and per s and s^2].
+        plant: The plant; `inertial` must be linear in these parameters.
+        q, qd, qdd: States, (time, n) [rad or m, and per s and s^2].
     """
     return _regressor(plant, standard_places(plant), jnp.asarray(q), jnp.asarray(qd), jnp.asarray(qdd))
 
 
 @eqx.filter_jit
 def _regressor(plant: Plant, places: tuple, q: Array, qd: Array, qdd: Array) -> Array:
+    """Differentiate the inertial force by field, and stack the columns of the given entries."""
     names = list(dict.fromkeys(name for name, _ in places))
 
     def force(values: list[Array]) -> Array:
@@ -135,8 +135,8 @@ def _regressor(plant: Plant, places: tuple, q: Array, qd: Array, qdd: Array) -> 
         return jax.vmap(moved.inertial)(q, qd, qdd)
 
     columns = jax.jacfwd(force)([jnp.asarray(getattr(plant, n)) for n in names])
-    own = dict(zip(names, columns, strict=True))
-    return jnp.stack([own[n] if k is None else own[n][..., k] for n, k in places], axis=-1)
+    by_name = dict(zip(names, columns, strict=True))
+    return jnp.stack([by_name[n] if k is None else by_name[n][..., k] for n, k in places], axis=-1)
 
 
 def base_parameters(
@@ -144,22 +144,22 @@ def base_parameters(
 ) -> BaseParameters:
     """Find the base parameters of a plant by the rank of its regressor on random states.
 
-    Columns are taken in order from the base to the tip, and left out where they are sums of those
-    taken before: what is left is, on an arm, what the rules of Gautier and Khalil leave.
+    Columns are taken in order from the base to the tip, and omitted if they are linear combinations of those
+    taken before. For an arm the result is that of the rules of Gautier and Khalil.
 
     Args:
-        plant: The plant; values of its parameters do not matter, its geometry does.
-        seed: Of the random states.
-        keep: Names to take before all others, so that they stand for a base parameter if they can.
-        known: Names of parameters whose values are known ("mass[1]", or "mass" for that of every link): the
-            base parameters are then sums of the others alone.
+        plant: The plant; the values of its parameters do not matter, its geometry does.
+        seed: Seed of the random states.
+        keep: Names to take before all others, so that they represent a base parameter if they can.
+        known: Names of parameters with known values ("mass[1]", or "mass" for all links): the base parameters
+            are then combinations of the others alone.
 
     Returns:
         The base parameters.
 
     Raises:
-        ValueError: If a name is none of the plant's, or in both `keep` and `known`, or rank and choice
-            disagree: then the geometry has a length or an angle that is nearly, but not quite, zero.
+        ValueError: If a name is not a parameter of the plant or is in both `keep` and `known`, or if rank and
+            choice disagree: then the geometry has a length or an angle that is nearly, but not exactly, zero.
 
     Source:
         Gautier (1991), J. Robotic Systems 8(4), for the choice by QR; Khalil & Dombre (2002), chapter 9.
@@ -168,15 +168,16 @@ def base_parameters(
     names = [_name(place) for place in places]
     wrong = [n for n in (*keep, *known) if n not in names and (n in keep or n not in dict(places))]
     if wrong:
-        raise ValueError(f"{wrong[0]} is none of the plant's parameters: {', '.join(names)}.")
+        raise ValueError(f"{wrong[0]} is not a parameter of the plant: {', '.join(names)}.")
     both = [n for n in keep if {n, n.partition("[")[0]} & set(known)]
     if both:
-        raise ValueError(f"{both[0]} is in keep and known; take it out of one of them.")
+        raise ValueError(f"{both[0]} is in keep and in known; remove it from one of them.")
+
     states = random_states(plant, _STATES * len(names), np.random.default_rng(seed))
     columns = np.asarray(inertial_regressor(plant, *states)).reshape(-1, len(names))
-    left = [k for k, (name, _) in enumerate(places) if not {name, names[k]} & set(known)]
-    order = [*keep, *(names[k] for k in left if names[k] not in keep)]
-    return grouped(columns[:, left], tuple(places[k] for k in left), order)
+    unknown = [k for k, (name, _) in enumerate(places) if not {name, names[k]} & set(known)]
+    order = [*keep, *(names[k] for k in unknown if names[k] not in keep)]
+    return grouped(columns[:, unknown], tuple(places[k] for k in unknown), order)
 
 
 def grouped(
@@ -184,12 +185,12 @@ def grouped(
     places: tuple[tuple[str, int | None], ...],
     order: Sequence[str] = (),
 ) -> BaseParameters:
-    """The sums of parameters that something linear in them tells.
+    """Find the combinations of parameters that a linear model identifies.
 
     Args:
-        columns: Its derivatives in the parameters, on random states.
+        columns: Derivatives of the model in the parameters, on random states.
         places: Field of the plant, and entry, of each parameter.
-        order: Their names, those first that are to stand for a sum; default as they are.
+        order: Names of the parameters, preferred representatives first; default the given order.
 
     Raises:
         ValueError: If rank and choice disagree.
@@ -198,6 +199,8 @@ def grouped(
     norm = np.linalg.norm(columns, axis=0)
     norm[norm <= _DEPENDENT * norm.max()] = np.inf
     scaled = columns / norm
+
+    # The rank of all columns must agree with the number that is chosen one by one.
     triangle = np.abs(np.diagonal(scipy.linalg.qr(scaled, mode="r", pivoting=True)[0]))
     rank = int(np.sum(triangle > _DEPENDENT))
     chosen = tuple(sorted(independent(scaled, [names.index(n) for n in order or names])))
@@ -206,35 +209,37 @@ def grouped(
             f"{len(chosen)} columns are independent one by one, {rank} together: a length or an angle of the "
             "geometry is nearly zero; write it as zero, or angles in more digits."
         )
+
     mapping = np.linalg.lstsq(scaled[:, chosen], scaled, rcond=None)[0] * norm[list(chosen), None] ** -1
     mapping = mapping * np.where(np.isinf(norm), 0.0, norm)
     return BaseParameters(places, chosen, tidied(mapping), np.linalg.svd(scaled, compute_uv=False))
 
 
 def tidied(mapping: Float[np.ndarray, "base standard"]) -> Float[np.ndarray, "base standard"]:
-    """A mapping without rounding of what is nothing, or a whole number, such as that of 2 d m Z over d."""
+    """Round entries of a mapping that are nearly zero or a whole number, such as that of 2 d m Z over d."""
     mapping = np.where(np.abs(mapping) < 1e-10 * np.abs(mapping).max(), 0.0, mapping)
     whole = np.round(mapping)
     return np.where(np.abs(mapping - whole) < 1e-10, whole, mapping)
 
 
 def random_states(plant: Plant, count: int, rng: np.random.Generator) -> Float[np.ndarray, "3 count n"]:
-    """Random positions that are possible, half a turn or half a metre to each side, and their derivatives."""
+    """Draw possible positions, half a turn or half a metre to each side, and their derivatives."""
     states = rng.uniform(-1.0, 1.0, (3, count, plant.joints))
     turns = np.asarray([plant.motion(k) == "rotary" for k in range(plant.joints)])
     states[0] *= np.where(turns, np.pi, 0.5)
-    while (found := plant.impossible(states[0])) is not None:
-        states[0, found[0]] = plant.any_motion(rng)[0]
+    while (impossible := plant.impossible(states[0])) is not None:
+        states[0, impossible[0]] = plant.any_motion(rng)[0]
     return states
 
 
 def independent(columns: Float[np.ndarray, "rows standard"], order: Sequence[int]) -> list[int]:
-    """Columns, of norm one or zero, that are no sums of those before, by Gram and Schmidt's method, twice."""
+    """Choose columns, of norm one or zero, that are independent of those before, by Gram-Schmidt, twice."""
     basis, chosen = np.zeros((len(columns), 0)), []
     for k in order:
-        left = columns[:, k] - basis @ (basis.T @ columns[:, k])
-        left = left - basis @ (basis.T @ left)
-        size = np.linalg.norm(left)
+        remainder = columns[:, k] - basis @ (basis.T @ columns[:, k])
+        remainder = remainder - basis @ (basis.T @ remainder)
+        size = np.linalg.norm(remainder)
         if size > _DEPENDENT:
-            basis, chosen = np.column_stack([basis, left / size]), [*chosen, k]
+            basis = np.column_stack([basis, remainder / size])
+            chosen = [*chosen, k]
     return chosen

@@ -1,4 +1,4 @@
-"""Rigid bodies as 4 x 4 matrices: ten inertial parameters moved elsewhere, and what they may be."""
+"""Rigid bodies as 4 x 4 pseudo-inertia matrices: change of frame, and physically consistent coordinates."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ TEN = (
 
 
 def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
-    """Integral of (x y z 1)' (x y z 1) over the mass of a body.
+    """Compute the integral of (x y z 1)' (x y z 1) over the mass of a body.
 
-    Positive definite where, and only where, some body of positive density everywhere has these parameters.
+    It is positive definite if and only if some body of positive density everywhere has these parameters.
 
     Args:
-        ten: In the order of `TEN`; products of inertia are -sum m x y.
-
+        ten: Inertial parameters in the order of `TEN`; products of inertia are -sum m x y.
     Source:
         Wensing, Kim & Slotine (2018), IEEE RA-L 3(1). (2.9) of the PA-10 report holds the sums +sum m x y.
     """
@@ -46,8 +45,11 @@ def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
 
 
 def ten_parameters(pseudo: Float[Array, "*n 4 4"]) -> Float[Array, "*n 10"]:
-    """The inverse of `pseudo_inertia`."""
-    s = lambda i, j: pseudo[..., i, j]
+    """Invert `pseudo_inertia`."""
+
+    def s(i: int, j: int) -> Array:
+        return pseudo[..., i, j]
+
     return jnp.stack(
         [
             s(3, 3),
@@ -66,11 +68,11 @@ def ten_parameters(pseudo: Float[Array, "*n 4 4"]) -> Float[Array, "*n 10"]:
 
 
 def moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[np.ndarray, "10 10"]:
-    """Matrix that takes a body's parameters from its frame into another.
+    """Build the matrix that transforms a body's parameters from its frame into another.
 
     Args:
         axes: Axes of its frame in the other, as columns.
-        origin: Its origin there [m].
+        origin: Origin of its frame in the other [m].
 
     Source:
         Khalil & Dombre (2002), section 9.3: its columns are lambda_1 to lambda_10.
@@ -80,14 +82,15 @@ def moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[np.nda
 
 
 def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
-    """Coordinates in which every body of positive density, and nothing else, is a point of all space.
+    """Map a body to coordinates in which every body of positive density, and nothing else, is a point.
 
-    Half the logarithm of the mass; the centre of mass x, y, z [m]; and of the upper triangular A with
-    A A' the spread about it (integral of r r' over the mass, by mass) the logarithms of the diagonal, and
-    entries 12, 13, 23.
+    The coordinates are half the logarithm of the mass; the centre of mass x, y, z [m]; and the entries of the
+    upper triangular A, whose A A' is the spread about the centre (integral of r r' over the mass, divided by
+    the mass): the logarithms of its diagonal, and its entries 12, 13, 23.
 
     Args:
-        ten: In the order of `TEN`, of a body.
+        ten: Inertial parameters of a body, in the order of `TEN`.
+
 
     Source:
         Rucker & Wensing (2022), IEEE RA-L 7(2); their s is here an entry of A itself.
@@ -95,7 +98,7 @@ def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
     m = ten[0]
     centre = ten[1:4] / m
     s = pseudo_inertia(ten)[:3, :3] / m - centre[:, None] * centre
-    # Written out: a factorisation of LAPACK's does not go into loops and batches.
+    # Written out: LAPACK's factorisation cannot be part of loops and batches.
     a33 = jnp.sqrt(s[2, 2])
     a13, a23 = s[0, 2] / a33, s[1, 2] / a33
     a22 = jnp.sqrt(s[1, 1] - a23**2)
@@ -112,7 +115,7 @@ def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
 
 
 def of_log_cholesky(x: Float[Array, " 10"]) -> Float[Array, " 10"]:
-    """The inverse of `log_cholesky`."""
+    """Invert `log_cholesky`."""
     zero = jnp.zeros(())
     (a11, a22, a33), (a12, a13, a23) = jnp.exp(x[4:7]), x[7:]
     a = jnp.stack([jnp.stack(row) for row in ([a11, a12, a13], [zero, a22, a23], [zero, zero, a33])])

@@ -202,17 +202,17 @@ def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
 def where_of(search: Search, baseline: Step, log: Log) -> Where:
     """Where the baseline's residual lies, on the whole log."""
     whole = [ForceData.of(search.data)]
-    e, jacobian = cand.evaluate_on(search.union, whole, baseline.theta, baseline.active)
+    e, jacobian = cand.evaluate_on(search.superset, whole, baseline.theta, baseline.active)
     wanted = None
     if log.reference is not None:
         # A mass that is not driven has no wanted motion but its own.
         wanted = search.data.at_kept(search.data.qd).copy()
-        driven = search.union.machine.plant.at_drives(np.arange(wanted.shape[1]))
+        driven = search.superset.machine.plant.at_drives(np.arange(wanted.shape[1]))
         wanted[:, driven] = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
     # What joints share cannot be moved for one of them alone.
-    alone = np.sum(search.union.enters[:, baseline.active], axis=0) == 1
+    alone = np.sum(search.superset.enters[:, baseline.active], axis=0) == 1
     own = jacobian[..., baseline.active[alone]]
-    return locate(-e, own, search.data, search.colour, wanted, search.union.machine.plant)
+    return locate(-e, own, search.data, search.colour, wanted, search.superset.machine.plant)
 
 
 def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], search: Search) -> str:
@@ -220,7 +220,7 @@ def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], 
         return "found"
     baseline = steps[0].theta
     rms = _rms(search, search.samples, baseline)
-    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.worth.above_numerics(baseline)
+    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.acceptance.above_numerics(baseline)
     return "unexplained" if above and where.significant else "nothing_missing"
 
 
@@ -229,10 +229,10 @@ def _final_machine(
 ) -> tuple[Machine, tuple[NamedEffect, ...]]:
     """The case's machine with only the effects that were added, at their refitted values."""
     plant, parameters = machine.plant, machine.parameters
-    theta = [*search.theta[search.union.base]]
+    theta = [*search.theta[search.superset.base]]
     effects = []
     for k, c in enumerate(search.added):
-        effect = cand.effect_at(search.union, c, search.theta[c.index])
+        effect = cand.effect_at(search.superset, c, search.theta[c.index])
         plant, free = free_effect(plant, effect, machine.units)
         parameters = parameters.extended(free)
         theta.extend(search.theta[c.index])
@@ -270,10 +270,12 @@ def _length(gap: Gap) -> float:
 
 
 def _round(search: Search, step: Step) -> Round:
-    fit, *others = (_rms(search, samples, step.theta) for samples in [search.samples, *search.worth.others])
+    fit, *others = (
+        _rms(search, samples, step.theta) for samples in [search.samples, *search.acceptance.others]
+    )
     return Round(step, fit, np.max(others, axis=0) if others else None)
 
 
 def _rms(search: Search, samples: cand.CandidateSamples, theta: np.ndarray) -> np.ndarray:
-    e, _ = cand.evaluate(search.union, samples, theta, ())
+    e, _ = cand.evaluate(search.superset, samples, theta, ())
     return np.sqrt(np.nanmean(np.where(samples.moving, e, np.nan) ** 2, axis=0))

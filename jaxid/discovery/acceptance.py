@@ -1,4 +1,4 @@
-"""What a change of the model is worth: above the noise, on other logs, and why it may not be named."""
+"""Acceptance tests of a model change: gain above the noise, confirmation by other logs, and objections."""
 
 from __future__ import annotations
 
@@ -15,41 +15,42 @@ from jaxid.discovery.selection import TIE_NATS
 from jaxid.logs.prepare import Prepared
 from jaxid.numerics.precision import NoiseModel
 
-# An effect must close this part of what stands above the noise floor (in sum of squares, so half
-# of it in RMS), whatever its evidence: on measured data everything helps a little.
+# An effect must close this part of the gap above the noise floor (in sum of squares, so about half of this
+# part in RMS), whatever its evidence: on measured data every effect helps a little.
 RELEVANT = 0.15
-# A residual whose RMS exceeds the noise floor by less than so many times its scatter is noise.
+# A residual counts as noise if its RMS exceeds the noise floor by less than this many standard deviations.
 _SCATTER = 3.0
-# ... and one that leaves less than this part of the noise's sum of squares explains noise; of few
-# independent samples, what a true model leaves less than only once in a thousand logs.
+# A fit that leaves less than this part of the noise's sum of squares explains noise. With few independent
+# samples the limit is lower: a true model falls below it only once in a thousand logs.
 _LEAST = 0.25
 _RARELY = 1e-3
-# The gain on the validation log must be at least this part of what the log itself promises.
+# The part by which the squared residual falls on a validation log must be at least this fraction of the part
+# by which the gap closes on the fitted log.
 _CONFIRMED = 0.1
 
 
 @dataclass
 class Acceptance:
-    """Logs and their noise, against which models are judged.
+    """Acceptance tests of models against logs and their noise.
 
     Args:
-        union: Machine with all candidates; a model is its vector of unknowns.
+        superset: Machine with all candidates; a model is a vector of its unknowns.
         data: The log to fit, prepared.
-        validation: Logs that must confirm what is found on it.
-        floor: RMS force that the sensors' noise alone leaves, by joint.
-        colour: Of that noise, by joint.
+        validation: Logs that must confirm an effect, prepared.
+        floor: RMS force residual caused by the sensors' noise alone, by joint.
+        colour: Model of that noise, by joint.
     """
 
-    union: cand.CandidateModel
+    superset: cand.CandidateModel
     data: Prepared
     validation: tuple[Prepared, ...]
     floor: np.ndarray
     colour: tuple[NoiseModel, ...]
 
     def __post_init__(self) -> None:
-        machine = self.union.machine
-        known = machine.sensor.force_noise
-        noise = None if known is None else np.asarray(known) * machine.gain
+        machine = self.superset.machine
+        force_std = machine.sensor.force_noise
+        noise = None if force_std is None else np.asarray(force_std) * machine.gain
         self.samples = cand.CandidateSamples(self.data, noise)
         self.others = [cand.CandidateSamples(d, noise) for d in self.validation]
         force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
@@ -58,22 +59,22 @@ class Acceptance:
         self._noise = float(np.sum(self.samples.moving.sum(axis=0) * np.square(self.floor)))
 
     def residual(self, theta: np.ndarray) -> Float[np.ndarray, "kept n"]:
-        """Residual of a model on the log."""
-        return cand.evaluate(self.union, self.samples, theta, ())[0]
+        """Return the force residual of a model on the fitted log."""
+        return cand.evaluate(self.superset, self.samples, theta, ())[0]
 
     def squares(self, theta: np.ndarray) -> float:
-        """Sum of squares of that, infinite where it diverged."""
+        """Return the sum of squares of the residual; infinite if it diverged."""
         total = self._sum(self.residual(theta))
         return total if np.isfinite(total) else np.inf
 
     def at_floor(self, theta: np.ndarray) -> bool:
-        """Whether all residuals are what the sensors' noise leaves, within the scatter of their RMS.
+        """Check that all residuals are at the noise floor, within the scatter of their RMS.
 
-        Those of the validation logs too: what a fit absorbs on its own log may show on another.
+        The validation logs are included: an effect that a fit absorbs on the fitted log may show on another.
         """
         part = self.data.recipe.independent
         for samples in (self.samples, *self.others):
-            e, moving = cand.evaluate(self.union, samples, theta, ())[0], samples.moving
+            e, moving = cand.evaluate(self.superset, samples, theta, ())[0], samples.moving
             for x, counts, floor in zip(e.T, moving.T, self.floor, strict=True):
                 scatter = np.sqrt(0.5 / max(part * counts.sum(), 1))
                 if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
@@ -81,68 +82,71 @@ class Acceptance:
         return True
 
     def above_numerics(self, theta: np.ndarray) -> bool:
-        """Whether a residual is more than filtering and integrating leave wrong."""
+        """Check that a residual exceeds the errors of filtering and integration."""
         return self._sum(self.residual(theta)) - self._noise > self._numerics
 
     def closed(self, old: Float[np.ndarray, "kept n"], new: Float[np.ndarray, "kept n"]) -> float:
-        """Part by which the gap above the noise floor closes, in sum of squares."""
+        """Return the part of the gap above the noise floor that closes, in sum of squares."""
         before, after = self._sum(old), self._sum(new)
         if before - after < self._numerics:
             return 0.0
-        # The floor is itself an estimate, and a search always finds something to close: at least
-        # half of the residual counts as gap.
+        # The floor is itself an estimate, and a search always finds something to close: at least half of the
+        # residual counts as gap.
         return float((before - after) / max(before - self._noise, 0.5 * before))
 
-    def swallowed(self, samples: cand.CandidateSamples, old: np.ndarray, new: np.ndarray) -> float:
-        """Part of the noise that the drive of a new model swallows and the old one's does not.
+    def absorbed_noise(self, samples: cand.CandidateSamples, old: np.ndarray, new: np.ndarray) -> float:
+        """Return the part of the noise that the new model's drive filters out and the old one's does not.
 
-        Noise of the logged force is on the log only. A drive that filters the force filters it
-        too, and would gain by that though it explains nothing. In squares, whitened.
+        Noise of the logged force exists in the log only. A drive that filters the force filters that noise
+        too, and would gain by it without explaining anything.
+
+        Returns:
+            Difference of the mean squares of whitened noise, at most 0.9.
         """
         if not samples.noisier:
             return 0.0
         whitener = ev.Whitener(self.colour, samples.moving)
         squares = []
         for theta in (old, new):
-            e, _ = cand.evaluate(self.union, samples, theta, ())
-            noisier, _ = cand.evaluate_on(self.union, samples.noisier, theta, ())
+            e, _ = cand.evaluate(self.superset, samples, theta, ())
+            noisier, _ = cand.evaluate_on(self.superset, samples.noisier, theta, ())
             squares.append(float(np.mean(whitener((noisier - e)[..., None]) ** 2)))
         return min(squares[0] - squares[1], 0.9)
 
     def confirmed(
         self, old: np.ndarray, new: np.ndarray, *, drive: bool
     ) -> tuple[float | None, float | None]:
-        """Gain on the validation logs, nothing refitted there.
+        """Return the gain on the validation logs, without a refit there.
 
         Args:
-            old, new: Unknowns of two models.
+            old, new: Unknowns of the two models.
             drive: Whether they differ in the drive, which filters noise.
 
         Returns:
-            Gain in log-likelihood [nats], each log with its own colour of noise, and the part by
-            which the sum of squared residuals falls, in the worst log; None without any.
+            Gain in log-likelihood [nats], each log with its own colour of noise; and the part by which the
+            sum of squared residuals falls on the worst log. None for both without validation logs.
         """
         if not self.others:
             return None, None
         total, worst = 0.0, np.inf
         for samples in self.others:
             before, after = (
-                np.where(samples.moving, cand.evaluate(self.union, samples, theta, ())[0], 0.0)
+                np.where(samples.moving, cand.evaluate(self.superset, samples, theta, ())[0], 0.0)
                 for theta in (old, new)
             )
             whitener = ev.Whitener.of(after, samples.moving, self.colour)
             squares = [np.sum(whitener(e[..., None]) ** 2) for e in (before, after)]
             if drive:
-                squares[1] /= 1 - self.swallowed(samples, old, new)
+                squares[1] /= 1 - self.absorbed_noise(samples, old, new)
             total += float(ev.log_evidence(int(whitener.rows.sum()), *squares))
             worst = min(worst, 1 - float(np.sum(after**2) / np.sum(before**2)))
         return total, worst
 
-    def apart(self, one: np.ndarray, two: np.ndarray) -> float:
-        """Gain in log-likelihood by which one of two models, being true, should beat the other [nats]."""
+    def divergence(self, one: np.ndarray, two: np.ndarray) -> float:
+        """Return the expected gain in log-likelihood of the true one of two models over the other [nats]."""
         total = 0.0
         for samples in (self.samples, *self.others):
-            e, other = (cand.evaluate(self.union, samples, theta, ())[0] for theta in (one, two))
+            e, other = (cand.evaluate(self.superset, samples, theta, ())[0] for theta in (one, two))
             whitener = ev.Whitener.of(e, samples.moving, self.colour)
             total += 0.5 * float(np.sum(whitener((e - other)[..., None]) ** 2))
         return total
@@ -156,38 +160,41 @@ class Acceptance:
         confirmed: float | None,
         fitted: int,
     ) -> str:
-        """Why what a model adds to another may not be named; empty where it may.
+        """Explain why the effects added to a model may not be named; empty if they may.
 
         Args:
-            index: Its unknowns.
-            old, new: All unknowns, without and with it.
-            validation, confirmed: What `confirmed` says of it.
-            fitted: How many unknowns were.
+            index: Indices of the added unknowns.
+            old, new: All unknowns, without and with the added effects.
+            validation, confirmed: Both results of `confirmed`.
+            fitted: Number of fitted unknowns.
         """
-        free = self.union.machine.parameters.free
+        free = self.superset.machine.parameters.free
         for i in index:
             if not np.isfinite(new[i]):
                 return "its fit diverged"
             if free[i].sign == "nonnegative" and new[i] <= 0.0:
                 return f"{free[i].name} would have to be negative"
             if np.isfinite(free[i].upper) and new[i] >= (1 - 1e-3) * free[i].upper:
-                return f"{free[i].name} runs to its limit, where it only imitates"
+                return f"{free[i].name} runs to its limit, at which the effect only imitates another"
+
         e = self.residual(new)
         if self._sum(e) < self._least(fitted) * self._noise:
-            return "it takes away what the sensors' noise alone must leave"
+            return "it removes more than the sensors' noise allows"
+
         closed = self.closed(self.residual(old), e)
         if closed < RELEVANT:
-            part = 50 * closed  # in RMS, where little is closed
+            part = 50 * closed  # in RMS: half of the part in squares, if that is small
             return f"it closes only {part:.1f} % of the gap" if part > 0.05 else "it closes none of the gap"
-        if validation is not None and (validation < TIE_NATS or confirmed < _CONFIRMED * closed):
-            return "it does not help on the validation log"
+        if validation is not None and confirmed is not None:  # both or neither
+            if validation < TIE_NATS or confirmed < _CONFIRMED * closed:
+                return "it does not help on the validation log"
         return ""
 
     def _least(self, fitted: int) -> float:
-        """Part of the noise's sum of squares that a fit of so many unknowns must leave.
+        """Return the part of the noise's sum of squares that a fit of so many unknowns must leave.
 
         Source:
-            Satterthwaite (1946) for sums of squares that weigh differently, here by joint.
+            Satterthwaite (1946) for sums of squares with unequal weights, here by joint.
         """
         count = self.data.recipe.independent * self.samples.moving.sum(axis=0)
         weight = np.square(self.floor)

@@ -1,7 +1,7 @@
-"""The plant with every effect it might be missing, each doing nothing yet.
+"""A model with every effect that the plant might be missing, each of them neutral at first.
 
-One union is compiled once; which unknowns move is data. Compiling each candidate by itself would
-take longer than all of the search.
+One superset is compiled once, and the choice of unknowns to fit is data. Compiling each candidate separately
+would take longer than the whole search.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from jaxid.model.unknowns import Free, Parameters, scatter, seeds
 from jaxid.numerics.lanes import in_threads
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual
 
-# An effect with more starts than this is evaluated on a plant of its own, all starts at once.
+# A candidate with more starts than this is evaluated on a plant without other effects, all starts at once.
 _FEW = 8
-# Of a long log a search looks at so many kept samples, those of all joints counted, in so many
-# pieces spread over it.
+# A search uses at most this many kept samples of a long log, summed over the joints, in this many pieces
+# spread over the log.
 _MOST = 8_000
 _PIECES = 4
-# A union is differentiated in so many columns at once, and only in those asked for: few, so that what a long
-# log makes of each operation stays in the processor's cache.
+# Number of directions in which the superset is differentiated at once. It is small, so that the intermediate
+# arrays of a long log stay in the processor's cache.
 _COLUMNS = 4
-# Strength at which the columns of an added force are taken, relative to the log's force.
+# Strength at which the columns of an added force are computed, relative to the strength of its start.
 _FAINT = 1e-6
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect in one place that the plant might be missing.
+    """One effect at one place that the plant might be missing.
 
     Args:
-        kind: Its name.
-        label: Kind and place, as results name it.
-        port: Where it acts: a joint from 0 on, or behind them a spring.
-        index: Its unknowns in the union's vector.
-        neutral: Values at which it does next to nothing.
-        starts: Values to search from, (starts, parameters).
-        amplitude: Which of its parameters scale with its strength; none for a drive effect.
+        kind: Kind of the effect, as in case files.
+        label: Kind and place, as in results.
+        port: Port at which the effect acts: joints from 0 on, then springs.
+        index: Indices of its unknowns in the superset's vector.
+        neutral: Values at which it has next to no effect.
+        starts: Values from which a search starts, (starts, parameters).
+        amplitude: Mask of its parameters that scale with its strength; none for a drive effect.
     """
 
     kind: str
@@ -64,23 +64,23 @@ class Candidate:
 
     @property
     def has_grid(self) -> bool:
-        """Whether its starts are evaluated on a plant of their own."""
+        """True if the starts are evaluated on a plant without other effects."""
         return len(self.starts) > _FEW
 
     def probe(self, start: int) -> np.ndarray:
-        """Values at which its columns are taken: the shape of a start, next to no strength."""
+        """Return the values at which its columns are computed: the shape of a start at a faint strength."""
         return np.where(self.amplitude, _FAINT, 1.0) * self.starts[start]
 
 
 @dataclass(frozen=True)
 class Point:
-    """A candidate at one start: how the residual differs there, and its columns.
+    """A candidate at one start: its change of the residual, and its columns.
 
     Args:
-        candidate: Which.
+        candidate: The candidate that is linearised.
         start: Index of the start.
-        offset: Residual there minus residual of the current model, (kept, n).
-        columns: Derivatives in the candidate's unknowns, (kept, n, parameters).
+        offset: Residual at the start minus the residual of the current model, (kept, n).
+        columns: Derivatives of the residual in the candidate's unknowns, (kept, n, parameters).
     """
 
     candidate: Candidate
@@ -90,7 +90,7 @@ class Point:
 
     @property
     def strength(self) -> Float[np.ndarray, "kept n"] | None:
-        """Residual per unit of the start's strength; None for a drive effect."""
+        """Change of the residual per unit of the start's strength; None for a drive effect."""
         c = self.candidate
         if not c.amplitude.any():
             return None
@@ -102,11 +102,11 @@ class CandidateModel:
     """Machine with all candidates.
 
     Args:
-        machine: Its plant carries every candidate; its parameters are the case's own, then theirs.
-        base: Indices of the case's own unknowns.
-        candidates: By kind and place.
-        enters: Which unknowns stand in the balance of which joints, (joints, unknowns).
-        colours: Numbers of the unknowns such that no two of one number stand in one balance.
+        machine: Its plant has every candidate; its unknowns are those of the case, then those of candidates.
+        base: Indices of the unknowns of the case.
+        candidates: Candidates by kind, then by place.
+        enters: Mask of the unknowns that occur in the balance of each joint, (joints, unknowns).
+        colours: Colour of each unknown; no two unknowns of one colour occur in the same balance.
     """
 
     machine: Machine
@@ -117,16 +117,16 @@ class CandidateModel:
 
     @property
     def neutral(self) -> np.ndarray:
-        """The vector at which only the baseline acts."""
+        """Vector of unknowns at which only the baseline acts."""
         return self.machine.parameters.guess
 
 
 class CandidateSamples:
-    """What a search looks at of a log: all of it, or pieces spread over a long one.
+    """The samples of a log that a search uses: all of them, or pieces spread over a long log.
 
     Args:
         data: The log, prepared.
-        force_noise: Standard deviation of the declared force, (m,); None: not known.
+        force_noise: Standard deviation of the declared force, (m,); None if it is not known.
     """
 
     def __init__(self, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None) -> None:
@@ -141,88 +141,99 @@ class CandidateSamples:
 
 
 def _noisier(arrays: ForceData, force_noise: np.ndarray) -> ForceData:
-    """A log with the noise of its force once more on top."""
+    """Return a log with a second draw of force noise added."""
     draw = np.random.default_rng(20240501).standard_normal(arrays.force.shape)
     return eqx.tree_at(lambda a: a.force, arrays, arrays.force + force_noise * draw)
 
 
 def evaluate(
-    union: CandidateModel,
+    superset: CandidateModel,
     samples: CandidateSamples,
     theta: Float[np.ndarray, " p"],
-    wanted: Sequence[int] | None = None,
+    wanted: Sequence[int] | np.ndarray | None = None,
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
-    """Residual of the union and its Jacobian in all unknowns, or at least in those wanted."""
-    return evaluate_on(union, samples.arrays, theta, wanted)
+    """Compute the residual of the superset and its Jacobian.
+
+    Args:
+        superset: Machine with all candidates.
+        samples: Samples of the log.
+        theta: All unknowns of the superset.
+        wanted: Indices of the unknowns that need derivatives; columns of others may be zero. None: all.
+    """
+    return evaluate_on(superset, samples.arrays, theta, wanted)
 
 
 def evaluate_on(
-    union: CandidateModel,
+    superset: CandidateModel,
     logs: list[ForceData],
     theta: Float[np.ndarray, " p"],
-    wanted: Sequence[int] | None = None,
+    wanted: Sequence[int] | np.ndarray | None = None,
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
-    """The same on several logs or pieces, their rows in that order."""
-    colours = np.asarray(union.colours, int)
-    directions = seeds(union.colours)
-    # Which are asked is data: one number of columns, and one compiled function.
+    """Compute residual and Jacobian, as `evaluate` does, on several logs or pieces, one after the other."""
+    colours = np.asarray(superset.colours, int)
+    directions = seeds(superset.colours)
+    # The choice of directions is data: with a fixed number of columns one compiled function serves all.
     ask = np.unique(colours if wanted is None else colours[np.asarray(wanted, int)])
     parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]
-    found = in_threads(_asked, [(union, log, theta, directions, part) for log in logs for part in parts])
-    each = [found[k : k + len(parts)] for k in range(0, len(found), len(parts))]
-    e = np.concatenate([some[0][0] for some in each])
-    own = np.concatenate([np.concatenate([c for _, c in some], axis=-1) for some in each])
+    calls = [(superset, log, theta, directions, part) for log in logs for part in parts]
+    results = in_threads(_directional_derivatives, calls)
+
+    by_log = [results[k : k + len(parts)] for k in range(0, len(results), len(parts))]
+    e = np.concatenate([some[0][0] for some in by_log])
+    derivatives = np.concatenate([np.concatenate([c for _, c in some], axis=-1) for some in by_log])
     jacobian = np.zeros((*e.shape, directions.shape[1]))
-    jacobian[..., ask] = own
+    jacobian[..., ask] = derivatives
+    # From colours to unknowns: an unknown has the column of its colour, in the balances that it enters.
     jacobian = jacobian[..., colours]
-    return e, jacobian if directions.shape[1] == len(theta) else jacobian * union.enters
+    return e, jacobian if directions.shape[1] == len(theta) else jacobian * superset.enters
 
 
-def _asked(
-    union: CandidateModel, log: ForceData, theta: np.ndarray, directions: np.ndarray, part: np.ndarray
+def _directional_derivatives(
+    superset: CandidateModel, log: ForceData, theta: np.ndarray, directions: np.ndarray, part: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and derivatives in some directions, filled up to one number of them."""
-    own = np.zeros((len(theta), _COLUMNS))
-    own[:, : len(part)] = directions[:, part]
-    plant, places = union.machine.plant, union.machine.parameters.places
-    e, columns = force_and_columns(plant, places, log, jnp.asarray(theta), own)
+    """Compute the residual and its derivatives in some directions, padded to a fixed number of them."""
+    padded = np.zeros((len(theta), _COLUMNS))
+    padded[:, : len(part)] = directions[:, part]
+    plant, places = superset.machine.plant, superset.machine.parameters.places
+    e, columns = force_and_columns(plant, places, log, jnp.asarray(theta), padded)
     return np.asarray(e), np.asarray(columns)[..., : len(part)]
 
 
 def refine(
-    union: CandidateModel, data: CandidateSamples, theta: Float[np.ndarray, " p"], moving: np.ndarray
+    superset: CandidateModel, data: CandidateSamples, theta: Float[np.ndarray, " p"], moving: np.ndarray
 ) -> tuple[Float[np.ndarray, " p"], bool]:
-    """Fit some unknowns of the union in the force domain, the rest held.
+    """Fit some unknowns of the superset in the force domain, with the others fixed.
 
-    The union's Jacobian is compiled already; driving a host solver with it costs less than
-    compiling a second one inside a loop.
+    The superset's Jacobian is compiled already; calling it from a host solver costs less than compiling a
+    second one inside a loop.
 
     Args:
-        union: The union.
-        data: The log.
-        theta: Start, all unknowns.
-        moving: Indices of those that move.
+        superset: Machine with all candidates.
+        data: Samples of the log.
+        theta: All unknowns at the start.
+        moving: Indices of the unknowns to fit.
 
     Returns:
         All unknowns, and whether the solver converged.
     """
     if not len(moving):
         return theta.copy(), True
-    few = free_of(union, moving)
-    transform = Transform.of(few)
-    lower, upper = (np.asarray(transform.inward(b)) for b in few.bounds)
+    some = free_of(superset, moving)
+    transform = Transform.of(some)
+    lower, upper = (np.asarray(transform.inward(b)) for b in some.bounds)
     weight = data.weight[..., None]
     latest: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
+    # The solver asks for residual and Jacobian at the same point one after the other.
     def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         key = x.tobytes()
         if key not in latest:
             latest.clear()
             at = theta.copy()
             at[moving] = np.asarray(transform.outward(jnp.asarray(x)))
-            e, jacobian = evaluate(union, data, at, moving)
+            e, jacobian = evaluate(superset, data, at, moving)
             slope = np.asarray(transform.slope(jnp.asarray(at[moving])))
-            with np.errstate(invalid="ignore", over="ignore"):  # what diverged is made finite below
+            with np.errstate(invalid="ignore", over="ignore"):  # diverged values are made finite below
                 rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))
             latest[key] = (_finite(e * weight[..., 0]).ravel(), _finite(rows))
         return latest[key]
@@ -231,7 +242,7 @@ def refine(
     fit = scipy.optimize.least_squares(
         lambda x: both(x)[0],
         start,
-        lambda x: both(x)[1],
+        lambda x: both(x)[1],  # pyright: ignore[reportArgumentType] (SciPy's stubs know names of methods only)
         (lower, upper),
         x_scale="jac",
         ftol=1e-7,
@@ -245,32 +256,32 @@ def refine(
 
 
 def _finite(x: np.ndarray) -> np.ndarray:
-    """What diverged, as a number so large that a solver turns back, yet not too large to square."""
+    """Replace diverged values by numbers so large that a solver turns back, yet small enough to square."""
     return np.clip(np.nan_to_num(x, nan=1e60), -1e60, 1e60)
 
 
 def points(
-    union: CandidateModel,
+    superset: CandidateModel,
     rest: list[Candidate],
     data: CandidateSamples,
     theta: Float[np.ndarray, " p"],
     residual: Float[np.ndarray, "kept n"],
 ) -> list[Point]:
-    """Every candidate that has few starts at each of them, all together through the union.
+    """Linearise every candidate that has few starts at each of its starts, through the superset.
 
     Args:
-        union: The union.
+        superset: Machine with all candidates.
         rest: Candidates to evaluate.
-        data: The log.
-        theta: Current model, all unknowns.
-        residual: Its residual.
+        data: Samples of the log.
+        theta: All unknowns of the current model.
+        residual: Residual of the current model.
     """
-    found = []
-    few = [c for c in rest if not c.has_grid]
-    for k in range(max((len(c.starts) for c in few), default=0)):
-        now = [c for c in few if k < len(c.starts)]
-        # Added forces are faint and can share an evaluation. A drive effect shifts the residual of
-        # its joint, and shares one with those of its kind on other joints.
+    results = []
+    with_few_starts = [c for c in rest if not c.has_grid]
+    for k in range(max((len(c.starts) for c in with_few_starts), default=0)):
+        now = [c for c in with_few_starts if k < len(c.starts)]
+        # Added forces are faint and can share one evaluation. A drive effect shifts the residual of its
+        # joint, and shares an evaluation with its kind on other joints only.
         faint = [c for c in now if c.amplitude.any() or np.allclose(c.starts[k], c.neutral)]
         shifting = [c for c in now if all(c is not f for f in faint)]
         kinds = dict.fromkeys(c.kind for c in shifting)
@@ -280,34 +291,34 @@ def points(
             at = theta.copy()
             for c in group:
                 at[c.index] = c.probe(k)
-            e, jacobian = evaluate(union, data, at, np.concatenate([c.index for c in group]))
+            e, jacobian = evaluate(superset, data, at, np.concatenate([c.index for c in group]))
             for c in group:
                 shift = np.zeros_like(e)
                 if not group[0].amplitude.any():
-                    own = slice(None) if len(group) == 1 else slice(c.port, c.port + 1)
-                    shift[:, own] = (e - residual)[:, own]
-                found.append(Point(c, k, shift, jacobian[..., c.index]))
-    return found
+                    joints = slice(None) if len(group) == 1 else slice(c.port, c.port + 1)
+                    shift[:, joints] = (e - residual)[:, joints]
+                results.append(Point(c, k, shift, jacobian[..., c.index]))
+    return results
 
 
-def grid_points(union: CandidateModel, candidate: Candidate, data: CandidateSamples) -> list[Point]:
-    """A candidate with many starts at each of them, on a plant that has nothing else."""
-    effect: Effect = union.machine.plant.effects[position(union, candidate)]
-    alone = eqx.tree_at(lambda p: p.effects, union.machine.plant, (effect,))
+def grid_points(superset: CandidateModel, candidate: Candidate, data: CandidateSamples) -> list[Point]:
+    """Linearise a candidate with many starts at each of them, on a plant without other effects."""
+    effect: Effect = superset.machine.plant.effects[position(superset, candidate)]
+    alone = eqx.tree_at(lambda p: p.effects, superset.machine.plant, (effect,))
     names = user_effect_names(effect)
     places = tuple((("effects", 0, n), None) for n in names)
     probes = np.stack([candidate.probe(k) for k in range(len(candidate.starts))])
-    found = []
+    results = []
     for arrays in data.arrays:
         chunks = [np.asarray(_columns(alone, places, arrays, jnp.asarray(s))) for s in _chunks(probes)]
-        found.append(np.concatenate(chunks)[: len(candidate.starts)])
-    columns = np.concatenate(found, axis=1)
+        results.append(np.concatenate(chunks)[: len(candidate.starts)])
+    columns = np.concatenate(results, axis=1)
     zero = np.zeros(columns.shape[1:3])
     return [Point(candidate, k, zero, c) for k, c in enumerate(columns)]
 
 
 def _chunks(starts: np.ndarray, size: int = 37) -> Iterator[np.ndarray]:
-    """Equal chunks, the last filled up: one compiled shape, and memory for one chunk only."""
+    """Yield chunks of equal size, the last one padded: one compiled shape, and memory for one chunk only."""
     for k in range(0, len(starts), size):
         chunk = starts[k : k + size]
         fill = np.repeat(chunk[-1:], size - len(chunk), axis=0)
@@ -322,24 +333,24 @@ def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array) -> Arr
     return jax.lax.map(columns, starts)
 
 
-def position(union: CandidateModel, candidate: Candidate) -> int:
-    """Index of a candidate among the effects of the union's plant."""
-    path = union.machine.parameters.free[candidate.index[0]].path
+def position(superset: CandidateModel, candidate: Candidate) -> int:
+    """Return the index of a candidate among the effects of the superset's plant."""
+    path = superset.machine.parameters.free[candidate.index[0]].path
     return int(path[1])
 
 
-def effect_at(union: CandidateModel, candidate: Candidate, values: Float[np.ndarray, " k"]) -> Effect:
-    """A candidate as an effect of its own, at some values of its unknowns."""
-    effect: Effect = union.machine.plant.effects[position(union, candidate)]
+def effect_at(superset: CandidateModel, candidate: Candidate, values: Float[np.ndarray, " k"]) -> Effect:
+    """Return a candidate as a separate effect with the given values of its unknowns."""
+    effect: Effect = superset.machine.plant.effects[position(superset, candidate)]
     return type(effect)(**dict(zip(user_effect_names(effect), values, strict=True)), port=candidate.port)
 
 
 def user_effect_names(effect: Effect) -> list[str]:
-    """Parameters that an effect has, those that it leaves out apart."""
+    """Return the names of the parameters that an effect has, without optional ones that are absent."""
     return [n for n in parameters_of(type(effect)) if getattr(effect, n) is not None]
 
 
-def free_of(union: CandidateModel, index: np.ndarray) -> Parameters:
-    """Some unknowns of the union."""
-    free: list[Free] = [union.machine.parameters.free[i] for i in index]
+def free_of(superset: CandidateModel, index: np.ndarray) -> Parameters:
+    """Return some of the superset's unknowns."""
+    free: list[Free] = [superset.machine.parameters.free[i] for i in index]
     return Parameters(tuple(free))

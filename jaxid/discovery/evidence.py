@@ -1,12 +1,12 @@
-"""Held-out evidence for columns, from Gram matrices by block of time, and its null distribution.
+"""Held-out evidence of columns, from Gram matrices by block of time, and its null distribution.
 
-A fit on some blocks and its error on another need only sums of products of columns, so that a
-thousand candidates on hundreds of surrogates cost no more than small matrices.
+A fit on some blocks and its error on another need sums of products of columns only, so that a thousand
+candidates on hundreds of surrogates cost no more than small matrices.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.fft
@@ -16,26 +16,28 @@ from jaxtyping import Bool, Float, Int
 from jaxid.numerics.precision import NoiseModel
 
 BLOCKS = 10
-# Rows that whitening may leave correlated; fewest stretches of a surrogate.
+# Number of rows over which whitening may leave a correlation, and least number of stretches of a surrogate.
 _CORRELATED = 10
 _STRETCHES = 20
-# Of a normal matrix, relative to its diagonal.
+# Ridge added to a normal matrix, relative to its diagonal.
 _RIDGE = 1e-9
-# Probability with which noise alone may exceed the threshold for all candidates together.
+# Probability that noise alone exceeds the threshold with any of the candidates.
 _FALSE_POSITIVE = 1e-3
 
 
 @dataclass(frozen=True)
 class Whitener:
-    """Turns residuals and columns of a log into rows of unit, uncorrelated noise.
+    """Linear map from residuals and columns of a log to rows with uncorrelated noise of unit variance.
 
     Args:
-        noise: Model by joint.
-        rows: Which samples count, by joint.
+        noise: Noise model of each joint.
+        rows: Mask of the samples that count, by joint.
     """
 
     noise: tuple[NoiseModel, ...]
     rows: Bool[np.ndarray, "kept n"]
+    _matrices: list[scipy.sparse.csr_array] = field(init=False, repr=False, compare=False)
+    _order: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         pairs = zip(self.noise, self.rows.T, strict=True)
@@ -49,14 +51,14 @@ class Whitener:
         counts: Bool[np.ndarray, "kept n"],
         colour: tuple[NoiseModel, ...] = (),
     ) -> Whitener:
-        """Whitener for noise such as `e`; from an expected colour, what of it is not so is fitted."""
+        """Build the whitener of noise such as `e`; with an expected colour, only the deviation is fitted."""
         if colour:
             first = cls(colour, counts)
             return first.then(cls.of(first.placed(first(e[..., None])[:, 0]), counts))
         return cls(tuple(NoiseModel.fit(x, c, 20) for x, c in zip(e.T, counts.T, strict=True)), counts)
 
     def then(self, after: Whitener) -> Whitener:
-        """This whitener and then another as one."""
+        """Compose this whitener with another that follows it."""
         noise = tuple(
             NoiseModel(
                 -np.convolve([1.0, *-a.coefficients], [1.0, *-b.coefficients])[1:],
@@ -67,18 +69,19 @@ class Whitener:
         return Whitener(noise, self.rows)
 
     def __call__(self, x: Float[np.ndarray, "kept n k"]) -> Float[np.ndarray, "row k"]:
-        """Whitened rows, block after block of time."""
+        """Return whitened rows, ordered by block of time."""
         return np.concatenate([m @ x[:, i] for i, m in enumerate(self._matrices)])[self._order]
 
     def placed(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, "kept n"]:
-        """Rows back at their samples; zero where none counts."""
-        out, own = np.zeros(self.rows.shape), np.empty_like(rows)
-        own[self._order] = rows
-        out.T[self.rows.T] = own
+        """Put rows back at their samples; samples that do not count are zero."""
+        out = np.zeros(self.rows.shape)
+        ordered = np.empty_like(rows)
+        ordered[self._order] = rows
+        out.T[self.rows.T] = ordered
         return out
 
     def blocks(self) -> np.ndarray:
-        """Block of time of every row, in rising order."""
+        """Return the block of time of every row, in ascending order."""
         return np.sort(self._blocks())
 
     def _blocks(self) -> np.ndarray:
@@ -90,40 +93,46 @@ class Whitener:
 
 
 def _predictor(model: NoiseModel, counts: Bool[np.ndarray, " kept"]) -> scipy.sparse.csr_array:
-    """Matrix from a signal to its innovations at the samples that count, over their deviation.
+    """Build the matrix from a signal to its scaled innovations at the samples that count.
 
-    After a gap fewer past samples are there, and the predictor of that order takes over: a log
-    with many reversals would lose most of its rows otherwise.
+    After a gap fewer past samples are available, and the predictor of that lower order is used: otherwise a
+    log with many reversals would lose most of its rows.
     """
     order = len(model.coefficients)
     size = scipy.fft.next_fast_len(max(4096, 64 * order), real=True)
-    covariance = np.fft.irfft(model.density(size), size)[: order + 1]
+    covariance = np.fft.irfft(model.density(size), size)[: order + 1]  # pyright: ignore[reportArgumentType] (its stub)
+
+    # Number of past samples in sequence at each row, at most the order.
     index = np.flatnonzero(counts)
     since = np.arange(len(counts)) - np.maximum.accumulate(np.where(counts, -1, np.arange(len(counts))))
     past = np.minimum(since[index] - 1, order)
     rows, columns, values = [], [], []
+
+    # Levinson-Durbin recursion: predictors of all orders, each used at the rows with that many past samples.
     a, variance = np.zeros(0), covariance[0]
     for k in range(order + 1):
         if k > 0:
-            turn = (covariance[k] - a @ covariance[k - 1 : 0 : -1]) / variance
-            a, variance = np.append(a - turn * a[::-1], turn), variance * (1 - turn**2)
+            reflection = (covariance[k] - a @ covariance[k - 1 : 0 : -1]) / variance
+            a = np.append(a - reflection * a[::-1], reflection)
+            variance = variance * (1 - reflection**2)
         here = np.flatnonzero(past == k)
         rows.append(np.repeat(here, k + 1))
         columns.append((index[here][:, None] - np.arange(k + 1)).ravel())
         values.append(np.tile(np.array([1.0, *-a]) / np.sqrt(variance), len(here)))
+
     entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
     return scipy.sparse.csr_array(entries, shape=(len(index), len(counts)))
 
 
 def grams(columns: Float[np.ndarray, "row k"], blocks: np.ndarray) -> Float[np.ndarray, "block k k"]:
-    """Products of columns, block by block."""
+    """Compute the products of columns, block by block."""
     return np.stack([columns[b].T @ columns[b] for b in _slices(blocks)])
 
 
 def products(
     columns: Float[np.ndarray, "row k"], e: Float[np.ndarray, "row r"], blocks: np.ndarray
 ) -> tuple[Float[np.ndarray, "block k r"], Float[np.ndarray, "block r"]]:
-    """Products of columns with residuals, and squares of residuals, block by block."""
+    """Compute products of columns with residuals, and squares of residuals, block by block."""
     slices = _slices(blocks)
     squares = [np.einsum("ir,ir->r", e[b], e[b]) for b in slices]
     return np.stack([columns[b].T @ e[b] for b in slices]), np.stack(squares)
@@ -139,68 +148,77 @@ def held_out(
     mixed: Float[np.ndarray, "block k r"],
     squares: Float[np.ndarray, "block r"],
 ) -> Float[np.ndarray, " r"]:
-    """Sum of squares on each block after a least-squares fit to the others, for every residual."""
-    return _left(_others(gram), gram, mixed.sum(axis=0) - mixed, mixed, squares)
+    """Compute each residual's sum of squares on every block after a least-squares fit to the others."""
+    return _held_out_squares(_others(gram), gram, mixed.sum(axis=0) - mixed, mixed, squares)
 
 
-def _left(
+def _held_out_squares(
     trained: Float[np.ndarray, "block k k"],
     held: Float[np.ndarray, "block k k"],
     trained_e: Float[np.ndarray, "block k r"],
     held_e: Float[np.ndarray, "block k r"],
     squares: Float[np.ndarray, "block r"],
 ) -> Float[np.ndarray, " r"]:
-    """What is left on the blocks: products over the others, with residuals too, and on each itself."""
+    """Sum squares after a fit; `trained` are products over the other blocks, `held` those on the block."""
     x = -np.linalg.solve(trained, trained_e)
     return np.sum(squares + np.sum(x * (2 * held_e + held @ x), axis=1), axis=0)
 
 
 def _others(gram: Float[np.ndarray, "block k k"]) -> Float[np.ndarray, "block k k"]:
-    """Products over all blocks but each, with a trace of a ridge: columns may depend on one another."""
+    """Sum products over all blocks except each, with a small ridge, since columns may be dependent."""
     total = gram.sum(axis=0)
     return total - gram + _RIDGE * np.diag(np.maximum(np.diag(total), 1e-300))
 
 
-def swept(
+def partial_products(
     gram: Float[np.ndarray, "block n n"], base: int
 ) -> tuple[Float[np.ndarray, "block m m"], Float[np.ndarray, "block m m"]]:
-    """Products of columns from which a base is taken out that was fitted to the other blocks.
+    """Compute products of columns after removal of a base that was fitted to the other blocks.
 
-    A base of sixty columns beside ten thousand pairs need not be solved for each again.
+    A base of sixty columns beside ten thousand pairs need not be solved for each pair again.
 
     Args:
-        gram: Products of all columns.
-        base: How many of them, the first ones, are the base.
+        gram: Products of all columns by block.
+        base: Number of columns, the first ones, that are the base.
 
     Returns:
-        Of the others: over the blocks fitted to, and on the block itself.
+        Products of the other columns, over the blocks of the fit and on the block itself.
     """
     rest = _others(gram)
-    taken = np.linalg.solve(rest[:, :base, :base], rest[:, :base, base:])
-    trained = rest[:, base:, base:] - np.swapaxes(rest[:, :base, base:], 1, 2) @ taken
-    back = np.swapaxes(taken, 1, 2)
+    regression = np.linalg.solve(rest[:, :base, :base], rest[:, :base, base:])
+    trained = rest[:, base:, base:] - np.swapaxes(rest[:, :base, base:], 1, 2) @ regression
+    back = np.swapaxes(regression, 1, 2)
     cross = back @ gram[:, :base, base:]
-    held = gram[:, base:, base:] - cross - np.swapaxes(cross, 1, 2) + back @ gram[:, :base, :base] @ taken
+    held = (
+        gram[:, base:, base:] - cross - np.swapaxes(cross, 1, 2) + back @ gram[:, :base, :base] @ regression
+    )
     return trained, held
 
 
-def left_beside(
+def residual_squares(
     trained: Float[np.ndarray, "block m m"],
     held: Float[np.ndarray, "block m m"],
     columns: Int[np.ndarray, " j"],
     target: Int[np.ndarray, " t"],
 ) -> float:
-    """What is left of a sum of columns once some others, and the base, are fitted; by `swept`."""
-    own, mixed = (columns[:, None], columns), (columns[:, None], target)
+    """Compute the held-out sum of squares of a sum of columns after a fit of others and of the base.
+
+    Args:
+        trained, held: Both results of `partial_products`.
+        columns: Indices of the columns to fit.
+        target: Indices of the columns whose sum is the residual.
+    """
+    square = (columns[:, None], columns)
+    mixed = (columns[:, None], target)
     squares = held[:, target[:, None], target].sum(axis=(1, 2))[:, None]
-    with_target = [x[:, *mixed].sum(axis=2)[..., None] for x in (trained, held)]
-    return float(_left(trained[:, *own], held[:, *own], *with_target, squares)[0])
+    trained_e, held_e = (x[:, *mixed].sum(axis=2)[..., None] for x in (trained, held))
+    return float(_held_out_squares(trained[:, *square], held[:, *square], trained_e, held_e, squares)[0])
 
 
 class Beside:
     """Held-out sums of squares of a base with further columns beside it, for many residuals.
 
-    What the base and the residuals have in common is summed and solved once; a candidate adds its own.
+    The part that involves only the base and the residuals is summed and solved once for all candidates.
 
     Args:
         base: Whitened columns of the base.
@@ -215,18 +233,18 @@ class Beside:
         self.gram = grams(base, blocks)
         self.mixed, squares = products(base, e, blocks)
         self.inverse = np.linalg.inv(_others(self.gram))
-        # What the base says of the residuals where it is fitted to the other blocks, and its products.
-        self.said = self.inverse @ (self.mixed.sum(axis=0) - self.mixed)
-        self.seen = self.gram @ self.said
-        self.squares = squares + np.sum(self.said * (self.seen - 2 * self.mixed), axis=1)
+        # Coefficients of the base fitted to the other blocks, for each residual, and their products.
+        self.fitted = self.inverse @ (self.mixed.sum(axis=0) - self.mixed)
+        self.products_fitted = self.gram @ self.fitted
+        self.squares = squares + np.sum(self.fitted * (self.products_fitted - 2 * self.mixed), axis=1)
 
     def crossed(
         self, extra: Float[np.ndarray, "row j"]
     ) -> tuple[Float[np.ndarray, "block k j"], Float[np.ndarray, "block j r"]]:
-        """Products of further columns with the base and with the residuals.
+        """Compute the products of further columns with the base and with the residuals.
 
-        The residuals are many, and going through them takes most of the time: what is to be scored
-        is best brought together.
+        The residuals are many, and multiplying them takes most of the time: it is best to pass the columns of
+        several candidates in one call.
         """
         slices = _slices(self.blocks)
         with_base = np.stack([self.base[b].T @ extra[b] for b in slices])
@@ -238,40 +256,56 @@ class Beside:
         crossed: tuple[Float[np.ndarray, "block k j"], Float[np.ndarray, "block j r"]],
         offset: Float[np.ndarray, "row 1"] | None = None,
     ) -> Float[np.ndarray, " r"]:
-        """With further columns and their products, and with an offset that all residuals share."""
-        if offset is not None:
-            more = self.crossed(offset)
-            extra = np.concatenate([extra, offset], axis=1)
-            crossed = [np.concatenate([crossed[k], more[k]], axis=2 - k) for k in range(2)]
+        """Return the sums of squares with further columns beside the base.
+
+        Args:
+            extra: Further columns.
+            crossed: Their products, from `crossed`.
+            offset: Change of all residuals, if there is one.
+        """
         with_base, with_e = crossed
-        own = grams(extra, self.blocks)
+        if offset is not None:
+            offset_base, offset_e = self.crossed(offset)
+            extra = np.concatenate([extra, offset], axis=1)
+            with_base = np.concatenate([with_base, offset_base], axis=2)
+            with_e = np.concatenate([with_e, offset_e], axis=1)
+
+        # Remove the base, fitted to the other blocks, from the further columns.
+        gram = grams(extra, self.blocks)
         others = with_base.sum(axis=0) - with_base
-        taken = self.inverse @ others
-        back = np.swapaxes(taken, 1, 2)
-        trained = _others(own) - np.swapaxes(others, 1, 2) @ taken
-        trained_e = with_e.sum(axis=0) - with_e - np.swapaxes(others, 1, 2) @ self.said
+        regression = self.inverse @ others
+        back = np.swapaxes(regression, 1, 2)
+        trained = _others(gram) - np.swapaxes(others, 1, 2) @ regression
+        trained_e = with_e.sum(axis=0) - with_e - np.swapaxes(others, 1, 2) @ self.fitted
         cross = back @ with_base
-        held = own - cross - np.swapaxes(cross, 1, 2) + back @ self.gram @ taken
-        held_e = with_e - back @ self.mixed - np.swapaxes(with_base, 1, 2) @ self.said + back @ self.seen
+        held = gram - cross - np.swapaxes(cross, 1, 2) + back @ self.gram @ regression
+        held_e = (
+            with_e
+            - back @ self.mixed
+            - np.swapaxes(with_base, 1, 2) @ self.fitted
+            + back @ self.products_fitted
+        )
         if offset is None:
-            return _left(trained, held, trained_e, held_e, self.squares)
+            return _held_out_squares(trained, held, trained_e, held_e, self.squares)
+
+        # The last column is the offset: it changes the residuals and is not fitted.
         squares = self.squares + 2 * held_e[:, -1] + held[:, -1, -1:]
         trained_e = trained_e[:, :-1] + trained[:, :-1, -1:]
         held_e = held_e[:, :-1] + held[:, :-1, -1:]
-        return _left(trained[:, :-1, :-1], held[:, :-1, :-1], trained_e, held_e, squares)
+        return _held_out_squares(trained[:, :-1, :-1], held[:, :-1, :-1], trained_e, held_e, squares)
 
 
 def log_evidence(rows: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Gain in held-out log-likelihood (nats) where a sum of squares falls from before to after."""
-    # Below 1e-12 of what was there, a sum of squares is rounding.
+    """Return the gain in held-out log-likelihood [nats] if a sum of squares falls from before to after."""
+    # A ratio below 1e-12 is rounding.
     return -0.5 * rows * np.log(np.maximum(after / np.maximum(before, 1e-300), 1e-12))
 
 
 def stretch(rows: int) -> int:
-    """How many rows keep their sign together in a surrogate.
+    """Return the number of rows that keep a common sign in a surrogate.
 
-    As many as whitening may leave correlated, or a hundredth of a long log; of a short log fewer,
-    since of five stretches there are no two hundred surrogates.
+    It is the number over which whitening may leave a correlation, or a hundredth of a long log. For a short
+    log it is smaller, since five stretches do not give two hundred different surrogates.
     """
     return max(min(_CORRELATED, rows // _STRETCHES), rows // 100, 1)
 
@@ -279,9 +313,9 @@ def stretch(rows: int) -> int:
 def flipped(
     e: Float[np.ndarray, " row"], length: int, runs: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "row runs"]:
-    """Surrogates of a whitened residual: the sign of every stretch of it drawn anew.
+    """Draw surrogates of a whitened residual with a random sign for every stretch of rows.
 
-    It keeps where the noise is large and what correlation whitening left, and destroys any
+    A surrogate keeps the places of large noise and any correlation that whitening left, and destroys the
     relation to the columns.
     """
     stretches = -(-len(e) // length)
@@ -290,10 +324,10 @@ def flipped(
 
 
 def threshold(largest: Float[np.ndarray, " runs"]) -> float:
-    """Evidence that noise alone exceeds with the stated probability.
+    """Return the evidence that noise alone exceeds with probability `_FALSE_POSITIVE`.
 
     Args:
-        largest: Of each surrogate, the largest evidence over all candidates.
+        largest: Largest evidence over all candidates, for each surrogate.
 
     Source:
         Gumbel's distribution of maxima, fitted by moments.

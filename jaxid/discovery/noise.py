@@ -1,4 +1,4 @@
-"""The noise in a residual: what colour the sensors give it, and what the residual says of that."""
+"""The noise in a residual: its colour expected from the sensors, and its colour fitted to the residual."""
 
 from __future__ import annotations
 
@@ -14,39 +14,41 @@ from jaxid.machine import Machine
 from jaxid.numerics import filters as signals
 from jaxid.numerics.precision import NoiseModel
 
-# Part of the force that filtering, holding and integrating leave wrong in any model: an effect
-# that brings less (in RMS) cannot be told from them.
+# Part of the force that filtering, holding and integrating leave wrong in any model: an effect with a smaller
+# RMS cannot be distinguished from these errors.
 NUMERICS = 1e-3
-# Order of the model of the sensors' noise, and points of its spectrum.
+# Order of the autoregressive model of the sensors' noise, and points of its spectrum.
 _ORDER = 30
 _POINTS = 1024
-# Times that the colour of the noise is fitted again after filling it up; more change nothing.
+# Number of refits of the noise colour after the fitted part is filled up; further refits change nothing.
 _FILLINGS = 2
 
 
 def sensor_colour(machine: Machine, log: Log, data: Prepared) -> tuple[NoiseModel, ...]:
-    """Model of the noise that the sensors leave in the balance at the kept samples, by joint.
+    """Model the noise that the sensors cause in the balance at the kept samples, by joint.
 
-    Position noise enters with the square of the frequency and spans four decades in power. From a
-    short residual with gaps no such range can be estimated, and what it hides is what tells slow
-    effects apart. Force noise that is not stated is read off the high band of the logged force;
-    what numerics leave wrong counts as white.
+    Position noise enters with the square of the frequency and spans four decades in power. A short residual
+    with gaps does not allow an estimate of such a range, and the weak part of the spectrum distinguishes slow
+    effects. Force noise that is not stated is estimated from the high band of the logged force; errors of
+    numerics count as white noise.
 
     Args:
         machine: The machine; its parameters enter through the impedance only.
-        log: The log.
-        data: The same, prepared.
+        log: The log before preparation.
+        data: The same log, prepared.
     """
-    unstated = machine.sensor.force_noise is None
-    force_noise = signals.high_band_std(log.force) if unstated else None
-    if unstated and data.recipe.median:
-        force_noise = force_noise / signals.median_noise(data.recipe.median)
+    force_noise = None
+    if machine.sensor.force_noise is None:
+        force_noise = signals.high_band_std(log.force)
+        if data.recipe.median:
+            force_noise = force_noise / signals.median_noise(data.recipe.median)
     f, power = noise_density(machine, log, data, force_noise)
     step = data.recipe.decimation
     rate = log.rate_hz / step
     grid = np.linspace(0, log.rate_hz / 2, step * _POINTS + 1)
     force = data.at_kept(data.force - data.force.mean(axis=0))
     numerics = NUMERICS**2 * float(np.mean(force**2))
+
     models = []
     for density in power.T:
         folded = _folded(np.interp(grid, f, density), step) + numerics / (rate / 2)
@@ -55,9 +57,9 @@ def sensor_colour(machine: Machine, log: Log, data: Prepared) -> tuple[NoiseMode
 
 
 def _folded(density: np.ndarray, step: int) -> np.ndarray:
-    """A density over `step` bands as keeping one sample in `step` folds them into one."""
+    """Fold a density over `step` bands into one band, as decimation by `step` does."""
     bands = [density[k * _POINTS : (k + 1) * _POINTS + 1] for k in range(step)]
-    return sum(band if k % 2 == 0 else band[::-1] for k, band in enumerate(bands))
+    return sum((band if k % 2 == 0 else band[::-1] for k, band in enumerate(bands)), start=np.zeros(()))
 
 
 def fit_whitener(
@@ -67,26 +69,28 @@ def fit_whitener(
     counts: Bool[np.ndarray, "kept n"],
     colour: tuple[NoiseModel, ...],
 ) -> tuple[Whitener, Float[np.ndarray, " row"]]:
-    """Whitener for the noise in a residual, and that noise as whitened rows.
+    """Fit a whitener to the noise in a residual, and return that noise as whitened rows.
 
-    The colour of the residual is partly the missing effect itself: whitened with that, the effect
-    would vanish. So all that might explain it has its say first. But that takes noise away too,
-    where it looks, and of a short log most: what it took is filled up with noise of unit variance,
-    once a first model of its colour is known, and the colour fitted again.
+    The colour of the residual is partly the missing effect itself, which would vanish if it were whitened
+    with that colour. So all columns that might explain it are fitted first. This also removes noise from
+    their span, most of it in a short log. The removed part is filled up with noise of unit variance once a
+    first model of the colour is known, and the colour is fitted again.
 
     Args:
-        e: Residual.
+        e: Force residual of the model.
         base: Columns of the model.
-        extra: Columns of what might be missing.
-        counts: Which samples count.
-        colour: What the sensors should leave, by joint.
+        extra: Columns of effects that might be missing.
+        counts: Mask of the samples that count.
+        colour: Noise expected from the sensors, by joint.
     """
     scale = np.array([c.innovation for c in colour])
     ready = [stacked(x, counts, scale) for x in (base, extra, e[..., None])]
-    left = np.zeros_like(e)
-    left.T[counts.T] = left_over(span(*ready[:2]), ready[2][:, 0])
-    left *= scale
-    whitener = Whitener.of(left, counts, colour)
+
+    remainder = np.zeros_like(e)
+    remainder.T[counts.T] = left_over(span(*ready[:2]), ready[2][:, 0])
+    remainder *= scale
+    whitener = Whitener.of(remainder, counts, colour)
+
     for _ in range(_FILLINGS):
         filled = whitener.placed(_filled(whitener, e, base, extra))
         whitener = whitener.then(Whitener.of(filled, counts))
@@ -96,7 +100,8 @@ def fit_whitener(
 def _filled(
     whitener: Whitener, e: np.ndarray, base: np.ndarray, extra: np.ndarray
 ) -> Float[np.ndarray, " row"]:
+    """Whiten a residual and replace its part in the span of the columns by noise of equal variance."""
     q = span(whitener(base), whitener(extra))
-    left = left_over(q, whitener(e[..., None])[:, 0])
-    spread = np.sqrt(np.sum(left**2) / max(len(left) - q.shape[1], 1))
-    return left + q @ (spread * np.random.default_rng(20240501).standard_normal(q.shape[1]))
+    remainder = left_over(q, whitener(e[..., None])[:, 0])
+    spread = np.sqrt(np.sum(remainder**2) / max(len(remainder) - q.shape[1], 1))
+    return remainder + q @ (spread * np.random.default_rng(20240501).standard_normal(q.shape[1]))

@@ -1,4 +1,4 @@
-"""What `discover` returns."""
+"""The result of `discover`."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """An effect that was added.
+    """An effect that the search added.
 
     Args:
-        kind: Its name.
-        label: Kind and place, as results name it.
-        place: one of `PLACES`, and which, 1-based.
+        kind: Kind of the effect, as in case files.
+        label: Kind and place, as in results.
+        place: A word of `PLACES` and a number counted from 1.
         names: Names of its parameters in the estimate.
         score: Its evidence when it was added.
-        alternatives: Effects that this log cannot tell from it.
+        alternatives: Effects that explain this log equally well.
     """
 
     kind: str
@@ -45,9 +45,9 @@ class Round:
     """One step of the search with its gap.
 
     Args:
-        step: The step.
-        fit: RMS force residual on the log, by joint.
-        validation: The worst of the validation logs; None without any.
+        step: The step of the search.
+        fit: RMS force residual on the fitted log, by joint.
+        validation: The largest RMS of the validation logs, by joint; None without any.
     """
 
     step: Step
@@ -57,21 +57,21 @@ class Round:
 
 @dataclass(frozen=True)
 class Discovery:
-    """What `discover` returns.
+    """Result of `discover`.
 
     Args:
         session: Case and logs.
         verdict: "found", "nothing_missing" or "unexplained".
-        where: Where the baseline's residual lies; None where nothing is missing.
-        effects: Effects added, in order.
-        rounds: The search.
-        before: The refitted baseline.
-        after: The last refit, effects included.
-        gaps_before: By log, the fitted one first.
-        gaps_after: The same after.
-        noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
-        proposals: Experiments that would tell effects apart which this log cannot.
-        unseen: Why break-away friction was not looked for; empty where it was.
+        where: Region in which the baseline's residual lies; None if nothing is missing.
+        effects: Added effects, in order.
+        rounds: Steps of the search with their gaps.
+        before: Estimate of the refitted baseline.
+        after: Estimate of the last refit, effects included.
+        gaps_before: Gaps before the search, by log, the fitted one first.
+        gaps_after: Gaps after the search, in the same order.
+        noise_floor: RMS force residual that the sensors' noise causes in the band, by joint.
+        proposals: Experiments that distinguish effects which explain this log equally well.
+        unseen: Reason why break-away friction was not searched for; empty if it was.
     """
 
     session: Session
@@ -94,7 +94,7 @@ class Discovery:
 
     @property
     def converged(self) -> bool:
-        """Whether the last refit did."""
+        """True if the last refit converged."""
         return self.after.converged
 
     def __str__(self) -> str:
@@ -106,7 +106,7 @@ class Discovery:
         """Write `discovery.json`, `report.html` and the proposed experiments to a folder.
 
         Raises:
-            InputError: If the folder holds what jaxid did not make and `overwrite` is not given.
+            InputError: If the folder has files that jaxid did not make and `overwrite` is not given.
         """
         from jaxid.results.as_json import save_discovery
 

@@ -14,15 +14,15 @@ class Score:
     """Evidence of one candidate.
 
     Args:
-        candidate: Which.
+        candidate: The candidate that is scored.
         start: Index of its best start.
-        guess: Where its refit starts.
-        second: Where it starts too: of an effect in the drive, the start that by itself brings the
-            residual down most. A linear screen promises wonders of a start that touches few samples.
+        guess: Values from which its refit starts.
         evidence: Held-out gain in log-likelihood on the log [nats].
-        validation: The same on the validation logs; None without any.
-        theta: All unknowns of the union after its refit; None where it was only screened.
-        reason: Why it was turned down; empty where it was not.
+        second: Second values from which a refit starts: for a drive effect, the start that alone reduces the
+            residual most. A linear screen exaggerates the gain of a start that affects few samples.
+        validation: Gain in log-likelihood on the validation logs [nats]; None without any.
+        theta: All unknowns of the superset after its refit; None if it was only screened.
+        reason: Reason why it was rejected; empty if it was not.
     """
 
     candidate: cand.Candidate
@@ -35,6 +35,12 @@ class Score:
     reason: str = ""
 
     @property
+    def refitted(self) -> np.ndarray:
+        """All unknowns of the superset after the refit of a candidate that was refitted."""
+        assert self.theta is not None, "only screened"
+        return self.theta
+
+    @property
     def total(self) -> float:
-        """Evidence of log and validation together."""
+        """Evidence of log and validation logs together [nats]."""
         return self.evidence + (self.validation or 0.0)

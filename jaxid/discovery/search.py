@@ -1,4 +1,4 @@
-"""What is missing: score every candidate on held-out time, add the best, refit, repeat."""
+"""The search for missing effects: score every candidate on held-out time, add the best, refit, repeat."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from jaxid.discovery.selection import MODEST, margin, next_effect, shortlist, si
 from jaxid.logs.prepare import Prepared
 from jaxid.numerics.precision import NoiseModel
 
-# What the case has is gone where less than this part of it is left beside an effect.
+# An unknown of the case counts as displaced if an effect leaves less than this part of its value.
 _GONE = 1e-2
-# An effect that is there already goes where it closes less than this part of the gap: a third of
-# what it must close to be named.
+# An effect in the model is dropped if it closes less than this part of the gap: a third of the part that it
+# must close to be named.
 _SUPERFLUOUS = 0.05
-# Two effects are added at once where they close this part of the gap and gain more than the best
-# single one with any partner, by so many times what noise may, and by this part of what they gain.
-# An effect that keeps less than this part of what its linear screen promised is left out there.
+# Two effects are added at once if together they close `_MOST_OF_IT` of the gap, and gain more than the best
+# single effect with any partner, by `_CLEARLY` times the threshold of noise and by `_MUCH` of their gain. An
+# effect whose refit keeps less than `_KEPT` of its linear evidence takes no part in pairs.
 _CLEARLY = 3.0
 _KEPT = 0.5
 _MUCH = 0.33
@@ -32,17 +32,30 @@ _MOST_OF_IT = 0.5
 
 
 @dataclass(frozen=True)
-class Step:
-    """One round of the search.
+class Model:
+    """A model in the superset: the effects that act, and the values of all unknowns.
 
     Args:
-        added: What it added; None for the baseline and for a drop.
-        dropped: What it dropped.
-        scores: Of all candidates, best first.
+        added: Effects beside the baseline, in the order in which they were added.
+        theta: All unknowns of the superset; those of other candidates are neutral.
+    """
+
+    added: tuple[cand.Candidate, ...]
+    theta: np.ndarray
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the search.
+
+    Args:
+        added: Score of the added effect; None for the baseline and for a drop.
+        dropped: The effect that was dropped or replaced.
+        scores: Scores of all candidates, best first.
         threshold: Evidence that noise alone exceeds once in a thousand searches.
-        theta: All unknowns of the union after the step.
-        active: Indices of those that are fitted.
-        why: Reason for what was dropped, where it is not that it became superfluous.
+        theta: All unknowns of the superset after the step.
+        active: Indices of the fitted unknowns.
+        why: Reason for a drop, unless the effect became superfluous.
     """
 
     added: Score | None
@@ -56,282 +69,362 @@ class Step:
 
 @dataclass
 class Search:
-    """State of a search: the union, the logs, and what has been added so far.
+    """A search: the superset, the logs, and the current model.
 
     Args:
-        union: Machine with all candidates.
+        superset: Machine with all candidates.
         data: The log to fit, prepared.
-        floor: RMS force that the sensors' noise alone leaves, by joint.
-        colour: Of that noise, by joint.
-        validation: Logs that must confirm each effect.
-        progress: Called with a line at every stage.
-        added: Effects added, in order.
-        barred: Effects taken out for good.
+        floor: RMS force residual caused by the sensors' noise alone, by joint.
+        colour: Model of that noise, by joint.
+        validation: Logs that must confirm each effect, prepared.
+        progress: Called with a line of text at every stage.
+        barred: Effects that were taken out for good.
     """
 
-    union: cand.CandidateModel
+    superset: cand.CandidateModel
     data: Prepared
     floor: np.ndarray
     colour: tuple[NoiseModel, ...]
     validation: tuple[Prepared, ...] = ()
     progress: Callable[[str], None] = lambda text: None
-    added: list[cand.Candidate] = field(default_factory=list)
     barred: list[cand.Candidate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.worth = Acceptance(self.union, self.data, self.validation, self.floor, self.colour)
-        self.samples = self.worth.samples
-        self.theta = self.union.neutral
-        self._many: dict[tuple[str, int], list[cand.Point]] = {}
+        self.acceptance = Acceptance(self.superset, self.data, self.validation, self.floor, self.colour)
+        self.samples = self.acceptance.samples
+        self.model = Model((), self.superset.neutral)
+        self._grid_points: dict[tuple[str, int], list[cand.Point]] = {}
+        # The largest threshold so far, by which effects are dropped later.
         self._limit = 0.0
-        # All unknowns where nothing is added.
-        self._alone = self.theta
+        self._baseline = self.model.theta
+
+    @property
+    def added(self) -> tuple[cand.Candidate, ...]:
+        """Effects of the current model."""
+        return self.model.added
+
+    @property
+    def theta(self) -> np.ndarray:
+        """All unknowns of the current model."""
+        return self.model.theta
 
     @property
     def active(self) -> np.ndarray:
-        """Unknowns fitted now: the case's own and those of the effects added."""
-        return self._active(self.added)
+        """Indices of the unknowns that the current model fits: those of the case and of the added effects."""
+        return self.fitted_by(self.model.added)
 
-    def _active(self, effects: Sequence[cand.Candidate]) -> np.ndarray:
-        return np.concatenate([self.union.base, *[c.index for c in effects]]).astype(int)
+    def fitted_by(self, effects: Sequence[cand.Candidate]) -> np.ndarray:
+        """Return the indices of the unknowns that a model with some effects fits."""
+        return np.concatenate([self.superset.base, *[c.index for c in effects]]).astype(int)
 
-    def rest(self) -> list[cand.Candidate]:
-        """Candidates not added yet."""
-        gone = [*self.added, *self.barred]
-        return [c for c in self.union.candidates if all(c is not g for g in gone)]
+    def rest(self, model: Model | None = None) -> list[cand.Candidate]:
+        """Return the candidates that a model, by default the current one, may still get."""
+        gone = [*(self.model if model is None else model).added, *self.barred]
+        return [c for c in self.superset.candidates if all(c is not g for g in gone)]
 
-    def many(self, candidate: cand.Candidate) -> list[cand.Point]:
-        """A candidate at its many starts, computed once."""
+    def grid_points(self, candidate: cand.Candidate) -> list[cand.Point]:
+        """Linearise a candidate at its many starts; the result is kept, since no other effect enters it."""
         key = (candidate.kind, candidate.port)
-        if key not in self._many:
-            self._many[key] = cand.grid_points(self.union, candidate, self.samples)
-        return self._many[key]
+        if key not in self._grid_points:
+            self._grid_points[key] = cand.grid_points(self.superset, candidate, self.samples)
+        return self._grid_points[key]
 
     def run(self, most: int) -> list[Step]:
-        """Add effects until none is worth it; drop what becomes superfluous on the way."""
+        """Add effects until none is accepted, and drop those that become superfluous on the way.
+
+        Args:
+            most: Largest number of effects in the model.
+        """
         self.progress("fitting the baseline")
-        self.theta = self._alone = self._fit(self.theta, self.active)
-        return [Step(None, None, (), 0.0, self.theta, self.active), *self._grow(most)]
+        self._baseline = self._fit(self.model.theta, self.active)
+        self.model = Model((), self._baseline)
+        first = self._step(self.model)
+        self.model, steps = self._grow(self.model, most)
+        return [first, *steps]
 
     def bar(self, c: cand.Candidate, why: str, most: int) -> list[Step]:
-        """Take an effect out for good, and go on without it."""
-        theta = self.without(c)
-        self.barred, self.added = [*self.barred, c], [a for a in self.added if a is not c]
-        self.theta = theta
-        steps = [Step(None, c, (), 0.0, theta, self.active, why)]
-        # What was worth its place beside it need not be so alone.
-        steps += self._drop_superfluous(self._limit, self.added)
-        return [*steps, *self._grow(most)]
+        """Take an effect out for good, and continue the search without it.
 
-    def without(self, c: cand.Candidate) -> np.ndarray:
-        """All unknowns, those of one effect neutral and the others fitted again."""
-        active = self._active([a for a in self.added if a is not c])
-        theta = self._neutral(self.theta, c)
-        found = self._fit(theta, active)
-        now, alone = np.abs(theta[self.union.base]), np.abs(self._alone[self.union.base])
-        if np.all(now > _GONE * alone):
-            return found
-        # An effect that took over from what the case has, as a limit that all of the force exceeds: from
-        # next to nothing that does not come back.
-        theta[self.union.base] = self._alone[self.union.base]
-        return min((found, self._fit(theta, active)), key=self.worth.squares)
+        Args:
+            c: The effect, of the current model.
+            why: Reason, as in results.
+            most: Largest number of effects in the model.
+        """
+        model = self.without(self.model, c)
+        self.barred = [*self.barred, c]
+        first = self._step(model, dropped=c, why=why)
+        # An effect that was needed beside the barred one may be superfluous without it.
+        model, dropped = self._drop_superfluous(model, self._limit, model.added)
+        self.model, steps = self._grow(model, most)
+        return [first, *dropped, *steps]
 
-    def _grow(self, most: int) -> list[Step]:
+    def without(self, model: Model, c: cand.Candidate) -> Model:
+        """Return a model without one of its effects, the other unknowns fitted again."""
+        added = tuple(a for a in model.added if a is not c)
+        active = self.fitted_by(added)
+        theta = model.theta.copy()
+        theta[c.index] = c.neutral
+        refitted = self._fit(theta, active)
+
+        base = self.superset.base
+        if np.all(np.abs(theta[base]) > _GONE * np.abs(self._baseline[base])):
+            return Model(added, refitted)
+        # The effect displaced an unknown of the case, for instance as a limit that all of the force exceeds.
+        # A fit does not return from values near zero: try a start from the baseline too.
+        theta[base] = self._baseline[base]
+        return Model(added, min((refitted, self._fit(theta, active)), key=self.acceptance.squares))
+
+    def _grow(self, model: Model, most: int) -> tuple[Model, list[Step]]:
+        """Add effects to a model until none is accepted, it has the most, or a set of effects recurs."""
         steps: list[Step] = []
-        tried = {frozenset(id(c) for c in self.added)}
+        tried = {frozenset(id(c) for c in model.added)}
         while True:
-            best, scores, limit = self.best(ahead=len(self.added) + 2 <= most)
+            best, scores, limit = self.best(model, ahead=len(model.added) + 2 <= most)
             self._limit = max(self._limit, limit)
-            if not best or len(self.added) >= most:
-                steps.append(Step(None, None, scores, limit, self.theta, self.active))
-                return steps
+            if not best or len(model.added) >= most:
+                steps.append(self._step(model, scores=scores, threshold=limit))
+                return model, steps
+
             for score in best:
-                self.added = [*self.added, score.candidate]
-                self.theta = score.theta
-                steps.append(Step(score, None, scores, limit, self.theta, self.active))
-            steps.extend(self._drop_superfluous(limit, self.added[:-1]))
-            now = frozenset(id(c) for c in self.added)
-            if now in tried:  # added and dropped in turn
-                return steps
+                model = Model((*model.added, score.candidate), score.refitted)
+                steps.append(self._step(model, added=score, scores=scores, threshold=limit))
+            model, dropped = self._drop_superfluous(model, limit, model.added[:-1])
+            steps.extend(dropped)
+
+            now = frozenset(id(c) for c in model.added)
+            if now in tried:  # effects are added and dropped in turn
+                return model, steps
             tried.add(now)
 
     def best(
-        self, near: float = 0.0, own: cand.Candidate | None = None, *, ahead: bool = False
+        self, model: Model, near: float = 0.0, replaced: cand.Candidate | None = None, *, ahead: bool = False
     ) -> tuple[tuple[Score, ...], tuple[Score, ...], float]:
-        """Screen all candidates, refit the most promising, choose; and all scores.
+        """Screen all candidates, refit the most promising, and choose.
 
         Args:
-            ahead: Look at two effects together too, and choose both where one alone would mislead.
-            near: Only those are refitted whose screened evidence reaches this part of the best's,
-                or of `own`'s.
-            own: The effect that is to be replaced.
+            model: The model to extend.
+            near: Candidates are refitted only if their screened evidence reaches this part of the best one's,
+                or of that of `replaced`.
+            replaced: The effect that was taken out of the model, if a replacement is sought.
+            ahead: True to examine pairs of effects too, and choose both if a single one would mislead.
+
+        Returns:
+            The chosen scores (none, one or two), all scores, and the threshold of noise.
         """
-        if self.worth.at_floor(self.theta):
+        if self.acceptance.at_floor(model.theta):
             return (), (), 0.0
-        self.progress(f"screening {len(self.rest())} effects")
-        screened = screen_candidates(self, ahead=ahead)
-        # A linear screen may promise far more of an effect than a refit then finds.
-        judged = [s for s in screened.scores if own is None or s.candidate is own]
-        top = max((s.evidence for s in judged), default=0.0)
+        self.progress(f"screening {len(self.rest(model))} effects")
+        screened = screen_candidates(self, model, ahead=ahead)
+
+        # A linear screen may promise far more than a refit then gains: the effect itself is the measure.
+        compared = [s for s in screened.scores if replaced is None or s.candidate is replaced]
+        top = max((s.evidence for s in compared), default=0.0)
         least = max(0.5 * screened.threshold, near * top)
         promising = [s for s in screened.scores if s.evidence > least]
         refitted = []
         for score in shortlist(promising):
             self.progress(f"refitting with {score.candidate.label}")
-            refitted.append(self._refit(score, screened))
+            refitted.append(self._refit(model, score, screened))
         refitted.sort(key=lambda s: -s.total)
         rest = [s for s in screened.scores if all(s.candidate is not r.candidate for r in refitted)]
+
         promised = {id(s.candidate): s.evidence for s in promising}
-        # The threshold's surrogates are not refitted. Few starts need the refit; what has a start
-        # everywhere must pass as they do.
-        passed = lambda s: min(s.evidence, promised[id(s.candidate)] if s.candidate.has_grid else np.inf)
+
+        # The surrogates of the threshold are not refitted. A candidate with few starts needs the refit; one
+        # with a start everywhere must exceed the threshold as the surrogates do, without it.
+        def passed(s: Score) -> float:
+            return min(s.evidence, promised[id(s.candidate)] if s.candidate.has_grid else np.inf)
+
         good = [s for s in refitted if not s.reason and passed(s) > screened.threshold]
         one = next_effect(good)
         broken = [s.candidate for s in refitted if s.evidence < _KEPT * promised[id(s.candidate)]]
-        two = self._two(screened, one, broken) if ahead else ()
+        two = self._two(model, screened, one, broken) if ahead else ()
         return two or ((one,) if one else ()), (*refitted, *rest), screened.threshold
 
-    def _two(self, screened: Screen, one: Score | None, broken: list[cand.Candidate]) -> tuple[Score, ...]:
-        """Two effects to add at once, where they explain far more than one with any partner."""
-        c = one.candidate if one else None
-        reached = screened.pairs.with_partner(c.kind, c.port) if c else screened.threshold
-        e, jacobian = cand.evaluate(self.union, self.samples, self.theta, self.active)
-        for *pair, gained in screened.pairs.best(broken):
+    def _two(
+        self, model: Model, screened: Screen, one: Score | None, broken: list[cand.Candidate]
+    ) -> tuple[Score, ...]:
+        """Choose two effects to add at once, if they explain far more than one with any partner."""
+        pairs = screened.pairs
+        assert pairs is not None, "screened ahead"
+        reached = screened.threshold
+        if one is not None:
+            reached = pairs.with_partner(one.candidate.kind, one.candidate.port)
+        active = self.fitted_by(model.added)
+        e, jacobian = cand.evaluate(self.superset, self.samples, model.theta, active)
+
+        for *points, gained in pairs.best(broken):
             if gained < reached + max(_CLEARLY * screened.threshold, _MUCH * gained):
                 return ()
-            guess = guess_pair(pair, screened, jacobian[..., self.active], e, self)
+            guess = guess_pair(points, screened, jacobian[..., active], e, self)
             if guess is None:
                 continue
-            self.progress("refitting with " + " and ".join(p.candidate.label for p in pair))
-            first, second = (Score(p.candidate, p.start, g, 0.0) for p, g in zip(pair, guess, strict=True))
-            both = self._refit(second, screened, beside=first)
-            old, new = (self.worth.residual(t) for t in (self.theta, both.theta))
-            enough = self.worth.closed(old, new) > _MOST_OF_IT and (one is None or both.total > one.total)
+            self.progress("refitting with " + " and ".join(p.candidate.label for p in points))
+            first, second = (Score(p.candidate, p.start, g, 0.0) for p, g in zip(points, guess, strict=True))
+            both = self._refit(model, second, screened, beside=first)
+            old, new = (self.acceptance.residual(t) for t in (model.theta, both.refitted))
+            enough = self.acceptance.closed(old, new) > _MOST_OF_IT and (
+                one is None or both.total > one.total
+            )
             if enough and not both.reason:
-                left = replace(self._refit(first, screened), reason="")
-                right = self._refit(second, screened)
-                # The first is added alone; each counts by what is lost without it.
-                added = replace(_after(both, right), **_place(left)), _after(both, left)
+                only_first = replace(self._refit(model, first, screened), reason="")
+                only_second = self._refit(model, second, screened)
+                # The first is added alone; the evidence of each is the loss without it.
+                added = (
+                    replace(
+                        only_first,
+                        evidence=both.evidence - only_second.evidence,
+                        validation=_difference(both.validation, only_second.validation),
+                    ),
+                    replace(
+                        both,
+                        evidence=both.evidence - only_first.evidence,
+                        validation=_difference(both.validation, only_first.validation),
+                    ),
+                )
                 if min(s.evidence for s in added) > screened.threshold:
                     return added
         return ()
 
     def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:
-        """For each effect added, those that could stand in its place without loss.
+        """Find, for each added effect, those that could replace it without loss.
 
-        Each effect is taken out and all are scored against the rest. A stand-in that closes
-        relevantly more of the gap without more parameters, or as much with fewer, takes its place.
+        Each effect is taken out, and all candidates are scored against the rest. A candidate takes its place
+        if it closes relevantly more of the gap without more parameters, or as much with fewer.
+
+        Args:
+            steps: Steps of the search; each replacement is appended.
+
+        Returns:
+            Equivalent effects by index of the added effect.
         """
-        found: dict[int, tuple[Score, ...]] = {}
-        for k in range(len(self.added)):
-            own = self.added[k]
-            self.progress(f"looking for what could replace {own.label}")
-            kept, theta = list(self.added), self.theta
-            self.theta = self.without(own)
-            self.added = [c for c in kept if c is not own]
-            _, scores, limit = self.best(MODEST, own)
+        out: dict[int, tuple[Score, ...]] = {}
+        for k in range(len(self.model.added)):
+            model, named = self.model, self.model.added[k]
+            self.progress(f"searching for a replacement of {named.label}")
+            _, scores, limit = self.best(self.without(model, named), MODEST, named)
             good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
-            self.added, self.theta = kept, theta
-            mine = next((s for s in scores if s.candidate is own), None)
-            if not good or mine is None:
-                found[k] = ()
+            current = next((s for s in scores if s.candidate is named), None)
+            if not good or current is None:
+                out[k] = ()
                 continue
-            if mine.theta is None:  # others promised more, and it was not refitted: it stands where it stood
-                mine = replace(mine, theta=theta)
-            best, ties = simplest_equivalent(good, self._undecided)
-            if best.candidate is not own and self._takes_over(best, mine, own):
-                self.added = [best.candidate if c is own else c for c in kept]
-                self.theta = self._fit(best.theta, self.active)
-                steps.append(Step(best, own, scores, limit, self.theta, self.active))
-            elif best.candidate is not own:
-                ties = (best, *ties) if self._equal(mine, best) else ()
-            found[k] = tuple(s for s in ties if s.candidate is not self.added[k])
-        return found
+            if current.theta is None:  # others promised more, and it was not refitted: keep its values
+                current = replace(current, theta=model.theta)
 
-    def _takes_over(self, best: Score, mine: Score, own: cand.Candidate) -> bool:
-        """Whether a stand-in is as good with fewer parameters, or closes relevantly more.
+            best, ties = simplest_equivalent(good, self._chance_difference)
+            if best.candidate is not named and self._takes_over(model, best, current):
+                added = tuple(best.candidate if c is named else c for c in model.added)
+                self.model = Model(added, self._fit(best.refitted, self.fitted_by(added)))
+                steps.append(
+                    self._step(self.model, added=best, dropped=named, scores=scores, threshold=limit)
+                )
+            elif best.candidate is not named:
+                ties = (best, *ties) if self._equal(current, best) else ()
+            out[k] = tuple(s for s in ties if s.candidate is not self.model.added[k])
+        return out
 
-        One with more parameters has had its chance beside what is there, in the rounds before.
+    def _takes_over(self, model: Model, best: Score, current: Score) -> bool:
+        """Check that a candidate is as good with fewer parameters, or closes relevantly more of the gap.
+
+        One with more parameters could be added beside the current effect in the rounds before.
         """
-        more = len(best.candidate.index) - len(own.index)
-        if more > 0 or self._equal(mine, best):
+        more = len(best.candidate.index) - len(current.candidate.index)
+        if more > 0 or self._equal(current, best):
             return more < 0
-        now, then = self.worth.residual(self.theta), self.worth.residual(best.theta)
-        return self.worth.closed(now, then) > RELEVANT
+        old, new = self.acceptance.residual(model.theta), self.acceptance.residual(best.refitted)
+        return self.acceptance.closed(old, new) > RELEVANT
 
-    def _undecided(self, one: Score, two: Score) -> float:
-        """Difference in evidence of two fits that chance may make [nats]: two deviations of it."""
-        # Where one is true, its gain scatters about what is expected with twice that as variance.
-        return 2 * np.sqrt(2 * self.worth.apart(one.theta, two.theta))
+    def _chance_difference(self, one: Score, two: Score) -> float:
+        """Return the difference in evidence of two fits that chance may cause: two deviations [nats]."""
+        # If one is true, its gain scatters about the expected gain with a variance of twice that gain.
+        return 2 * np.sqrt(2 * self.acceptance.divergence(one.refitted, two.refitted))
 
-    def _equal(self, mine: Score, best: Score) -> bool:
-        return mine.total > best.total - max(margin(best), self._undecided(best, mine))
+    def _equal(self, current: Score, best: Score) -> bool:
+        """Check that an effect explains the log as well as the best one."""
+        return current.total > best.total - max(margin(best), self._chance_difference(best, current))
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
-        return cand.refine(self.union, self.samples, theta, active)[0]
+        """Fit the active unknowns to the log, from and beside the others."""
+        return cand.refine(self.superset, self.samples, theta, active)[0]
 
-    def _neutral(self, theta: np.ndarray, c: cand.Candidate) -> np.ndarray:
-        theta = theta.copy()
-        theta[c.index] = c.neutral
-        return theta
+    def _step(
+        self,
+        model: Model,
+        *,
+        added: Score | None = None,
+        dropped: cand.Candidate | None = None,
+        scores: tuple[Score, ...] = (),
+        threshold: float = 0.0,
+        why: str = "",
+    ) -> Step:
+        """Record a step of the search that ends at a model."""
+        return Step(
+            added=added,
+            dropped=dropped,
+            scores=scores,
+            threshold=threshold,
+            theta=model.theta,
+            active=self.fitted_by(model.added),
+            why=why,
+        )
 
-    def _refit(self, score: Score, screened: Screen, beside: Score | None = None) -> Score:
+    def _refit(self, model: Model, score: Score, screened: Screen, beside: Score | None = None) -> Score:
+        """Refit a model with one more effect, or with two, and score the gain."""
         new = [s for s in (beside, score) if s is not None]
-        active = self._active([*self.added, *[s.candidate for s in new]])
+        active = self.fitted_by([*model.added, *[s.candidate for s in new]])
         fits = []
         for guesses in itertools.product(*[_starts(s) for s in new]):
-            theta = self.theta.copy()
+            theta = model.theta.copy()
             for s, guess in zip(new, guesses, strict=True):
                 theta[s.candidate.index] = guess
             fits.append(self._fit(theta, active))
-        theta = min(fits, key=self.worth.squares)
-        e, jacobian = cand.evaluate(self.union, self.samples, theta, active)
+        theta = min(fits, key=self.acceptance.squares)
+
+        e, jacobian = cand.evaluate(self.superset, self.samples, theta, active)
         after = screened.held_out(e, jacobian[..., active])
         drive = any(not s.candidate.amplitude.any() for s in new)
         if drive:
-            after = after / (1 - self.worth.swallowed(self.samples, self.theta, theta))
+            after = after / (1 - self.acceptance.absorbed_noise(self.samples, model.theta, theta))
         gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
-        validation, confirmed = self.worth.confirmed(self.theta, theta, drive=drive)
+
+        validation, confirmed = self.acceptance.confirmed(model.theta, theta, drive=drive)
         index = np.concatenate([s.candidate.index for s in new])
-        reason = self.worth.objection(index, self.theta, theta, validation, confirmed, len(active))
+        reason = self.acceptance.objection(index, model.theta, theta, validation, confirmed, len(active))
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
 
-    def _drop_superfluous(self, limit: float, of: Sequence[cand.Candidate]) -> list[Step]:
-        """Drop effects whose loss costs less than noise, or less than is relevant."""
+    def _drop_superfluous(
+        self, model: Model, limit: float, effects: Sequence[cand.Candidate]
+    ) -> tuple[Model, list[Step]]:
+        """Drop those of some effects whose loss is below the noise, or below what is relevant."""
         steps = []
-        for c in of:
-            left = [a for a in self.added if a is not c]
-            theta = self.without(c)
-            if not self._costs(theta, self._active(left), limit):
-                self.added, self.theta = left, theta
-                steps.append(Step(None, c, (), limit, theta, self.active))
-        return steps
+        for c in effects:
+            smaller = self.without(model, c)
+            if not self._costs(model, smaller, limit):
+                model = smaller
+                steps.append(self._step(model, dropped=c, threshold=limit))
+        return model, steps
 
-    def _costs(self, theta: np.ndarray, active: np.ndarray, limit: float) -> bool:
-        """Whether a smaller model is worse by more than noise and by what is relevant."""
-        e, jacobian = cand.evaluate(self.union, self.samples, self.theta, self.active)
-        now = Screen.of(ev.Whitener.of(e, self.samples.moving, self.colour), e, jacobian[..., self.active])
-        less, jacobian = cand.evaluate(self.union, self.samples, theta, active)
-        after = now.held_out(less, jacobian[..., active])
+    def _costs(self, model: Model, smaller: Model, limit: float) -> bool:
+        """Check that a smaller model is worse than a model by more than noise and by a relevant part."""
+        active, remaining = self.fitted_by(model.added), self.fitted_by(smaller.added)
+        e, jacobian = cand.evaluate(self.superset, self.samples, model.theta, active)
+        whitener = ev.Whitener.of(e, self.samples.moving, self.colour)
+        now = Screen.of(whitener, e, jacobian[..., active])
+
+        less, jacobian = cand.evaluate(self.superset, self.samples, smaller.theta, remaining)
+        after = now.held_out(less, jacobian[..., remaining])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
-        return lost > limit and self.worth.closed(less, e) > _SUPERFLUOUS
+        return lost > limit and self.acceptance.closed(less, e) > _SUPERFLUOUS
 
 
 def _starts(score: Score) -> list[np.ndarray]:
-    """Where a refit of a candidate starts: once or twice."""
+    """Return the one or two starts of a candidate's refit."""
     second = score.second
     if second is None or np.array_equal(second, score.guess):
         return [score.guess]
     return [score.guess, second]
 
 
-def _after(both: Score, one: Score) -> Score:
-    """What two effects gain over one of them."""
-    validation = None if both.validation is None else both.validation - one.validation
-    return replace(both, evidence=both.evidence - one.evidence, validation=validation)
-
-
-def _place(score: Score) -> dict:
-    """All of a score but what it gained."""
-    names = ("candidate", "start", "guess", "second", "theta", "reason")
-    return {n: getattr(score, n) for n in names}
+def _difference(both: float | None, one: float | None) -> float | None:
+    """Return the gain of two effects over that of one of them; None without validation logs."""
+    return None if both is None or one is None else both - one

@@ -1,4 +1,4 @@
-"""Which effects a machine might be missing, where, and the plant that has them all."""
+"""The superset: effects that a machine might be missing, at each place, and the plant with all of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from jaxid.simulation.force_balance import ForceData, sharpened, whole_motion
 
 
 def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
-    """How large the quantities of a prepared log are, by port of a plant."""
+    """Compute the scales of motion and force in a prepared log, by port of a plant."""
     y, yd, ydd = (np.asarray(a) for a in _port_motion(plant, ForceData.of(data)))
     n, drives = data.q.shape[1], data.force.shape[1]
     force = data.force - np.mean(data.force, axis=0)
@@ -33,25 +33,25 @@ def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
     def rms(x: np.ndarray) -> float:
         return float(np.sqrt(np.mean(x**2)))
 
-    found = []
+    scales = []
     for port in range(y.shape[1]):
         rows = data.moving[:, port] if port < n else data.moving.any(axis=1)
         v, a = data.at_kept(yd)[rows, port], data.at_kept(ydd)[rows, port]
         drive = plant.drive_of(port, drives) if len(v) else None
-        own = slice(None) if drive is None else slice(drive, drive + 1)
-        found.append(
+        drive_columns = slice(None) if drive is None else slice(drive, drive + 1)
+        scales.append(
             Scales(
                 position=float(np.ptp(y[:, port]) / 2),
                 velocity=rms(v) if len(v) else 0.0,
                 acceleration=rms(a) if len(v) else 0.0,
-                force=rms(force[:, own]),
+                force=rms(force[:, drive_columns]),
                 peak_velocity=float(np.abs(v).max(initial=0.0)),
-                peak_force=float(np.abs(data.force[:, own]).max()),
+                peak_force=float(np.abs(data.force[:, drive_columns]).max()),
                 period=data.period,
                 duration=data.period * len(data.q),
             )
         )
-    return tuple(found)
+    return tuple(scales)
 
 
 @eqx.filter_jit
@@ -63,15 +63,15 @@ def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
 def build_candidate_model(
     machine: Machine, data: Prepared, effects: Sequence[type[Effect]] | None = None
 ) -> CandidateModel:
-    """Add every effect that the plant does not have yet, at every joint and spring that suits it.
+    """Add every effect that the plant does not have yet, at every joint and spring that accepts it.
 
     Args:
         machine: The baseline.
         data: The log to be searched, for scales.
-        effects: Those that it might be missing; default all but those on request.
+        effects: Effects to add; default all except those on request.
 
     Raises:
-        InputError: If an effect that is not jaxid's own cannot be searched for.
+        InputError: If a user-defined effect cannot be searched for.
     """
     if effects is None:
         effects = [cls for cls in EFFECTS.values() if not cls.on_request]
@@ -79,7 +79,8 @@ def build_candidate_model(
     plant, parameters = machine.plant, machine.parameters
     base = np.arange(len(parameters.free))
     candidates = []
-    # Kind by kind, so that the effects of one kind are traced as one.
+
+    # Kind by kind, so that the effects of one kind are traced together.
     for cls in effects:
         ports = [i for i, s in enumerate(scales) if s.velocity > 0.0 and _missing(machine, cls, i, data)]
         if ports and is_user_effect(cls):
@@ -90,43 +91,44 @@ def build_candidate_model(
             first = len(parameters.free)
             parameters = parameters.extended(free)
             index = np.arange(first, first + len(free))
-            where = label(plant, cls.kind, port)
-            candidates.append(_candidate(cls, where, port, index, scales[port]))
-    union = machine.with_plant(sharpened(plant, data), parameters)
+            place = label(plant, cls.kind, port)
+            candidates.append(_candidate(cls, place, port, index, scales[port]))
+
+    superset = machine.with_plant(sharpened(plant, data), parameters)
     enters = _enters(plant, parameters, data.q.shape[1], data.force.shape[1])
-    return CandidateModel(union, base, tuple(candidates), enters, colours(enters))
+    return CandidateModel(superset, base, tuple(candidates), enters, colours(enters))
 
 
 def _enters(plant: Plant, parameters: Parameters, joints: int, drives: int) -> Bool[np.ndarray, "n p"]:
-    """Which unknowns stand in the balance of which joints, as far as the plant says."""
+    """Return which unknowns occur in the balance of which joints, as declared by the plant."""
     enters = np.ones((joints, len(parameters.free)), bool)
     undriven = [i for i in range(joints) if plant.drive_of(i, drives) is None]
     for k, f in enumerate(parameters.free):
         if f.path[0] != "effects":
             continue
-        effect = plant.effects[f.path[1]]
-        if is_user_effect(type(effect)):  # it may act on the drive without saying so
+        effect = plant.effects[int(f.path[1])]
+        if is_user_effect(type(effect)):  # it may act on the drive without declaring it
             continue
-        # The scale of forces where no drive is follows all drives.
+        # Joints without a drive scale their forces by all drives.
         rows = [*plant.joints_loaded_by(effect.port, joints), *(undriven if effect.in_drive else [])]
         enters[:, k] = np.isin(np.arange(joints), rows)
     return enters
 
 
 def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> bool:
-    """Whether a port may lack an effect: one that it does not have yet, nor by another name."""
+    """Check that a port may lack an effect: it has none of its kind, nor an equivalent parameter."""
     plant = machine.plant
     if not plant.accepts(cls, port, data.force.shape[1]):
         return False
-    twin = plant.equivalent_parameter(cls, port)
-    fitted = twin is not None and any(
-        f.path == (twin[0],) and f.index == twin[1] for f in machine.parameters.free
+    equivalent = plant.equivalent_parameter(cls, port)
+    fitted = equivalent is not None and any(
+        f.path == (equivalent[0],) and f.index == equivalent[1] for f in machine.parameters.free
     )
     return not fitted and all(e.kind != cls.kind or e.port != port for e in plant.effects)
 
 
 def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[Free]:
-    """Unknowns within the bounds that a search keeps."""
+    """Bound unknowns by the limits of a search."""
     out = []
     for f in free:
         lower, upper = limits.get(f.name.rpartition(".")[2], (-np.inf, np.inf))
@@ -134,15 +136,16 @@ def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[F
     return out
 
 
-def _candidate(cls: type[Effect], where: str, port: int, index: np.ndarray, scales: Scales) -> Candidate:
+def _candidate(cls: type[Effect], place: str, port: int, index: np.ndarray, scales: Scales) -> Candidate:
+    """Describe one effect at one port as a candidate."""
     neutral, infos = cls.neutral(scales), parameters_of(cls)
     names = [n for n in infos if n in neutral]
     return Candidate(
-        cls.kind,
-        where,
-        port,
-        index,
-        np.asarray([neutral[n] for n in names], float),
-        np.asarray([[s[n] for n in names] for s in cls.starts(scales)], float),
-        np.asarray([cls.adds_force and carries_force(infos[n]) for n in names]),
+        kind=cls.kind,
+        label=place,
+        port=port,
+        index=index,
+        neutral=np.asarray([neutral[n] for n in names], float),
+        starts=np.asarray([[s[n] for n in names] for s in cls.starts(scales)], float),
+        amplitude=np.asarray([cls.adds_force and carries_force(infos[n]) for n in names]),
     )

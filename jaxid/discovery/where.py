@@ -1,7 +1,7 @@
-"""Where simulation and measurement part, explained without any physics.
+"""The region in which simulation and measurement differ, found without any physics.
 
-The residual is regressed on one variable at a time with a curve of no particular form, and scored
-like any candidate: on held-out time, against surrogates.
+The residual is regressed on one variable at a time with a curve of arbitrary shape. The curve is scored as
+candidates are: on held-out blocks of time, against surrogates.
 """
 
 from __future__ import annotations
@@ -18,23 +18,25 @@ from jaxid.logs.prepare import Prepared
 from jaxid.model.plant import Plant
 from jaxid.numerics.precision import NoiseModel
 
+# Knots of the curve, at quantiles of the variable.
 _KNOTS = 12
-# A window of this many samples is loud where its energy exceeds the median's by this factor: in
-# noise of one level that happens less than once in 10^9 windows.
+# A window of this many samples is loud if its energy exceeds the median's by this factor: in stationary noise
+# that happens less than once in 10^9 windows. It must also reach this part of the loudest window's energy.
 _WINDOW = 20
 _LOUD = 8.0
 _QUIET = 0.02
-# Measured acceleration and force carry the noise that the residual is made of, and a loop echoes
-# in them whatever disturbs it: the residual depends on them even where they are not its cause. They
-# describe, where they explain so much more than all else does, but decide nothing.
-_OWN_NOISE = ("acceleration", "force")
+# Measured acceleration and force carry the noise of the residual, and a feedback loop passes disturbances on
+# to them: the residual depends on them even if they are not its cause. One of them is named if it explains
+# more than the other variables by this factor, but it never decides if the residual is significant.
+_NOISY = ("acceleration", "force")
 _FAR_MORE = 2.0
-# Intervals say where a residual lies if they hold most of its sum of squares.
+# Intervals of time are named if they hold at least this part of the residual's sum of squares, and more than
+# this factor times the part that a curve over the motion explains, at most the last value.
 _MOSTLY = 0.5
-_SAYS_MORE = 2.0
+_CURVE_FACTOR = 2.0
 _NEARLY_ALL = 0.95
-# A spectral line must carry this part of the variance, and stand above the median of its
-# neighbours by a factor that white noise exceeds once in 10^8.
+# A spectral line must carry this part of the variance, and exceed the median of its neighbours by a factor
+# that white noise exceeds once in 10^8.
 _LINE_PART = 0.05
 _LINE_FACTOR = 25.0
 
@@ -44,17 +46,17 @@ class Where:
     """Region and intervals in which a residual lies.
 
     Args:
-        joint: 1-based.
-        variable: What the residual depends on most.
-        region: Range of that variable in which it is largest.
-        intervals: Times in which it is loud [s].
-        text: The same in words.
+        joint: Joint of the residual, counted from 1.
+        variable: Variable on which the residual depends most.
+        region: Range of that variable in which the residual is largest.
+        intervals: Intervals of time in which the residual is loud [s].
+        text: The finding as a sentence.
         explained: Part of the residual's variance that the variable explains on held-out time.
         evidence: Held-out gain in log-likelihood [nats].
-        threshold: What noise alone exceeds once in a thousand.
-        clear: Whether position, elongation, velocity or time explain more than that.
-        x, mean, low, high: The curve and its 95 % band, in force.
-        frequency_hz: Of a spectral line; None without one.
+        threshold: Evidence that noise alone exceeds once in a thousand logs [nats].
+        clear: Whether position, elongation, velocity or time exceed that threshold.
+        x, mean, low, high: The curve over the variable and its 95 % band, in units of force.
+        frequency_hz: Frequency of a spectral line; None without one.
     """
 
     joint: int
@@ -74,7 +76,7 @@ class Where:
 
     @property
     def significant(self) -> bool:
-        """Whether anything but noise is there."""
+        """True if the residual holds more than noise."""
         loud = bool(self.intervals) and self.variable == "time"
         return self.clear or self.frequency_hz is not None or loud
 
@@ -82,18 +84,19 @@ class Where:
 def variables(
     data: Prepared, joint: int, plant: Plant | None = None
 ) -> dict[str, Float[np.ndarray, " kept"]]:
-    """What a residual may depend on, at the kept samples.
+    """Collect the variables on which a residual may depend, at the kept samples.
 
     Args:
         data: The prepared log.
-        joint: 0-based.
-        plant: Its springs stretch by more than one position, and not every joint need have a drive;
-            left out: an axis.
+        joint: Index of the joint, from 0.
+        plant: Adds elongations of springs, and knows which joints have a drive; None: a single axis.
     """
     v = data.at_kept(data.qd)[:, joint]
     time = data.times
+    # Time of the last reversal at every sample.
     flips = np.flatnonzero(np.diff(np.sign(v)) != 0)
     last = np.maximum.accumulate(np.where(np.isin(np.arange(len(v)), flips + 1), time, time[0]))
+
     drive = 0 if plant is None else plant.drive_of(joint, data.force.shape[1])
     force = {} if drive is None else {"force": data.at_kept(data.force)[:, drive]}
     return {
@@ -110,11 +113,12 @@ def variables(
 def _elongations(
     plant: Plant, q: Float[np.ndarray, "kept n"], joint: int
 ) -> dict[str, Float[np.ndarray, " kept"]]:
-    """Of the springs between a joint and another; of one to a wall it is the position."""
+    """Return the elongations of springs between two joints; that of a spring to a wall is the position."""
     n = q.shape[1]
     if plant.springs(n) == 0:
         return {}
-    ports, slope = np.asarray(jax.vmap(plant.ports)(q)), np.asarray(jax.jacfwd(plant.ports)(q[0]))
+    ports = np.asarray(jax.vmap(plant.ports)(q))
+    slope = np.asarray(jax.jacfwd(plant.ports)(q[0]))
     between = [k for k in range(n, ports.shape[1]) if slope[k, joint] and np.count_nonzero(slope[k]) > 1]
     return {f"elongation of spring {k - n + 1}": ports[:, k] for k in between}
 
@@ -131,18 +135,18 @@ def locate(
 
     Args:
         residual: Measured minus modelled force at the kept samples.
-        jacobian: Of the residual in the model's unknowns: what they can absorb does not count.
+        jacobian: Derivatives of the residual in the model's unknowns; what these can absorb does not count.
         data: The prepared log.
-        colour: Of the noise that the sensors leave, by joint.
-        wanted: Velocity of the reference at the kept samples; absent: unknown.
-        plant: As `variables` takes it.
+        colour: Noise expected from the sensors, by joint.
+        wanted: Velocity of the reference at the kept samples; None: the measured velocity.
+        plant: The plant, as in `variables`.
     """
     wanted = data.at_kept(data.qd) if wanted is None else wanted
-    found = [
+    by_joint = [
         _locate(residual[:, i], jacobian[:, i], data, colour[i], wanted[:, i], i, plant)
         for i in range(residual.shape[1])
     ]
-    return max(found, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
+    return max(by_joint, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
 
 
 def _locate(
@@ -154,51 +158,63 @@ def _locate(
     joint: int,
     plant: Plant | None,
 ) -> Where:
+    """Find the variable that explains most of the residual of one joint."""
     counts = data.moving[:, joint]
     named = variables(data, joint, plant)
-    hats = {name: _hats(x, counts) for name, x in named.items()}
+    gains, limit = _gains(e, jacobian, named, counts, colour)
+    clean = max((n for n in gains if n not in _NOISY), key=lambda n: gains[n])
+    explained = _explained(gains[clean], counts)
+    clear = gains[clean] > limit
+
+    intervals = _loud(e, counts, data)
+    # A fitted colour would whiten a line away; the colour expected from the sensors keeps it.
+    sensors = ev.Whitener((colour,), counts[:, None])
+    line, part = _spectral_line(_unexplained(sensors, e, jacobian), sensors, data, wanted)
+    # A line or intervals are named only if they explain more than position or velocity do.
+    line = line if part > explained else None
+
+    # A curve over the motion is more informative than the times at which it is far from zero.
+    over_motion = clear and not clean.startswith("time")
+    needed = min(_CURVE_FACTOR * explained, _NEARLY_ALL) if over_motion else explained
+    if line is not None or _share_inside(e, counts, data, intervals) > max(needed, _MOSTLY):
+        best = "time"
+    else:
+        best = _best(gains, clean)
+    return _describe(e, counts, named[best], best, joint, gains[best], limit, clear, intervals, line)
+
+
+def _gains(
+    e: np.ndarray, jacobian: np.ndarray, named: dict[str, np.ndarray], counts: np.ndarray, colour: NoiseModel
+) -> tuple[dict[str, float], float]:
+    """Compute the held-out evidence of a curve over each variable, and the threshold of noise [nats]."""
+    hats = {name: _hat_functions(x, counts) for name, x in named.items()}
     every = np.concatenate(list(hats.values()), axis=1)
     whitener, _ = fit_whitener(e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,))
     blocks = whitener.blocks()
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])
-    # Of the residual itself: what curves of six variables leave of it would look too quiet.
-    left = _beyond(whitener, e, jacobian)
+
+    # Surrogates of the residual itself: the remainder after curves of six variables would be too small.
+    remainder = _unexplained(whitener, e, jacobian)
     rng = np.random.default_rng(20240501)
-    surrogates = ev.flipped(left, ev.stretch(len(left)), 100, rng)
-    before = _held(base, np.concatenate([white, surrogates], axis=1), blocks)
-    largest, gains = np.full(100, -np.inf), {}
+    surrogates = ev.flipped(remainder, ev.stretch(len(remainder)), 100, rng)
+
+    before = _held_out(base, np.concatenate([white, surrogates], axis=1), blocks)
+    largest = np.full(100, -np.inf)
+    gains = {}
     for name, hat in hats.items():
         both = np.concatenate([base, _independent(whitener(hat[:, None]))], axis=1)
-        after = _held(both, np.concatenate([white, surrogates], axis=1), blocks)
+        after = _held_out(both, np.concatenate([white, surrogates], axis=1), blocks)
         gain = ev.log_evidence(len(blocks), before, after)
         gains[name] = float(gain[0])
-        if name not in _OWN_NOISE:
+        if name not in _NOISY:
             largest = np.maximum(largest, gain[1:])
-    intervals = _loud(e, counts, data)
-    # A fitted colour would whiten a line away; the sensors' own leaves it standing.
-    sensors = ev.Whitener((colour,), counts[:, None])
-    line, part = _line(_beyond(sensors, e, jacobian), sensors, data, wanted)
-    limit = ev.threshold(largest)
-    # Position or velocity that explain more say more than a line in the spectrum, or than intervals.
-    clean = max((n for n in gains if n not in _OWN_NOISE), key=lambda n: gains[n])
-    explained = _explained(gains[clean], counts)
-    line = line if part > explained else None
-    clear = gains[clean] > limit
-    # A curve over the motion says more than the times at which it is far from zero.
-    over_motion = clear and not clean.startswith("time")
-    said = min(_SAYS_MORE * explained, _NEARLY_ALL) if over_motion else explained
-    if line is not None or _share(e, counts, data, intervals) > max(said, _MOSTLY):
-        best = "time"
-    else:
-        best = _best(gains, clean)
-    gain = gains[best]
-    return _describe(e, counts, named[best], best, joint, gain, limit, clear, intervals, line)
+    return gains, ev.threshold(largest)
 
 
 def _best(gains: dict[str, float], clean: str) -> str:
-    """The variable to name: one that carries the residual's noise must explain far more."""
-    other = max((n for n in _OWN_NOISE if n in gains), key=lambda n: gains[n])
+    """Choose the variable to name: one that carries the residual's noise must explain far more."""
+    other = max((n for n in _NOISY if n in gains), key=lambda n: gains[n])
     return other if gains[other] > _FAR_MORE * max(gains[clean], 0.0) else clean
 
 
@@ -214,7 +230,10 @@ def _describe(
     intervals: tuple,
     line: float | None,
 ) -> Where:
+    """Describe the residual over one variable: the curve, the region of its peak, and a sentence."""
     centre, mean, error, ends = _binned(e, counts, x)
+
+    # The region around the peak with the same sign and at least half of its height.
     peak = int(np.argmax(np.abs(mean) - error))
     strong = np.abs(mean) > 0.5 * np.abs(mean[peak])
     lo, hi = peak, peak
@@ -223,67 +242,71 @@ def _describe(
     while hi < len(mean) - 1 and strong[hi + 1] and mean[hi + 1] * mean[peak] > 0:
         hi += 1
     region = float(ends[lo, 0]), float(ends[hi, 1])
-    explained = _explained(gain, counts)
+
     text = f"joint {joint + 1}: the residual depends on {name}"
     text += f", most between {region[0]:.3g} and {region[1]:.3g} (SI)"
     if line is not None:
-        text = f"joint {joint + 1}: the residual holds a line at {line:.3g} Hz that the wanted motion lacks"
+        text = (
+            f"joint {joint + 1}: the residual has a spectral line at {line:.3g} Hz that the reference lacks"
+        )
     elif name == "time" and intervals:
         text = f"joint {joint + 1}: the residual is loud in {len(intervals)} interval(s) of time"
     return Where(
-        joint + 1,
-        name,
-        region,
-        intervals,
-        text,
-        explained,
-        gain,
-        limit,
-        clear,
-        centre,
-        mean,
-        mean - 1.96 * error,
-        mean + 1.96 * error,
-        line,
+        joint=joint + 1,
+        variable=name,
+        region=region,
+        intervals=intervals,
+        text=text,
+        explained=_explained(gain, counts),
+        evidence=gain,
+        threshold=limit,
+        clear=clear,
+        x=centre,
+        mean=mean,
+        low=mean - 1.96 * error,
+        high=mean + 1.96 * error,
+        frequency_hz=line,
     )
 
 
 def _explained(gain: float, counts: np.ndarray) -> float:
-    """Part of the variance that a gain in log-likelihood amounts to."""
+    """Convert a gain in log-likelihood to a part of the variance."""
     return float(1 - np.exp(-2 * max(gain, 0.0) / max(int(counts.sum()), 1)))
 
 
-def _hats(x: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "kept knot"]:
-    """Piecewise-linear functions with knots at quantiles: any curve, of no particular form."""
+def _hat_functions(x: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "kept knot"]:
+    """Evaluate piecewise-linear basis functions with knots at quantiles, for a curve of arbitrary shape."""
     knots = np.unique(np.quantile(x[counts], np.linspace(0, 1, _KNOTS)))
     eye = np.eye(len(knots))
     return np.stack([np.interp(x, knots, row) for row in eye], axis=1)
 
 
 def _independent(columns: np.ndarray) -> np.ndarray:
+    """Return orthonormal columns that span the same space as the given ones."""
     norm = np.linalg.norm(columns, axis=0)
     columns = columns[:, norm > 0] / norm[norm > 0]
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     return u[:, s > 1e-8 * s[0]] if len(s) else columns
 
 
-def _beyond(
+def _unexplained(
     whitener: ev.Whitener, e: Float[np.ndarray, " kept"], jacobian: Float[np.ndarray, "kept p"]
 ) -> Float[np.ndarray, " row"]:
-    """What a model cannot absorb of its residual, whitened."""
+    """Return the whitened part of a residual that the model's unknowns cannot absorb."""
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])[:, 0]
     return white - base @ np.linalg.lstsq(base, white, rcond=1e-9)[0]
 
 
-def _held(columns: np.ndarray, e: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+def _held_out(columns: np.ndarray, e: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Return the held-out sums of squares of residuals after a fit of the columns."""
     return ev.held_out(ev.grams(columns, blocks), *ev.products(columns, e, blocks))
 
 
 def _binned(
     e: np.ndarray, counts: np.ndarray, x: np.ndarray, bins: int = 30
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float[np.ndarray, "bin 2"]]:
-    """Of bins of x with equal counts the median, the mean of e and its error, and both ends."""
+    """Bin e over x with equal counts: median of x, mean of e, its standard error, and both ends of x."""
     order = np.argsort(x[counts])
     parts = [p for p in np.array_split(order, bins) if len(p)]
     es, xs = e[counts], x[counts]
@@ -296,56 +319,58 @@ def _binned(
 
 
 def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[float, float], ...]:
-    """Intervals in which the residual has far more energy than elsewhere."""
+    """Find intervals in which the residual has far more energy than elsewhere."""
     energy = np.where(counts, e, 0.0) ** 2
     kernel = np.ones(_WINDOW)
     share = np.convolve(counts.astype(float), kernel, mode="same")
     local = np.convolve(energy, kernel, mode="same") / np.maximum(share, 1)
-    usual = np.median(local[share > _WINDOW / 2])
     counted = share > _WINDOW / 2
-    # What bends the fit leaves something everywhere: next to the loudest that is quiet.
+    usual = np.median(local[counted])
+    # An effect that distorts the fit leaves some residual everywhere, but little beside the loudest window.
     loud = counted & (local > np.maximum(_LOUD * usual, _QUIET * local[counted].max()))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], loud, [False]]).astype(int)))
     time = data.times
     spans = [(float(time[a]), float(time[b - 1])) for a, b in edges.reshape(-1, 2)]
-    if len(spans) > 20 or loud.mean() > 0.3:  # everywhere is nowhere
+    if len(spans) > 20 or loud.mean() > 0.3:  # nearly everywhere is no region
         return ()
     return tuple(spans)
 
 
-def _share(
+def _share_inside(
     e: np.ndarray, counts: np.ndarray, data: Prepared, intervals: tuple[tuple[float, float], ...]
 ) -> float:
-    """Part of the residual's sum of squares that lies in some intervals."""
+    """Return the part of the residual's sum of squares that lies inside some intervals."""
     inside = np.zeros(len(e), bool)
     for start, end in intervals:
         inside |= (data.times >= start) & (data.times <= end)
     return float(np.sum(e[counts & inside] ** 2) / np.sum(e[counts] ** 2))
 
 
-def _line(
-    left: Float[np.ndarray, " row"], whitener: ev.Whitener, data: Prepared, wanted: np.ndarray
+def _spectral_line(
+    remainder: Float[np.ndarray, " row"], whitener: ev.Whitener, data: Prepared, wanted: np.ndarray
 ) -> tuple[float | None, float]:
-    """Frequency of a line in the whitened residual that the wanted motion lacks [Hz], and its part."""
-    if len(left) < 100:
+    """Find the frequency of a line in the whitened residual that the reference lacks [Hz], and its part."""
+    if len(remainder) < 100:
         return None, 0.0
-    # Rows that are left out stay as gaps: closed up, a line would shift and smear.
-    series = whitener.placed(left)[:, 0]
+
+    # Rows that do not count stay as gaps: if they were closed, a line would shift and smear.
+    series = whitener.placed(remainder)[:, 0]
     n = len(series)
     window = np.hanning(n)
     power = np.abs(np.fft.rfft(series * window)) ** 2
     power[:5] = 0.0
     k = int(np.argmax(power))
     part = power[max(k - 2, 0) : k + 3].sum() / power.sum()
+
     moved = np.abs(np.fft.rfft((wanted - wanted.mean()) * window)) ** 2
     if part < _LINE_PART or _stands_out(moved, k) or not _stands_out(power, k):
         return None, 0.0
     rate = 1.0 / (data.period * data.recipe.decimation)
-    return float((k + _between(power, k)) * rate / n), float(part)
+    return float((k + _bin_offset(power, k)) * rate / n), float(part)
 
 
-def _between(power: Float[np.ndarray, " f"], k: int) -> float:
-    """By what part of a bin a line lies beside its highest one: the vertex of a parabola."""
+def _bin_offset(power: Float[np.ndarray, " f"], k: int) -> float:
+    """Return the offset of a spectral line from its highest bin, in bins: the vertex of a parabola."""
     if not 0 < k < len(power) - 1 or min(power[k - 1], power[k + 1]) <= 0:
         return 0.0
     low, top, high = np.log(power[k - 1 : k + 2])
@@ -353,5 +378,6 @@ def _between(power: Float[np.ndarray, " f"], k: int) -> float:
 
 
 def _stands_out(power: np.ndarray, k: int) -> bool:
+    """Check that a bin exceeds the median of its neighbours as noise would not."""
     around = power[max(5, k - 50) : k + 51]
     return bool(power[k] > _LINE_FACTOR * np.median(around))

@@ -1,4 +1,4 @@
-"""Improve the shape of a signal by a search without derivatives."""
+"""Improve the shape of a signal by gradient descent with a fixed number of evaluations."""
 
 from __future__ import annotations
 
@@ -15,23 +15,30 @@ def improved(
     first: tuple[float, np.ndarray],
     evaluations: int,
 ) -> tuple[float, np.ndarray]:
-    """The least value that so many evaluations beside the first find, and where."""
-    seen = [(first[0], start.copy())]
+    """Minimise a function by L-BFGS-B and return the least value that was evaluated, and its point.
+
+    Args:
+        both: Function that returns value and gradient.
+        start: Point to start from.
+        first: Value and gradient at the start.
+        evaluations: Largest number of further evaluations.
+    """
+    evaluated = [(first[0], start.copy())]
 
     def counted(p: np.ndarray) -> tuple[float, np.ndarray]:
         if np.array_equal(p, start):
             return first
-        if len(seen) > evaluations:
+        if len(evaluated) > evaluations:
             raise _Spent
         value, slope = both(p)
-        seen.append((value, p.copy()))
+        evaluated.append((value, p.copy()))
         return value, slope
 
-    # The solver's own limit holds between line searches only, and one takes up to twenty.
+    # The solver's limit is checked between line searches only, and one takes up to twenty evaluations.
     with contextlib.suppress(_Spent):
         scipy.optimize.minimize(counted, start, jac=True, method="L-BFGS-B")
-    return min(seen, key=lambda found: found[0])
+    return min(evaluated, key=lambda e: e[0])
 
 
 class _Spent(Exception):
-    """The evaluations that may be spent are spent."""
+    """Raised when all evaluations are spent."""

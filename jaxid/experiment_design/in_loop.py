@@ -1,4 +1,4 @@
-"""The experiment that tells a case's unknowns best, by the information that its log would hold."""
+"""Design the experiment in a loop that identifies a case's unknowns best, by the information of its log."""
 
 from __future__ import annotations
 
@@ -34,38 +34,38 @@ from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import Replay
 
-# Relative width of the guesses where the case states none.
+# Relative width of the guesses if the case states none.
 _PRIOR = 0.5
 # A tour reaches its speed within this part of the stroke; sines go up to this part of the rate.
 _RUN_UP, _FASTEST = 0.02, 0.1
-# Starts that are improved, of those that tell most, and evaluations for each.
+# Number of most informative starts that are improved, and evaluations for each.
 _IMPROVED, _EVALUATIONS = 2, 25
-# Of the controller's own limit: what saturates is no longer in the loop.
+# Part of the controller's limit that the command may use: a saturated loop is open.
 _UNSATURATED = 0.95
 _BEYOND = 1e6
-# Weight of what goes beyond a limit beside the information.
+# Weight of the cost of limits beside the information.
 _STERN = 100.0
-# Steps between two ticks: what a design costs grows with them, what it gains does not.
+# Integration steps between two ticks at most: more of them cost time, and the design does not improve.
 _STEPS = 8
-# Sharpness at which an experiment is designed: friction that sticks exactly has no slope in the reference.
+# Sharpness at which an experiment is designed: friction that sticks exactly has no gradient in the reference.
 _SHARPNESS = 0.1
 
 
 @dataclass(frozen=True)
 class Design:
-    """An experiment, and what is expected of it.
+    """An experiment, and its expected result.
 
     Args:
         machine: The machine at the guesses.
         signal: "reference" or "input".
         time: Ticks [s].
-        values: Of the signal, (ticks, m).
-        std: Standard deviations that are expected, in parts of the guess (of what may be zero: physical over
-            the guess), (p,); what the guesses say included.
-        plain: The same of a tour from end to end at several speeds.
-        nats: Information gained over the guesses, of the design and of the tour.
-        limits: What it keeps to.
-        peaks: How far the machine goes.
+        values: The signal at the ticks, (ticks, m).
+        std: Expected standard deviations relative to the guess, the prior included, (p,). For an unknown that
+            may be zero: absolute deviation divided by the guess.
+        plain: The same quantities for a tour from end to end at several speeds, (p,).
+        nats: Information gained over the prior, by the design and by the tour [nats].
+        limits: Limits within which the design keeps.
+        peaks: Extremes of the motion.
     """
 
     machine: Machine
@@ -79,7 +79,7 @@ class Design:
     peaks: Peaks
 
     def csv(self) -> str:
-        """Time and signal as `[reference] kind = "csv"` (or `[input]`) takes them, every digit kept."""
+        """Return time and signal as CSV for `[reference] kind = "csv"` or `[input]`, with every digit."""
         return signal_csv(self.signal, self.time, self.values)
 
     def save(self, path: str | Path) -> Path:
@@ -95,13 +95,14 @@ class Design:
             lines.append(f"{name:<{width}}  {std:<8.2%}  {plain:<8.2%}")
         lines.append(
             f"{self.nats[0]:.1f} nats over the guesses, the tour {self.nats[1]:.1f}; "
-            f"{self.time[-1]:.3g} s, speed up to {_shown(self.peaks.speed)}, "
-            f"command up to {_shown(self.peaks.force)}"
+            f"{self.time[-1]:.3g} s, speed up to {_formatted(self.peaks.speed)}, "
+            f"command up to {_formatted(self.peaks.force)}"
         )
         return "\n".join(lines)
 
 
-def _shown(values: np.ndarray) -> str:
+def _formatted(values: np.ndarray) -> str:
+    """Format some numbers with three digits."""
     return ", ".join(f"{v:.3g}" for v in np.ravel(values))
 
 
@@ -109,42 +110,59 @@ def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
     """Find the signal with the largest information determinant, by gradients through the simulation.
 
     Args:
-        case: The case, with what `jaxid.design` asks of it.
-        progress: Called with a line at every stage.
+        case: The case, with the tables that `jaxid.design` requires.
+        progress: Called with a line of text at every stage.
 
     Raises:
         InputError: If no experiment keeps within the limits.
     """
-    bench = _DesignProblem.of(case)
-    progress("looking at sines and tours")
-    both = lambda p: _valued(bench, p)
-    # Within the limits from the beginning: what breaks them is led back to them, not to what tells most.
-    starts = [p for p in map(bench.within, bench.starts) if p is not None]
+    problem = _DesignProblem.of(case)
+    progress("evaluating sines and tours")
+
+    def both(p: np.ndarray) -> tuple[float, np.ndarray]:
+        return _value_and_slope(problem, p)
+
+    # Starts are within the limits: from outside a descent leads back to the limits, not to information.
+    starts = [p for p in map(problem.within, problem.starts) if p is not None]
     if not starts:
         raise InputError(
             "no experiment within the limits was found",
             where=f"{case.path}, [limits]",
-            hint="widen them, or check the loop's gains: the machine went beyond whatever it was asked",
+            hint="widen them, or check the loop's gains: every trial exceeded them, whatever its amplitude",
         )
-    known = [both(p) for p in starts]
-    ranked = sorted(range(len(starts)), key=lambda k: known[k][0])[:_IMPROVED]
-    found = []
+
+    values = [both(p) for p in starts]
+    ranked = sorted(range(len(starts)), key=lambda k: values[k][0])[:_IMPROVED]
+    optima = []
     for k in ranked:
-        progress("improving the most telling")
-        found.append(improved(both, starts[k], known[k], _EVALUATIONS)[1])
-    progress("expecting what each will tell")
-    kept = [p for p in (*starts, *map(bench.within, found)) if p is not None]
-    return bench.designed([bench.shapes.signal(p) for p in kept])
+        progress("improving the most informative")
+        optima.append(improved(both, starts[k], values[k], _EVALUATIONS)[1])
+
+    progress("computing the expected precision of each")
+    kept = [p for p in (*starts, *map(problem.within, optima)) if p is not None]
+    return problem.designed([problem.shapes.signal(p) for p in kept])
 
 
 @dataclass(frozen=True)
 class _DesignProblem:
-    """What a design is tried on."""
+    """Machine, noise, prior and family of signals of a design.
+
+    Args:
+        machine: The machine at the guesses.
+        replay: Run of the loop or the open drive, without its signal.
+        weight: One over the noise of each compared column, rounding through the loop included, (rows, k).
+        direct_share: Part of that noise that is not rounding through the loop, (k,).
+        prior: Prior of the unknowns.
+        on: Compared quantities: "position", "force" or "both".
+        limits: Limits of the experiment.
+        shapes: Family of signals.
+        starts: Numbers of the signals from which a design starts.
+    """
 
     machine: Machine
     replay: Replay
     weight: np.ndarray
-    own: np.ndarray
+    direct_share: np.ndarray
     prior: Prior
     on: str
     limits: Limits
@@ -153,6 +171,7 @@ class _DesignProblem:
 
     @classmethod
     def of(cls, case: Case) -> _DesignProblem:
+        """Set up the design of a case."""
         setting = case.simulation
         rate, duration = float(setting["sample_rate"]), float(setting["duration"])
         machine = build_machine(case, period=1 / rate)
@@ -164,112 +183,154 @@ class _DesignProblem:
         plant = machine.plant.smoothed(np.asarray(_SHARPNESS), np.asarray(speed))
         machine = machine.with_plant(plant, machine.parameters)
         shapes, starts = _family(machine, limits, ticks, period)
-        m, n = machine.gain.size, case.plant.joints
-        looped = machine.controller is not None
-        drive = Drive(machine.gain, period, "zero_order", 1, True)
-        none = np.zeros((ticks, m))
-        start, undisturbed = np.broadcast_to(setting.get("initial_position", 0.0), n), np.zeros((ticks, 1))
+
+        start = np.broadcast_to(setting.get("initial_position", 0.0), case.plant.joints)
         refuse_impossible(plant, start[None], f"{case.path}, [simulation] initial_position")
-        inputs = (none, undisturbed, None) if looped else (None, None, none)
-        # While an experiment is sought the command may go beyond: a cost without slope leads nowhere.
-        free = machine.controller
-        if looped and free.limit is not None:
-            free = replace(free, limit=_BEYOND * jnp.asarray(free.limit))
-        state = (start.astype(float), np.zeros(n))
-        replay = Replay(drive, free, Sensor(), *inputs, *state, None, every, np.eye(n))
-        q = jnp.asarray(replay.position)[None]
-        steps = min(needed_substeps(plant, drive, q, jnp.zeros_like(q), jnp.zeros((1, m))), _STEPS)
-        replay = replace(replay, drive=replace(drive, substeps=steps))
-        on = case.output_error.get("on", "position")
-        prior = Prior.of(machine, case.output_error.get("prior", _PRIOR), np.zeros(0))
-        bench = cls(machine, replay, np.zeros(0), np.zeros(0), prior, on, limits, shapes, starts)
-        own, whole = _noises(case, bench)
-        return replace(bench, weight=np.tile(1.0 / whole, (len(range(0, ticks, every)), 1)), own=own / whole)
+        problem = cls(
+            machine=machine,
+            replay=_empty_replay(machine, start, ticks, period, every),
+            weight=np.zeros(0),
+            direct_share=np.zeros(0),
+            prior=Prior.of(machine, case.output_error.get("prior", _PRIOR), np.zeros(0)),
+            on=case.output_error.get("on", "position"),
+            limits=limits,
+            shapes=shapes,
+            starts=starts,
+        )
+        # The noise depends on the loop: rounding passes through it.
+        direct, whole = _noise_levels(case, problem)
+        weight = np.tile(1.0 / whole, (len(range(0, ticks, every)), 1))
+        return replace(problem, weight=weight, direct_share=direct / whole)
 
     def run(self, signal: Array, sensor: Sensor | None = None) -> Replay:
-        """The machine under a signal."""
+        """Return the run of the machine under a signal."""
         replay = self.replay if sensor is None else with_sensor(self.replay, sensor)
-        return _under(replay, self.machine.plant, jnp.asarray(signal))
+        return _replayed_under(replay, self.machine.plant, jnp.asarray(signal))
 
     def peaks(self, signal: np.ndarray) -> Peaks:
-        """How far it goes."""
+        """Return the extremes of the motion under a signal."""
         run = _trajectory(self.run(signal), self.machine.plant)
         return Peaks.of(*(np.asarray(x) for x in (run.position, run.velocity, run.command)))
 
     def within(self, p: np.ndarray) -> np.ndarray | None:
-        """Some numbers, at the largest amplitude at which the machine keeps to its limits."""
+        """Return numbers of a signal at the largest amplitude within the limits; None if there is none."""
         kept = kept_within(self.limits, self.shapes, p, self.peaks)
         return None if kept is None else kept[0]
 
     def expected(self, signal: np.ndarray) -> np.ndarray:
-        """Covariance of the unknowns that a signal's log will leave, in units of the prior, (p, p).
+        """Return the expected covariance of the unknowns after a signal, in units of the prior, (p, p).
 
-        Where readings round, that which is found of a log simulated at the guesses: see `through_rounding`.
+        If readings are rounded, it is estimated from a log simulated at the guesses: see `through_rounding`.
         """
         problem = Problem(
-            _under(self.replay, self.machine.plant, jnp.asarray(signal)),
-            self.machine.parameters.places,
-            self.machine.plant,
-            np.zeros(self.weight.shape),
-            self.weight,
-            self.prior,
-            self.on,
-            (np.asarray(self.machine.plant.smoothing.sharpness),),
-            tuple(range(self.replay.position.size)),
+            replay=_replayed_under(self.replay, self.machine.plant, jnp.asarray(signal)),
+            places=self.machine.parameters.places,
+            plant=self.machine.plant,
+            measured=np.zeros(self.weight.shape),
+            weight=self.weight,
+            prior=self.prior,
+            on=self.on,
+            ladder=(np.asarray(self.machine.plant.smoothing.sharpness),),
+            encoders=tuple(range(self.replay.position.size)),
         )
         if not rounds(self.machine, problem):
             information = np.asarray(_information(*self.args(), jnp.asarray(signal)))
             return np.linalg.inv(np.eye(len(information)) + information)
-        return run_alone(expected_steps(self.machine, problem, self.own))
+        return run_alone(expected_steps(self.machine, problem, self.direct_share))
 
     def args(self) -> tuple:
-        """For the compiled functions."""
+        """Return the arguments of the compiled functions, in order."""
         unknown = self.machine.parameters
         return (self.replay, unknown.places, self.machine.plant, self.weight, self.prior, self.on)
 
     def designed(self, signals: list[np.ndarray]) -> Design:
-        """The most telling of some signals with what is expected of it, beside the first."""
-        left = [self.expected(x) for x in signals]
-        gained = [-0.5 * float(np.linalg.slogdet(covariance)[1]) for covariance in left]
+        """Choose the most informative of some signals, with its expected precision and that of the first."""
+        covariances = [self.expected(x) for x in signals]
+        gained = [-0.5 * float(np.linalg.slogdet(covariance)[1]) for covariance in covariances]
         best = int(np.argmax(gained))
-        std = [np.sqrt(np.diag(left[k])) * self.relative for k in (best, 0)]
+        std, plain = (np.sqrt(np.diag(covariances[k])) * self.relative for k in (best, 0))
         signal = signals[best]
-        time = float(self.replay.drive.period) * np.arange(len(signal))
-        name = "reference" if self.replay.controller is not None else "input"
-        nats = (gained[best], gained[0])
-        return Design(self.machine, name, time, signal, *std, nats, self.limits, self.peaks(signal))
+        return Design(
+            machine=self.machine,
+            signal="reference" if self.replay.controller is not None else "input",
+            time=float(self.replay.drive.period) * np.arange(len(signal)),
+            values=signal,
+            std=std,
+            plain=plain,
+            nats=(gained[best], gained[0]),
+            limits=self.limits,
+            peaks=self.peaks(signal),
+        )
 
     @property
     def relative(self) -> np.ndarray:
-        """A prior as a part of its guess."""
+        """Width of the prior relative to the guess, (p,)."""
         return np.where(self.prior.log, 1.0, 1.0 / np.abs(self.prior.base)) * self.prior.scale
 
 
+def _empty_replay(machine: Machine, start: np.ndarray, ticks: int, period: float, every: int) -> Replay:
+    """Build the run of a machine from rest, with a signal of zeros.
+
+    Args:
+        machine: The machine at the guesses.
+        start: Position at the start, (n,).
+        ticks: Number of ticks of the signal.
+        period: Time between ticks [s].
+        every: Number of ticks in a sample of the log.
+    """
+    n, m = start.size, machine.gain.size
+    none = np.zeros((ticks, m))
+    controller = machine.controller
+    looped = controller is not None
+    # The command may exceed the saturation during the search, since a saturated command has no gradient; the
+    # cost of limits keeps it within.
+    if controller is not None and controller.limit is not None:
+        controller = replace(controller, limit=_BEYOND * jnp.asarray(controller.limit))
+    drive = Drive(machine.gain, period, "zero_order", 1, True)
+    replay = Replay(
+        drive=drive,
+        controller=controller,
+        sensor=Sensor(),
+        reference=none if looped else None,
+        disturbance=np.zeros((ticks, 1)) if looped else None,
+        command=None if looped else none,
+        position=start.astype(float),
+        velocity=np.zeros(n),
+        restart=None,
+        every=every,
+        follow=np.eye(n),
+    )
+    q = jnp.asarray(replay.position)[None]
+    steps = needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), jnp.zeros((1, m)))
+    return replace(replay, drive=replace(drive, substeps=min(steps, _STEPS)))
+
+
 def _limits(case: Case, machine: Machine) -> Limits:
-    """The limits that a case states; the command's is within the controller's where it states none."""
+    """Take the limits that a case states; a force that is not stated follows from the controller's limit."""
     stated, n, m = case.limits, case.plant.joints, machine.gain.size
-    low, high = np.broadcast_to(np.asarray(stated["stroke"], float), (n, 2)).T
-    own = None if machine.controller is None else machine.controller.limit
-    force = stated.get("force", np.inf if own is None else _UNSATURATED * np.asarray(own))
     if machine.controller is None and "force" not in stated:
         raise InputError("[limits] has no force", where=str(case.path), hint="add force = ... to [limits]")
+    low, high = np.broadcast_to(np.asarray(stated["stroke"], float), (n, 2)).T
+    saturation = None if machine.controller is None else machine.controller.limit
+    force = stated.get("force", np.inf if saturation is None else _UNSATURATED * np.asarray(saturation))
     return Limits(
-        np.array(low),
-        np.array(high),
-        np.broadcast_to(stated["speed"], n).astype(float),
-        np.broadcast_to(force, m).astype(float),
-        tuple(stated),
+        low=np.array(low),
+        high=np.array(high),
+        speed=np.broadcast_to(stated["speed"], n).astype(float),
+        force=np.broadcast_to(force, m).astype(float),
+        stated=tuple(stated),
     )
 
 
 def _family(machine: Machine, limits: Limits, ticks: int, period: float) -> tuple[Shapes, list[np.ndarray]]:
-    """Signals within the limits, and where to start: the tour first."""
+    """Build the family of signals within the limits, and the starts of the search: the tour first."""
     speed, looped = float(limits.speed.max()), machine.controller is not None
     if looped:
         ends = (limits.low, limits.high, limits.speed * period)
-        low, high, step = (machine.plant.at_drives(x) for x in ends)
+        low, high, step = (np.asarray(machine.plant.at_drives(x)) for x in ends)
     else:
         low, high, step = -limits.force, limits.force, np.full(limits.force.shape, np.inf)
+
     stroke = float((high - low).max())
     pace = speed if looped else 20 * stroke / (ticks * period)
     hardest = pace**2 / (_RUN_UP * stroke)
@@ -279,31 +340,36 @@ def _family(machine: Machine, limits: Limits, ticks: int, period: float) -> tupl
     return shapes, [shapes.numbers(w) for w in weights]
 
 
-def _noises(case: Case, bench: _DesignProblem) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Of what is compared: that of its own, and with what rounding does in the loop to the command."""
-    sensor, n, m = bench.machine.sensor, case.plant.joints, bench.machine.gain.size
+def _noise_levels(
+    case: Case, problem: _DesignProblem
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Compute the noise of each compared column, without and with rounding that passes through the loop."""
+    sensor, n, m = problem.machine.sensor, case.plant.joints, problem.machine.gain.size
     std: list[np.ndarray] = []
-    more = np.zeros(0)
-    if bench.on in ("position", "both"):
+    through_loop = np.zeros(0)
+    if problem.on in ("position", "both"):
         if sensor.position_std is None:
             raise _no_noise(case, "position", "position_noise or position_resolution")
         std.append(np.broadcast_to(np.asarray(sensor.position_std), n))
-        more = np.zeros(n)
-    if bench.on in ("force", "both"):
+        through_loop = np.zeros(n)
+    if problem.on in ("force", "both"):
         if sensor.force_noise is None:
             raise _no_noise(case, "force", "force_noise")
-        signal = bench.shapes.signal(bench.starts[0])
-        runs = (_trajectory(bench.run(signal, s), bench.machine.plant) for s in (sensor, Sensor()))
+        force_noise = np.broadcast_to(np.asarray(sensor.force_noise), m)
+        std.append(np.abs(problem.machine.gain) * force_noise)
+
+        # Rounded readings change the command: compare a run with the sensor to one without.
+        signal = problem.shapes.signal(problem.starts[0])
+        runs = (_trajectory(problem.run(signal, s), problem.machine.plant) for s in (sensor, Sensor()))
         rounded, exact = (np.asarray(run.command) for run in runs)
-        through = np.sqrt(np.mean((rounded - exact) ** 2, axis=0))
-        own = np.broadcast_to(np.asarray(sensor.force_noise), m)
-        std.append(np.abs(bench.machine.gain) * own)
-        more = np.concatenate([more, np.abs(bench.machine.gain) * through])
-    own = np.concatenate(std)
-    return own, np.hypot(own, more)
+        change = np.sqrt(np.mean((rounded - exact) ** 2, axis=0))
+        through_loop = np.concatenate([through_loop, np.abs(problem.machine.gain) * change])
+    direct = np.concatenate(std)
+    return direct, np.hypot(direct, through_loop)
 
 
 def _no_noise(case: Case, what: str, key: str) -> InputError:
+    """Build the error of a case whose noise is not stated."""
     return InputError(
         f"the noise of the {what} is not known",
         where=f"{case.path}, [sensor]",
@@ -311,8 +377,8 @@ def _no_noise(case: Case, what: str, key: str) -> InputError:
     )
 
 
-def _under(replay: Replay, plant: Plant, signal: Array) -> Replay:
-    """A run under a signal, from rest at its first value in a loop."""
+def _replayed_under(replay: Replay, plant: Plant, signal: Array) -> Replay:
+    """Return a run under a signal, from rest at its first value if it is a loop."""
     if replay.controller is None:
         return replace(replay, command=signal)
     start = jnp.asarray(replay.position)
@@ -326,36 +392,40 @@ _trajectory = eqx.filter_jit(lambda replay, plant: replay(plant))
 def _sensitivity(
     replay: Replay, places: tuple, plant: Plant, weight: Array, prior: Prior, on: str, signal: Array
 ) -> Array:
-    """Derivative of what is compared over its noise, in units of the prior, (rows, p)."""
+    """Differentiate the compared quantities over their noise, in units of the prior, (rows, p)."""
     p, none = len(places), jnp.zeros(weight.shape)
-    run = residual_of(_under(replay, plant, signal), places, plant, none, weight, prior, on, jnp.eye(p))
+    run = residual_of(
+        _replayed_under(replay, plant, signal), places, plant, none, weight, prior, on, jnp.eye(p)
+    )
     return jax.jacfwd(run)(jnp.zeros(p)).reshape(-1, p)
 
 
 @eqx.filter_jit
 def _information(*args: Any) -> Array:
+    """Compute the information matrix of a signal in units of the prior, (p, p)."""
     j = _sensitivity(*args)
     return j.T @ j
 
 
 @eqx.filter_jit
 def _loss(p: Array, args: tuple, shapes: Shapes, bounds: LimitCost) -> tuple[Array, Array]:
-    """Minus the information gained [nats] and what limits cost, with the slope."""
-    replay, places, plant, _, prior, _ = args
+    """Compute minus the information gained [nats] plus the cost of the limits, and the gradient."""
+    replay, places, plant, weight, prior, on = args
 
     def of(p: Array) -> tuple[Array, Array]:
         signal = shapes(p)
-        j = _sensitivity(*args, signal)
+        j = _sensitivity(replay, places, plant, weight, prior, on, signal)
         gained = 0.5 * jnp.linalg.slogdet(jnp.eye(j.shape[1]) + j.T @ j)[1]
         here = scatter(places, plant, prior.base)
-        value = -gained + _STERN * bounds.cost(_under(replay, plant, signal)(here))
+        value = -gained + _STERN * bounds.cost(_replayed_under(replay, plant, signal)(here))
         return value, value
 
     slope, value = jax.jacfwd(of, has_aux=True)(p)
     return value, slope
 
 
-def _valued(bench: _DesignProblem, p: np.ndarray) -> tuple[float, np.ndarray]:
-    value, slope = _loss(jnp.asarray(p), bench.args(), bench.shapes, LimitCost.of(bench.limits))
+def _value_and_slope(problem: _DesignProblem, p: np.ndarray) -> tuple[float, np.ndarray]:
+    """Evaluate the loss of some numbers; a run that diverged gets the worst value and no direction."""
+    value, slope = _loss(jnp.asarray(p), problem.args(), problem.shapes, LimitCost.of(problem.limits))
     good = np.isfinite(value) & np.all(np.isfinite(slope))
     return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))

@@ -1,4 +1,4 @@
-"""What an experiment may do to a machine: stroke, speed and force."""
+"""Limits of an experiment on a machine: stroke, speed and force."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.simulation.loops import Trajectory
 
-# Going beyond this part of a limit costs: as much as a factor e in evidence at the limit itself.
+# From this part of a limit on, an experiment is penalised: at the limit by as much as a factor e in evidence.
 _FROM = 0.97
 
 if TYPE_CHECKING:
@@ -31,13 +31,13 @@ _AMPLITUDES = (1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.15, 0.07)
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds on the motion and on the command, by joint.
+    """Bounds on the motion and on the command, by joint and by drive.
 
     Args:
         low, high: Ends of the stroke [m or rad].
         speed: Largest speed [m/s or rad/s].
-        force: Largest magnitude of the command, in its own units.
-        stated: Which of "stroke", "speed" and "force" the case gives; the rest is what the log used.
+        force: Largest magnitude of the command, in units of the command.
+        stated: Those of "stroke", "speed" and "force" that the case gives; the others are those of the log.
     """
 
     low: Float[np.ndarray, " n"]
@@ -48,15 +48,15 @@ class Limits:
 
     @classmethod
     def of(cls, stated: Mapping[str, Any], machine: Machine, log: Log, data: Prepared) -> Limits:
-        """The limits that a case states, the rest as far as the log went.
+        """Take the limits that a case states, and the extremes of the log for the others.
 
-        Where no force is stated it is the controller's own limit, if it has one: that is what the
-        drive is known to stand.
+        Without a stated force the limit is the controller's saturation, if it has one, since the drive is
+        known to stand it.
 
         Args:
-            stated: The case's [limits].
-            machine: The machine.
-            log, data: Its log, raw and prepared.
+            stated: Table [limits] of the case.
+            machine: The machine of the log.
+            log, data: The log, before and after preparation.
         """
         n, m = log.position.shape[1], log.force.shape[1]
         stroke = stated.get("stroke")
@@ -65,19 +65,19 @@ class Limits:
         else:
             low, high = np.broadcast_to(np.asarray(stroke, float), (n, 2)).T
         speed = np.abs(data.qd).max(axis=0) if "speed" not in stated else stated["speed"]
-        own = None if machine.controller is None else machine.controller.limit
-        used = np.abs(log.force).max(axis=0) if own is None else np.asarray(own)
+        saturation = None if machine.controller is None else machine.controller.limit
+        used = np.abs(log.force).max(axis=0) if saturation is None else np.asarray(saturation)
         force = stated.get("force", used)
         return cls(
-            np.array(low, float),
-            np.array(high, float),
-            np.broadcast_to(speed, n).astype(float),
-            np.broadcast_to(force, m).astype(float),
-            tuple(stated),
+            low=np.array(low, float),
+            high=np.array(high, float),
+            speed=np.broadcast_to(speed, n).astype(float),
+            force=np.broadcast_to(force, m).astype(float),
+            stated=tuple(stated),
         )
 
     def broken(self, peaks: Peaks) -> bool:
-        """Whether a run goes beyond them."""
+        """Check if a run exceeds the limits or diverged."""
         return bool(
             np.any(peaks.low < self.low)
             or np.any(peaks.high > self.high)
@@ -90,15 +90,16 @@ class Limits:
 def kept_within(
     limits: Limits, shapes: Shapes, p: Float[np.ndarray, " p"], peaks_of: Callable[[np.ndarray], Peaks]
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "time m"], Peaks] | None:
-    """The signal of some numbers at the largest amplitude at which a machine keeps to its limits.
+    """Find the largest amplitude at which a machine keeps within its limits.
 
     Args:
-        limits: The limits.
-        shapes, p: The family of signals, and the numbers.
-        peaks_of: How far the machine goes under a signal.
+        limits: Limits of the experiment.
+        shapes: Family of signals.
+        p: Numbers of the signal in its family.
+        peaks_of: Function from a signal to the extremes of its run.
 
     Returns:
-        Its numbers, the signal and how far it goes; None where it goes beyond whatever the amplitude.
+        Numbers, signal and extremes at that amplitude; None if the limits are exceeded at every amplitude.
     """
     for factor in _AMPLITUDES:
         smaller = shapes.smaller(p, factor)
@@ -111,7 +112,7 @@ def kept_within(
 
 @dataclass(frozen=True)
 class Peaks:
-    """How far a run went; the fields are those of `Limits`."""
+    """Extremes of a run; the fields are those of `Limits`."""
 
     low: Float[np.ndarray, " n"]
     high: Float[np.ndarray, " n"]
@@ -120,7 +121,7 @@ class Peaks:
 
     @classmethod
     def of(cls, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> Peaks:
-        """Of runs whose time is the axis before the last."""
+        """Compute the extremes of runs with time on the axis before the last."""
 
         def most(x: np.ndarray) -> np.ndarray:
             return np.max(x.reshape(-1, x.shape[-1]), axis=0)
@@ -129,7 +130,7 @@ class Peaks:
 
 
 class LimitCost(eqx.Module):
-    """`Limits` as arrays."""
+    """`Limits` as JAX arrays, with a cost for gradients."""
 
     low: Array
     high: Array
@@ -138,12 +139,13 @@ class LimitCost(eqx.Module):
 
     @classmethod
     def of(cls, limits: Limits) -> LimitCost:
-        """The limits' arrays."""
+        """Collect the arrays of limits."""
         return cls(*(jnp.asarray(x) for x in (limits.low, limits.high, limits.speed, limits.force)))
 
     def cost(self, run: Trajectory) -> Array:
-        """What it costs that a motion comes near them or goes beyond; zero well within."""
+        """Return the cost of a motion near the limits or beyond; zero well within."""
         half = 0.5 * (self.high - self.low)
         off = jnp.abs(run.position - 0.5 * (self.low + self.high)) / half
         parts = (off, jnp.abs(run.velocity) / self.speed, jnp.abs(run.command) / self.force)
-        return sum(jnp.sum(jnp.square(jax.nn.relu(largest(x) - _FROM) / (1 - _FROM))) for x in parts)
+        costs = [jnp.sum(jnp.square(jax.nn.relu(largest(x) - _FROM) / (1 - _FROM))) for x in parts]
+        return costs[0] + costs[1] + costs[2]

@@ -1,4 +1,4 @@
-"""What a check found."""
+"""Findings of the checks of a log."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,9 +9,9 @@ class Finding:
     """One fault of a log, or one reason for care.
 
     Attributes:
-        severity: "error" stops the work, "warning" is told.
+        severity: "error" stops the work, "warning" is reported only.
         what: The fault, with its size and unit.
-        where: File and quantity.
+        where: File and quantity in which it is.
         hint: What the user can do about it.
     """
 
@@ -21,5 +21,5 @@ class Finding:
     hint: str
 
     def __str__(self) -> str:
-        """One line for a terminal."""
+        """Format the finding as one line for a terminal."""
         return f"{self.severity}: {self.where}: {self.what}; {self.hint}"

@@ -21,31 +21,31 @@ OPTIONAL_COLUMNS = (
     "temperature",
 )
 LOG_KEYS = ("time", "sample_rate", "position", "force", "hold", "rows", *OPTIONAL_COLUMNS)
-# Chosen: fewer samples than this leave nothing after filtering and trimming.
+# Chosen: with fewer samples nothing remains after filtering and trimming.
 MINIMUM_SAMPLES = 50
-# No shape here: columns may come flat, and `Log` itself says what does not fit.
+# No shape here: columns may be flat, and `Log` checks their lengths.
 Column = np.ndarray
 
 
 @dataclass(frozen=True)
 class Log:
-    """One measured or simulated log; its arrays are float64 copies that cannot be written.
+    """One measured or simulated log; its arrays are read-only float64 copies.
 
-    Time is kept as (samples,), all else as (samples, width); flat columns may be given.
+    Time is kept as (samples,), all other columns as (samples, width); flat columns are accepted.
 
     Attributes:
-        time: Time [s], from where the file starts.
-        position: Positions [m or rad], a column a joint; NaN throughout where a joint has no encoder.
+        time: Time [s], from the start of the file.
+        position: Positions [m or rad], a column a joint; NaN throughout for a joint without an encoder.
         force: The logged command, before the known gain of the actuator.
         velocity: Measured velocity [m/s or rad/s].
         acceleration: Measured acceleration [m/s^2 or rad/s^2].
-        reference: What the controller was asked to follow [m or rad].
+        reference: Reference of the controller [m or rad].
         load_position: Position behind a flexible coupling [m or rad].
         load_acceleration: Acceleration behind a flexible coupling [m/s^2 or rad/s^2].
         temperature: Temperature, in the unit of the file.
-        hold: How the command runs between samples, one of `HOLDS`.
-        rows: Rows of the file, 0-based and half open; (0, 0) stands for all.
-        source: Where the log came from, for messages.
+        hold: Shape of the command between samples, one of `HOLDS`.
+        rows: Rows of the file, 0-based and half open; (0, 0) means all.
+        source: Origin of the log, for messages.
     """
 
     time: Column
@@ -62,7 +62,7 @@ class Log:
     source: str = "log"
 
     def __post_init__(self):
-        """Copy the arrays, freeze them and check that they belong together.
+        """Copy the arrays, make them read-only and check that they fit together.
 
         Raises:
             InputError: If lengths differ or `hold` is unknown.
@@ -92,14 +92,14 @@ class Log:
 
     @property
     def measured(self) -> tuple[bool, ...]:
-        """Which joints have an encoder."""
+        """Mask of the joints with an encoder."""
         return tuple(bool(m) for m in ~np.isnan(self.position[0]))
 
     def need_every_encoder(self, method: str) -> None:
         """Refuse a log in which a joint has no encoder, for a method that needs its position.
 
         Raises:
-            InputError: If there is one.
+            InputError: If a joint has no encoder.
         """
         if not all(self.measured):
             raise InputError(
@@ -110,7 +110,7 @@ class Log:
 
     @property
     def filled(self) -> Float[np.ndarray, "samples joints"]:
-        """Positions in which joints without an encoder stand where the others are, on average."""
+        """Positions, with the mean of the other joints in place of those without an encoder."""
         if all(self.measured):
             return self.position
         others = np.nanmean(self.position, axis=1, keepdims=True)
@@ -120,7 +120,7 @@ class Log:
     def period(self) -> float:
         """Sampling period [s].
 
-        The mean step, which for the even sampling that `read_log` insists on is the
+        It is the mean step, which for the even sampling that `read_log` requires is the
         median without its rounding (2e-5 on the time stamps of one real log).
         """
         return float((self.time[-1] - self.time[0]) / (self.samples - 1))
@@ -132,13 +132,13 @@ class Log:
 
 
 def with_load(log: Log, load: int | None, joints: int) -> Log:
-    """The log with a column of positions for each joint, that of the load where it belongs.
+    """Return the log with a column of positions for each joint, that of the load included.
 
     Args:
-        log: Of a plant's encoders: all joints in `position`, or all but the load, which stands in
-            `load_position` or has none.
-        load: Joint behind an elastic coupling, 0-based; None: every joint has its encoder.
-        joints: How many there are.
+        log: Log of a plant's encoders: all joints in `position`, or all but the load, whose position is in
+            `load_position` or not measured.
+        load: Index of the joint behind an elastic coupling, from 0; None: every joint has its encoder.
+        joints: Number of joints of the plant.
 
     Raises:
         InputError: If the load is given twice, or columns are missing.
@@ -151,20 +151,21 @@ def with_load(log: Log, load: int | None, joints: int) -> Log:
             raise InputError(
                 "load_position is given beside the positions of all joints",
                 where=log.source,
-                hint="leave it out, or let position name the motor's column alone",
+                hint="remove load_position, or let position name the motor's column alone",
             )
         return log
     if width != joints - 1:
         raise InputError(
-            f"position has {width} columns where {joints - 1} or {joints} belong",
+            f"position has {width} columns, expected {joints - 1} or {joints}",
             where=log.source,
-            hint="name the motor's column, and the load's as load_position where it has one",
+            hint="name the motor's column, and the load's as load_position if it has one",
         )
     column = np.full(log.samples, np.nan) if log.load_position is None else log.load_position[:, 0]
     return replace(log, position=np.insert(log.position, load, column, axis=1), load_position=None)
 
 
 def _frozen(values: Any) -> np.ndarray:
+    """Return a read-only float64 copy."""
     copy = np.array(values, dtype=np.float64)
     copy.setflags(write=False)
     return copy
@@ -173,14 +174,14 @@ def _frozen(values: Any) -> np.ndarray:
 def read_log(
     path: str | Path, columns: dict[str, Any], *, joints: int | None = 1, drives: int | None = None
 ) -> Log:
-    """Read a log and refuse what no estimator could use.
+    """Read a log, and refuse one that no estimator could use.
 
     Args:
         path: A `.csv`, `.npz`, `.mat` or `.parquet` file.
-        columns: The `[log]` table of a case: names of columns by quantity, and
-            `sample_rate` [Hz] where there is no time, `hold`, `rows`.
-        joints: Number of positions expected; None takes what there is.
-        drives: Number of forces and references expected; None: no more than positions.
+        columns: The `[log]` table of a case: names of columns by quantity; `sample_rate` [Hz] if there is no
+            time; `hold` and `rows`.
+        joints: Expected number of positions; None accepts any.
+        drives: Expected number of forces and references; None: at most as many as positions.
 
     Returns:
         The log.
@@ -190,23 +191,26 @@ def read_log(
     """
     path = Path(path)
     _check_keys(columns)
-    names = {key: _names(columns, key) for key in _wanted(columns)}
+    names = {key: _names(columns, key) for key in _given_quantities(columns)}
     _check_distinct(names)
     rows = _rows(columns)
     data, rows = read_columns(path, [name for group in names.values() for name in group], rows)
     _check_finite(data, rows[0], path)
+
     groups = {key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()}
     _check_widths(groups, names, joints, drives, path)
     samples = rows[1] - rows[0]
     if samples < MINIMUM_SAMPLES:
         hint = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
         raise InputError(f"is too short: {samples} samples", where=str(path), hint=hint)
+
     time = _time(groups.pop("time", None), columns, rows, path)
     hold = columns.get("hold", "zero_order")
     return Log(time=time, hold=hold, rows=rows, source=str(path), **groups)
 
 
 def _check_keys(columns: dict[str, Any]) -> None:
+    """Refuse unknown keys of `[log]`, missing columns, and values that are no hold or rate."""
     for key in columns:
         if key not in LOG_KEYS:
             raise InputError(f"unknown key '{key}'", where="[log]", hint=suggest(key, LOG_KEYS))
@@ -227,35 +231,39 @@ def _check_keys(columns: dict[str, Any]) -> None:
 
 
 def _is_number(value: Any) -> bool:
+    """Check that a value of TOML is a number; booleans are not."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _wanted(columns: dict[str, Any]) -> list[str]:
+def _given_quantities(columns: dict[str, Any]) -> list[str]:
+    """List the quantities that have a column."""
     quantities = ("time", "position", "force", *OPTIONAL_COLUMNS)
     return [key for key in quantities if columns.get(key) is not None]
 
 
 def _names(columns: dict[str, Any], key: str) -> list[str]:
+    """Return the names of the columns of one quantity."""
     given = columns[key]
     names = given if isinstance(given, list | tuple) else [given]
     if not names or not all(isinstance(name, str) for name in names):
         hint = "give the name of a column, or a list of names"
-        raise InputError(f"{key} = {given!r} names no column", where="[log]", hint=hint)
+        raise InputError(f"{key} = {given!r} is not the name of a column", where="[log]", hint=hint)
     if len(set(names)) < len(names):
-        hint = "name one column a joint"
+        hint = "name one column for each joint"
         raise InputError(f"{key} names a column twice: {names}", where="[log]", hint=hint)
     return list(names)
 
 
 def _check_distinct(names: dict[str, list[str]]) -> None:
-    """Refuse one column for two quantities; a reference may be what was measured elsewhere."""
+    """Refuse one column for two quantities; only a reference may be measured elsewhere."""
     for one, other in (("time", "position"), ("time", "force"), ("force", "position")):
         if set(names.get(one, ())) & set(names.get(other, ())):
-            hint = "each quantity has a column of its own"
+            hint = "give each quantity a separate column"
             raise InputError(f"{one} and {other} are the same column", where="[log]", hint=hint)
 
 
 def _rows(columns: dict[str, Any]) -> tuple[int, int] | None:
+    """Return the first row and the end of `rows`, if they are given."""
     rows = columns.get("rows")
     if rows is None:
         return None
@@ -265,17 +273,18 @@ def _rows(columns: dict[str, Any]) -> tuple[int, int] | None:
         or not all(isinstance(row, int) and not isinstance(row, bool) for row in rows)
     ):
         hint = "give two whole numbers, first and end (0-based, half open): rows = [0, 25000]"
-        raise InputError(f"rows = {rows!r} is no range", where="[log]", hint=hint)
+        raise InputError(f"rows = {rows!r} is not a range", where="[log]", hint=hint)
     return (rows[0], rows[1])
 
 
 def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
+    """Refuse columns with NaN or infinite values."""
     for name, values in data.items():
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if not bad.size:
             continue
         kind = "NaN" if np.isnan(values[bad[0]]).any() else "infinite"
-        hint = "cut these rows out with rows = [first, end], or interpolate before"
+        hint = "exclude these rows by rows = [first, end], or interpolate before"
         where = f"{path}, column '{name}'"
         what = f"{bad.size} row(s) are NaN or infinite, the first is row {first + bad[0]} ({kind})"
         raise InputError(what, where=where, hint=hint)
@@ -288,29 +297,30 @@ def _check_widths(
     drives: int | None,
     path: Path,
 ) -> None:
-    """One time, as many positions as joints, and as many forces as drives, or no more than those."""
+    """Check for one time, as many positions as joints, and as many forces as drives, or at most as joints."""
     expected = groups["position"].shape[1] if joints is None else joints
-    most = expected if drives is None else drives
+    drive_count = expected if drives is None else drives
     for key, values in groups.items():
         width, needed, what = values.shape[1], expected, "joint"
         if key == "time":
             needed = 1
         elif key in ("force", "reference"):
-            needed, what = most, "joint" if most == expected else "drive"
+            needed, what = drive_count, "joint" if drive_count == expected else "drive"
             if drives is None:
                 needed = min(needed, width)
         elif key not in ("position", "velocity", "acceleration"):
             continue
         if width != needed:
             where = f"{path}, [log] {key} = {names[key]}"
-            hint = f"name one column a {what}, in the order of the {what}s"
-            belongs = most if what == "drive" else needed
-            raise InputError(f"{width} column(s) where {belongs} belong", where=where, hint=hint)
+            hint = f"name one column for each {what}, in the order of the {what}s"
+            count = drive_count if what == "drive" else needed
+            raise InputError(f"{width} column(s), expected {count}", where=where, hint=hint)
 
 
 def _time(
     column: np.ndarray | None, columns: dict[str, Any], rows: tuple[int, int], path: Path
 ) -> Float[np.ndarray, " samples"]:
+    """Return the time of the samples, from the time column or the sampling rate."""
     rate = columns.get("sample_rate")
     if column is None:
         return np.arange(*rows) / float(columns["sample_rate"])
@@ -318,7 +328,7 @@ def _time(
     time = sound_time(column[:, 0], rows[0], where)
     logged = (time.size - 1) / (time[-1] - time[0])
     if rate is not None and abs(logged / rate - 1) > 0.01:
-        what = f"the time column says {logged:.6g} Hz, sample_rate says {rate:.6g} Hz"
-        hint = "leave one of them out; is time in seconds?"
+        what = f"the time column gives {logged:.6g} Hz, but sample_rate is {rate:.6g} Hz"
+        hint = "remove one of them; is time in seconds?"
         raise InputError(what, where=where, hint=hint)
     return time

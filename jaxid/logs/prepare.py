@@ -1,8 +1,8 @@
-"""From a log to the motion and force that inverse dynamics compares, and the choice of how.
+"""Prepare a log for inverse dynamics: choose the filter, differentiate, and mark the samples that count.
 
-A stated recipe is applied to the letter. Where none is stated, cut-off, decimation and rest
-velocity follow from the log's own noise, and are reported. A running median of the force is stated
-or there is none: it goes before all else, see `Recipe.cleaned`.
+A stated recipe is applied literally. If none is stated, cut-off, decimation and rest velocity follow from the
+log's noise and are reported. A running median of the force is applied only if it is stated: it precedes all
+other steps, see `Recipe.cleaned`.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.numerics import filters as signals
 
-# The surroundings of reversals that are left out are less of the motion than this.
+# The omitted samples around reversals are at most this part of the motion.
 _MOSTLY = 0.5
-# Decimation keeps 1 / 0.4 samples a period of the band's edge, and of a short log so many in all.
+# Decimation keeps 1 / 0.4 samples in a period of the band's edge, and at least so many of a short log.
 A_PERIOD = 0.4
 _ENOUGH = 100
-# Periods of the band's edge that are left out at each end.
+# Number of periods of the band's edge that are omitted at each end.
 _ENDS = 3
-# The parallel filter's edge over the frequency at which a parabola has half of a velocity left, at
-# most: there nine tenths are left.
+# Largest ratio of the parallel filter's edge to the frequency at which a parabola passes half of a velocity:
+# at this ratio it passes nine tenths.
 _FLAT = 1 / 3
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a log is filtered.
+    """Settings of the filter of a log.
 
     Args:
-        cutoff_hz: Of the zero-phase low-pass on the position; with "parabolic" derivatives, which
-            leave the position as it is, where half of the velocity is left.
-        order: Of the Butterworth filter, which is run twice.
+        cutoff_hz: Cut-off of the zero-phase low-pass on the position [Hz]. With "parabolic" derivatives,
+            which do not filter the position, the frequency at which half of the velocity passes.
+        order: Order of the Butterworth filter, which is applied twice.
         decimation: One sample in so many is kept, after the parallel filter.
-        trim: Samples left out at each end, after decimation.
-        rest_velocity: Below it a sample counts as at rest [m/s or rad/s], by joint.
-        align_hold: Whether the command is seen as it acts, half a sample late where it is held,
-            instead of at the instants at which it was logged.
+        trim: Number of samples omitted at each end, after decimation.
+        rest_velocity: Velocity below which a sample counts as at rest [m/s or rad/s], by joint.
+        align_hold: Whether the command is taken as it acts, half a sample late if it is held, and not at the
+            instants at which it was logged.
         derivatives: "central" (differences), "spectral" (exact in the band) or "parabolic" (of the
-            parabola through the neighbours, with no low-pass before it).
+            parabola through the neighbours, without a low-pass before it).
         keeps_reversals: Whether a fit uses samples that only pass through zero.
-        edge: Of the parallel filter over half the sampling rate (see `signals.Decimator`); None:
-            its decimation's.
-        reach: Samples on each side of a parabola.
-        median: Samples of the running median of the force; None: as it was logged.
+        edge: Edge of the parallel filter over half the sampling rate (see `signals.Decimator`); None:
+            that of its decimation.
+        reach: Number of samples on each side of a parabola.
+        median: Number of samples of the running median of the force; None: the force as logged.
     """
 
     cutoff_hz: float
@@ -64,7 +64,7 @@ class Recipe:
     median: int | None = None
 
     def cleaned(self, log: Log) -> Log:
-        """A log as everything else sees it: its force behind the running median.
+        """Apply the running median of the force, which all other steps take as the logged force.
 
         Raises:
             InputError: If the log is shorter than the median or the parabola.
@@ -75,22 +75,22 @@ class Recipe:
         return replace(log, force=signals.running_median(log.force, self.median))
 
     def band_hz(self, rate_hz: float) -> float:
-        """Edge of the band in which forces are compared."""
+        """Return the edge of the band in which forces are compared [Hz]."""
         return min(self.cutoff_hz, self.decimator.band_hz(rate_hz))
 
     def motion_hz(self, rate_hz: float) -> float:
-        """Cut-off that the position has, or would have if it were filtered."""
+        """Return the cut-off of the position [Hz], or the one that it would have if it were filtered."""
         if self.derivatives != "parabolic" or self.edge is None:
             return self.cutoff_hz
         return min(self.edge, 0.45) * rate_hz
 
     def response(self, frequency: np.ndarray, rate_hz: float, order: int = 0) -> np.ndarray:
-        """Gain of a derivative over the exact one at each frequency [Hz], without the parallel filter.
+        """Return the gain of a derivative over the exact one at each frequency, without the parallel filter.
 
         Args:
-            frequency: [Hz].
-            rate_hz: Sampling rate of the log.
-            order: Of the derivative, 0 to 2; only a parabola treats them differently.
+            frequency: Frequencies [Hz], (f,).
+            rate_hz: Sampling rate of the log [Hz].
+            order: Order of the derivative, 0 to 2; only a parabola treats them differently.
         """
         if self.derivatives == "parabolic":
             if order == 0:
@@ -99,21 +99,22 @@ class Recipe:
         if self.derivatives == "spectral":
             return signals.roll_off(frequency, self.cutoff_hz)
         sos = scipy.signal.butter(self.order, self.cutoff_hz, fs=rate_hz, output="sos")
-        return np.abs(scipy.signal.freqz_sos(sos, worN=frequency, fs=rate_hz)[1]) ** 2
+        response = scipy.signal.freqz_sos(sos, worN=frequency, fs=rate_hz)[1]  # pyright: ignore[reportArgumentType] (stub)
+        return np.abs(response) ** 2
 
     def hold(self, log: Log, period: float | None = None) -> float:
-        """For how long each command of a log is held from its sample on [s]; zero where that is not to count.
+        """Return the time for which each command of a log is held [s]; zero if the hold does not count.
 
         Args:
-            log: The log.
-            period: Of the controller [s]; absent: the log's sampling time.
+            log: The log with its kind of hold.
+            period: Period of the controller [s]; None: the log's sampling time.
         """
         held = self.align_hold and log.hold == "zero_order"
         return (period or log.period) if held else 0.0
 
     @property
     def independent(self) -> float:
-        """Part of the kept samples whose noise is independent: half where the band is just filled."""
+        """Part of the kept samples with independent noise: one half if the band fills the kept rate."""
         if self.edge is None:
             return 0.5
         return min(0.5, 0.5 * self.decimation * self.edge / (2 * A_PERIOD))
@@ -122,30 +123,31 @@ class Recipe:
     def decimator(self) -> signals.Decimator:
         """The parallel filter.
 
-        A stated recipe's is its decimation's. Else the band ends where the position's filter is
-        still flat: beyond that, the force would have no motion to be compared with.
+        For a stated recipe its edge is that of the decimation. Otherwise the band ends where the position's
+        filter is still flat: beyond, the force would have no motion to be compared with.
         """
         return signals.Decimator(self.decimation, self.trim, self.edge)
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A log made ready for inverse dynamics.
+    """A log that is filtered for inverse dynamics.
 
     Args:
         q, qd, qdd: Filtered motion at the log's rate, (time, n).
         force: Declared force, (time, m) [N or N m].
         period: Sampling time of the log [s].
-        hold: For how long each force is held from its sample on [s]; zero where that is not to
-            count (see `Recipe.align_hold`).
-        recipe: How it was filtered.
-        moving: Which kept samples are not at rest, (kept, n).
-        fitted: Which kept samples a fit uses, (kept, n): those that move; under a stated recipe
-            also those that only pass through zero, as the published recipes leave nothing out.
-        kept: Their indices in these arrays.
+        hold: Time for which each force is held from its sample on [s]; zero if that does not count (see
+            `Recipe.align_hold`).
+        recipe: Settings of the filter.
+        moving: Mask of the kept samples that are not at rest, (kept, n).
+        fitted: Mask of the kept samples that a fit uses, (kept, n): those that move; under a stated recipe
+            also those that only pass through zero, as the published recipes omit nothing.
+        kept: Indices of the kept samples in the arrays of motion.
         start: Time of the first sample, from the start of the log [s].
-        measured: Which joints have an encoder; the motion of the others is that of `Log.filled`.
-        steps: Integration steps a sample by which theirs is found (see `jaxid.dynamics.hidden_joints`).
+        measured: Whether each joint has an encoder; the motion of the others is that of `Log.filled`.
+        steps: Integration steps in a sample for the motion of joints without an encoder (see
+            `jaxid.dynamics.hidden_joints`).
     """
 
     q: Float[np.ndarray, "time n"]
@@ -168,14 +170,14 @@ class Prepared:
         return self.start + self.period * self.kept
 
     def parts(self, most: int, pieces: int) -> list[Prepared]:
-        """The log itself, or, where it keeps more than `most` samples, pieces spread over it.
+        """Return the log itself or, if it keeps more than `most` samples, pieces spread over it.
 
-        All pieces have one length, so that compiled code serves them all, and begin on a kept
-        sample. A joint that moves between them only has a further piece where it does.
+        All pieces have one length, so that one compiled function serves them, and begin on a kept sample. For
+        a joint that moves only between the pieces, a further piece is added.
 
         Args:
-            most: Samples to keep, all pieces together.
-            pieces: Into how many.
+            most: Largest number of kept samples, all pieces together.
+            pieces: Number of pieces.
         """
         if len(self.kept) <= most:
             return [self]
@@ -185,14 +187,15 @@ class Prepared:
         last = (len(self.q) - length) // step
         starts = [int(k) for k in np.linspace(0, last, pieces)]
         for moving in self.moving.T:
-            # The first sample of a piece does not continue another.
-            seen = any(moving[k + 1 : k + rows].any() for k in starts)
-            if moving.any() and not seen:
-                own = np.flatnonzero(moving)
-                starts.append(int(np.clip(own[len(own) // 2] - rows // 2, 0, last)))
+            # The first sample of a piece does not continue another piece.
+            covered = any(moving[k + 1 : k + rows].any() for k in starts)
+            if moving.any() and not covered:
+                moving_rows = np.flatnonzero(moving)
+                starts.append(int(np.clip(moving_rows[len(moving_rows) // 2] - rows // 2, 0, last)))
         return [self._piece(k * step, length) for k in starts]
 
     def _piece(self, first: int, length: int) -> Prepared:
+        """Cut out a piece that begins at a kept sample."""
         part = slice(first, first + length)
         kept = self.recipe.decimator.kept(length)
         at = first // self.recipe.decimation
@@ -210,28 +213,28 @@ class Prepared:
         )
 
     def at_kept(self, x: np.ndarray) -> np.ndarray:
-        """Values of a signal of the log at the kept samples."""
+        """Return the values of a signal of the log at the kept samples."""
         return x[self.kept]
 
 
 def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
     """Complete a stated recipe from the log, or choose all of it.
 
-    The parallel filter ends where the position first stands less than four times above its noise floor
-    in power (a gap between the lines of a multisine is enough), at most at 0.3 of the sampling rate; the
-    position's own filter, at twice that, is flat where the parallel filter still passes anything. The
-    rest velocity is five standard deviations of the velocity's noise in that band, at least half a
-    percent of the RMS velocity.
+    The parallel filter ends at the first frequency at which the position is less than four times above its
+    noise floor in power (a gap between the lines of a multisine is enough), at most at 0.3 of the sampling
+    rate. The position's filter, with twice that cut-off, is flat over the band of the parallel filter. The
+    rest velocity is five standard deviations of the velocity's noise in that band, at least half a percent of
+    the RMS velocity.
 
-    Parabolic derivatives leave the position unfiltered, and the parallel filter ends where they are still
-    flat, or earlier; with a stated decimation it is that decimation's, to the letter.
+    Parabolic derivatives do not filter the position, and the parallel filter ends where they are still flat,
+    or earlier; with a stated decimation its edge is that of the decimation.
 
     Args:
-        log: The log.
-        stated: The case's `[preprocess]`; its entries win.
+        log: The log to filter.
+        stated: The case's `[preprocess]`; its entries take precedence.
 
     Raises:
-        InputError: If it states a cut-off that the log's sampling rate cannot have, or a median or a
+        InputError: If it states a cut-off that the log's sampling rate does not allow, or a median or a
             parabola that is longer than the log.
     """
     stated = dict(stated or {})
@@ -241,30 +244,27 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
             f"[preprocess] cutoff_hz = {stated['cutoff_hz']:g} is not below half the sampling rate of "
             f"{rate:.6g} Hz",
             where=log.source,
-            hint="lower it, or leave it out: it is then chosen",
+            hint="lower it, or remove it: it is then chosen",
         )
     parabolic, reach = stated.get("derivatives") == "parabolic", int(stated.get("reach", 2))
     _require_length(log, stated.get("median"), reach if parabolic else None)
+
+    # A literal recipe has no edge of its parallel filter beside that of the decimation.
     literal = "cutoff_hz" in stated or (parabolic and "decimation" in stated)
     how = stated.get("derivatives", "central" if literal else "spectral")
     edge = None if literal else _noise_cutoff(log)
     if parabolic:
         cutoff = signals.parabolic_cutoff(reach) * rate
-        edge = None if literal else min(edge, _FLAT * cutoff)
+        edge = None if edge is None else min(edge, _FLAT * cutoff)
     else:
-        cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
-    band = cutoff if literal else edge
+        cutoff = float(stated["cutoff_hz"]) if edge is None else min(2 * edge, 0.45 * rate)
+    band = cutoff if edge is None else edge
     decimation = int(stated.get("decimation", _decimation(log, band)))
-    q, qd, _ = differentiate(log.filled, log.period, cutoff, 4, how, reach=reach)
-    noise = signals.high_band_std(log.filled)
-    # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
-    velocity_noise = noise * 2 * np.pi * np.sqrt(2 * cutoff**3 / (3 * rate))
-    if parabolic:
-        # Slope of a line through 2 k + 1 samples.
-        velocity_noise = noise * rate * np.sqrt(3 / (reach * (reach + 1) * (2 * reach + 1)))
-    rest = np.maximum(5 * velocity_noise, 5e-3 * np.sqrt(np.mean(qd**2, axis=0)))
+
     if "rest_velocity" in stated:
-        rest = np.full(q.shape[1], stated["rest_velocity"], float)
+        rest = np.full(log.position.shape[1], stated["rest_velocity"], float)
+    else:
+        rest = _rest_velocity(log, cutoff, how, reach)
     return Recipe(
         cutoff_hz=cutoff,
         order=int(stated.get("order", 4)),
@@ -274,16 +274,31 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         align_hold=bool(stated.get("align_hold", not literal)),
         derivatives=how,
         keeps_reversals=literal,
-        edge=None if literal else 2 * edge / rate,
+        edge=None if edge is None else 2 * edge / rate,
         reach=reach,
         median=stated.get("median"),
     )
 
 
+def _rest_velocity(log: Log, cutoff_hz: float, how: str, reach: int) -> np.ndarray:
+    """Choose the velocity below which a sample counts as at rest, by joint: see `choose_recipe`."""
+    _, qd, _ = differentiate(log.filled, log.period, cutoff_hz, 4, how, reach=reach)
+    rate = log.rate_hz
+    noise = signals.high_band_std(log.filled)
+    if how == "parabolic":
+        # Slope of a line through 2 k + 1 samples.
+        velocity_noise = noise * rate * np.sqrt(3 / (reach * (reach + 1) * (2 * reach + 1)))
+    else:
+        # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
+        velocity_noise = noise * 2 * np.pi * np.sqrt(2 * cutoff_hz**3 / (3 * rate))
+    return np.maximum(5 * velocity_noise, 5e-3 * np.sqrt(np.mean(qd**2, axis=0)))
+
+
 def _require_length(log: Log, median: int | None, reach: int | None) -> None:
     """Refuse a window that is as long as the log."""
-    for key, value, width in (("median", median, median), ("reach", reach, 2 * (reach or 0) + 1)):
-        if value is not None and width >= log.samples:
+    windows = {"median": (median, median), "reach": (reach, None if reach is None else 2 * reach + 1)}
+    for key, (value, width) in windows.items():
+        if width is not None and width >= log.samples:
             raise InputError(
                 f"[preprocess] {key} = {value} takes {width} samples, and the log has {log.samples}",
                 where=log.source,
@@ -292,37 +307,37 @@ def _require_length(log: Log, median: int | None, reach: int | None) -> None:
 
 
 def _decimation(log: Log, band_hz: float) -> int:
-    """One sample in how many to keep: as many as the band needs, and of a short log more.
+    """Choose the decimation that the band needs, or a smaller one for a short log.
 
-    What else is left out (ends, stops, reversals) is left out in whole samples; of twenty-five
-    kept ones too few would remain. Their noise is correlated, which whitening takes care of.
+    Other omissions (ends, stops, reversals) are whole kept samples; of twenty-five kept ones too few would
+    remain. Noise of the additional samples is correlated, which whitening takes into account.
     """
     return max(1, min(spaced(log.rate_hz, band_hz), log.samples // _ENOUGH))
 
 
 def spaced(rate_hz: float, band_hz: float) -> int:
-    """One sample in how many a band needs."""
+    """Return the decimation that a band needs."""
     return max(1, int(A_PERIOD * rate_hz / band_hz))
 
 
 def trimmed(log: Log, band_hz: float, decimation: int, *, literal: bool, periods: int = _ENDS) -> int:
-    """Kept samples to leave out at each end: as far as the ends of filters reach.
+    """Return the number of kept samples to omit at each end, as far as the ends of filters reach.
 
     Args:
-        log: The log.
-        band_hz: Edge of the band.
+        log: The log to filter.
+        band_hz: Edge of the band [Hz].
         decimation: One sample in so many is kept.
-        literal: Whether the recipe is stated; else of a short log not more than an eighth.
-        periods: Of the band's edge, over which filters forget the ends.
+        literal: Whether the recipe is stated; else at most an eighth of a short log is omitted.
+        periods: Number of periods of the band's edge after which the effect of the ends has decayed.
     """
     reach = int(np.ceil(periods * log.rate_hz / (band_hz * decimation)))
     return reach if literal else min(reach, log.samples // decimation // 8)
 
 
 def _noise_cutoff(log: Log) -> float:
-    """Frequency up to which every joint's position stands above its noise without a gap [Hz]."""
+    """Find the frequency up to which every joint's position is above its noise without a gap [Hz]."""
     rate = log.rate_hz
-    # Two seconds a segment: friction's corners recur over seconds, noise everywhere.
+    # Segments of two seconds: corners of friction recur over seconds, noise is everywhere.
     position = log.position[:, list(log.measured)]
     length = int(min(len(position), max(256, 2 * rate)))
     f, p = scipy.signal.welch(position, rate, window="hann", nperseg=length, detrend="linear", axis=0)
@@ -330,7 +345,7 @@ def _noise_cutoff(log: Log) -> float:
     above = np.all(p > 4 * floor, axis=1) & (f < 0.3 * rate)
     first_lost = np.argmax(~above[1:]) + 1 if np.any(~above[1:]) else len(f) - 1
     lowest = 8.0 / (log.samples * log.period)
-    # Two digits, rounded down: it is not known better, and alike logs share compiled code.
+    # Two digits, rounded down: it is not known better, and similar logs share compiled code.
     digit = 10.0 ** (np.floor(np.log10(f[first_lost])) - 1)
     return float(np.clip(np.floor(f[first_lost] / digit) * digit, lowest, 0.3 * rate))
 
@@ -344,7 +359,7 @@ def differentiate(
     orders: int = 2,
     reach: int = 2,
 ) -> tuple[np.ndarray, ...]:
-    """Signal and its derivatives up to an order; filtered unless `how` is "parabolic", see `Recipe`."""
+    """Differentiate a signal up to an order; it is filtered unless `how` is "parabolic", see `Recipe`."""
     if how == "parabolic":
         if orders > 2:
             raise ValueError(f"a parabola has no derivative of order {orders}.")
@@ -361,10 +376,10 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | Non
     """Filter a log and mark the samples that count.
 
     Args:
-        log: The log, as `Recipe.cleaned` gives it.
+        log: The log, from `Recipe.cleaned`.
         gain: Declared force per unit of command, (m,).
-        recipe: How to filter it.
-        hold_period: For how long a held command is held [s]; absent: the log's sampling time.
+        recipe: Settings of the filter.
+        hold_period: Time for which a held command is held [s]; None: the log's sampling time.
     """
     q, qd, qdd = differentiate(
         log.filled, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives, reach=recipe.reach
@@ -374,27 +389,27 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | Non
     reach = recipe.decimator.reach
     if not recipe.keeps_reversals:
         reach = affordable(at_rest, turning(qd), max(reach, recipe.decimation - 1))
-        # An axis that swings faster than the filter reaches has nothing but reversals: they stay.
+        # An axis that swings faster than the filter's reach has only reversals: they are kept.
         at_rest = at_rest | (turning(qd) & (reach > 0))
     moving = ~smeared(at_rest, reach)[kept] & log.measured
     fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
     return Prepared(
-        q,
-        qd,
-        qdd,
-        log.force * gain,
-        log.period,
-        recipe.hold(log, hold_period),
-        recipe,
-        moving,
-        fitted if recipe.keeps_reversals else moving,
-        kept,
+        q=q,
+        qd=qd,
+        qdd=qdd,
+        force=log.force * gain,
+        period=log.period,
+        hold=recipe.hold(log, hold_period),
+        recipe=recipe,
+        moving=moving,
+        fitted=fitted if recipe.keeps_reversals else moving,
+        kept=kept,
         measured=log.measured,
     )
 
 
 def affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
-    """How many samples about stops and reversals to leave out, so that most of the motion remains."""
+    """Return the number of samples to omit around stops and reversals, so that most of the motion remains."""
     for part in (1.0, 0.75, 0.5, 0.25):
         near = int(np.ceil(part * reach))
         lost = smeared(at_rest | turning, near) & ~at_rest
@@ -404,21 +419,21 @@ def affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
 
 
 def turning(v: np.ndarray) -> np.ndarray:
-    """Samples between which a velocity changes its sign: a fast reversal has none at rest."""
+    """Mark the samples between which a velocity changes its sign: a fast reversal has none at rest."""
     turns = np.diff(np.sign(v), axis=0) != 0
     edge = np.zeros((1, v.shape[1]), bool)
     return np.concatenate([turns, edge]) | np.concatenate([edge, turns])
 
 
 def smeared(flags: np.ndarray, reach: int) -> np.ndarray:
-    """Flags and their neighbours: the parallel filter smears a stop, which goes with them."""
+    """Mark flags and their neighbours: the parallel filter spreads a stop over them."""
     width = 2 * reach + 1
     count = np.cumsum(np.pad(flags, ((reach + 1, reach), (0, 0))), axis=0)
     return count[width:] > count[:-width]
 
 
 def lasting(flags: np.ndarray, length: int) -> np.ndarray:
-    """Only those flags, (time, n), that stand for longer than `length` samples on end."""
+    """Keep only those flags, (time, n), that are set for more than `length` consecutive samples."""
     out = np.zeros_like(flags)
     for i, f in enumerate(flags.T):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], f, [False]]).astype(int)))

@@ -1,7 +1,7 @@
-"""Rough signal arithmetic for checks: running means in place of filters.
+"""Rough signal processing for checks: running means in place of filters.
 
-Nothing here needs the accuracy of the package's filters; it has to be there at
-once, before JAX or scipy are loaded.
+These checks do not need the accuracy of the package's filters; they must run at once, before JAX or SciPy are
+loaded.
 """
 
 import math
@@ -10,8 +10,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-# A force of which the acceleration explains less than this part is a controller's own: a spring and a damper
-# to a reference that stands. It says nothing of the inertia.
+# A force of which the acceleration explains less than this part comes from the controller: a spring and a
+# damper to a constant reference. It does not determine the inertia.
 _SHARE = 0.01
 
 Signal = Float[np.ndarray, " samples"]
@@ -36,12 +36,12 @@ def smooth(values: Signal, window: int) -> Float[np.ndarray, " fewer"]:
 
 
 def windows(samples: int) -> list[int]:
-    """Window lengths worth trying on so many samples: powers of two up to a sixteenth."""
+    """Return window lengths for so many samples: powers of two up to a sixteenth of them."""
     return [2**k for k in range(12) if 2**k <= max(1, samples // 16)]
 
 
 def correlation(one: Signal, other: Signal) -> float:
-    """Correlation coefficient; 0 where one of them is constant."""
+    """Return the correlation coefficient; 0 if one signal is constant."""
     one, other = one - one.mean(), other - other.mean()
     scale = float(np.sqrt((one @ one) * (other @ other)))
     return float(one @ other) / scale if scale > 0 else 0.0
@@ -50,12 +50,12 @@ def correlation(one: Signal, other: Signal) -> float:
 def implied_inertia(
     force: Signal, q: Signal, period: float, others: Float[np.ndarray, "samples k"] | None = None
 ) -> float | None:
-    """Estimate an inertia roughly, with no knowledge of the machine.
+    """Estimate an inertia roughly, without knowledge of the machine.
 
-    A regression lets viscous and dry friction, a spring and an offset have their share of the
-    force. Noise makes an acceleration too large and its inertia too small, by less the longer
-    the window; so the value is believed where twice the window gives the same. Where inertia
-    and spring are alike in every window (a single tone), the ratio of the scatters has to do.
+    A regression attributes parts of the force to viscous and dry friction, a spring and an offset. Noise
+    makes an acceleration too large and its inertia too small, by less for a longer window; so a value is
+    accepted if twice the window gives the same. If inertia and spring cannot be distinguished in any window
+    (a single tone), the ratio of the standard deviations is used.
 
     Args:
         force: Force at the load [N or N m].
@@ -64,27 +64,27 @@ def implied_inertia(
         others: Positions of other joints, which springs may join to this one; None without any.
 
     Returns:
-        The inertia [kg or kg m^2]; None where no value is to be believed.
+        The inertia [kg or kg m^2]; None if no value is reliable.
     """
     velocity = (q[2:] - q[:-2]) / (2.0 * period)
     acceleration = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / period**2
     positions = [q[1:-1]] if others is None else [q[1:-1], *others[1:-1].T]
     tried = []
     for window in windows(q.size):
-        # Force and acceleration pass the same means: the law between them stays as it was.
+        # Force and acceleration pass through the same means, so the law between them is unchanged.
         f, a, v, *x = (smooth(s, window) for s in (force[1:-1], acceleration, velocity, *positions))
         if a.std() > 0 and f.std() > 0:
             explained, value = _regress(f, a, v, *x)
             tried.append((explained, value, float(f.std() / a.std())))
     best = max((explained for explained, _, _ in tried), default=0.0)
-    told = [value if explained > 0.9 * best > 0.5 else None for explained, value, _ in tried]
-    if any(value is not None for value in told):
-        return _plateau(told)
+    believed = [value if explained > 0.9 * best > 0.5 else None for explained, value, _ in tried]
+    if any(value is not None for value in believed):
+        return _plateau(believed)
     return _plateau([ratio for _, _, ratio in tried])
 
 
 def _plateau(values: list[float | None]) -> float | None:
-    """The first value that the next one confirms to 25 %."""
+    """Return the first value that the next one confirms to 25 %."""
     for one, other in pairwise(values):
         if one is not None and other is not None and 0.8 < one / other < 1.25:
             return other
@@ -92,9 +92,9 @@ def _plateau(values: list[float | None]) -> float | None:
 
 
 def _regress(f: Signal, a: Signal, v: Signal, *x: Signal) -> tuple[float, float | None]:
-    """Share of the force explained, and the coefficient of the acceleration where it is told.
+    """Return the part of the force explained, and the coefficient of the acceleration if it is identifiable.
 
-    It is NaN where the acceleration has no share.
+    The coefficient is NaN if the acceleration has no share of the force.
     """
     columns = np.stack([a, v, np.sign(v), *x], axis=1)
     columns = columns - columns.mean(axis=0)
@@ -102,12 +102,12 @@ def _regress(f: Signal, a: Signal, v: Signal, *x: Signal) -> tuple[float, float 
     scale[scale == 0] = 1.0
     columns, f = columns / scale, f - f.mean()
     theta = np.linalg.lstsq(columns, f, rcond=1e-6)[0]
-    left = f - columns @ theta
-    # What the other columns leave of the acceleration is all that can tell the inertia.
+    remaining = f - columns @ theta
+    # Only the part of the acceleration that other columns do not explain determines the inertia.
     others = columns[:, 1:] @ np.linalg.lstsq(columns[:, 1:], columns[:, 0], rcond=1e-6)[0]
-    told = float(np.var(columns[:, 0] - others))
+    independent = float(np.var(columns[:, 0] - others))
     value = float(theta[0] / scale[0])
-    explained = 1.0 - float(left @ left) / float(f @ f)
+    explained = 1.0 - float(remaining @ remaining) / float(f @ f)
     if abs(theta[0]) < _SHARE * f.std():
         return explained, math.nan
-    return explained, value if told > 0.01 and value > 0 else None
+    return explained, value if independent > 0.01 and value > 0 else None

@@ -1,7 +1,7 @@
-"""Does a log make physical sense, before anything is fitted to it?
+"""Check that a log makes physical sense, before a fit.
 
-`read_log` has refused what cannot be read; here stand the faults that are perfectly
-readable numbers: a machine at rest, a command at its limit, the wrong unit.
+`read_log` refuses logs that cannot be read. The checks here find faults in readable numbers: a machine at
+rest, a command at its limit, a wrong unit.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,11 +16,11 @@ from jaxid.logs.units_check import ByJoint, magnitude_findings, plausible_inerti
 
 __all__ = ["Finding", "check_log", "plausible_inertia", "raise_on_error"]
 
-# Chosen: with fewer levels than this over the whole stroke, an acceleration is made of steps.
+# Chosen: with fewer levels than this over the whole stroke, an acceleration consists of steps.
 _COARSE_LEVELS = 500
-# A position of fewer values is no movement.
+# A position with fewer values does not count as motion.
 FEWEST_LEVELS = 5
-# Of all rows; a command that is longer at its limit than not says little about the force.
+# Parts of all rows; a command that is at its limit more often than not does not determine the force.
 _SATURATED = 0.5
 _OFTEN_SATURATED = 0.05
 
@@ -36,21 +36,21 @@ def check_log(
     fewest_levels: int = FEWEST_LEVELS,
     resolution_stated: bool = False,
 ) -> list[Finding]:
-    """Look for the faults of a readable log.
+    """Find the faults of a readable log.
 
     Args:
-        log: The log.
-        command_limit: Known saturation of the logged command, in its unit; a list by channel.
-        motion: "linear" (m) or "rotary" (rad), of all joints or one for each.
-        units: Labels of the case where the quantities are not mechanical; a foreign
-            position unit leaves out the checks that need metres or radians.
-        path: Name of the log in messages; its source where absent.
-        driven: Joints with a drive, 0-based, in the order of the drives; None: the first ones.
-        fewest_levels: A position of fewer values is no movement.
-        resolution_stated: Whether the case says in what steps the position comes.
+        log: The log to check.
+        command_limit: Known saturation of the logged command, in units of the command; a list by channel.
+        motion: "linear" (m) or "rotary" (rad), one for all joints or a list by joint.
+        units: Labels of the case if the quantities are not mechanical; with another unit of position, checks
+            that need metres or radians are omitted.
+        path: Name of the log in messages; None: its source.
+        driven: Indices of the joints with a drive, in the order of the drives; None: the first ones.
+        fewest_levels: Least number of distinct positions that count as motion.
+        resolution_stated: Whether the case states the resolution of the position.
 
     Returns:
-        What was found; empty for a sound log.
+        The faults; empty for a sound log.
     """
     where = str(path or log.source)
     findings = [*_movement(log, where, fewest_levels, resolution_stated), *_force(log, command_limit, where)]
@@ -64,13 +64,13 @@ def check_log(
 
 
 def raise_on_error(findings: Iterable[Finding]) -> None:
-    """Refuse a log in which an error was found.
+    """Refuse a log with an error among its findings.
 
     Args:
-        findings: What `check_log` returned.
+        findings: Findings of `check_log`.
 
     Raises:
-        InputError: For the first error; the number of further ones is told.
+        InputError: For the first error; its hint gives the number of further ones.
     """
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
@@ -80,18 +80,18 @@ def raise_on_error(findings: Iterable[Finding]) -> None:
 
 
 def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
-    """Joints that stand still, and positions that come in coarse steps."""
-    seen = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
-    reasons = [_stillness(q, fewest) for _, q in seen]
+    """Find joints that do not move, and positions with coarse steps."""
+    measured = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
+    reasons = [_stillness(q, fewest) for _, q in measured]
     if all(reasons):
         hint = "check that position names the right column and that the machine moved"
         return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, position", hint)]
     findings = []
-    for (joint, q), reason in zip(seen, reasons, strict=True):
+    for (joint, q), reason in zip(measured, reasons, strict=True):
         where = f"{path}, position of joint {joint}"
         levels, step = _levels(q)
         if reason:
-            hint = "its parameters cannot be told from this log; check the column"
+            hint = "its parameters are not identifiable from this log; check the column"
             findings.append(Finding("warning", f"the joint does not move: {reason}", where, hint))
         elif step and levels < _COARSE_LEVELS:
             what = f"the position is quantised in steps of {step:.3g}: {levels} levels in all"
@@ -102,7 +102,7 @@ def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
 
 
 def _stillness(q: np.ndarray, fewest: int) -> str:
-    """Why this position is no movement; empty where it is one."""
+    """Explain why a position shows no motion; empty if it does."""
     if np.ptp(q) == 0:
         return f"the position is {q[0]:.6g} throughout"
     levels, step = _levels(q)
@@ -111,14 +111,14 @@ def _stillness(q: np.ndarray, fewest: int) -> str:
     centred = q - q.mean()
     lags = range(1, min(20, q.size // 4) + 1)
     similar = [abs(centred[lag:] @ centred[:-lag]) / (centred @ centred) for lag in lags]
-    # Any motion that the sampling resolves looks like itself a sample later; noise does not.
+    # A motion that the sampling resolves is correlated with itself a sample later; noise is not.
     if max(similar) < max(0.1, 4.0 / np.sqrt(q.size)):
         return f"the position is noise of {q.std():.3g} (standard deviation)"
     return ""
 
 
 def _levels(q: np.ndarray) -> tuple[int, float]:
-    """Number of distinct positions, and their spacing; spacing 0 where they lie on no grid."""
+    """Return the number of distinct positions and their spacing; spacing 0 if they are on no grid."""
     levels = np.unique(q)
     gaps = np.diff(levels)
     # Equal levels may differ in their last bits after a conversion of units.
@@ -131,12 +131,12 @@ def _levels(q: np.ndarray) -> tuple[int, float]:
 
 
 def _force(log: Log, limit: ByJoint | None, path: str) -> list[Finding]:
-    """Commands that are constant, or sit at their limit."""
+    """Find commands that are constant, or at their limit."""
     channels = log.force.T
     constant = np.ptp(log.force, axis=0) == 0
     if constant.all():
         level = "zero" if not log.force.any() else f"constant ({channels[0][0]:.6g})"
-        hint = "check that force names the right column; nothing can be learned without a change"
+        hint = "check that force names the right column; a constant force identifies nothing"
         return [Finding("error", f"the force is {level} throughout", f"{path}, force", hint)]
     limits = [None] * len(channels) if limit is None else np.broadcast_to(limit, len(channels))
     findings = []
@@ -151,13 +151,14 @@ def _force(log: Log, limit: ByJoint | None, path: str) -> list[Finding]:
 
 
 def _saturation(u: np.ndarray, bound: float | None, where: str) -> list[Finding]:
+    """Find a command that is often at its limit."""
     extreme = np.abs(u).max() if bound is None else bound
     at_limit = np.abs(u) >= (1.0 - 1e-6) * extreme
     share = float(at_limit.mean())
     if share <= (_OFTEN_SATURATED if bound is not None else _SATURATED):
         return []
     what = f"the command is saturated: |u| = {extreme:.6g} in {100 * share:.0f} % of the rows"
-    hint = "log a gentler motion, or take other rows"
+    hint = "log a gentler motion, or select other rows"
     # A random binary excitation has two levels of both signs and is a sound experiment.
     binary = bound is None and share > 0.98 and np.ptp(np.sign(u[at_limit])) == 2
     severity = "error" if share > _SATURATED and not binary else "warning"

@@ -1,22 +1,23 @@
-"""Is the time column that of a log sampled at one rate?"""
+"""Check that a time column is that of a log sampled at one rate."""
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
 
-# Chosen: a deviation of 1 % of the period shifts a derivative by 1 %, which is
-# about what friction that differs by direction is worth; a few rows cannot.
+# Chosen: a deviation of 1 % of the period shifts a derivative by 1 %, which is about the size of a friction
+# that differs by direction. A few rows do not matter.
 _JITTER = 0.01
 _FEW_ROWS = 5
+# A step longer than so many periods is a gap.
 _GAP = 1.5
 
 
 def sound_time(time: Float[np.ndarray, " samples"], first: int, where: str) -> Float[np.ndarray, " samples"]:
     """Check that time runs forward at one rate.
 
-    Time stamps that were only rounded when they were written (1.638 ms logged as
-    1 or 2 ms) are no jitter: they are put back on the grid that they came from.
+    Time stamps that were only rounded when they were written (1.638 ms logged as 1 or 2 ms) are no jitter:
+    they are put back on their grid.
 
     Args:
         time: Time column [s].
@@ -24,7 +25,7 @@ def sound_time(time: Float[np.ndarray, " samples"], first: int, where: str) -> F
         where: File and column, for the message.
 
     Returns:
-        The time [s], on its grid where it had been rounded.
+        The time [s], on its grid if it had been rounded.
 
     Raises:
         InputError: If time stands still, runs backwards, has gaps or jitters.
@@ -41,6 +42,7 @@ def sound_time(time: Float[np.ndarray, " samples"], first: int, where: str) -> F
 
 
 def _check_forward(time: np.ndarray, step: np.ndarray, first: int, where: str) -> None:
+    """Refuse time that repeats or runs backwards."""
     wrong = np.flatnonzero(step <= 0)
     if not wrong.size:
         return
@@ -50,16 +52,16 @@ def _check_forward(time: np.ndarray, step: np.ndarray, first: int, where: str) -
         what = f"time repeats in {wrong.size} rows, first in row {first + k + 1}"
         raise InputError(what, where=where, hint=hint)
     verb = "repeats" if step[k] == 0 else "runs backwards"
-    hint = "remove the doubled rows, or keep to one run with rows = [first, end]"
+    hint = "remove the doubled rows, or restrict the log to one run by rows = [first, end]"
     what = f"time {verb} in row {first + k + 1} ({time[k]:.9g} s, then {time[k + 1]:.9g} s)"
     raise InputError(what, where=where, hint=hint)
 
 
 def _decimal_unit(time: np.ndarray) -> float:
-    """The last decimal that the time stamps carry [s]; 0 where there is none.
+    """Return the last decimal of the time stamps [s]; 0 if there is none.
 
-    Seen in the later half only: with a fixed number of digits, small numbers are
-    written more finely, and the coarsest unit is the one that limits.
+    Only the later half is examined: with a fixed number of digits, small numbers are written more finely, and
+    the coarsest unit is the limiting one.
     """
     late = time[time.size // 2 :]
     for decimals in range(10):
@@ -70,8 +72,9 @@ def _decimal_unit(time: np.ndarray) -> float:
 
 
 def _check_gaps(time: np.ndarray, step: np.ndarray, period: float, first: int, where: str) -> None:
+    """Refuse a log with a few long gaps in its time."""
     gaps = np.flatnonzero(step > _GAP * period)
-    # Timing that is loose throughout is jitter; a gap is the exception.
+    # Irregular timing throughout is jitter; a gap is an exception.
     if not gaps.size or gaps.size > 0.05 * step.size:
         return
     k = int(gaps[np.argmax(step[gaps])])
@@ -84,6 +87,7 @@ def _check_gaps(time: np.ndarray, step: np.ndarray, period: float, first: int, w
 
 
 def _widest(gaps: np.ndarray, count: int, first: int) -> str:
+    """Suggest the longest range of rows without a gap."""
     edges = np.concatenate([[0], gaps + 1, [count]])
     k = int(np.argmax(np.diff(edges)))
     start, end = first + edges[k], first + edges[k + 1]
@@ -91,6 +95,7 @@ def _widest(gaps: np.ndarray, count: int, first: int) -> str:
 
 
 def _check_jitter(step: np.ndarray, period: float, first: int, where: str) -> None:
+    """Refuse a log whose sampling period varies."""
     off = np.abs(step - period) / period
     loose = np.flatnonzero(off > _JITTER)
     if loose.size <= _FEW_ROWS:

@@ -1,7 +1,7 @@
-"""Quantities that disagree by the factor of a usual slip of units.
+"""Find quantities that disagree by the factor of a common error of units.
 
-Everything is compared after the same running means on both sides, which leave a
-law between the two quantities as it was while they take noise away.
+Both sides of a comparison pass through the same running means, which keep a law between the two quantities
+and remove noise.
 """
 
 import math
@@ -14,17 +14,17 @@ from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
 from jaxid.logs.rough_inertia import correlation, implied_inertia, smooth, windows
 
-# One number for all joints or channels, or one each.
+# One number for all joints or channels, or one for each.
 ByJoint = float | int | Sequence[float | int] | np.ndarray
 _DEGREES = 180.0 / math.pi
 _RPM = 30.0 / math.pi
-# Chosen: two columns that correlate less are not the same quantity in two units.
-_ALIKE = 0.9
+# Chosen: two columns with a smaller correlation are not the same quantity in two units.
+_SIMILAR = 0.9
 
 
 @dataclass(frozen=True)
 class _Slip:
-    """A usual factor and what it says; `motion` where it belongs to one kind of axis."""
+    """A common factor and its explanation; `motion` if it applies to one kind of axis only."""
 
     factor: float
     text: str
@@ -32,6 +32,7 @@ class _Slip:
     severity: str = "error"
 
     def matches(self, ratio: float, motion: str, spread: float) -> bool:
+        """Check that a ratio is this factor, up to a spread."""
         near = abs(math.log(ratio / self.factor)) < math.log(spread)
         return near and self.motion in ("", motion)
 
@@ -59,8 +60,8 @@ _REFERENCE = (
     _Slip(_DEGREES, "the reference looks like degrees", "rotary"),
     _Slip(1.0 / _DEGREES, "position looks like degrees", "rotary"),
 )
-# Inertia implied by the log over the guess of the case. A guess is often ten times
-# off, so a factor that only a poor guess could make as well is no more than a warning.
+# Inertia implied by the log over the guess of the case. A guess is often wrong by a factor of ten, so a
+# factor that a poor guess could also explain is only a warning.
 _INERTIA = (
     _Slip(1e-3, "position looks like millimetres, or force like kilonewtons", "linear"),
     _Slip(1e-6, "position looks like micrometres", "linear"),
@@ -78,10 +79,10 @@ def ratio_findings(
     """Compare the columns for velocity and reference with the position.
 
     Args:
-        log: The log.
-        motion: "linear" or "rotary", of all joints or one for each.
+        log: The log to check.
+        motion: "linear" or "rotary", one for all joints or a list by joint.
         path: Name of the log in messages.
-        driven: Joints with a drive, 0-based, in the order of the references; None: the first ones.
+        driven: Indices of the joints with a drive, in the order of the references; None: the first ones.
     """
     findings = []
     motions = _by_joint(motion, log)
@@ -95,7 +96,7 @@ def ratio_findings(
         if log.velocity is not None:
             where = f"{path}, velocity of joint {joint + 1}"
             findings += _compare_velocity(log.velocity[:, joint], q, log.period, motions[joint], where)
-        if joint in reference_of:
+        if log.reference is not None and joint in reference_of:
             where = f"{path}, reference of joint {joint + 1}"
             findings += _compare_reference(log.reference[:, reference_of[joint]], q, motions[joint], where)
     return findings
@@ -109,44 +110,46 @@ def _by_joint(motion: str | Sequence[str], log: Log) -> list[str]:
 def _compare_velocity(
     velocity: np.ndarray, q: np.ndarray, period: float, motion: str, where: str
 ) -> list[Finding]:
+    """Compare a velocity with the derivative of the position, in the window in which they agree best."""
     slope = (q[2:] - q[:-2]) / (2.0 * period)
     pairs = [(smooth(velocity[1:-1], w), smooth(slope, w)) for w in windows(q.size)]
     measured, derived = max(pairs, key=lambda pair: abs(correlation(*pair)))
-    alike = correlation(measured, derived)
-    if abs(alike) < _ALIKE:
-        what = f"velocity is not the derivative of position (correlation {alike:.2f})"
-        hint = "check that velocity names the right column, or leave it out"
+    similarity = correlation(measured, derived)
+    if abs(similarity) < _SIMILAR:
+        what = f"velocity is not the derivative of position (correlation {similarity:.2f})"
+        hint = "check that velocity names the right column, or remove it"
         return [Finding("warning", what, where, hint)]
-    if alike < 0:
+    if similarity < 0:
         what = "velocity has the opposite sign of the derivative of position"
-        return [Finding("error", what, where, "turn the sign of one of them, or leave it out")]
+        return [Finding("error", what, where, "change the sign of one of them, or remove velocity")]
     ratio = float(measured.std() / derived.std())
     return _judge(ratio, _VELOCITY, motion, "velocity is {:.4g} times the derivative", where)
 
 
 def _compare_reference(r: np.ndarray, q: np.ndarray, motion: str, where: str) -> list[Finding]:
-    if np.ptp(r) == 0 or abs(correlation(r, q)) < _ALIKE:
-        # A loop may be loose, or the reference constant: no ground for a verdict.
+    """Compare a reference with the position that follows it."""
+    if np.ptp(r) == 0 or abs(correlation(r, q)) < _SIMILAR:
+        # The loop may be loose, or the reference constant: there is no basis for a verdict.
         return []
     ratio = float(r.std() / q.std())
     return _judge(ratio, _REFERENCE, motion, "the reference is {:.4g} times the position", where)
 
 
 def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: str) -> list[Finding]:
-    """An error where a usual slip explains the factor, a warning where none does."""
+    """Report a ratio that is not one: an error if a common slip explains it, else a warning."""
     if 0.67 < ratio < 1.5:
         return []
-    told = text.format(ratio)
+    finding = text.format(ratio)
     for slip in slips:
         if slip.matches(ratio, motion, 1.2):
-            hint = "bring all columns to SI units"
-            return [Finding("error", f"{told}: {slip.text}", where, hint)]
+            hint = "convert all columns to SI units"
+            return [Finding("error", f"{finding}: {slip.text}", where, hint)]
     hint = "check the units of both columns"
-    return [Finding("warning", f"{told}, which should be 1", where, hint)]
+    return [Finding("warning", f"{finding}, which should be 1", where, hint)]
 
 
 def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list[Finding]:
-    """Strokes, speeds and sampling periods that no machine has.
+    """Find strokes, speeds and sampling periods that no machine has.
 
     Args:
         log: The log, in mechanical units.
@@ -174,23 +177,26 @@ def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list
 
 
 def _magnitude(q: np.ndarray, period: float, motion: str, where: str) -> Finding | None:
+    """Report a stroke or a speed that no machine has."""
     span = float(np.ptp(q))
-    # Over at least ten samples, so that a coarse encoder makes no speed of its own.
+    # Over at least ten samples, so that steps of a coarse encoder do not count as speed.
     lag = max(10, q.size // 1000)
     speed = float(np.abs(q[lag:] - q[:-lag]).max() / (lag * period))
     if motion == "linear":
         # Chosen: no axis travels 50 m or runs at 100 m/s; metres written as mm do at once.
-        seen, limit, absurd = (span, 50.0, 1e4) if span > 50.0 else (speed, 100.0, 1e5)
-        told = f"a stroke of {span:.4g} m" if span > 50.0 else f"a speed of {speed:.4g} m/s"
-        unit, hint = "millimetres" if span < 1e4 else "micrometres", "convert position to m"
+        value, limit, absurd = (span, 50.0, 1e4) if span > 50.0 else (speed, 100.0, 1e5)
+        what = f"a stroke of {span:.4g} m" if span > 50.0 else f"a speed of {speed:.4g} m/s"
+        unit = "millimetres" if span < 1e4 else "micrometres"
+        hint = "convert position to m"
     else:
         # Chosen: 1e4 rad/s is 95 000 rpm.
-        seen, limit, absurd = speed, 1e4, 1e6
-        told, unit, hint = f"a speed of {speed:.4g} rad/s", "degrees", "convert position to rad"
-    if seen <= limit:
+        value, limit, absurd = speed, 1e4, 1e6
+        what = f"a speed of {speed:.4g} rad/s"
+        unit, hint = "degrees", "convert position to rad"
+    if value <= limit:
         return None
-    severity = "error" if seen > absurd else "warning"
-    return Finding(severity, f"{told}: position looks like {unit}", where, hint)
+    severity = "error" if value > absurd else "warning"
+    return Finding(severity, f"{what}: position looks like {unit}", where, hint)
 
 
 def plausible_inertia(
@@ -203,19 +209,18 @@ def plausible_inertia(
 ) -> Finding | None:
     """Compare the inertia that the log implies with the guess, by its order of magnitude.
 
-    Only where the two differ by the factor of a usual slip of units is anything said; a
-    guess may be poor.
+    A finding is made only if the two differ by the factor of a common error of units; a guess may be poor.
 
     Args:
-        log: The log.
+        log: The log to check.
         guess: Inertia by joint [kg or kg m^2].
         gain: Force per unit of the logged command, by drive.
-        motion: "linear" or "rotary", of all joints or one for each.
-        driven: Joint of each drive, 0-based; absent: all, in their order.
+        motion: "linear" or "rotary", one for all joints or a list by joint.
+        driven: Index of the joint of each drive; None: all joints, in their order.
 
     Returns:
-        The first joint's finding, or None where nothing speaks against the units.
-        None too where it is not told which joints have a force of their own.
+        The finding of the first joint that has one; None if no joint has, or if the joints of the forces are
+        not known.
     """
     joints = log.position.shape[1]
     driven = np.arange(joints) if driven is None else driven
@@ -225,7 +230,8 @@ def plausible_inertia(
     forces = log.force * np.asarray(gain, dtype=np.float64)
     motions = _by_joint(motion, log)
     for force, joint in zip(forces.T, driven, strict=True):
-        others = np.delete(log.position, [joint, *np.flatnonzero(~np.array(log.measured))], axis=1)
+        without_encoder = np.flatnonzero(~np.array(log.measured))
+        others = np.delete(log.position, np.array([joint, *without_encoder]), axis=1)
         rough = implied_inertia(force, log.position[:, joint], log.period, others)
         where = f"{log.source}, joint {joint + 1}"
         span = float(np.ptp(log.position[:, joint]))
@@ -236,14 +242,15 @@ def plausible_inertia(
 
 
 def _judge_inertia(rough: float | None, guess: float, span: float, motion: str, where: str) -> Finding | None:
+    """Report an implied inertia that differs from the guess by the factor of a common error of units."""
     if rough is None or guess <= 0:
         return None
     for slip in _INERTIA:
         spread = 2.0 if slip.severity == "warning" else 5.0
         if slip.matches(rough / guess, motion, spread):
             what = f"the log implies an inertia of about {rough:.2g}, the guess is {guess:.3g}"
-            hint = "bring the log to SI units, check actuator.gain, or correct the guess"
-            # A guess may be 57 times off; an angle of more than 20 makes it degrees.
+            hint = "convert the log to SI units, check actuator.gain, or correct the guess"
+            # A guess may be wrong by a factor of 57; an angle of more than 20 indicates degrees.
             sure = slip.severity == "error" or (slip.motion == "rotary" and span > 20.0)
             return Finding("error" if sure else "warning", f"{what}: {slip.text}", where, hint)
     return None

@@ -134,7 +134,7 @@ def test_chosen_ones_may_be_asked_for():
     with pytest.raises(ValueError, match=r"mass\[8\] is none"):
         base_parameters(plant, keep=("mass[8]",))
     for known in ("mass[7]", "mass"):
-        with pytest.raises(ValueError, match=r"mass\[7\] is in keep and known"):
+        with pytest.raises(ValueError, match=r"mass\[7\] is in keep and in known"):
             base_parameters(plant, keep=("mass[7]",), known=(known,))
 
 

@@ -132,10 +132,10 @@ def test_deviations_are_those_of_repeated_measurements():
 FAULTS = {
     "no such joint": (dict(joint=8), r"joint is 8; the plant has joints 1 to 7"),
     "angles": (dict(configurations=ANGLES[:, :6]), r"shape \(40, 6\); give a row of 7 positions"),
-    "lengths": (dict(measured=INERTIAS[:3, 2]), "3 inertias for 40 configurations; give one for each"),
+    "lengths": (dict(measured=INERTIAS[:3, 2]), "3 inertias for 40 configurations; give one inertia"),
     "stuck": (dict(measured=np.r_[1.0, np.nan, INERTIAS[2:, 2]]), "configuration 2 is nan .*sticks"),
     "negative": (dict(measured=-INERTIAS[:, 2]), "configuration 1 is -"),
-    "a name": (dict(known=("mass[9]",)), r"mass\[9\] is none of the plant's parameters; .*mass\[1\]"),
+    "a name": (dict(known=("mass[9]",)), r"mass\[9\] is not a parameter of the plant; .*mass\[1\]"),
     "all known": (dict(known=(*KNOWN, "inertia_xx", "inertia_yy", "inertia_zz")), "nothing that is unknown"),
 }
 

@@ -11,8 +11,9 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
-from jaxid.discovery.screen import _felt
-from jaxid.discovery.where import _between
+from jaxid.discovery.screen import _has_influence
+from jaxid.discovery.search import Model
+from jaxid.discovery.where import _bin_offset
 from jaxid.gap import noise_density
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import open_session
@@ -37,17 +38,17 @@ def axis(tmp_path_factory):
     """A search on an axis that lacks nothing, its force noise stated."""
     session = opened(tmp_path_factory.mktemp("axis"), machines.emps_like(3, 1.0, 6.0))
     search = start_search(session)[1]
-    search.theta = fitted(search)
+    search.model = Model((), fitted(search))
     return session, search
 
 
 def fitted(search):
-    return cand.refine(search.union, search.samples, search.theta, search.active)[0]
+    return cand.refine(search.superset, search.samples, search.theta, search.active)[0]
 
 
 def with_values(search, kind, values):
     theta = search.theta.copy()
-    theta[next(c for c in search.union.candidates if c.kind == kind).index] = values
+    theta[next(c for c in search.superset.candidates if c.kind == kind).index] = values
     return theta
 
 
@@ -116,12 +117,15 @@ def test_a_lag_swallows_noise_of_the_force_and_a_delay_does_not(tmp_path):
     sensor = Sensor(position_resolution=1e-10, position_noise=1e-10, force_noise=0.02)
     session = opened(tmp_path, dataclasses.replace(setup, sensor=sensor))
     search = start_search(session)[1]
-    search.theta, lag = fitted(search), 2e-3
+    search.model = Model((), fitted(search))
+    lag = 2e-3
     lagging, delayed = with_values(search, LAG, lag), with_values(search, DELAY, 3e-3)
-    swallowed = [search.worth.swallowed(search.samples, search.theta, t) for t in (lagging, delayed)]
+    swallowed = [
+        search.acceptance.absorbed_noise(search.samples, search.theta, t) for t in (lagging, delayed)
+    ]
     log, data = session.fit.log, session.fit.data
     assert session.recipe.decimation == 1, "nothing is folded"
-    f, power = noise_density(search.union.machine, log, data)
+    f, power = noise_density(search.superset.machine, log, data)
     numerics = np.mean((NUMERICS * (data.force - data.force.mean())) ** 2) / (log.rate_hz / 2)
     share = power[:, 0] / (power[:, 0] + numerics)
     expected = np.mean(share * (1 - 1 / (1 + (2 * np.pi * f * lag) ** 2)))
@@ -134,13 +138,13 @@ def test_nothing_is_known_to_be_swallowed_where_no_noise_is_stated(tmp_path):
     session = opened(tmp_path, machines.emps_like(3, 1.0, 4.0), sensor=False)
     search = start_search(session)[1]
     lagging = with_values(search, LAG, 0.02)
-    assert search.worth.swallowed(search.samples, search.theta, lagging) == 0.0
+    assert search.acceptance.absorbed_noise(search.samples, search.theta, lagging) == 0.0
 
 
 def test_models_are_as_far_apart_as_their_residuals_in_the_noise(axis):
     _, search = axis
     offset = [with_values(search, "constant_force", x) for x in (0.0, 0.5, 1.0)]
-    apart = [search.worth.apart(offset[0], x) for x in offset]
+    apart = [search.acceptance.divergence(offset[0], x) for x in offset]
     assert apart[0] == 0.0
     # Half a squared distance: it goes with the square of the force.
     assert apart[2] == pytest.approx(4 * apart[1], rel=1e-6)
@@ -148,15 +152,15 @@ def test_models_are_as_far_apart_as_their_residuals_in_the_noise(axis):
 
 def test_what_takes_the_sensors_own_noise_away_is_turned_down(axis):
     _, search = axis
-    index = next(c for c in search.union.candidates if c.kind == "constant_force").index
+    index = next(c for c in search.superset.candidates if c.kind == "constant_force").index
     off = with_values(search, "constant_force", 5.0)
-    assert search.worth.objection(index, off, search.theta, None, None, 3) == ""
+    assert search.acceptance.objection(index, off, search.theta, None, None, 3) == ""
     with pytest.MonkeyPatch.context() as patch:
         # As if the sensors had to leave a hundred times what is there.
-        patch.setattr(search.worth, "_noise", 100 * search.worth._noise)
-        patch.setattr(search.worth, "_numerics", 0.0)
-        why = search.worth.objection(index, off, search.theta, None, None, 3)
-    assert why == "it takes away what the sensors' noise alone must leave"
+        patch.setattr(search.acceptance, "_noise", 100 * search.acceptance._noise)
+        patch.setattr(search.acceptance, "_numerics", 0.0)
+        why = search.acceptance.objection(index, off, search.theta, None, None, 3)
+    assert why == "it removes more than the sensors' noise allows"
 
 
 def test_a_joint_with_little_noise_counts_for_little():
@@ -176,7 +180,7 @@ def test_a_joint_with_little_noise_counts_for_little():
 
 def test_few_independent_samples_may_leave_little(axis):
     _, search = axis
-    worth = search.worth
+    worth = search.acceptance
     many, few = worth._least(5), []
     assert many == 0.25
     moving = worth.samples.moving
@@ -193,10 +197,10 @@ def test_few_independent_samples_may_leave_little(axis):
 
 def test_many_starts_are_evaluated_once(axis, monkeypatch):
     _, search = axis
-    cogging = next(c for c in search.union.candidates if c.has_grid)
-    first = search.many(cogging)
+    cogging = next(c for c in search.superset.candidates if c.has_grid)
+    first = search.grid_points(cogging)
     monkeypatch.setattr(cand, "many_points", lambda *a: pytest.fail("evaluated again"))
-    assert search.many(cogging) is first
+    assert search.grid_points(cogging) is first
 
 
 def test_a_joint_that_moves_between_the_pieces_only_is_looked_at(axis, monkeypatch):
@@ -218,22 +222,22 @@ def test_a_line_is_placed_between_the_bins(true):
     series = np.cos(2 * np.pi * true * np.arange(n) / n + 0.4)
     power = np.abs(np.fft.rfft(series * np.hanning(n))) ** 2
     k = int(np.argmax(power))
-    assert k + _between(power, k) == pytest.approx(true, abs=0.03)
-    assert _between(power, 0) == 0.0
+    assert k + _bin_offset(power, k) == pytest.approx(true, abs=0.03)
+    assert _bin_offset(power, 0) == 0.0
 
 
-def test_a_limit_that_no_sample_reaches_is_not_felt(tmp_path):
+def test_a_limit_that_no_sample_reaches_is_not_has_influence(tmp_path):
     """Its column is the residual itself, faintly: at length one it would whiten the missing effect away."""
     hidden = machines.emps_like(3, 1.0, 6.0).with_effect("quadratic_drag", coefficient=800.0)
     search = start_search(opened(tmp_path, hidden))[1]
-    search.theta = fitted(search)
-    e, _ = cand.evaluate(search.union, search.samples, search.theta)
+    search.model = Model((), fitted(search))
+    e, _ = cand.evaluate(search.superset, search.samples, search.theta)
     counts, scale = search.samples.moving, np.array([c.innovation for c in search.colour])
-    saturation = next(c for c in search.union.candidates if c.kind == "saturation")
+    saturation = next(c for c in search.superset.candidates if c.kind == "saturation")
     far = dataclasses.replace(saturation, starts=np.array([1.2 * saturation.starts[0]]))
     near = dataclasses.replace(saturation, starts=np.array([0.7 * saturation.starts[0]]))
     felt = [
-        _felt(*cand.points(search.union, [c], search.samples, search.theta, e), counts, scale)
+        _has_influence(*cand.points(search.superset, [c], search.samples, search.theta, e), counts, scale)
         for c in (far, near)
     ]
     assert felt == [False, True]
@@ -242,14 +246,14 @@ def test_a_limit_that_no_sample_reaches_is_not_felt(tmp_path):
 def test_the_validation_log_may_ask_for_a_search(axis):
     """A fit may absorb on its own log what shows on another one."""
     session, search = axis
-    assert search.worth.at_floor(search.theta)
+    assert search.acceptance.at_floor(search.theta)
     off = with_values(search, "constant_force", 1.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search.worth, "others", [search.samples])
-        assert search.worth.at_floor(search.theta)
+        patch.setattr(search.acceptance, "others", [search.samples])
+        assert search.acceptance.at_floor(search.theta)
         shown = cand.CandidateSamples(session.fit.data)
         moved = session.fit.data.force + 1.0
         shown.arrays = [ForceData.of(dataclasses.replace(session.fit.data, force=moved))]
-        patch.setattr(search.worth, "others", [shown])
-        assert not search.worth.at_floor(search.theta)
-    assert not search.worth.at_floor(off)
+        patch.setattr(search.acceptance, "others", [shown])
+        assert not search.acceptance.at_floor(search.theta)
+    assert not search.acceptance.at_floor(off)

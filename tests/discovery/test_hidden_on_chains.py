@@ -197,8 +197,8 @@ def test_where_points_at_the_spring(tmp_path):
     case = next(c for c in cases("calibrate") if c.what == "cubic_stiffness" and c.place == 2)
     session = open_session(write_case(tmp_path, text_of(case)), logged(case), align_hold=True)
     _, search = start_search(session)
-    search.theta = cand.refine(search.union, search.samples, search.theta, search.active)[0]
-    step = Step(None, None, (), 0.0, search.theta, search.active)
+    theta = cand.refine(search.superset, search.samples, search.theta, search.active)[0]
+    step = Step(None, None, (), 0.0, theta, search.active)
     where = where_of(search, step, session.fit.log)
     assert where.significant
     assert where.variable == "elongation of spring 2"

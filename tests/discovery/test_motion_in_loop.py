@@ -6,6 +6,7 @@ import jaxid
 from benchmarks import hidden_run
 from jaxid.commands.discover import start_search
 from jaxid.discovery.in_loop.confirm import WHY, hindering
+from jaxid.discovery.search import Model
 from jaxid.effects import EFFECTS
 from jaxid.model.unknowns import free_effect
 from truth.axis.cases import write_case
@@ -65,7 +66,7 @@ def test_an_effect_hinders_by_what_it_does_to_the_loop(tmp_path, closed):
     search.run(0)
     assert hindering(search, session, baseline.machine) is None, "nothing was added"
     force = next(c for c in search.rest() if c.kind == "constant_force")
-    search.added = [force]
+    search.model = Model((force,), search.theta.copy())
     effect, machine = EFFECTS["constant_force"](level=0.0), baseline.machine
     plant, free = free_effect(machine.plant, effect, machine.units)
     machine = machine.with_plant(plant, machine.parameters.extended(free))

@@ -74,20 +74,20 @@ def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolu
     loop = Loop.of(found.session, LoopFit.of(found.session, found.session.machine, {}, ended))
     assert np.all(np.isfinite(loop.base))
     # What may have either sign is looked for in either.
-    looks = loop.looks()
+    trials = loop.trials()
     # Fits begin where simulation, not the line of a look, says that the residual is less.
-    cogging = next(c for c in loop.union.candidates if c.kind == "cogging")
-    begins = loop.begins(cogging, looks)
+    cogging = next(c for c in loop.superset.candidates if c.kind == "cogging")
+    begins = loop.start_points(cogging, trials)
     assert 1 < len({b.start for b in begins}) == len(begins) <= 6
     assert np.all(np.diff([b.squares for b in begins]) >= 0)
     for b in begins:
         e, _ = loop._at(cogging, b.values, b.point)
         assert b.squares == pytest.approx(e @ e)
         assert b.squares < loop.residual @ loop.residual
-    drag = next(x for x in looks if x.candidate.kind == "quadratic_drag")
+    drag = next(x for x in trials if x.candidate.kind == "quadratic_drag")
     for sign in (1.0, -1.0):
         faced = dataclasses.replace(loop, residual=-sign * drag.columns[:, 0])
-        seen = next(s for s in faced.scored(looks) if s.candidate.kind == "quadratic_drag")
+        seen = next(s for s in faced.scored(trials) if s.candidate.kind == "quadratic_drag")
         assert seen.evidence > 10
         assert np.sign(seen.guess[0]) == sign
 

@@ -140,10 +140,10 @@ def test_some_of_the_registered_are_searched_for_on_request(tmp_path, log):
 
 FAULTS = {
     "Clip": "changes the force by .* at its neutral values; define neutral.*adds_force = False",
-    "Root": "is no number at the values of neutral; change them, or correct act",
-    "Unsized": "cannot be started .KeyError.*; let neutral.*give a number for strength",
+    "Root": "is not finite at the values of neutral; change them, or correct act",
+    "Unsized": "cannot be built at its neutral .* .KeyError.*; let neutral.*give a number for strength",
     "Known": "has no parameters; declare",
-    "Misspelt": "cannot be started.*give a number for strength",
+    "Misspelt": "cannot be built at its neutral values or its starts.*give a number for strength",
 }
 
 

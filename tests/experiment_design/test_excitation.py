@@ -216,7 +216,7 @@ harmonics = 2
 def test_a_stroke_that_the_plant_cannot_be_in_is_refused(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(FIVE_BAR)
-    with pytest.raises(jaxid.InputError, match=r"\[limits\]: .*cannot be in; narrow stroke"):
+    with pytest.raises(jaxid.InputError, match=r"\[limits\]: .*cannot reach; narrow stroke"):
         jaxid.design(path)
 
 
@@ -236,7 +236,7 @@ def test_a_stroke_that_the_plant_cannot_be_in_is_refused(tmp_path):
                 ),
                 viscous="",
             ),
-            ["no force depends on what is unknown"],
+            ["no force depends on an unknown"],
         ),
         ("[8.0, 20.0]", "[8.0]", ["acceleration", "1 entry"]),
     ],

@@ -33,7 +33,7 @@ def test_unreadable_file(csv_file, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "read_bytes", denied)
-    refuse(csv_file, match="cannot be read .*Permission denied.*; check that it may be read")
+    refuse(csv_file, match="cannot be read .*Permission denied.*; check the permissions of the file")
 
 
 @pytest.mark.parametrize("text", ["", "\n\n", "# only a comment\n", "t,q,u\n", "t,q,u\n# none\n"])
@@ -141,7 +141,7 @@ def test_unequal_lengths(tmp_path):
 def test_number_of_joints(tmp_path):
     data = {**signals(), "q2": signals()["u"]}
     path = write_csv(tmp_path / "log.csv", data)
-    refuse(path, joints=2, match=r"position = \['q'\]: 1 column\(s\) where 2 belong; name one")
+    refuse(path, joints=2, match=r"position = \['q'\]: 1 column\(s\), expected 2; name one")
     one_driven = {**COLUMNS, "position": ["q", "q2"]}
     assert read_log(path, one_driven, joints=2).force.shape == (ROWS, 1)
     assert read_log(path, one_driven, joints=None).position.shape == (ROWS, 2)
@@ -190,7 +190,7 @@ def test_jitter(tmp_path):
 
 def test_rate_and_time_must_agree(csv_file):
     columns = {**COLUMNS, "sample_rate": 1.0}
-    refuse(csv_file, columns, match="time column says 1000 Hz, sample_rate says 1 Hz.*in seconds")
+    refuse(csv_file, columns, match="time column gives 1000 Hz, but sample_rate is 1 Hz.*in seconds")
 
 
 @pytest.mark.parametrize("rows", [[0, 201], [-5, 100], [100, 100], [150, 20]])
@@ -213,9 +213,9 @@ def test_too_short(csv_file):
         ({"forse": "u"}, "unknown key 'forse'; did you mean 'force'"),
         ({"hold": "zero-order"}, "hold = 'zero-order' is unknown; did you mean 'zero_order'"),
         ({"sample_rate": -1.0}, "sample_rate = -1.0 is not a rate"),
-        ({"rows": [0.5, 7]}, "rows = .* is no range"),
-        ({"rows": 7}, "rows = 7 is no range"),
-        ({"force": 3}, "force = 3 names no column"),
+        ({"rows": [0.5, 7]}, "rows = .* is not a range"),
+        ({"rows": 7}, "rows = 7 is not a range"),
+        ({"force": 3}, "force = 3 is not the name of a column"),
         ({"force": ["u", "u"]}, "names a column twice"),
     ],
 )

@@ -1,8 +1,8 @@
-"""Break-away friction, looked for where it acts: in the moments in which an axis starts from rest.
+"""Break-away friction, estimated from the moments in which a joint starts from rest.
 
-Samples at rest carry no balance of forces, only a bound, so the search in the force domain cannot
-see what acts there. Every start from rest is run again by itself, from the measured position at
-rest and under the logged command; the level is read off the moment at which it breaks loose.
+Samples at rest give no balance of forces, only a bound, so the search in the force domain cannot find an
+effect that acts at rest. Every start from rest is simulated separately, from the measured position at rest
+and under the logged command. The level follows from the moment at which the joint breaks loose.
 """
 
 from __future__ import annotations
@@ -30,21 +30,22 @@ from jaxid.simulation.loops import Drive, open_loop
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError, needed_steps
 
-# Fewest starts that can tell a level from a chance.
+# Fewest starts from which a level can be estimated.
 _FEWEST = 3
-# Levels tried at once, twice: over all that the log allows, then between neighbours of the best.
+# Number of levels that are tried at once, twice: over the range of the log, then between the neighbours of
+# the best; and number of folds of the cross-validation.
 _LEVELS = 40
 _FOLDS = 4
-# What is found must stay with so many times the integration steps: what one a sample leave wrong
-# may look like a late start where the readings are fine.
+# A level must be confirmed with this many times the integration steps: with one step a sample, the error of
+# integration may look like a late start if the readings are fine.
 _FINER = 8
-# A start tells its moment and its vigour, and what the model does wrong there is the same in all
-# samples that follow: so many of them count as independent.
-_TELLS = 3
+# A start shows its moment and its initial acceleration, and the error of the model is common to all samples
+# that follow: so many of them count as independent.
+_INDEPENDENT = 3
 # For the better of two definitions of a rest. A likelihood ratio on held-out starts exceeds one over this
 # with at most this probability, whatever its distribution (Markov).
 _FALSE_POSITIVE = 0.5e-3
-# The velocity of a Stribeck curve must exceed the slowest that counts as motion so many times.
+# The velocity of a Stribeck curve must be at least this many times the slowest that counts as motion.
 _RESOLVED = 2.0
 # Part of its squared residual that the median start must lose.
 _RELEVANT = 0.15
@@ -52,16 +53,16 @@ _RELEVANT = 0.15
 
 @dataclass(frozen=True)
 class BreakAway:
-    """What the starts say of a level above sliding friction.
+    """A level above sliding friction, estimated from starts.
 
     Args:
-        level: Most likely [N or N m].
-        std: Its standard deviation.
-        evidence: Held-out gain in log-likelihood over none [nats].
-        threshold: What noise alone exceeds once in a thousand.
+        level: Posterior mean [N or N m].
+        std: Its standard deviation [N or N m].
+        evidence: Held-out gain in log-likelihood over a model without it [nats].
+        threshold: Evidence that noise alone exceeds once in a thousand logs [nats].
         closed: Part of its squared residual that the median start loses.
-        times: When the joint left its rests in the first log [s].
-        count: Starts in all logs.
+        times: Times at which the joint left its rests in the first log [s].
+        count: Number of starts in all logs.
     """
 
     level: float
@@ -74,64 +75,72 @@ class BreakAway:
 
     @property
     def holds(self) -> bool:
-        """Whether it is more than chance, and more than a trifle."""
+        """True if the level is positive, significant and relevant."""
         return self.level > 0.0 and self.evidence > self.threshold and self.closed > _RELEVANT
 
 
 def break_away(
     estimate: Estimate, runs: Sequence[OpenedLog], joints: Sequence[int] = (0,)
 ) -> list[BreakAway | str]:
-    """Level of break-away friction above Coulomb's that the starts from rest of some logs ask for.
+    """Estimate the level of break-away friction above Coulomb's from the starts from rest of some logs.
 
     Args:
         estimate: The model without it; its parameters move within their covariance.
-        runs: The logs. What a rest is, the first decides; those held or sampled otherwise are
-            left out.
-        joints: 0-based, each looked at by itself.
+        runs: The logs. The first one defines a rest; those with another hold or rate are not used.
+        joints: Indices from 0, each examined separately.
 
     Returns:
-        By joint the finding, or why there is none.
+        By joint the estimated level, or a reason why there is none.
     """
     machine = estimate.machine
     log = runs[0].log
-    unknown = [_unknown(machine, log) or _blurred(estimate, runs[0].data, j) for j in joints]
+    unknown = [
+        _reason_against(machine, log) or _unresolved_friction(estimate, runs[0].data, j) for j in joints
+    ]
     try:
         steps = needed_steps(machine, log)
     except TooStiffError:
-        return ["the model found is too stiff to be simulated"] * len(joints)
+        return ["the resulting model is too stiff to be simulated"] * len(joints)
+
     known = [j for j, why in zip(joints, unknown, strict=True) if not why]
-    alike = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
+    comparable = [r for r in runs if r.log.hold == log.hold and abs(r.log.period / log.period - 1) < 1e-3]
     noise = position_noise(machine, log)
-    cuts, lengths = starts_from_rest(machine, alike, noise, known) if known else ([], [])
+    cuts, lengths = starts_from_rest(machine, comparable, noise, known) if known else ([], [])
     enough = [[s for s in of_joint if s.count >= _FEWEST] for of_joint in cuts]
-    most = max((s.count for of_joint in enough for s in of_joint), default=1)
-    trial = _Trial(estimate, log, known, steps, 2 ** int(np.ceil(np.log2(most))))
-    few = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
-    found: dict[int, BreakAway | str] = {}
+    largest = max((s.count for of_joint in enough for s in of_joint), default=1)
+    trial = _Trial(
+        estimate=estimate, log=log, joints=known, steps=steps, padded=2 ** int(np.ceil(np.log2(largest)))
+    )
+
+    results: dict[int, BreakAway | str] = {}
     for k, joint in enumerate(known):
-        found[joint] = few
+        result: BreakAway | str = f"there are fewer than {_FEWEST} starts from a rest that the readings show"
         for finer in (1, _FINER):
             judged = []
             for starts in enough[k]:
-                fits = trial.fits(k, starts, float(noise[joint]), lengths[k], finer, found[joint])
+                fits = trial.fits(k, starts, float(noise[joint]), lengths[k], finer, result)
                 leaves = np.asarray(starts.time + (starts.still - 1) * log.period)
                 judged.append(_judge(*fits, leaves[np.asarray(starts.log) == 0]))
-            found[joint] = max(judged, key=lambda b: b.evidence, default=few)
-            if not (judged and found[joint].holds):
+            if not judged:
                 break
-    return [why or found[j] for j, why in zip(joints, unknown, strict=True)]
+            best = max(judged, key=lambda b: b.evidence)
+            result = best
+            if not best.holds:
+                break
+        results[joint] = result
+    return [why or results[j] for j, why in zip(joints, unknown, strict=True)]
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """What all joints share: one compiled plant with break-away friction at each of them.
+    """The trial of all joints: one compiled plant with break-away friction at each of them.
 
     Args:
-        estimate: The model.
-        log: Of the sampling time and hold of all.
-        joints: That are looked at.
-        steps: Integration steps a sample.
-        padded: Starts in a compiled call.
+        estimate: The model without break-away friction.
+        log: A log, for sampling time and hold of all logs.
+        joints: Indices of the joints that are examined.
+        steps: Integration steps in a sample.
+        padded: Number of starts in a compiled call.
     """
 
     estimate: Estimate
@@ -143,15 +152,18 @@ class _Trial:
     def fits(
         self, which: int, starts: Starts, noise: float, length: int, finer: int, before: BreakAway | str
     ) -> tuple[np.ndarray, list[_Fit]]:
-        """Fits at levels from none to the most that the log allows, denser about the best.
+        """Fit the starts at levels from zero to the largest that the log allows, densely about the best.
 
         Args:
-            which: Index of the joint that starts.
-            starts: When it does.
-            noise: Of its readings.
-            length: Samples of a start that count.
+            which: Index of the joint that starts, among those of the trial.
+            starts: Its starts from rest.
+            noise: Standard deviation of its readings.
+            length: Number of samples of a start that count.
             finer: Factor on the integration steps.
-            before: What was found with fewer: levels from none to twice that are enough.
+            before: Estimate with fewer steps: levels from zero to twice that level suffice.
+
+        Returns:
+            The levels, the first of which is zero, and a fit at each.
         """
         machine, count = self.estimate.machine, starts.count
         filled = starts.padded(self.padded)
@@ -163,8 +175,8 @@ class _Trial:
         places, theta = machine.parameters.places, jnp.asarray(self.estimate.theta)
 
         def at(levels: np.ndarray) -> list[_Fit]:
-            own = jnp.asarray(levels)[:, None] * jnp.asarray(np.eye(len(self.joints))[which])
-            both = _runs(plant, places, drive, filled, jnp.asarray(self.joints[which]), own, theta)
+            by_joint = jnp.asarray(levels)[:, None] * jnp.asarray(np.eye(len(self.joints))[which])
+            both = _runs(plant, places, drive, filled, jnp.asarray(self.joints[which]), by_joint, theta)
             e, jacobian = (np.asarray(a)[:, :count, :length] for a in both)
             return [_Fit(x, j, prior, noise) for x, j in zip(e, jacobian, strict=True)]
 
@@ -176,18 +188,18 @@ class _Trial:
         fits = at(coarse)
         spread = min(f.spread for f in fits)
         best = int(np.argmin([f.cost(spread) for f in fits]))
-        # An even number between the neighbours, so that the best is not tried twice.
+        # An even number of levels between the neighbours, so that the best is not tried twice.
         ends = coarse[max(best - 1, 0)], coarse[min(best + 1, _LEVELS - 1)]
         fine = np.linspace(*ends, _LEVELS + 2)[1:-1]
         return np.concatenate([coarse, fine]), [*fits, *at(fine)]
 
 
-def _unknown(machine: Machine, log: Log) -> str:
-    """What of the moment of a start is not known; empty where all is."""
+def _reason_against(machine: Machine, log: Log) -> str:
+    """Explain why the moment of a start cannot be simulated; empty if it can."""
     if not any(e.kind == CoulombFriction.kind for e in machine.plant.effects):
         return "there is no sliding friction that it could stand above"
     if not machine.plant.starts_alone:
-        return "the joints push one another, by more than what keeps one from starting"
+        return "the forces between the joints exceed the force that keeps one at rest"
     for e in machine.plant.effects:
         if e.adds_force and e.initial_state(jnp.zeros(())) is not None:
             return f"the state of {e.kind} at rest is not known"
@@ -198,15 +210,15 @@ def _unknown(machine: Machine, log: Log) -> str:
     return ""
 
 
-def _blurred(estimate: Estimate, data: Prepared, joint: int) -> str:
-    """Whether friction just above rest is not known, which delays starts too; empty where it is."""
+def _unresolved_friction(estimate: Estimate, data: Prepared, joint: int) -> str:
+    """Explain why friction just above rest, which delays starts too, is not resolved; empty if it is."""
     machine = estimate.machine
     for k, effect in enumerate(machine.plant.effects):
         if effect.kind != StribeckFriction.kind or effect.port != joint:
             continue
         free = zip(machine.parameters.free, estimate.identifiable, strict=True)
-        told = all(t for f, t in free if f.path[:2] == ("effects", k))
-        if not told or float(effect.velocity) < _RESOLVED * data.recipe.rest_velocity[joint]:
+        identifiable = all(t for f, t in free if f.path[:2] == ("effects", k))
+        if not identifiable or float(effect.velocity) < _RESOLVED * data.recipe.rest_velocity[joint]:
             return f"{effect.kind} is not resolved by the samples that move"
     return ""
 
@@ -215,19 +227,26 @@ def _blurred(estimate: Estimate, data: Prepared, joint: int) -> str:
 def _runs(
     plant: Plant, places: tuple, drive: Drive, starts: Starts, joint: Array, levels: Array, theta: Array
 ) -> tuple[Array, Array]:
-    """Measured minus simulated position of every start of a joint at every level, and its Jacobian.
+    """Compute the position error of every start of a joint at every level, and its Jacobian.
 
     Args:
-        levels: (level, k), of the break-away friction that stands last in the plant.
+        plant: The plant, with break-away friction as its last effects.
+        places: Places of the unknowns in the plant.
+        drive: Gain, hold and integration steps.
+        starts: Starts from rest.
+        joint: Index of the joint that starts.
+        levels: Levels of the last effects, (level, k).
+        theta: Values of the unknowns, (p,).
 
     Returns:
-        (level, start, time) and (level, start, time, p), the mean over the samples at rest taken off.
+        Measured minus simulated position, (level, start, time), without its mean over the samples at rest;
+        and the Jacobian in the unknowns, (level, start, time, p).
     """
-    few = levels.shape[1]
+    count = levels.shape[1]
 
     def run(level: Array, theta: Array) -> Array:
         now = scatter(places, plant, theta)
-        now = eqx.tree_at(lambda p: [e.level for e in p.effects[-few:]], now, list(level))
+        now = eqx.tree_at(lambda p: [e.level for e in p.effects[-count:]], now, list(level))
 
         def one(s: Starts) -> Array:
             run = open_loop(
@@ -237,7 +256,7 @@ def _runs(
                 s.rest,
                 s.velocity,
                 start=s.time,
-                own=(*s.own, *[None] * few),
+                own=(*s.internal_states, *[None] * count),
                 past=s.past,
             )
             e = s.position[:, joint] - run.position[:, joint]
@@ -258,88 +277,91 @@ def _runs(
 
 
 def _prior(estimate: Estimate) -> np.ndarray:
-    """Rows that hold the parameters to their estimate; those that it cannot tell do not move."""
-    told = np.asarray(estimate.identifiable)
+    """Return rows that hold the parameters to their estimate; unidentifiable ones do not move."""
+    identifiable = np.asarray(estimate.identifiable)
     size = np.where(estimate.theta != 0, np.abs(estimate.theta), 1.0)
     rows = np.diag(1e6 / size)
-    covariance = estimate.precision.covariance[np.ix_(told, told)]
+    covariance = estimate.precision.covariance[np.ix_(identifiable, identifiable)]
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    rows[np.ix_(told, told)] = (vectors / np.sqrt(np.maximum(values, 1e-12))).T / scale
+    rows[np.ix_(identifiable, identifiable)] = (vectors / np.sqrt(np.maximum(values, 1e-12))).T / scale
     return rows
 
 
 class _Fit:
-    """All starts at one level, the other parameters moved within their prior."""
+    """A fit of all starts at one level, with the other parameters moved within their prior."""
 
     def __init__(self, e: np.ndarray, jacobian: np.ndarray, prior: np.ndarray, noise: float) -> None:
         self.e, self.jacobian, self.prior, self.noise = e, jacobian, prior, noise
-        # A start has one weight for all its samples: all that a fit needs of it are its products.
+        # A start has one weight for all its samples, so a fit needs only sums of products over its samples.
         self.normal = np.einsum("itp,itq->ipq", jacobian, jacobian, optimize=True)
         self.gradient = np.einsum("itp,it->ip", jacobian, e)
 
     @property
     def spread(self) -> float:
-        """Usual RMS of a start's residual, at least the sensor's noise."""
+        """Typical RMS of a start's residual, at least the sensor's noise."""
         return float(max(np.sqrt(np.median(np.mean(self.e**2, axis=1))), self.noise))
 
     def losses(self, spread: float, train: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, float]:
-        """Twice the negative log-likelihood of each of some starts after a fit to others.
+        """Compute twice the negative log-likelihood of each of some starts after a fit to others.
 
-        Heavy-tailed: a rest that was none must not decide.
+        The likelihood is heavy-tailed, so that a false rest does not decide.
 
         Returns:
-            By start, and what the prior charges for the fit.
+            The loss by start, and the loss of the prior.
         """
         e = self.e[train]
         outlying = 1 + np.mean(e**2, axis=1) / spread**2
-        weight = _TELLS / e.shape[1] / outlying / spread**2
+        weight = _INDEPENDENT / e.shape[1] / outlying / spread**2
         normal = np.tensordot(weight, self.normal[train], 1) + self.prior.T @ self.prior
         scale = 1 / np.sqrt(np.diag(normal))
         gradient = scale * (weight @ self.gradient[train])
         step = -scale * np.linalg.solve(normal * np.outer(scale, scale), gradient)
-        left = np.mean((self.e[test] + self.jacobian[test] @ step) ** 2, axis=1)
-        return _TELLS * np.log1p(left / spread**2), float(np.sum((self.prior @ step) ** 2))
+        remaining = np.mean((self.e[test] + self.jacobian[test] @ step) ** 2, axis=1)
+        return _INDEPENDENT * np.log1p(remaining / spread**2), float(np.sum((self.prior @ step) ** 2))
 
     def cost(self, spread: float, rows: np.ndarray | None = None) -> float:
-        """Twice the negative log-likelihood of a fit to some starts, by default all."""
+        """Return twice the negative log-likelihood of a fit to some starts, by default all."""
         rows = np.arange(len(self.e)) if rows is None else rows
         losses, charge = self.losses(spread, rows, rows)
         return float(losses.sum()) + charge
 
 
 def _judge(levels: np.ndarray, fits: list[_Fit], times: np.ndarray) -> BreakAway:
-    """Held-out evidence, and the level with its deviation; the first level is none."""
+    """Compute the held-out evidence, and the level with its deviation; the first level is zero."""
     spread = min(f.spread for f in fits)
     count = len(fits[0].e)
+
+    # Cross-validation: the level is chosen on some folds and judged on another.
     folds = np.arange(count) % min(_FOLDS, count)
-    old, new = [], []
+    old_losses, new_losses = [], []
     for k in range(min(_FOLDS, count)):
         train, test = np.flatnonzero(folds != k), np.flatnonzero(folds == k)
         chosen = min(fits, key=lambda f: f.cost(spread, train))
-        old.append(fits[0].losses(spread, train, test)[0])
-        new.append(chosen.losses(spread, train, test)[0])
-    old, new = np.concatenate(old), np.concatenate(new)
+        old_losses.append(fits[0].losses(spread, train, test)[0])
+        new_losses.append(chosen.losses(spread, train, test)[0])
+    old, new = np.concatenate(old_losses), np.concatenate(new_losses)
+
+    # The posterior over levels that are unevenly spaced.
     order = np.argsort(levels)
     cost = np.array([f.cost(spread) for f in fits])[order]
-    # The posterior over levels that are spaced unevenly.
     weight = np.exp(-0.5 * (cost - cost.min())) * np.gradient(levels[order])
     weight /= weight.sum()
     level = float(levels[order] @ weight)
     step = float(np.gradient(levels[order]) @ weight)
     variance = float((levels[order] - level) ** 2 @ weight) + step**2 / 12
     return BreakAway(
-        level,
-        float(np.sqrt(variance)),
-        0.5 * float(np.sum(old - new)),
-        float(-np.log(_FALSE_POSITIVE)),
-        _closed(old, new),
-        times,
-        count,
+        level=level,
+        std=float(np.sqrt(variance)),
+        evidence=0.5 * float(np.sum(old - new)),
+        threshold=float(-np.log(_FALSE_POSITIVE)),
+        closed=_closed(old, new),
+        times=times,
+        count=count,
     )
 
 
 def _closed(old: np.ndarray, new: np.ndarray) -> float:
-    """Part by which the median start comes nearer, in squares above the usual residual."""
-    before, after = (np.median(np.expm1(x / _TELLS)) for x in (old, new))
+    """Return the part by which the squared residual of the median start falls."""
+    before, after = (np.median(np.expm1(x / _INDEPENDENT)) for x in (old, new))
     return float(1 - after / before) if before > 0 else 0.0

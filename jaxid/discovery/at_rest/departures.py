@@ -1,4 +1,4 @@
-"""Starts from rest, cut out of a log: when, from where, and under what command."""
+"""Starts from rest, cut out of a log: their times, positions and commands."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from jaxid.session import OpenedLog
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.force_balance import ForceData
 
-# Readings that agree within this range, in standard deviations of their noise, are a rest: noise
-# alone does otherwise once in a thousand times. There must be as many of them as a reversal
-# without sticking could not keep together, and at least so many.
+# Readings that agree within this range, in standard deviations of their noise, count as a rest: noise alone
+# exceeds it once in a thousand times. A rest needs more agreeing readings than a reversal without sticking
+# could give, and at least this many.
 _RANGE = 5.0
 _STILL = 3
-# ... and at most about so many: where readings hardly move, no number of them would do.
+# At most about this many readings are asked for: if they hardly move, no number of them would suffice.
 _LONGEST = 60
-# Samples that follow a start, at least.
+# Least number of samples after a start.
 _AFTER = 12
-# Most that are kept, of all logs and joints together.
+# Largest number of starts, of all logs and joints together.
 _MOST = 192
-# A controller's law is taken for the one that made a log where it gives the logged command back to
-# within this many deviations of its noise, or this part of its RMS.
+# The controller's law replaces the logged command if it reproduces it to within this many deviations of its
+# noise, or this part of its RMS.
 _SAME = 1.5
 _NEARLY = 0.02
 
@@ -46,14 +46,14 @@ class Starts(eqx.Module):
     Args:
         past: Logged command before each start, as far back as a delay reaches, (start, earlier, m).
         command: Logged command, (start, time, m).
-        position: Measured, (start, time, n).
-        rest: Position at the first sample, (start, n): of the joint that rests its mean reading, of the
-            others, which may move, the filtered one.
-        velocity: There, (start, n); zero of the joint that rests.
-        time: Of the first sample [s], (start,).
-        own: Own states of the plant's effects at the first sample.
-        still: How many of the samples are at rest.
-        log: Which log each is from, (start,).
+        position: Measured position, (start, time, n).
+        rest: Position at the first sample, (start, n): the mean reading for the joint at rest, the filtered
+            position for the others, which may move.
+        velocity: Velocity at the first sample, (start, n); zero for the joint at rest.
+        time: Time of the first sample [s], (start,).
+        internal_states: Internal states of the plant's effects at the first sample.
+        still: Number of samples at rest.
+        log: Index of the log of each start, (start,).
     """
 
     past: Array
@@ -62,17 +62,17 @@ class Starts(eqx.Module):
     rest: Array
     velocity: Array
     time: Array
-    own: tuple
+    internal_states: tuple
     still: Array
     log: Array
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of starts."""
         return len(self.time)
 
     def padded(self, count: int) -> Starts:
-        """With the last start repeated, so that one compiled shape serves any number."""
+        """Repeat the last start up to a number, so that one compiled shape serves any number."""
         more = count - len(self.time)
         spread = eqx.tree_at(lambda s: s.still, self, jnp.full(len(self.time), self.still))
         return jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]), spread)
@@ -81,55 +81,64 @@ class Starts(eqx.Module):
 def starts_from_rest(
     machine: Machine, runs: Sequence[OpenedLog], noise: Float[np.ndarray, " n"], joints: Sequence[int]
 ) -> tuple[list[list[Starts]], list[int]]:
-    """Find where joints leave a rest, by a lax and by a strict notion of one.
+    """Find the starts from rest of some joints, by a loose and by a strict definition of a rest.
 
     Args:
-        machine: The machine.
-        runs: Logs of one sampling time.
+        machine: The machine with the values of its estimate.
+        runs: Logs with one sampling time.
         noise: Standard deviation of a reading, by joint.
-        joints: 0-based.
+        joints: Indices of the joints, from 0.
 
     Returns:
-        By joint one or two cuts, the starts of all logs in each, all of one length so that compiled
-        code serves them; and how many samples of that each joint asks for.
+        By joint one or two cuts, each with the starts of all logs, all of one length so that compiled code
+        serves them; and the number of samples of that length that each joint needs.
     """
     first = runs[0]
-    stills = [sorted(set(_stills(float(noise[j]), first.log, first.data, j))) for j in joints]
-    lengths = [of_joint[-1] + max(_AFTER, 2 * of_joint[-1]) for of_joint in stills]
+    still_counts = [sorted(set(_still_counts(float(noise[j]), first.log, first.data, j))) for j in joints]
+    lengths = [of_joint[-1] + max(_AFTER, 2 * of_joint[-1]) for of_joint in still_counts]
     length = max(lengths)
     delays = machine.plant.command_delays(runs[0].log.force.shape[1])
     most = max(1, _MOST // (len(joints) * len(runs)))
     lead = int(np.ceil(float(delays.max()) / runs[0].log.period)) + 1
-    ready = [
+    logs = [
         (
-            _own_states(machine.plant, ForceData.of(r.data)),
-            replace(r.log, force=_acted(r.machine(machine), r.log)),
+            _internal_states(machine.plant, ForceData.of(r.data)),
+            replace(r.log, force=_applied_command(r.machine(machine), r.log)),
             r.data,
         )
         for r in runs
     ]
     cuts = [
         [
-            _joined([_cut(*each, float(noise[j]), still, length, lead, j, most) for each in ready])
+            _concatenated([_cut(*each, float(noise[j]), still, length, lead, j, most) for each in logs])
             for still in of_joint
         ]
-        for j, of_joint in zip(joints, stills, strict=True)
+        for j, of_joint in zip(joints, still_counts, strict=True)
     ]
     return cuts, lengths
 
 
-def _joined(cuts: list[Starts]) -> Starts:
-    """The starts of several logs as one."""
-    still = cuts[0].still
-    own = jax.tree.map(lambda *a: jnp.concatenate(a), *[c.own for c in cuts])
-    names = ("past", "command", "position", "rest", "velocity", "time")
-    parts = [[getattr(c, n) for c in cuts] for n in names]
-    which = jnp.repeat(jnp.arange(len(cuts)), jnp.asarray([c.count for c in cuts]))
-    return Starts(*[jnp.concatenate(p) for p in parts], own, still, which)
+def _concatenated(cuts: list[Starts]) -> Starts:
+    """Concatenate the starts of several logs."""
+
+    def together(name: str) -> Array:
+        return jnp.concatenate([getattr(c, name) for c in cuts])
+
+    return Starts(
+        past=together("past"),
+        command=together("command"),
+        position=together("position"),
+        rest=together("rest"),
+        velocity=together("velocity"),
+        time=together("time"),
+        internal_states=jax.tree.map(lambda *a: jnp.concatenate(a), *[c.internal_states for c in cuts]),
+        still=cuts[0].still,
+        log=jnp.repeat(jnp.arange(len(cuts)), jnp.asarray([c.count for c in cuts])),
+    )
 
 
 def _cut(
-    own: tuple,
+    internal_states: tuple,
     log: Log,
     data: Prepared,
     noise: float,
@@ -139,31 +148,33 @@ def _cut(
     joint: int,
     most: int,
 ) -> Starts:
+    """Cut the starts of one joint out of one log, at most so many, spread evenly over it."""
     after = length - still
     ends = _departures(log.position[:, joint], noise, still, after)
     ends = ends[np.unique(np.linspace(0, len(ends) - 1, min(len(ends), most)).astype(int))]
     rows = ends[:, None] + np.arange(1 - still, after + 1)
     earlier = np.maximum(rows[:, :1] + np.arange(-lead, 0), 0)
+
     rest, velocity = data.q[rows[:, 0]].copy(), data.qd[rows[:, 0]].copy()
     rest[:, joint] = log.position[rows[:, :still], joint].mean(axis=1)
     velocity[:, joint] = 0.0
     return Starts(
-        jnp.asarray(log.force[earlier]),
-        jnp.asarray(log.force[rows]),
-        jnp.asarray(log.position[rows]),
-        jnp.asarray(rest),
-        jnp.asarray(velocity),
-        jnp.asarray(log.time[rows[:, 0]] - log.time[0]),
-        jax.tree.map(lambda a: a[rows[:, 0]], own),
-        jnp.asarray(still),
-        jnp.zeros(len(rows), int),
+        past=jnp.asarray(log.force[earlier]),
+        command=jnp.asarray(log.force[rows]),
+        position=jnp.asarray(log.position[rows]),
+        rest=jnp.asarray(rest),
+        velocity=jnp.asarray(velocity),
+        time=jnp.asarray(log.time[rows[:, 0]] - log.time[0]),
+        internal_states=jax.tree.map(lambda a: a[rows[:, 0]], internal_states),
+        still=jnp.asarray(still),
+        log=jnp.zeros(len(rows), int),
     )
 
 
-def _stills(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
-    """Samples that must agree for a rest, if reversals are as quick as is usual, or as slow as any.
+def _still_counts(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
+    """Return the numbers of samples that must agree for a rest, for typical and for slow reversals.
 
-    Few find the short rests of a stiff loop, many are needed where motion is slow against noise.
+    A small number finds the short rests of a stiff loop; a large one is needed for slow motion in noise.
     """
     v, a = data.qd[:, joint], np.abs(data.qdd[:, joint])
     turns = np.flatnonzero(v[1:] * v[:-1] <= 0)
@@ -174,31 +185,31 @@ def _stills(noise: float, log: Log, data: Prepared, joint: int) -> list[int]:
 
 
 def _departures(q: Float[np.ndarray, " time"], noise: float, still: int, after: int) -> np.ndarray:
-    """Last samples of rests that are followed by motion."""
+    """Find the last samples of rests that are followed by motion."""
     if len(q) <= still + after:
         return np.zeros(0, int)
     windows = np.lib.stride_tricks.sliding_window_view(q, still)
     agree = np.ptp(windows, axis=1) <= _RANGE * noise
     ends = np.flatnonzero(agree[:-1] & ~agree[1:]) + still - 1
     ends = ends[ends + after < len(q)]
-    # Where it has not gone far soon after, it was noise that ended the rest.
+    # If the joint has not moved far soon after, noise ended the rest.
     moved = np.abs(q[ends + after] - q[ends]) > 2 * _RANGE * noise
     return ends[moved]
 
 
 @eqx.filter_jit
-def _own_states(plant: Plant, data: ForceData) -> tuple:
-    """Own states of the effects along a log, under the command as it acts."""
+def _internal_states(plant: Plant, data: ForceData) -> tuple:
+    """Integrate the internal states of the effects along a log, under the delayed command."""
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     return integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
 
 
-def _acted(machine: Machine, log: Log) -> np.ndarray:
-    """The command as it acted: what the controller makes of the readings, noise of the log left out.
+def _applied_command(machine: Machine, log: Log) -> np.ndarray:
+    """Return the command without the noise of the log, as the controller computes it from the readings.
 
-    At a start a single noisy sample above the level would set the simulation moving. The logged
-    command stands where there is no controller, or one that does not give it back.
+    A single noisy sample above the level at a start would set the simulation in motion. The logged command is
+    returned if there is no controller, or one that does not reproduce it.
     """
     if machine.controller is None or log.reference is None:
         return log.force
@@ -221,6 +232,8 @@ def _commands(
     reference: Array,
     disturbance: Array,
 ) -> Array:
+    """Run a controller's law over logged readings."""
+
     def tick(memory: tuple, now: tuple) -> tuple[tuple, Array]:
         position, path, disturbance = now
         u, memory = controller.command(Tick(position, path, driven), memory, disturbance)

@@ -1,4 +1,4 @@
-"""Whether an effect that fits the forces brings the simulated loop nearer: it is run with and without."""
+"""Confirmation in the simulated loop: an effect that fits the forces must also bring the motion nearer."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from jaxid.gap import simulated
 from jaxid.machine import Machine
 from jaxid.session import OpenedLog, Session
 
-# An effect hinders where the simulated loop without it is nearer by so much: mean logarithm of the
-# relative gaps in position and command over all logs.
+# An effect is taken out if the simulated loop without it is nearer to the logs by this much: mean logarithm
+# of the relative gaps in position and command over all logs.
 _NEARER = 0.1
 WHY = "the simulated loop comes nearer to the log without it"
 
 
 def hindering(search: Search, session: Session, final: Machine) -> cand.Candidate | None:
-    """The effect that most keeps the simulated loop from the logs; None where each helps.
+    """Find the effect that most keeps the simulated loop from the logs; None if each of them helps.
 
-    The force domain sees the band of the filter only. What fits there by growing beyond it, such as
-    a ripple that is fast or a limit that nothing reaches, shows in the motion. In open loop any error
-    grows with time, and the distance says little: nothing is asked then.
+    The force domain covers the band of the filter only. An effect that fits there by growth beyond the band,
+    such as a fast ripple or a limit that is never reached, shows in the motion. In open loop any error grows
+    with time, and the distance is not informative: the test is omitted then.
 
     Args:
-        search: As it ended.
+        search: The search at its end.
         session: Case and logs.
         final: Machine with the effects that the search added, at their values.
     """
@@ -34,22 +34,26 @@ def hindering(search: Search, session: Session, final: Machine) -> cand.Candidat
     whole = _distance(final, runs)
     nearer = {}
     for k, c in enumerate(search.added):
-        theta = search.without(c)[search.active]
+        theta = search.without(search.model, c).theta[search.active]
         nearer[k] = whole - _distance(final.with_estimate(theta), runs)
     worst = max(nearer, key=nearer.__getitem__)
     return search.added[worst] if nearer[worst] > _NEARER else None
 
 
 def _distance(machine: Machine, runs: list[OpenedLog]) -> float:
-    """Mean logarithm of the relative gaps in the loop, over the columns of a log and then the logs.
+    """Return the mean logarithm of the relative gaps in the loop, over columns of a log and then over logs.
 
-    A log from which the simulation runs away counts as far as one may be and still be a simulation.
+    A log on which the simulation diverges counts with a relative gap of 1000.
     """
     means = []
     for r in runs:
         gap = simulated(r.machine(machine), r.log)
-        columns = np.array([1e3]) if gap is None else np.concatenate([gap.relative, gap.command_relative])
+        if gap is None:
+            columns = np.array([1e3])
+        else:
+            assert gap.command_relative is not None, "a loop has a command"
+            columns = np.concatenate([gap.relative, gap.command_relative])
         # A signal that is zero throughout has no relative gap.
-        told = columns[np.isfinite(columns) & (columns > 0)]
-        means.append(float(np.mean(np.log(told))) if len(told) else 0.0)
+        defined = columns[np.isfinite(columns) & (columns > 0)]
+        means.append(float(np.mean(np.log(defined))) if len(defined) else 0.0)
     return float(np.mean(means))

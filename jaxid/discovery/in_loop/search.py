@@ -1,9 +1,9 @@
-"""What a model within a prior lacks, judged in its simulated loop: its log may tell no forces.
+"""Search for effects that a model within a prior lacks, in its simulated loop.
 
-Each effect that the machine might lack is added to the simulated loop next to no strength, and its column is
-laid through what the fit leaves, the unknowns free to give way within their priors. What noise alone would
-gain by the best of them, rounding in the loop included, is drawn; what gains more is fitted for good, from
-where its looks lead when they are simulated.
+This search serves logs that may not determine forces. Each candidate effect is added to the simulated loop
+with next to no strength, and its column is regressed on the residual of the fit, while the unknowns respond
+within their priors. The largest gain by noise alone is drawn, rounding in the loop included. Candidates that
+gain more are fitted fully, from the points to which their linear trials lead in simulation.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from jaxid.model.unknowns import Free, free_effect
 from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session
 
-# So many candidates are fitted for good, the most promising first: those that a linear look gives this part
-# of the threshold; the second where something is seen, for the look knows an effect at few shapes only.
+# Number of most promising candidates that are fitted fully. They must reach this part of the threshold in
+# their linear trial: the second value if the residual is not noise, since a trial covers few shapes.
 _FEW, _PROMISING = 4, (0.5, 0.1)
-# What is that near to the best [nats] cannot be told from it.
+# Effects whose evidence is that near to the best [nats] are equivalent to it.
 _AS_GOOD = 2.0
-UNSEEN = "a fit within a prior looks at the loop alone"
+UNSEEN = "a fit within a prior examines the simulated loop only"
 
 
 def explore_within(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
-    """`discover` for a case with `[output_error] prior`.
+    """Run `discover` for a case with `[output_error] prior`.
 
     Args:
         session: Case and log.
-        max_effects: Most effects to add.
-        progress: Called with a line at every stage.
+        max_effects: Largest number of effects to add.
+        progress: Called with a line of text at every stage.
 
     Raises:
         InputError: If the loop cannot be simulated, or a guess is zero.
     """
-    progress("fitting what is there")
+    progress("fitting the baseline")
     first = run_alone(steps_of("output_error", session))
     before = after = LoopFit.of(session, session.machine, {}, first)
     effects: list[NamedEffect] = []
@@ -54,59 +54,103 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
     added: Score | None = None
     while True:
         loop = Loop.of(session, after)
-        progress(f"screening {len(loop.union.candidates)} effects in the loop")
-        looks = loop.looks()
-        threshold, noisy = loop.threshold(looks)
-        screened = loop.scored(looks)
-        step = Step(added, None, tuple(screened), threshold, loop.theta, loop.union.base)
+        progress(f"screening {len(loop.superset.candidates)} effects in the loop")
+        trials = loop.trials()
+        threshold, noisy = loop.threshold(trials)
+        screened = loop.scored(trials)
+        step = Step(
+            added=added,
+            dropped=None,
+            scores=tuple(screened),
+            threshold=threshold,
+            theta=loop.theta,
+            active=loop.superset.base,
+        )
         rounds.append(Round(step, loop.rms, None))
         if len(effects) >= max_effects:
             break
-        refitted = []
+
         least = _PROMISING[0 if noisy else 1] * threshold
-        for score in [s for s in screened if s.evidence > least][:_FEW]:
-            progress(f"refitting with {score.candidate.label}")
-            refitted.append(_refitted(loop, after, score, looks))
-        good = sorted((r for r in refitted if r[0].evidence > threshold), key=lambda r: -r[0].evidence)
-        if not good:
+        promising = [s for s in screened if s.evidence > least][:_FEW]
+        addition = _best_addition(loop, after, promising, threshold, trials, progress)
+        if addition is None:
             break
-        added, after, found = good[0]
-        # Those that were only compared had nothing drawn about them.
+        # Fits for the comparison were made without draws about them.
+        fit, effect = addition
         drawn = session.case.output_error.get("drawn", True)
-        after = _fit(session, after.machine, after.widths, after.estimate.theta, drawn=drawn)
-        near = [s for s, *_ in good[1:] if s.evidence > added.evidence - _AS_GOOD]
-        effects.append(replace(found, alternatives=tuple(near)))
+        after = _fit(session, fit.machine, fit.widths, fit.estimate.theta, drawn=drawn)
+        effects.append(effect)
+        added = effect.score
     verdict = "found" if effects else "nothing_missing" if noisy else "unexplained"
     progress("simulating")
     last = after.estimate
     old = gaps(first.machine, session.runs)
     new = gaps(last.machine, session.runs) if effects else old
     floor = noise_floor(first.machine, session.fit.log, session.fit.data)
-    where = None if verdict == "nothing_missing" else Loop.of(session, before).where()
     return Discovery(
-        session, verdict, where, tuple(effects), tuple(rounds), first, last, old, new, floor, (), UNSEEN
+        session=session,
+        verdict=verdict,
+        where=None if verdict == "nothing_missing" else Loop.of(session, before).where(),
+        effects=tuple(effects),
+        rounds=tuple(rounds),
+        before=first,
+        after=last,
+        gaps_before=old,
+        gaps_after=new,
+        noise_floor=floor,
+        unseen=UNSEEN,
     )
 
 
+def _best_addition(
+    loop: Loop,
+    base: LoopFit,
+    promising: list[Score],
+    threshold: float,
+    trials: list[LinearTrial],
+    progress: Callable[[str], None],
+) -> tuple[LoopFit, NamedEffect] | None:
+    """Refit promising candidates; return the best fit and its effect, or None if none is accepted."""
+    refitted = []
+    for score in promising:
+        progress(f"refitting with {score.candidate.label}")
+        refitted.append(_refitted(loop, base, score, trials))
+    good = sorted((r for r in refitted if r[0].evidence > threshold), key=lambda r: -r[0].evidence)
+    if not good:
+        return None
+    best, fit, effect = good[0]
+    near = [s for s, *_ in good[1:] if s.evidence > best.evidence - _AS_GOOD]
+    return fit, replace(effect, alternatives=tuple(near))
+
+
 def _refitted(
-    loop: Loop, base: LoopFit, score: Score, looks: list[LinearTrial]
+    loop: Loop, base: LoopFit, score: Score, trials: list[LinearTrial]
 ) -> tuple[Score, LoopFit, NamedEffect]:
-    """The best fit within the prior with an effect beside the rest, and what it gains."""
-    fits = [_fitted(loop, base, score.candidate, begin) for begin in loop.begins(score.candidate, looks)]
-    gained, begin, fit = max(fits, key=lambda f: f[0])
-    refitted = replace(score, start=begin.start, guess=begin.values, evidence=gained)
-    c, own = score.candidate, fit.machine.parameters.names[len(loop.union.base) :]
-    return refitted, fit, NamedEffect(c.kind, c.label, fit.machine.plant.place(c.port), own, refitted, ())
+    """Fit the best model within the prior with one more effect, and score its gain."""
+    fits = [_fitted(loop, base, score.candidate, p) for p in loop.start_points(score.candidate, trials)]
+    gained, start, fit = max(fits, key=lambda f: f[0])
+    refitted = replace(score, start=start.start, guess=start.values, evidence=gained)
+    c = score.candidate
+    effect = NamedEffect(
+        kind=c.kind,
+        label=c.label,
+        place=fit.machine.plant.place(c.port),
+        names=tuple(fit.machine.parameters.names[len(loop.superset.base) :]),
+        score=refitted,
+        alternatives=(),
+    )
+    return refitted, fit, effect
 
 
-def _fitted(loop: Loop, base: LoopFit, c: Candidate, begin: StartPoint) -> tuple[float, StartPoint, LoopFit]:
+def _fitted(loop: Loop, base: LoopFit, c: Candidate, start: StartPoint) -> tuple[float, StartPoint, LoopFit]:
+    """Fit a model with one more effect from a start point; return the gain [nats], the start and the fit."""
     machine = base.machine
-    plant, free = free_effect(machine.plant, effect_at(loop.union, c, begin.values), machine.units)
+    plant, free = free_effect(machine.plant, effect_at(loop.superset, c, start.values), machine.units)
     machine = machine.with_plant(plant, machine.parameters.extended(free))
     widths = base.widths | {f.name: _width(f, c.starts[:, k]) for k, f in enumerate(free)}
-    known = np.asarray(loop.problem.prior.outward(begin.point))[: len(loop.union.base)]
-    fit = _fit(loop.session, machine, widths, np.concatenate([known, begin.values]), drawn=False)
-    return loop.gained(fit, base) if fit.estimate.converged else 0.0, begin, fit
+    known = np.asarray(loop.problem.prior.outward(start.point))[: len(loop.superset.base)]
+    fit = _fit(loop.session, machine, widths, np.concatenate([known, start.values]), drawn=False)
+    return loop.gained(fit, base) if fit.estimate.converged else 0.0, start, fit
 
 
 def _fit(
@@ -117,9 +161,9 @@ def _fit(
     *,
     drawn: bool,
 ) -> LoopFit:
-    """A fit within the prior from some values of the unknowns; `drawn`: as of `directions_steps`."""
+    """Fit within the prior from some values of the unknowns; for `drawn` see `directions_steps`."""
     stated = session.case.output_error
-    found = run_alone(
+    result = run_alone(
         directions_steps(
             machine,
             session.fit.log,
@@ -130,11 +174,11 @@ def _fit(
             drawn=drawn,
         )
     )
-    return LoopFit.of(session, machine, widths, found)
+    return LoopFit.of(session, machine, widths, result)
 
 
 def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:
-    """Standard deviation of what an effect begins at: it may be as far off as where else it might begin."""
+    """Return the standard deviation of an effect's start: the range of its possible starts."""
     if free.sign == "positive":
         return max(1.0, float(np.log(starts.max() / starts.min())))
     return float(max(np.abs(starts).max(), abs(free.guess))) or 1.0

@@ -1,1 +1,1 @@
-"""Experiments that separate effects which a log cannot tell apart."""
+"""Experiments that separate effects that a log cannot distinguish."""

@@ -1,7 +1,7 @@
-"""Two models that explain a log alike, and how far an experiment would drive them apart.
+"""Two models that explain a log equally well, and the evidence between them that an experiment would give.
 
-The expected difference is an analytic function of the experiment: one rival is simulated, the
-other's balance is read along that motion, and what its own unknowns can absorb is taken out.
+The expected difference is an analytic function of the experiment: one rival is simulated, the residual of the
+other is computed along that motion, and the part that its unknowns can absorb is removed.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
 if TYPE_CHECKING:
     from jaxid.discovery.search import Search
 
-# Curvature below this part of the largest is nothing that a fit could use.
+# Curvature below this part of the largest cannot be used by a fit.
 _BLIND = 1e-10
 
 
 @dataclass(frozen=True)
 class Pair:
-    """An effect that was named and one that explains the log alike.
+    """An effect that was named and one that explains the log equally well.
 
     Args:
-        kinds: Their names, the named one first.
-        labels: The same with their places.
-        thetas: All unknowns of the union, with the one effect in place and with the other.
+        kinds: Kinds of both effects, the named one first.
+        ports: Ports of both effects.
+        thetas: All unknowns of the superset, with the one effect in place and with the other.
         active: Indices of the unknowns that each model fits.
-        plant: The machine with both effects and what both models share, no other candidates.
-        index: Unknowns of that plant in the union's vector.
-        places: Where they go in it.
+        plant: Plant with both effects and those that both models share, without other candidates.
+        index: Indices of that plant's unknowns in the superset's vector.
+        places: Places of the unknowns in that plant.
     """
 
     kinds: tuple[str, str]
@@ -57,54 +57,54 @@ class Pair:
     places: tuple
 
     @classmethod
-    def of(cls, search: Search, own: cand.Candidate, rival: Score) -> Pair:
-        """The models of an effect added and of an alternative to it.
+    def of(cls, search: Search, named: cand.Candidate, rival: Score) -> Pair:
+        """Build the models of an added effect and of an alternative to it.
 
         Args:
-            search: The search, at its end.
-            own: The effect added.
+            search: The search at its end.
+            named: The effect that was added.
             rival: The alternative, refitted.
         """
-        union = search.union
-        rest = [c for c in search.added if c is not own]
-        base = union.base
-        active = [
-            np.concatenate([base, *[r.index for r in rest], c.index]).astype(int)
-            for c in (own, rival.candidate)
-        ]
-        plant, index, places = _reduced(union, [*rest, own, rival.candidate])
+        superset = search.superset
+        rest = [c for c in search.added if c is not named]
+        plant, index, places = _reduced(superset, [*rest, named, rival.candidate])
         return cls(
-            (own.kind, rival.candidate.kind),
-            (own.port, rival.candidate.port),
-            (search.theta, rival.theta),
-            tuple(active),
-            plant,
-            index,
-            places,
+            kinds=(named.kind, rival.candidate.kind),
+            ports=(named.port, rival.candidate.port),
+            thetas=(search.theta, rival.refitted),
+            active=(search.fitted_by([*rest, named]), search.fitted_by([*rest, rival.candidate])),
+            plant=plant,
+            index=index,
+            places=places,
         )
 
-    def turned(self) -> Pair:
-        """The same with the rival first."""
-        kinds, ports, thetas, active = (x[::-1] for x in (self.kinds, self.ports, self.thetas, self.active))
-        return Pair(kinds, ports, thetas, active, self.plant, self.index, self.places)
+    def swapped(self) -> Pair:
+        """Return the pair with the rival first."""
+        return replace(
+            self,
+            kinds=self.kinds[::-1],
+            ports=self.ports[::-1],
+            thetas=self.thetas[::-1],
+            active=self.active[::-1],
+        )
 
-    def rounder(self, factor: float) -> Pair:
-        """The same with a sign so many times as wide."""
+    def smoother(self, factor: float) -> Pair:
+        """Return the pair with a smoothed sign that is wider by a factor."""
         return replace(self, plant=self.plant.smoothed(factor * self.plant.smoothing.sharpness))
 
     def model(self, which: int) -> Plant:
-        """The plant of one of them."""
+        """Return the plant of the first (0) or of the second model (1)."""
         return scatter(self.places, self.plant, jnp.asarray(self.thetas[which][self.index]))
 
 
-def _reduced(union: cand.CandidateModel, keep: list[cand.Candidate]) -> tuple[Plant, np.ndarray, tuple]:
-    """The union's plant without the candidates that neither model has."""
-    drop = {cand.position(union, c) for c in union.candidates if all(c is not k for k in keep)}
-    effects = union.machine.plant.effects
+def _reduced(superset: cand.CandidateModel, keep: list[cand.Candidate]) -> tuple[Plant, np.ndarray, tuple]:
+    """Return the superset's plant with some candidates only, their unknowns and the places of these."""
+    drop = {cand.position(superset, c) for c in superset.candidates if all(c is not k for k in keep)}
+    effects = superset.machine.plant.effects
     stays = [i for i in range(len(effects)) if i not in drop]
-    plant = eqx.tree_at(lambda p: p.effects, union.machine.plant, tuple(effects[i] for i in stays))
+    plant = eqx.tree_at(lambda p: p.effects, superset.machine.plant, tuple(effects[i] for i in stays))
     index, places = [], []
-    for k, (path, entry) in enumerate(union.machine.parameters.places):
+    for k, (path, entry) in enumerate(superset.machine.parameters.places):
         if path[0] != "effects":
             places.append((path, entry))
         elif path[1] in stays:
@@ -116,18 +116,18 @@ def _reduced(union: cand.CandidateModel, keep: list[cand.Candidate]) -> tuple[Pl
 
 
 class Experiment(eqx.Module):
-    """How an experiment runs: the loop, or the drive alone, and what is read of it.
+    """How an experiment runs, in the loop or with the drive alone, and how its log is evaluated.
 
     Args:
-        drive: How the command acts.
-        controller: The law; None: the signal is the command itself.
-        start: Position at the start, (n,); in a loop the joints that are driven start on the reference.
-        driven: Those joints, 0-based.
-        every: The log holds one tick in so many.
-        period: Of the log [s].
-        data: Holds how forces are filtered; its arrays are not used.
+        drive: Gain, hold and integration of the command.
+        controller: Law of the loop; None: the signal is the command itself.
+        start: Position at the start, (n,); in a loop the driven joints start on the reference.
+        driven: Indices of the driven joints, from 0.
+        every: Number of ticks in a sample of the log.
+        period: Sampling time of the log [s].
+        data: Filter of the forces; its arrays are not used.
         rest: Velocity below which a sample counts as at rest, (n,).
-        whiten: Filter that turns the log's noise into unit white noise, (n, order + 1).
+        whiten: Filter from the log's noise to unit white noise, (n, order + 1).
     """
 
     drive: Drive
@@ -147,13 +147,13 @@ class Experiment(eqx.Module):
         sensor: Sensor | None = None,
         noise: Float[Array, "ticks n"] | None = None,
     ) -> Trajectory:
-        """Motion of a plant from rest under a reference or a command, at the samples of its log.
+        """Simulate a plant from rest under a reference or a command, at the samples of its log.
 
         Args:
-            plant: The plant.
+            plant: The plant to simulate.
             signal: Reference or command at every tick.
-            sensor: What reads the position; absent: exact.
-            noise: Standard normal numbers for its noise; absent: none.
+            sensor: Sensor of the position; None: exact readings.
+            noise: Standard normal numbers for its noise; None: no noise.
         """
         zero = jnp.zeros_like(self.start)
         if self.controller is None:
@@ -167,39 +167,40 @@ class Experiment(eqx.Module):
         return jax.tree.map(lambda a: a[:: self.every], run)
 
     def start_of(self, first: Float[Array, " m"]) -> Float[Array, " n"]:
-        """Position at the start of a signal with this first value."""
+        """Return the position at the start of a signal with this first value."""
         if self.controller is None:
             return self.start
-        return self.start.at[jnp.asarray(self.driven)].set(first)
+        return jnp.asarray(self.start).at[jnp.asarray(self.driven)].set(first)
 
-    def seen(self, run: Trajectory) -> tuple[ForceData, Float[Array, "kept n"]]:
-        """A motion as inverse dynamics takes it, and how much each sample counts."""
-        slope = jnp.gradient(run.velocity, axis=0) / self.period
+    def force_data(self, run: Trajectory) -> tuple[ForceData, Float[Array, "kept n"]]:
+        """Return a motion as data of the force domain, and the weight of each sample, zero at rest."""
+        slope = jnp.asarray(jnp.gradient(run.velocity, axis=0)) / self.period
         force = self.drive.gain * run.command
         data = eqx.tree_at(
             lambda d: (d.q, d.qd, d.qdd, d.force),
             self.data,
             (run.position, run.velocity, slope, force),
         )
+
         d = self.data.decimator
         kept = run.velocity[:: d.factor] if d.filters else run.velocity
         kept = kept[d.trim : kept.shape[0] - d.trim]
         return data, 1 - jnp.exp(-jnp.square(kept / self.rest))
 
     def white(self, e: Float[Array, "kept n"]) -> Float[Array, "kept n"]:
-        """A force as rows of unit white noise."""
+        """Whiten a force by the filter of each joint."""
         columns = [jnp.convolve(x, w)[: x.size] for x, w in zip(e.T, self.whiten, strict=True)]
         return jnp.stack(columns, axis=1)
 
 
 class ModelPair(eqx.Module):
-    """Both rivals as compiled code takes them.
+    """Arrays of both rivals for compiled code.
 
     Args:
-        plant: Their common plant.
-        thetas: Unknowns of each, (2, m).
-        masks: One for the unknowns that each fits, (2, m).
-        places: Where the unknowns go.
+        plant: The common plant of both.
+        thetas: Unknowns of each model, (2, m).
+        masks: One for the unknowns that each model fits, else zero, (2, m).
+        places: Places of the unknowns in the plant.
     """
 
     plant: Plant
@@ -209,46 +210,46 @@ class ModelPair(eqx.Module):
 
     @classmethod
     def of(cls, pair: Pair) -> ModelPair:
-        """The arrays of a pair."""
+        """Collect the arrays of a pair."""
         masks = [np.isin(pair.index, active).astype(float) for active in pair.active]
         thetas = [theta[pair.index] for theta in pair.thetas]
         return cls(pair.plant, jnp.asarray(thetas), jnp.asarray(masks), pair.places)
 
 
 def expected(
-    bench: Experiment, duel: ModelPair, signal: Float[Array, "ticks m"], bounds: LimitCost
+    experiment: Experiment, models: ModelPair, signal: Float[Array, "ticks m"], bounds: LimitCost
 ) -> tuple[Float[Array, " 2"], Array]:
-    """Evidence [nats] by which each rival, being true, would beat the other; and what limits cost."""
+    """Compute the evidence of each rival over the other if it is true [nats], and the cost of the limits."""
 
     def one(true: Array, other: Array, mask: Array) -> tuple[Array, Array]:
-        own = scatter(duel.places, duel.plant, true)
-        run = bench.run(own, signal)
-        data, weight = bench.seen(run)
+        true_plant = scatter(models.places, models.plant, true)
+        run = experiment.run(true_plant, signal)
+        data, weight = experiment.force_data(run)
         root = jnp.sqrt(weight)
 
-        # The true model's own residual is what numerics leave: it is in the other's alike.
-        def apart(theta: Array, data: ForceData, root: Array) -> Array:
-            e = force_residual(scatter(duel.places, duel.plant, theta), data)
-            return (root * bench.white(e - force_residual(own, data))).ravel()
+        # The residual of the true model is numerical error, which is part of the other's residual too.
+        def difference(theta: Array, data: ForceData, root: Array) -> Array:
+            e = force_residual(scatter(models.places, models.plant, theta), data)
+            return (root * experiment.white(e - force_residual(true_plant, data))).ravel()
 
         absorbed = jax.lax.stop_gradient(
-            _absorbed(lambda theta: apart(theta, *jax.lax.stop_gradient((data, root))), other, mask)
+            _absorbed(lambda theta: difference(theta, *jax.lax.stop_gradient((data, root))), other, mask)
         )
-        # At the best fit its derivative does not matter: it is held while the signal moves.
-        d, change = jax.jvp(lambda theta: apart(theta, data, root), (other,), (absorbed,))
+        # At the best fit the derivative in the absorbed change is zero: it is held while the signal moves.
+        d, change = jax.jvp(lambda theta: difference(theta, data, root), (other,), (absorbed,))
         rows = jnp.sum(weight)
         nats = 0.5 * rows * jnp.log1p(jnp.sum((d + change) ** 2) / jnp.maximum(rows, 1.0))
         return nats, bounds.cost(run)
 
-    nats, cost = jax.vmap(one)(duel.thetas, duel.thetas[::-1], duel.masks[::-1])
+    nats, cost = jax.vmap(one)(models.thetas, models.thetas[::-1], models.masks[::-1])
     return nats, jnp.sum(cost)
 
 
-def _absorbed(apart, theta: Array, mask: Array) -> Array:
-    """Change of the unknowns that takes most of a difference away."""
+def _absorbed(difference, theta: Array, mask: Array) -> Array:
+    """Return the change of the unknowns that minimises a difference."""
 
     def both(theta: Array) -> tuple[Array, Array]:
-        d = apart(theta)
+        d = difference(theta)
         return d, d
 
     jacobian, d = jax.jacfwd(both, has_aux=True)(theta)
@@ -262,17 +263,17 @@ def _absorbed(apart, theta: Array, mask: Array) -> Array:
 
 @eqx.filter_jit
 def loss(
-    p: Float[Array, " p"], bench: Experiment, duel: ModelPair, shapes: Shapes, bounds: LimitCost
+    p: Float[Array, " p"], experiment: Experiment, models: ModelPair, shapes: Shapes, bounds: LimitCost
 ) -> tuple[Array, Array]:
-    """What to minimise, and its gradient: minus the logarithms of both evidences, plus what limits cost."""
+    """Compute minus the mean logarithm of both evidences plus the cost of the limits, and its gradient."""
 
     def of(p: Array) -> tuple[Array, Array]:
-        nats, cost = expected(bench, duel, shapes(p), bounds)
+        nats, cost = expected(experiment, models, shapes(p), bounds)
         value = -0.5 * jnp.sum(jnp.log(nats + 1e-3)) + cost
         return value, value
 
-    # Of several joints forwards, though it takes four times as long: the code that XLA of jaxlib 0.10
-    # makes of the way back through three masses of which one has presliding ends in a segmentation fault.
-    differentiate = jax.jacfwd if bench.start.size > 1 else jax.grad
+    # Several joints are differentiated forwards, though it takes four times as long: with jaxlib 0.10, XLA's
+    # code for reverse mode through three masses, one with presliding, ends in a segmentation fault.
+    differentiate = jax.jacfwd if experiment.start.size > 1 else jax.grad
     slope, value = differentiate(of, has_aux=True)(p)
     return value, slope

@@ -17,15 +17,15 @@ READERS = {".csv": read_csv, ".npz": read_npz, ".mat": read_mat, ".parquet": rea
 def read_columns(
     path: str | Path, names: list[str], rows: Rows | None = None
 ) -> tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]:
-    """Read the named columns of a file, unchanged and without a look at their meaning.
+    """Read the named columns of a file, unchanged and without regard to their meaning.
 
     A matrix in `.npz` or `.mat` has its samples along the longer side. A name
     like `pos[2]` is its second column.
 
     Args:
-        path: The file; its suffix says the format.
-        names: The columns wanted.
-        rows: 0-based, half open; all where absent. Rows outside are not looked at.
+        path: The file; its suffix determines the format.
+        names: Names of the columns.
+        rows: First row and end, 0-based and half open; None: all. Rows outside are not examined.
 
     Returns:
         The columns by name, each of shape (samples, width), and the rows in the file.
@@ -43,11 +43,11 @@ def read_columns(
         hint = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
         raise InputError("no such file", where=str(path), hint=hint)
     if not path.is_file():
-        raise InputError("is not a file", where=str(path), hint="name the log itself")
+        raise InputError("is not a file", where=str(path), hint="give the path of the log")
     if path.stat().st_size == 0:
         raise InputError("is empty", where=str(path), hint="export the log again")
     try:
         return reader(path, list(dict.fromkeys(names)), rows)
     except OSError as error:
-        hint = "check that it may be read"
+        hint = "check the permissions of the file"
         raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error

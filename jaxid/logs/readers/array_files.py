@@ -34,7 +34,7 @@ def read_npz(path: Path, names: list[str], rows: Rows | None) -> Columns:
 
 def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
     """Read columns of a MATLAB file up to version 7.2; see `read_columns`."""
-    # Loaded here, not above: a CSV should not wait for it.
+    # Imported here, since reading a CSV should not wait for it.
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
@@ -70,7 +70,7 @@ def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
 
 
 def _base(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """The variable that a name like `pos[2]` belongs to; a literal `pos[2]` comes first."""
+    """Return the variable of a name like `pos[2]`; a variable with that literal name takes precedence."""
     match = _INDEXED.match(name)
     return match[1] if match and name not in known else name
 
@@ -80,16 +80,16 @@ def _pick(path: Path, known: Mapping[str, Any], names: list[str], rows: Rows | N
 
     Args:
         path: The file, for messages.
-        known: All variables; those not asked for may be None.
-        names: What is wanted.
-        rows: 0-based, half open; None is all.
+        known: All variables by name; those that are not requested may be None.
+        names: Names of the requested columns.
+        rows: First row and end, 0-based and half open; None: all.
     """
     columns = {name: _column(path, known, name) for name in names}
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"'{name}' {count}" for name, count in lengths.items())
-        hint = "columns of one log have one length"
-        raise InputError(f"unequal lengths: {told}", where=str(path), hint=hint)
+        sizes = ", ".join(f"'{name}' {count}" for name, count in lengths.items())
+        hint = "all columns of a log need the same length"
+        raise InputError(f"unequal lengths: {sizes}", where=str(path), hint=hint)
     count = next(iter(lengths.values()), 0)
     if names and not count:
         raise InputError("is empty", where=str(path), hint="export the log again")
@@ -98,6 +98,7 @@ def _pick(path: Path, known: Mapping[str, Any], names: list[str], rows: Rows | N
 
 
 def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray, "samples _"]:
+    """Return one column as an array (samples, width) of float64."""
     base = _base(name, known)
     if base not in known:
         hint = suggest(base, known)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers.rows import Rows, resolve_rows
 
-# In order of preference where a header holds equally many of two of them.
+# In order of preference if a header has equally many of two of them.
 _DELIMITERS = (";", "\t", ",")
 
 
@@ -18,8 +18,8 @@ def read_csv(
 ) -> tuple[dict[str, Float[np.ndarray, "samples 1"]], Rows]:
     """Read columns of a CSV file; see `read_columns`.
 
-    The fast road is numpy's own parser on the lines that are wanted; where it
-    trips, the lines are walked once more to say which cell is at fault.
+    NumPy's parser reads the selected lines; if it fails, the lines are examined once more to find the faulty
+    cell.
     """
     header, delimiter, body = _split(_text(path), path)
     columns = [_find(name, header, path) for name in names]
@@ -37,6 +37,7 @@ def read_csv(
 
 
 def _text(path: Path) -> str:
+    """Read a text file in UTF-8, UTF-16 or Latin-1."""
     raw = path.read_bytes()
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", errors="replace")
@@ -50,13 +51,14 @@ def _text(path: Path) -> str:
 
 
 def _split(text: str, path: Path) -> tuple[list[str], str, list[str]]:
-    """Header cells, delimiter and the lines of data, without comments and blank lines."""
+    """Split a table into header cells, delimiter and lines of data, without comments and blank lines."""
     lines = [line for line in text.splitlines() if line and not line.isspace()]
     comments = 0
     while comments < len(lines) and lines[comments].lstrip().startswith("#"):
         comments += 1
     if comments == len(lines):
         raise InputError("is empty", where=str(path), hint="export the log again")
+
     head, body = lines[comments], lines[comments + 1 :]
     if comments and _is_numeric(head):
         # numpy.savetxt writes its header as the last comment.
@@ -64,6 +66,7 @@ def _split(text: str, path: Path) -> tuple[list[str], str, list[str]]:
     if _is_numeric(head):
         hint = "add a first row with the names of the columns"
         raise InputError(f"no header row: it begins '{head[:40]}'", where=str(path), hint=hint)
+
     if "#" in text:
         body = [line.split("#", 1)[0] for line in body]
         body = [line for line in body if line and not line.isspace()]
@@ -74,15 +77,18 @@ def _split(text: str, path: Path) -> tuple[list[str], str, list[str]]:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
+    """Split a line into cells; quotes are respected."""
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
 
 
 def _is_numeric(line: str) -> bool:
+    """Check that all cells of a line that are not empty are numbers."""
     cells = _cells(line, max(_DELIMITERS, key=line.count))
     return any(cells) and all(_number(cell) is not None for cell in cells if cell)
 
 
 def _number(cell: str) -> float | None:
+    """Return the number in a cell; None if it is not a number."""
     try:
         return float(cell)
     except ValueError:
@@ -90,6 +96,7 @@ def _number(cell: str) -> float | None:
 
 
 def _find(name: str, header: list[str], path: Path) -> int:
+    """Return the index of a column, which must occur once in the header."""
     if name not in header:
         hint = suggest(name, [known for known in header if known])
         raise InputError(f"has no column '{name}'", where=str(path), hint=hint)
@@ -102,15 +109,15 @@ def _find(name: str, header: list[str], path: Path) -> int:
 def _check_widths(body: list[str], header: list[str], delimiter: str, first: int, path: Path) -> None:
     """Refuse rows that are wider than the header: their cells belong to other columns.
 
-    numpy's parser looks at the wanted columns only, and a decimal comma in a
-    comma-separated file would shift them without a word.
+    NumPy's parser reads the requested columns only, and a decimal comma in a comma-separated file would shift
+    them silently.
     """
     for k, line in enumerate(body):
         if line.count(delimiter) < len(header):
             continue
         cells = _cells(line, delimiter)
         if any(cells[len(header) :]):
-            hint = "one cell a column; decimals are written with a point"
+            hint = "give one cell for each column; write decimals with a point"
             what = f"row {first + k} has {len(cells)} cells, the header {len(header)}"
             raise InputError(what, where=str(path), hint=hint)
 
@@ -131,7 +138,7 @@ def _blame(
             if _number(cell) is not None and "_" not in cell:
                 continue
             fault = f"'{cell}' is not a number" if cell else "the cell is empty"
-            hint = "correct or remove the row, or keep clear of it with rows = [first, end]"
+            hint = "correct or remove the row, or exclude it by rows = [first, end]"
             if _number(cell.replace(",", ".")) is not None:
                 hint = "write decimals with a point"
             where = f"{path}, column '{name}', row {first + k} (0-based)"

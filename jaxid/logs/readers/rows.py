@@ -1,4 +1,4 @@
-"""Which rows of a file are meant."""
+"""The range of rows to read from a file."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ def resolve_rows(rows: Rows | None, count: int, path: Path) -> Rows:
     """Check a range of rows against the rows that a file has.
 
     Args:
-        rows: 0-based, half open; None is all of them.
-        count: Rows in the file.
+        rows: First row and end, 0-based and half open; None: all.
+        count: Number of rows in the file.
         path: The file, for the message.
 
     Returns:
-        The rows to take.
+        First row and end of the range.
 
     Raises:
         InputError: If the range is empty, reversed or beyond the file.
