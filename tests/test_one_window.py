@@ -157,7 +157,7 @@ def test_windows_that_cannot_be(tmp_path, name):
 def test_friction_by_coefficient_is_not_in_proportion(tmp_path):
     path = case(tmp_path)
     path.write_text(path.read_text().replace("level = [\n  {", "friction_coefficient = [\n  {"))
-    with pytest.raises(InputError, match="not enter the balance in proportion; .* friction by its level"):
+    with pytest.raises(InputError, match="the balance is not linear in .*; .* friction by its level"):
         identify(path, first_instants(), method="algebraic")
 
 
@@ -170,5 +170,5 @@ def test_nothing_moves(tmp_path):
         reference=np.concatenate([rest, log.reference]),
         source="late",
     )
-    with pytest.raises(InputError, match="nothing moves between 0 and 0.06 s"):
+    with pytest.raises(InputError, match="no joint moves between 0 and 0.06 s"):
         identify(case(tmp_path, "[0.0, 0.06]"), late, method="algebraic")

@@ -17,10 +17,10 @@ from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
 from jaxid.errors import InputError
-from jaxid.estimators.within_prior.fit import expected_steps
+from jaxid.estimators.within_prior.fit import expected_covariance_steps
 from jaxid.estimators.within_prior.prior import Prior
-from jaxid.estimators.within_prior.problem import Problem, residual_of, with_sensor
-from jaxid.estimators.within_prior.rounding import rounds
+from jaxid.estimators.within_prior.problem import Problem, WeightedResidual
+from jaxid.estimators.within_prior.quantisation import omits_quantisation
 from jaxid.experiment_design.improve import improved
 from jaxid.experiment_design.limits import LimitCost, Limits, Peaks, kept_within
 from jaxid.experiment_design.shapes import Shapes, basis
@@ -204,23 +204,23 @@ class _DesignProblem:
     def expected(self, signal: np.ndarray) -> np.ndarray:
         """Covariance of the unknowns that a signal's log will leave, in units of the prior, (p, p).
 
-        Where readings round, that which is found of a log simulated at the guesses: see `through_rounding`.
+        If readings are quantised, it is that of a log simulated at the guesses: see `fit_with_quantisation`.
         """
         problem = Problem(
-            _under(self.replay, self.machine.plant, jnp.asarray(signal)),
-            self.machine.parameters.places,
-            self.machine.plant,
-            np.zeros(self.weight.shape),
-            self.weight,
-            self.prior,
-            self.on,
-            (np.asarray(self.machine.plant.sharpness),),
-            tuple(range(self.replay.position.size)),
+            replay=_under(self.replay, self.machine.plant, jnp.asarray(signal)),
+            places=self.machine.parameters.places,
+            plant=self.machine.plant,
+            measured=np.zeros(self.weight.shape),
+            weight=self.weight,
+            prior=self.prior,
+            on=self.on,
+            sharpnesses=(np.asarray(self.machine.plant.sharpness),),
+            encoders=tuple(range(self.replay.position.size)),
         )
-        if not rounds(self.machine, problem):
+        if not omits_quantisation(self.machine, problem):
             information = np.asarray(_information(*self.args(), jnp.asarray(signal)))
             return np.linalg.inv(np.eye(len(information)) + information)
-        return run_alone(expected_steps(self.machine, problem, self.own))
+        return run_alone(expected_covariance_steps(self.machine, problem, self.own))
 
     def args(self) -> tuple:
         """For the compiled functions."""
@@ -328,7 +328,16 @@ def _sensitivity(
 ) -> Array:
     """Derivative of what is compared over its noise, in units of the prior, (rows, p)."""
     p, none = len(places), jnp.zeros(weight.shape)
-    run = residual_of(_under(replay, plant, signal), places, plant, none, weight, prior, on, jnp.eye(p))
+    compared = WeightedResidual(
+        replay=_under(replay, plant, signal),
+        places=places,
+        plant=plant,
+        measured=none,
+        weight=weight,
+        prior=prior,
+        on=on,
+    )
+    run = compared.along(jnp.eye(p))
     return jax.jacfwd(run)(jnp.zeros(p)).reshape(-1, p)
 
 
