@@ -136,7 +136,7 @@ def test_coarse_readings_of_the_motor_alone_are_fitted_from_the_guesses_too(tmp_
     (tmp_path / "case.toml").write_text(axes.text(load=False, sensor=sensor))
     session = open_session(tmp_path / "case.toml", tmp_path / "log.csv")
     far = run_alone(METHODS["inverse_dynamics"](session))
-    assert far.told
+    assert far.all_identified
     assert far.value("stiffness") < 0.1 * axes.TRUTH["stiffness"]
     found = run_alone(METHODS["output_error"](session))
     assert found.converged

@@ -93,5 +93,5 @@ def test_a_restart_about_other_unknowns(axis, tmp_path):
     with pytest.raises(InputError, match="has the unknowns inertia, .* make both the same"):
         estimate(path, axis[1])
     path = with_table(tmp_path, axis, '\n[recursive]\nrestart = "first/result.json"\nrows = "summed"\n')
-    with pytest.raises(InputError, match="restart is of a run with other rows"):
+    with pytest.raises(InputError, match="the run to restart from had other rows"):
         estimate(path, axis[1])
