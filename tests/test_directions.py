@@ -226,7 +226,7 @@ def test_rounding_widens_what_it_moves(tmp_path):
         text = stages.text(1, resolution=count, more=STATED)
         (tmp_path / "case.toml").write_text(text)
         estimate = jaxid.identify(tmp_path / "case.toml", log).estimate
-        assert any("rounding" in note and "taken off" in note for note in estimate.notes)
+        assert any("quantisation" in note and "was removed" in note for note in estimate.notes)
         second = estimate.details["directions"][1]
         sigma.append(second["std"] / second["std_white"])
     assert sigma[1] > 1.3 * sigma[0]
