@@ -16,8 +16,8 @@ from tqdm import tqdm
 import jaxid
 from jaxid.commands.identify import identify_many
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.within_prior.evaluations import criterion_steps
 from jaxid.estimators.within_prior.prior import Prior
-from jaxid.estimators.within_prior.problem import criterion_steps
 from jaxid.logs.log import Log
 from jaxid.numerics.lanes import cores, run_alone, run_batched
 from jaxid.session import open_session

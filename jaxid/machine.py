@@ -72,7 +72,7 @@ class Machine:
         """The same machine around another plant and its unknowns."""
         return replace(self, plant=plant, parameters=parameters)
 
-    def with_estimate(self, theta: Sequence[float]) -> Machine:
+    def with_estimate(self, theta: Sequence[float] | np.ndarray) -> Machine:
         """The same machine with its unknowns set, which are also the new guesses."""
         theta = np.asarray(theta, dtype=np.float64)
         parameters = self.parameters.with_guess(theta)

@@ -15,7 +15,7 @@ from jaxid.model.plant import Plant
 
 
 def integrate_internal_states(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
+    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array | float, start: Array | float = 0.0
 ) -> tuple:
     """Integrate the effects' internal states along a measured motion.
 
@@ -59,7 +59,7 @@ def integrate_internal_states(
     return own
 
 
-def _recurrence(start: Array, decay: Array, push: Array, h: Array) -> Array:
+def _recurrence(start: Array, decay: Array, push: Array, h: Array | float) -> Array:
     """Solve dz/dt = decay z + push from samples of both: push a cubic between them, decay a line.
 
     Lines in place of the cubic would be 1 % off at a sixth of the sampling rate, as much as a
@@ -85,7 +85,7 @@ def _recurrence(start: Array, decay: Array, push: Array, h: Array) -> Array:
     return jnp.concatenate([start[None], later])
 
 
-def _vector_recurrence(start: Array, slope: Array, push: Array, h: Array) -> Array:
+def _vector_recurrence(start: Array, slope: Array, push: Array, h: Array | float) -> Array:
     """Solve dz/dt = slope z + push, slope constant (k, k), from samples of the push, (time, k)."""
     e, p1, p2, p3, p4 = _matrix_phi(h * slope)
     here, line, bend, turn = _cubics(push)
@@ -128,7 +128,7 @@ def _matrix_phi(x: Float[Array, "k k"]) -> list[Array]:
 
 
 def balance_along(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
+    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array | float, start: Array | float = 0.0
 ) -> tuple[Float[Array, "time n"], Float[Array, "time m"]]:
     """Compute the residual of the balance and the force of the drives along a motion, at the load [N or N m].
 
@@ -150,7 +150,7 @@ def balance_along(
 
 
 def residual_along(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array, start: Array | float = 0.0
+    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array | float, start: Array | float = 0.0
 ) -> Float[Array, "time n"]:
     """Compute inverse dynamics minus declared force, over `drive_ratio` [N or N m, declared units].
 

@@ -41,7 +41,7 @@ def _output_error(
 
     log, on = session.fit.log, on or session.case.output_error.get("on", "position")
     if "prior" in session.case.output_error:
-        from jaxid.estimators.within_prior.fit import directions_steps
+        from jaxid.estimators.within_prior.fit import within_prior_steps
 
         if solver is not None:
             raise InputError(
@@ -52,7 +52,7 @@ def _output_error(
         need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
         stated = {k: v for k, v in session.case.output_error.items() if k not in ("on", "start")}
         others = yield from _beside_the_guesses(session)
-        asked = directions_steps(session.machine, log, on=on, numerics=numerics, others=others, **stated)
+        asked = within_prior_steps(session.machine, log, on=on, numerics=numerics, others=others, **stated)
         return (yield from asked)
     start = yield from _start(session)
     if solver is not None:
@@ -74,9 +74,9 @@ def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
     method, unknown = session.case.output_error.get("start", "guess"), session.machine.parameters
     if method == "guess":
         return []
-    from jaxid.estimators.recursive.rows import in_proportion_steps
+    from jaxid.estimators.recursive.rows import keep_linear_steps
 
-    machine = yield from in_proportion_steps(session.machine, session.fit.data)
+    machine = yield from keep_linear_steps(session.machine, session.fit.data)
     case = replace(session.case, recursive=session.case.recursive | {"start": "guess"})
     first = yield from METHODS[method](replace(session, machine=machine, case=case))
     found = dict(zip(first.names, first.theta, strict=True))

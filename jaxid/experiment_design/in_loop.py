@@ -17,10 +17,10 @@ from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
 from jaxid.errors import InputError
-from jaxid.estimators.within_prior.fit import expected_steps
+from jaxid.estimators.within_prior.fit import expected_covariance_steps
 from jaxid.estimators.within_prior.prior import Prior
-from jaxid.estimators.within_prior.problem import Problem, residual_of, with_sensor
-from jaxid.estimators.within_prior.rounding import rounds
+from jaxid.estimators.within_prior.problem import Problem, WeightedResidual
+from jaxid.estimators.within_prior.quantisation import omits_quantisation
 from jaxid.experiment_design.improve import improved
 from jaxid.experiment_design.limits import LimitCost, Limits, Peaks, kept_within
 from jaxid.experiment_design.shapes import Shapes, basis
@@ -220,7 +220,7 @@ class _DesignProblem:
     def expected(self, signal: np.ndarray) -> np.ndarray:
         """Return the expected covariance of the unknowns after a signal, in units of the prior, (p, p).
 
-        If readings are rounded, it is estimated from a log simulated at the guesses: see `through_rounding`.
+        If readings are quantised, it is that of a log simulated at the guesses: see `fit_with_quantisation`.
         """
         problem = Problem(
             replay=_replayed_under(self.replay, self.machine.plant, jnp.asarray(signal)),
@@ -230,13 +230,13 @@ class _DesignProblem:
             weight=self.weight,
             prior=self.prior,
             on=self.on,
-            ladder=(np.asarray(self.machine.plant.smoothing.sharpness),),
+            sharpnesses=(np.asarray(self.machine.plant.smoothing.sharpness),),
             encoders=tuple(range(self.replay.position.size)),
         )
-        if not rounds(self.machine, problem):
+        if not omits_quantisation(self.machine, problem):
             information = np.asarray(_information(*self.args(), jnp.asarray(signal)))
             return np.linalg.inv(np.eye(len(information)) + information)
-        return run_alone(expected_steps(self.machine, problem, self.direct_share))
+        return run_alone(expected_covariance_steps(self.machine, problem, self.direct_share))
 
     def args(self) -> tuple:
         """Return the arguments of the compiled functions, in order."""
@@ -394,9 +394,16 @@ def _sensitivity(
 ) -> Array:
     """Differentiate the compared quantities over their noise, in units of the prior, (rows, p)."""
     p, none = len(places), jnp.zeros(weight.shape)
-    run = residual_of(
-        _replayed_under(replay, plant, signal), places, plant, none, weight, prior, on, jnp.eye(p)
+    compared = WeightedResidual(
+        replay=_replayed_under(replay, plant, signal),
+        places=places,
+        plant=plant,
+        measured=none,
+        weight=weight,
+        prior=prior,
+        on=on,
     )
+    run = compared.along(jnp.eye(p))
     return jax.jacfwd(run)(jnp.zeros(p)).reshape(-1, p)
 
 

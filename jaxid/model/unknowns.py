@@ -49,6 +49,15 @@ class Free:
     index: int | tuple[int, int] | None = None
     true: float | None = None
 
+    @property
+    def effect(self) -> int | None:
+        """Index of the effect that has the unknown; None for a parameter of the plant."""
+        if self.path[0] != "effects":
+            return None
+        index = self.path[1]
+        assert isinstance(index, int), "effects are a tuple"
+        return index
+
     def get(self, plant: Plant) -> Array:
         """Return the leaf that holds this unknown."""
         return leaf(plant, self.path)

@@ -338,7 +338,7 @@ def test_refuses_what_it_cannot_find(tmp_path):
     for message, swap in (
         ("has nothing to find: all is known; take kind = 'computed_torque'", known),
         (
-            "the balance is not in proportion to",
+            "the balance is not linear in",
             [
                 (
                     'kind = "viscous_friction"\ncoefficient',
@@ -347,7 +347,7 @@ def test_refuses_what_it_cannot_find(tmp_path):
             ],
         ),
         (
-            "has a memory or a delay",
+            "has an internal state or a delay",
             [("[controller]", '[[effects]]\nkind = "actuator_lag"\ntime_constant = 0.01\n[controller]')],
         ),
     ):

@@ -351,9 +351,9 @@ def test_a_run_that_fails_is_a_row_that_says_so(tmp_path):
     study = jaxid.study(write_case(tmp_path, text), runs=2)
     failed = [r for r in study.summary if r["estimator"] == "algebraic"]
     assert all(r["failed"] == 1.0 and r["used"] == 0 and np.isnan(r["rmse"]) for r in failed)
-    assert all(f["runs"] == 2 and "hold no rest" in f["why"] for f in study.failures)
+    assert all(f["runs"] == 2 and "are without a rest" in f["why"] for f in study.failures)
     assert {f["estimator"] for f in study.failures} == {"algebraic"}
-    assert "hold no rest" in str(study)
+    assert "are without a rest" in str(study)
 
 
 PULSE = '[input]\nkind = "trapezoid"\nstart = 0.0\ntargets = [6.0, 0.0]\nspeed = 200.0\nacceleration = 5e3\n'

@@ -20,9 +20,10 @@ from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.common.levenberg_marquardt import Minimum
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, output_residual
-from jaxid.estimators.within_prior.posterior import most_probable
-from jaxid.estimators.within_prior.problem import Problem, read
-from jaxid.estimators.within_prior.rounding import drawn_roundings
+from jaxid.estimators.within_prior.evaluations import linearise
+from jaxid.estimators.within_prior.posterior import maximum_a_posteriori
+from jaxid.estimators.within_prior.problem import Problem
+from jaxid.estimators.within_prior.quantisation import quantisation_samples
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics.lanes import run_alone
@@ -51,7 +52,7 @@ class LoopFit:
 
     Args:
         machine: The fitted machine, at its guesses.
-        widths: Standard deviations of unknowns that have a separate one, by name; see `directions_steps`.
+        widths: Standard deviations of unknowns that have a separate one, by name; see `within_prior_steps`.
         estimate: Result of the fit.
         problem: Residual, weights and prior of the fit.
         point: Optimum of the loop without rounding of readings, in units of the prior.
@@ -73,10 +74,10 @@ class LoopFit:
         problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
         point = problem.prior.inward(problem.padded(estimate.theta))
 
-        here = run_alone(read(problem, problem.ladder[-1], point))
-        problem, here = problem.weighed(here)
+        here = run_alone(linearise(problem, problem.sharpnesses[-1], point))
+        problem, here = problem.reweighted(here)
         noise = problem.noise(here, len(estimate.details["directions"]))
-        point, here, _ = run_alone(most_probable(problem, noise, point))
+        point, here, _ = run_alone(maximum_a_posteriori(problem, noise, point))
         return cls(
             machine=machine, widths=widths, estimate=estimate, problem=problem, point=point, minimum=here
         )
@@ -260,7 +261,7 @@ class Loop:
 
         p, log = self.problem, self.session.fit.log
         plant = with_numerical_damping(self.superset.machine.plant, jnp.asarray(log.filled[0]), log.period)
-        plant = plant.smoothed(p.ladder[-1])
+        plant = plant.smoothed(p.sharpnesses[-1])
         args = (p.replay, self.superset.machine.parameters.places, plant, p.measured, p.weight, p.on)
         e, columns = _columns(*args, theta, directions)
 
@@ -322,7 +323,7 @@ class Loop:
         """Draw residuals of white noise, with the rounding in the loop if there is any."""
         rng = np.random.default_rng(1)
         white = rng.standard_normal((_DRAWS, self.samples))
-        rounded = drawn_roundings(self.session.machine, self.problem, _DRAWS)
+        rounded = quantisation_samples(self.session.machine, self.problem, _DRAWS)
         if rounded is not None:
             e = rounded / self.sigma
             share = min(float(np.mean(e**2)), 1.0)

@@ -20,7 +20,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.estimators import steps_of
-from jaxid.estimators.within_prior.fit import directions_steps
+from jaxid.estimators.within_prior.fit import within_prior_steps
 from jaxid.gap import gaps, noise_floor
 from jaxid.machine import Machine
 from jaxid.model.unknowns import Free, free_effect
@@ -161,10 +161,10 @@ def _fit(
     *,
     drawn: bool,
 ) -> LoopFit:
-    """Fit within the prior from some values of the unknowns; for `drawn` see `directions_steps`."""
+    """Fit within the prior from some values of the unknowns; for `drawn` see `within_prior_steps`."""
     stated = session.case.output_error
     result = run_alone(
-        directions_steps(
+        within_prior_steps(
             machine,
             session.fit.log,
             prior=stated["prior"],

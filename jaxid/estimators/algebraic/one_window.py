@@ -1,7 +1,7 @@
 """Algebraic identification over one window of a log: least squares, and the paper's four other forms.
 
-All work on the rows of `jaxid.estimators.algebraic.online`: of each joint and sample the balance, weighted by
-(t - t0)^2 and integrated twice, as columns of the unknowns and the value b where they are zero.
+All forms use the rows of `jaxid.estimators.algebraic.online`: for each joint and sample the balance, weighted
+by (t - t0)^2 and integrated twice, as columns of the unknowns and the value b for unknowns of zero.
 
 Source:
     Wi, Ri, Ri & Ri, (14)-(25), after Beltran-Carbajal & Silva-Navarro (2015). As printed, (18) lacks
@@ -28,16 +28,16 @@ from jaxid.model.unknowns import Free
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import Precision, assess
 
-# A matrix whose scaled condition is worse than this tells nothing at noise of rounding.
+# A matrix whose scaled condition number is above this is singular to rounding errors.
 _SINGULAR = 1e12
 # Shortest interval of one direction, in samples.
 _SHORTEST = 12
-# Samples for which a joint must have moved on end, for its rows to count: in less, start-up errors
-# of the quadrature are as large as what damping and springs do.
+# Consecutive samples for which a joint must have moved for its rows to count: before that, start-up errors
+# of the quadrature are as large as the effect of damping and springs.
 _LONG_ENOUGH = 40
 
 Window = tuple[float, float]
-# Rows of one joint: samples by own unknowns, and b.
+# Rows of one joint: the columns of its unknowns, and b.
 Rows = tuple[Float[np.ndarray, "time k"], Float[np.ndarray, " time"]]
 
 
@@ -46,10 +46,11 @@ class Stretch:
     """The part of a log that a window covers.
 
     Args:
-        position, command: Readings and command there.
-        online: The recursion that gives the rows.
-        moving: Which intervals before each sample are faster than rest, (time, n).
-        direction: Sign of the velocity of those, (time, n).
+        position: Measured positions, (time, n) [m or rad].
+        command: Logged commands, (time, m).
+        online: The recursion that computes the rows.
+        moving: Mask of the samples before which the joint moves faster than at rest, (time, n).
+        direction: Sign of the velocity of those samples, zero for the others, (time, n).
     """
 
     position: Float[np.ndarray, "time n"]
@@ -60,7 +61,13 @@ class Stretch:
 
     @classmethod
     def of(cls, machine: Machine, log: Log, data: Prepared, window: Window | None) -> Stretch:
-        """Cut a window out of a log; with a stated cut-off its positions are the filtered ones.
+        """Cut a window out of a log; with a stated cut-off the positions are the filtered ones.
+
+        Args:
+            machine: The machine whose unknowns are estimated.
+            log: The log.
+            data: The same log, filtered.
+            window: Start and end [s]; None: the whole log.
 
         Raises:
             InputError: If the window leaves the log or holds too few samples, the command is not held,
@@ -68,10 +75,11 @@ class Stretch:
         """
         if log.hold != "zero_order":
             raise InputError(
-                f"the command is {log.hold}, not held between samples",
+                f"one window needs a command that is held between samples, and [log] hold is {log.hold}",
                 where=log.source,
                 hint="leave out [algebraic] window, or use inverse_dynamics",
             )
+
         start, end = window or (log.time[0], log.time[-1])
         # A log of 0.1 s ends one sample before 0.1 s.
         if start < log.time[0] - 1.5 * log.period or end > log.time[-1] + 1.5 * log.period:
@@ -79,32 +87,34 @@ class Stretch:
                 f"[algebraic] window = [{start:g}, {end:g}] s is not within the log, which runs from "
                 f"{log.time[0]:g} to {log.time[-1]:g} s",
                 where=log.source,
-                hint="choose one that is",
+                hint="choose a window within the log",
             )
         inside = (log.time >= start - 1e-9) & (log.time <= end + 1e-9)
         if inside.sum() < 4 * _SHORTEST:
             raise InputError(
                 f"[algebraic] window = [{start:g}, {end:g}] s holds {int(inside.sum())} samples",
                 where=log.source,
-                hint=f"let it hold at least {4 * _SHORTEST}",
+                hint=f"choose a window of at least {4 * _SHORTEST} samples",
             )
+
         recipe = data.recipe
         position = (data.q if recipe.keeps_reversals else log.position)[inside]
         velocity = np.diff(data.q[inside], axis=0, prepend=data.q[inside][:1]) / log.period
         if recipe.derivatives == "parabolic":
-            # Its position is not filtered: differences would have twice the noise or more.
+            # This recipe does not filter the position: differences would have twice the noise or more.
             velocity = data.qd[inside]
         fast = np.abs(velocity).max(axis=0)
         still = InputError(
-            f"nothing moves between {start:g} and {end:g} s",
+            f"no joint moves between {start:g} and {end:g} s",
             where=log.source,
             hint="choose another [algebraic] window",
         )
+
         if not fast.any():
             raise still
         online = Online.of(machine, log.period, np.asarray(recipe.rest_velocity), fast)
         rest = online.rest_velocity
-        # A filter rings into a rest; readings that do not differ do not move.
+        # A filter rings into a rest: a joint moves only if its raw positions change too.
         raw = np.pad(log.position[inside], ((2, 2), (0, 0)), mode="edge")
         moving = (np.abs(velocity) > rest) & (np.abs(raw[4:] - raw[:-4]) / (4 * log.period) > 0.5 * rest)
         if not moving.any():
@@ -112,50 +122,67 @@ class Stretch:
         return cls(position, log.force[inside], online, moving, np.sign(velocity) * moving)
 
     def rows(self, restart: Bool[np.ndarray, "time n"]) -> SolveRequest:
-        """The rows, windows beginning where it says."""
+        """Return the request for the rows, with windows that start at the samples of a mask."""
         return SolveRequest(window_rows, (self.online, self.position, self.command, restart))
 
     def ages(self, restart: Bool[np.ndarray, "time n"]) -> Float[np.ndarray, "time n"]:
-        """Time since the start of each joint's window [s]."""
+        """Return the time since the start of each joint's window [s]."""
         index = np.arange(len(restart))[:, None]
         last = np.maximum.accumulate(np.where(restart, index, 0), axis=0)
         return self.online.period * (index - last)
 
 
 def least_squares_steps(machine: Machine, log: Log, data: Prepared, window: Window | None) -> Steps[Estimate]:
-    """All rows of a window at once; dry friction is a column like any other."""
+    """Estimate by least squares over all rows of a window; dry friction is a column like any other.
+
+    Args:
+        machine: The machine whose unknowns are estimated.
+        log: The log.
+        data: The same log, filtered.
+        window: Start and end [s]; None: the whole log.
+    """
     cut = Stretch.of(machine, log, data, window)
     _, rows = yield cut.rows(~cut.moving)
     rows, owner, p = np.asarray(rows), cut.online.owner, len(machine.parameters.free)
+
+    # Rows shortly after a rest do not count, nor those of joints whose equations hold for zeros.
     rows = np.where(lasting(cut.moving, min(_LONG_ENOUGH, len(rows) // 2) - 1)[..., None], rows, 0.0)
     rows[:, _homogeneous(rows, owner, machine.parameters.guess)] = 0.0
     counts = np.any(rows != 0, axis=-1)
+
+    # A joint's rows are replaced by their triangular factor, in the columns of its unknowns.
     jacobian, b = np.zeros((*counts.shape, p)), rows[..., -1]
     triangles = []
     for i in range(len(owner)):
-        own = owner[i] < p
-        jacobian[:, i, owner[i][own]] = rows[:, i, :-1][:, own]
-        # Of a joint's rows their triangle says all, in its own unknowns alone.
-        short = np.linalg.qr(np.concatenate([rows[:, i, :-1][:, own], b[:, i, None]], axis=1), mode="r")
+        used = owner[i] < p
+        jacobian[:, i, owner[i][used]] = rows[:, i, :-1][:, used]
+        short = np.linalg.qr(np.concatenate([rows[:, i, :-1][:, used], b[:, i, None]], axis=1), mode="r")
         triangles.append(np.zeros((len(short), p + 1)))
-        triangles[-1][:, [*owner[i][own], p]] = short
+        triangles[-1][:, [*owner[i][used], p]] = short
     flat, values = np.split(np.concatenate(triangles), [p], axis=1)
     scale = np.linalg.norm(flat, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     theta = -np.linalg.lstsq(flat / scale, values[:, 0], rcond=1e-13)[0] / scale
+
     e = jacobian @ theta + b
     names = machine.parameters.names
     size = float(np.linalg.norm(b[counts]))
     precision = assess(names, jacobian, e, counts, size, np.where(theta != 0, theta, 1.0))
     resting = int(counts.size - counts.sum())
-    notes = (f"one window of {log.period * (len(rows) - 1):.3g} s; {resting} rows of rest left out",)
+    notes = (f"one window of {log.period * (len(rows) - 1):.3g} s; {resting} rows at rest omitted",)
     return _estimate("algebraic", machine, theta, precision, np.where(counts, e, np.nan), notes)
 
 
 def _homogeneous(rows: np.ndarray, owner: np.ndarray, guess: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Joints whose equations hold for zeros: those tied to them neither are driven nor know a value.
+    """Return the mask of the joints whose equations are homogeneous, and solved by unknowns of zero.
 
-    A mass that swings by itself tells ratios; least squares would say that nothing is there.
+    They and the joints that share unknowns with them have no drive and no known parameter. A mass that swings
+    freely identifies ratios only, and least squares would return zero for all of them.
+
+    Args:
+        rows: Columns of the unknowns and the value b, by sample and joint, (time, n, c + 1).
+        owner: Index of the unknown of each column, p for none, (n, c).
+        guess: Guesses, which give the size of a row, (p,).
     """
     p, n = len(guess), len(owner)
     stands = np.zeros((n, p), bool)
@@ -174,7 +201,7 @@ def single_time(rows: Rows, period: float) -> np.ndarray:
 
 
 def ratio(rows: Rows, period: float) -> np.ndarray:
-    """Twice integrated |Delta_j| over twice integrated |Delta|, (18)-(19): signs are lost."""
+    """Divide twice integrated |Delta_j| by twice integrated |Delta|, (18)-(19): signs are lost."""
     matrix, b = _iterated(*rows, period)
     whole = np.abs(np.linalg.det(matrix))
     if not np.max(whole) > 0:
@@ -189,33 +216,34 @@ def ratio(rows: Rows, period: float) -> np.ndarray:
 
 
 def without_friction(one: Rows, other: Rows, column: int, period: float) -> np.ndarray:
-    """Two intervals, the level of friction eliminated between them, (20)-(25).
+    """Solve the rows of two intervals, the level of friction eliminated between them, (20)-(25).
 
-    The column of friction carries the direction of motion: what is a sum where directions differ and
-    a difference where they do not is one formula.
+    The column of friction has the sign of the motion: one formula covers the paper's sum, for opposite
+    directions, and its difference, for equal ones.
 
     Args:
         one, other: Rows of the two intervals.
-        column: Of friction among the unknowns.
+        column: Index of the friction level among the unknowns.
         period: Sampling time [s].
     """
-    own = [k for k in range(one[0].shape[1]) if k != column]
+    others = [k for k in range(one[0].shape[1]) if k != column]
     ends = [tuple(x[-1] for x in _iterated(*rows, period)) for rows in (one, other)]
-    (a1, b1), (a2, b2) = ((a[: len(own)], b[: len(own)]) for a, b in ends)
+    (a1, b1), (a2, b2) = ((a[: len(others)], b[: len(others)]) for a, b in ends)
     d1, d2 = a1[:, column], a2[:, column]
-    matrix = d2[:, None] * a1[:, own] - d1[:, None] * a2[:, own]
-    theta = np.zeros(len(own) + 1)
-    theta[own] = _solved(matrix, d2 * b1 - d1 * b2)
-    levels = [-(a[0, own] @ theta[own] + b[0]) / a[0, column] for a, b in ((a1, b1), (a2, b2))]
+    matrix = d2[:, None] * a1[:, others] - d1[:, None] * a2[:, others]
+    theta = np.zeros(len(others) + 1)
+    theta[others] = _solved(matrix, d2 * b1 - d1 * b2)
+    levels = [-(a[0, others] @ theta[others] + b[0]) / a[0, column] for a, b in ((a1, b1), (a2, b2))]
     theta[column] = np.mean(levels)
     return theta
 
 
 def _iterated(columns: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows at every sample and their integrals, as many as there are unknowns, (16)."""
+    """Return rows at every sample and their iterated integrals, as many as there are unknowns, (16)."""
     levels = [(columns, b)]
     for _ in range(columns.shape[1] - 1):
-        levels.append(tuple(_integral(x, period) for x in levels[-1]))
+        a, value = levels[-1]
+        levels.append((_integral(a, period), _integral(value, period)))
     return np.stack([a for a, _ in levels], axis=1), np.stack([b for _, b in levels], axis=1)
 
 
@@ -224,7 +252,7 @@ def _integral(x: np.ndarray, period: float) -> np.ndarray:
 
 
 def _solved(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Solve matrix @ theta = -b, scaled by rows and columns; NaN where it is singular."""
+    """Solve matrix @ theta = -b, scaled by rows and columns; NaN if it is singular."""
     across = np.abs(matrix).max(axis=1, keepdims=True)
     if not np.all(across > 0):
         return np.full(matrix.shape[1], np.nan)
@@ -236,9 +264,13 @@ def _solved(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def joint_by_joint(form: Callable[[Rows, float], np.ndarray], name: str) -> Callable[..., Steps[Estimate]]:
-    """An estimator that solves each joint's rows by themselves, from its start to its first rest.
+    """Build an estimator that solves each joint's rows separately, from its start to its first rest.
 
-    What two joints share (a spring) is the mean of both. No standard deviation is given.
+    Unknowns that two joints share (of a spring) are the mean of both. No standard deviation is given.
+
+    Args:
+        form: Function that solves rows, given the sampling time.
+        name: Name of the method.
     """
 
     def steps(machine: Machine, log: Log, data: Prepared, window: Window | None) -> Steps[Estimate]:
@@ -246,71 +278,83 @@ def joint_by_joint(form: Callable[[Rows, float], np.ndarray], name: str) -> Call
         restart = ~cut.moving
         _, rows = yield cut.rows(restart)
         ages = cut.ages(restart)
-        found = []
+        answers = []
         for i in range(rows.shape[1]):
             begin, end = _first_run(cut.moving[:, i])
             part = slice(begin, end)
-            # Of what came before a row counted, nothing is known: it is zero.
-            own, values = _own(cut.online, i, np.asarray(rows)[part, i], ages[part, i])
-            found.append((own, form(values, log.period) if end - begin >= _SHORTEST else None))
-        return _merged(name, machine, found, log)
+            # Rows that do not count yet are zero.
+            unknowns, values = _rows_of_joint(cut.online, i, np.asarray(rows)[part, i], ages[part, i])
+            answers.append((unknowns, form(values, log.period) if end - begin >= _SHORTEST else None))
+        return _merged(name, machine, answers, log)
 
     return steps
 
 
 def two_intervals(changed: bool, name: str) -> Callable[..., Steps[Estimate]]:
-    """An estimator that eliminates friction between two intervals of one direction each.
+    """Build an estimator that eliminates friction between two intervals of one direction each.
 
     Args:
-        changed: Take one interval before a reversal and one after it; else both halves of the first.
-        name: Of the method.
+        changed: Take an interval before a reversal and one after it; else both halves of the first interval.
+        name: Name of the method.
     """
 
     def steps(machine: Machine, log: Log, data: Prepared, window: Window | None) -> Steps[Estimate]:
         cut = Stretch.of(machine, log, data, window)
         pairs = [_intervals(d, changed) for d in cut.direction.T]
-        answers = []
+
+        # The rows of all joints, once with windows that start at their first interval, once at the second.
+        passes = []
         for which in (0, 1):
             restart = np.zeros(cut.moving.shape, bool)
             restart[0] = True
             for i, pair in enumerate(pairs):
                 restart[pair[which][0] if pair else 0, i] = True
-            answers.append((np.asarray((yield cut.rows(restart))[1]), cut.ages(restart)))
-        found = []
+            passes.append((np.asarray((yield cut.rows(restart))[1]), cut.ages(restart)))
+
+        answers = []
         for i, pair in enumerate(pairs):
             if pair is None:
-                found.append(((), None))
+                answers.append(((), None))
                 continue
             both = [
-                _own(cut.online, i, rows[a:b, i], ages[a:b, i])
-                for (rows, ages), (a, b) in zip(answers, pair, strict=True)
+                _rows_of_joint(cut.online, i, rows[a:b, i], ages[a:b, i])
+                for (rows, ages), (a, b) in zip(passes, pair, strict=True)
             ]
-            own = both[0][0]
-            column = [k for k, j in enumerate(own) if _is_friction(machine, machine.parameters.free[j])]
+            unknowns = both[0][0]
+            column = [k for k, j in enumerate(unknowns) if _is_friction(machine, machine.parameters.free[j])]
             if len(column) != 1:
-                found.append((own, None))
+                answers.append((unknowns, None))
                 continue
             theta = without_friction(both[0][1], both[1][1], column[0], log.period)
-            found.append((own, theta))
-        return _merged(name, machine, found, log)
+            answers.append((unknowns, theta))
+        return _merged(name, machine, answers, log)
 
     return steps
 
 
 def _is_friction(machine: Machine, free: Free) -> bool:
-    return free.path[0] == "effects" and machine.plant.effects[free.path[1]].kind == "coulomb_friction"
+    return free.effect is not None and machine.plant.effects[free.effect].kind == "coulomb_friction"
 
 
-def _own(online: Online, joint: int, rows: np.ndarray, ages: np.ndarray) -> tuple[tuple[int, ...], Rows]:
-    """Unknowns that stand in a joint's rows, and these as the double integrals that they are."""
+def _rows_of_joint(
+    online: Online, joint: int, rows: np.ndarray, ages: np.ndarray
+) -> tuple[tuple[int, ...], Rows]:
+    """Return the unknowns in a joint's rows, and the rows as double integrals without their weight.
+
+    Args:
+        online: The recursion that computed the rows.
+        joint: Index of the joint.
+        rows: Its rows over (t - t0)^2, (time, c + 1).
+        ages: Time t - t0 since the start of its window, (time,) [s].
+    """
     whole = rows * ages[:, None] ** 2
     columns = [c for c, k in enumerate(online.owner[joint]) if k < online.guess.size]
-    own = tuple(int(online.owner[joint, c]) for c in columns)
-    return own, (whole[:, columns], whole[:, -1])
+    unknowns = tuple(int(online.owner[joint, c]) for c in columns)
+    return unknowns, (whole[:, columns], whole[:, -1])
 
 
 def _first_run(flags: np.ndarray) -> tuple[int, int]:
-    """From the sample before the first true entry to the last of that run."""
+    """Return the range of samples of the first run of true entries, and the sample before it."""
     if not flags.any():
         return 0, 0
     begin = int(np.argmax(flags))
@@ -319,7 +363,12 @@ def _first_run(flags: np.ndarray) -> tuple[int, int]:
 
 
 def _intervals(direction: np.ndarray, changed: bool) -> tuple[tuple[int, int], ...] | None:
-    """Two stretches of samples in one direction each; None where there are none."""
+    """Return two ranges of samples, each in one direction; None if there are none.
+
+    Args:
+        direction: Sign of the velocity, zero at rest, (time,).
+        changed: Whether the two directions differ; else the ranges are halves of one interval.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[0.0], direction, [0.0]])))
     runs = [(a, b, direction[a]) for a, b in zip(edges[:-1], edges[1:], strict=True) if direction[a] != 0]
     if not changed:
@@ -336,30 +385,44 @@ def _intervals(direction: np.ndarray, changed: bool) -> tuple[tuple[int, int], .
     return None
 
 
-def _merged(name: str, machine: Machine, found: list[tuple], log: Log) -> Estimate:
-    """One estimate of what each joint says."""
+def _merged(name: str, machine: Machine, answers: list[tuple], log: Log) -> Estimate:
+    """Merge the solutions of the joints into one estimate, by the mean of each unknown.
+
+    Args:
+        name: Name of the method.
+        machine: The machine.
+        answers: Indices of the unknowns of each joint and their values, None if there is no solution.
+        log: The log, for the error message.
+
+    Raises:
+        InputError: If no joint has a solution.
+    """
     p = len(machine.parameters.free)
     total, times = np.zeros(p), np.zeros(p)
-    for own, theta in found:
+    for unknowns, theta in answers:
         if theta is not None and np.all(np.isfinite(theta)):
-            total[list(own)] += theta
-            times[list(own)] += 1
-    told = times > 0
-    if not told.any():
+            total[list(unknowns)] += theta
+            times[list(unknowns)] += 1
+    identifiable = times > 0
+    if not identifiable.any():
         raise InputError(
-            "no joint has an interval that its equations could be solved on",
+            "no joint has an interval on which its equations can be solved",
             where=log.source,
-            hint="take a longer window, or `algebraic`",
+            hint="take a longer window, or use algebraic",
         )
-    theta = np.where(told, total / np.maximum(times, 1), machine.parameters.guess)
+
+    theta = np.where(identifiable, total / np.maximum(times, 1), machine.parameters.guess)
     unknown = np.full((p, p), np.nan)
-    blind = [{n: 1.0} for n, t in zip(machine.parameters.names, told, strict=True) if not t]
-    precision = Precision(unknown, told, blind, np.full(p, np.nan))
-    left = [k + 1 for k, (_, theta) in enumerate(found) if theta is None or not np.all(np.isfinite(theta))]
+    combinations = [{n: 1.0} for n, t in zip(machine.parameters.names, identifiable, strict=True) if not t]
+    precision = Precision(unknown, identifiable, combinations, np.full(p, np.nan))
+
+    unsolved = [
+        k + 1 for k, (_, theta) in enumerate(answers) if theta is None or not np.all(np.isfinite(theta))
+    ]
     notes = ["this form gives no standard deviation"]
-    if left:
-        notes.append(f"no equations of joint {', '.join(map(str, left))} could be solved")
-    return _estimate(name, machine, theta, precision, np.full((1, len(found)), np.nan), tuple(notes))
+    if unsolved:
+        notes.append(f"the equations of joint {', '.join(map(str, unsolved))} could not be solved")
+    return _estimate(name, machine, theta, precision, np.full((1, len(answers)), np.nan), tuple(notes))
 
 
 def _estimate(
@@ -385,7 +448,7 @@ def _estimate(
     )
 
 
-# Names of the forms that solve a joint's equations by themselves.
+# Forms that solve the equations of each joint separately, by the name of their method.
 FORMS: dict[str, Callable[..., Steps[Estimate]]] = {
     "algebraic_single_time": joint_by_joint(single_time, "algebraic_single_time"),
     "algebraic_ratio": joint_by_joint(ratio, "algebraic_ratio"),

@@ -1,18 +1,17 @@
-"""Algebraic identification sample by sample: the balance's iterated integrals as a recursion.
+"""On-line algebraic identification: the iterated integrals of the balance as a recursion.
 
 Over a window that starts at t0 the balance of each joint is multiplied by (t - t0)^2 and integrated
-twice up to every sample. By parts no derivative of the measurement is left where the balance is
-linear in it, its coefficients constant, and the initial conditions vanish. Each sample adds one row
-a joint to a least-squares problem in the unknowns; integrals are of fourth order, from samples that
-have been.
+twice up to every sample. Integration by parts removes the derivatives of the measurement from all terms
+that are linear in it with constant coefficients, and the initial conditions vanish. Each sample adds one row
+per joint to a least-squares problem in the unknowns; the integrals are causal and of fourth order.
 
-A joint's window begins anew when it leaves rest: the force that holds a stuck joint is not in the
-balance. A held force bends the motion at every sample, where a quadrature of the position loses its
-order. So what is held is integrated twice exactly, and that double integral then passes the same
-quadrature as the position, whose corners it cancels.
+A joint's window restarts when it leaves rest: the force that holds a stuck joint is not in the
+balance. A force that is held between samples jumps at each of them, and a quadrature of the position loses
+its order there. Held terms are therefore integrated twice exactly, and that double integral then passes the
+same quadrature as the position, so that the errors at the jumps cancel.
 
-Nothing here is written down a second time: coefficients of acceleration and velocity, and
-the columns of the unknowns, are derivatives of the plant's own balance.
+The coefficients of acceleration and velocity, and the columns of the unknowns, are derivatives of the
+plant's balance, which is stated nowhere else.
 """
 
 from __future__ import annotations
@@ -34,25 +33,25 @@ from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import Parameters, colours, scatter, seeds
 
-# Adams-Moulton weights on the newest sample and up to three before it, by how many there are.
+# Adams-Moulton weights of the newest sample and up to three before it, by the number of earlier samples.
 _WEIGHTS = np.array(
     [[0.0, 0.0, 0.0, 0.0], [1 / 2, 1 / 2, 0.0, 0.0], [5 / 12, 8 / 12, -1 / 12, 0.0],
      [9 / 24, 19 / 24, -5 / 24, 1 / 24]]
 )  # fmt: skip
-# Samples after the start of a window before its rows count: so many hold next to nothing.
+# Samples after the start of a window before its rows count: the first ones hold almost no information.
 _FEWEST = 5
-# Part of a joint's largest velocity below which it rests, at least.
+# Least rest velocity, as a fraction of the joint's largest velocity.
 _LEAST = 1e-6
-# Relative to the largest, below this an eigenvalue of the scaled normal matrix is rounding.
+# An eigenvalue of the scaled normal matrix below this, relative to the largest, is a rounding error.
 _ROUNDING = 1e-14
 
 
 class Integral(eqx.Module):
-    """A running integral of a sampled function, fourth order once four samples have been.
+    """A running integral of a sampled function, of fourth order from the fourth sample on.
 
     Args:
-        value: Up to the last sample.
-        past: The function at the last three samples, the newest first, (3, ...).
+        value: Integral up to the last sample.
+        past: Values of the function at the last three samples, the newest first, (3, ...).
     """
 
     value: Array
@@ -60,11 +59,17 @@ class Integral(eqx.Module):
 
     @classmethod
     def zero(cls, like: Array) -> Integral:
-        """Nothing integrated yet."""
+        """Return an integral of zero, before the first sample."""
         return cls(jnp.zeros_like(like), jnp.zeros((3, *like.shape)))
 
     def next(self, f: Array, since: Array, period: float) -> Integral:
-        """With one sample more; `since` counts the samples before it, by joint (first axis)."""
+        """Return the integral up to one more sample.
+
+        Args:
+            f: The function at the new sample; its first axis is the joints.
+            since: Number of samples since the start of each joint's window, (n,).
+            period: Sampling time [s].
+        """
         weights = jnp.asarray(_WEIGHTS)[jnp.minimum(since, 3)]
         shape = (-1, *[1] * (f.ndim - 1))
         grown = weights[:, 0].reshape(shape) * f
@@ -75,15 +80,16 @@ class Integral(eqx.Module):
 
 
 class OnlineMemory(eqx.Module):
-    """What is kept from sample to sample.
+    """State of the recursion between samples.
 
     Args:
-        since: Samples since the start of each joint's window, (n,).
-        position: The last reading, (n,).
-        single: Integrals of q, t q, t^2 q (n, n each: the clock's joint, then the coordinate), of t^2
-            times the smooth part of the balance (n, c + 1), and of p and t p.
+        since: Number of samples since the start of each joint's window, (n,).
+        position: The last measured position, (n,) [m or rad].
+        single: Integrals of q, t q, t^2 q (n, n each: first the joint whose window counts t, then the
+            coordinate), of t^2 times the smooth part of the balance (n, c + 1), and of p and t p.
         double: Integrals of the first, second, fourth and fifth of these.
-        held: Single integral of what is held between samples, and the double one, p; exact.
+        held: Single and double integral of the terms that are held between samples, exact; the double
+            integral is p, (n, c + 1) each.
         normal: Sum of the outer products of each joint's rows, (n, c + 1, c + 1).
     """
 
@@ -96,13 +102,14 @@ class OnlineMemory(eqx.Module):
 
 
 class OnlineEstimate(eqx.Module):
-    """What the rows so far say.
+    """Least-squares estimate from the rows so far.
 
     Args:
-        theta: The unknowns, (p,).
-        relative: How far the fit's own residual would move each, over its value, were it the same
-            in all rows: no standard deviation, but it goes to zero where the rows tell an unknown.
-        trusted: Where that is below the tolerance and the rows tell the unknown at all.
+        theta: Values of the unknowns, (p,).
+        relative: Bound on the relative error of each unknown: the change that the residual of the fit
+            would cause if it were the same in all rows. It is no standard deviation, but it goes to zero
+            for an unknown that the rows identify, (p,).
+        trusted: Mask of the unknowns that are identifiable with a bound below the tolerance, (p,).
     """
 
     theta: Float[Array, " p"]
@@ -114,16 +121,16 @@ class Online(eqx.Module):
     """On-line algebraic estimator of a machine's unknowns; `update` may stand in a scan.
 
     Args:
-        plant: The plant, its sign as sharp as `rest_velocity` allows.
-        places: Of the unknowns.
-        guess: Any values of them: the balance is linear, they only fix the origin.
-        gain: Declared force per unit of command, by drive.
+        plant: The plant, its smoothed sign as sharp as `rest_velocity` allows.
+        places: Paths of the unknowns in the plant.
+        guess: Any values of the unknowns, (p,): the balance is linear, and they only fix the origin.
+        gain: Declared force per unit of command, by drive, (m,).
         period: Sampling time [s].
-        rest_velocity: Below it a joint counts as at rest, (n,).
-        fast: Velocity at which the slope of the forces is taken for the linear part, (n,).
-        owner: Which unknown each of the c columns of a joint's row is of, (n, c); p where of none.
-        seeds: Of the columns: unknowns that share one stand in different joints' balances, (p, c).
-        tolerance: Of `OnlineEstimate.relative`, where an estimate may be trusted.
+        rest_velocity: Velocity below which a joint counts as at rest, (n,) [m/s or rad/s].
+        fast: Velocity at which the slope of the forces is taken for the linear part, (n,) [m/s or rad/s].
+        owner: Index of the unknown of each of the c columns of a joint's row, p for none, (n, c).
+        seeds: Seeds of the columns, (p, c): unknowns of the balances of different joints share a column.
+        tolerance: Value of `OnlineEstimate.relative` below which an estimate is trusted.
     """
 
     plant: Plant
@@ -146,40 +153,48 @@ class Online(eqx.Module):
         fast: np.ndarray,
         tolerance: float = 0.05,
     ) -> Online:
-        """The estimator of a machine.
+        """Build the estimator of a machine.
+
+        Args:
+            machine: The machine whose unknowns are estimated.
+            period: Sampling time [s].
+            rest_velocity: Velocity below which a joint counts as at rest, (n,) [m/s or rad/s].
+            fast: Largest velocity of each joint, (n,) [m/s or rad/s].
+            tolerance: Value of `OnlineEstimate.relative` below which an estimate is trusted.
 
         Raises:
-            InputError: If an unknown does not enter the balance in proportion, or an effect has a
-                memory of its own, delays the command or changes with time: that asks for
-                `inverse_dynamics`.
+            InputError: If the balance is not linear in an unknown, or an effect has an internal state,
+                delays the command or changes with time. Such machines need `inverse_dynamics`.
         """
         check_linear(machine)
-        # A joint that never moves has no velocity of its own.
+        # A joint that never moves takes the velocity of the fastest.
         fast = np.where(fast > 0, fast, np.max(fast))
         rest_velocity = np.maximum(rest_velocity, _LEAST * fast)
         plant = machine.plant.smoothed(
             np.asarray(1 / 3), typical_velocity(machine.plant, rest_velocity[None], np.min)
         )
         enters = _enters(plant, machine.parameters, len(fast), machine.gain.size)
+
+        # Unknowns that never stand in the same balance share a column.
         numbers = colours(enters)
         owner = np.full((len(fast), max(numbers, default=-1) + 1), len(numbers))
         for k, number in enumerate(numbers):
             owner[enters[:, k], number] = k
         return cls(
-            plant,
-            machine.parameters.places,
-            np.asarray(machine.parameters.guess),
-            machine.gain,
-            period,
-            rest_velocity,
-            fast,
-            owner,
-            seeds(numbers),
-            tolerance,
+            plant=plant,
+            places=machine.parameters.places,
+            guess=np.asarray(machine.parameters.guess),
+            gain=machine.gain,
+            period=period,
+            rest_velocity=rest_velocity,
+            fast=fast,
+            owner=owner,
+            seeds=seeds(numbers),
+            tolerance=tolerance,
         )
 
     def start(self, position: Float[Array, " n"]) -> OnlineMemory:
-        """Memory at the first reading."""
+        """Return the memory after the first measured position."""
         n, c = self.owner.shape
         square, wide = jnp.zeros((n, n)), jnp.zeros((n, c + 1))
         first = self._smooth(position)
@@ -188,7 +203,14 @@ class Online(eqx.Module):
         single = tuple(Integral.zero(f).next(f, zero, self.period) for f in functions)
         double = tuple(Integral.zero(x).next(x, zero, self.period) for x in (square, square, wide, wide))
         normal = jnp.zeros((n, c + 1, c + 1))
-        return OnlineMemory(zero, position, single, double, (wide, wide), normal)
+        return OnlineMemory(
+            since=zero,
+            position=position,
+            single=single,
+            double=double,
+            held=(wide, wide),
+            normal=normal,
+        )
 
     def update(
         self,
@@ -197,20 +219,22 @@ class Online(eqx.Module):
         command: Float[Array, " m"],
         restart: Bool[Array, " n"] | None = None,
     ) -> tuple[OnlineMemory, Float[Array, "n c1"]]:
-        """Take one reading more.
+        """Add one sample.
 
         Args:
-            memory: So far.
-            position: The new reading.
-            command: Held since the last one.
-            restart: Joints whose window begins at this reading; absent: those at rest.
+            memory: The memory so far.
+            position: The new measured position, (n,) [m or rad].
+            command: The command held since the last sample, by drive, (m,).
+            restart: Mask of the joints whose window starts at this sample; absent: those at rest.
 
         Returns:
-            The new memory and the joints' rows: the balance, times (t - t0)^2, integrated twice and
-            over (t - t0)^2, as its derivatives in the unknowns of `owner` and, last, its value where
-            all are zero. Rows that do not count are zero.
+            The new memory and the joints' rows, (n, c + 1): the balance times (t - t0)^2, integrated twice
+            and over (t - t0)^2, as its derivatives in the unknowns of `owner`, followed by its value for
+            unknowns of zero. Rows that do not count are zero.
         """
         h = self.period
+
+        # Terms that are held since the last sample, integrated exactly.
         velocity = (position - memory.position) / h
         smooth = self._smooth(position)
         held = self._held(0.5 * (position + memory.position), velocity, self.gain * command)
@@ -218,6 +242,8 @@ class Online(eqx.Module):
         t1 = h * since
         slope, twofold = memory.held
         twofold, slope = twofold + h * slope + 0.5 * h**2 * held, slope + h * held
+
+        # Iterated integrals by quadrature, and the balance from them by parts.
         functions = self._functions(position, t1, smooth, twofold)
         once = tuple(i.next(f, since, h) for i, f in zip(memory.single, functions, strict=True))
         picked = tuple(once[k].value for k in (0, 1, 3, 4))
@@ -226,53 +252,65 @@ class Online(eqx.Module):
         first = first_by_parts(once[2].value, twice[1].value)
         forced = second_by_parts(t1[:, None], twofold, once[5].value, twice[3].value)
         rows = self._motion(position, second, first) + twice[2].value + forced
+
+        # A joint at rest starts a new window.
         resting = jnp.abs(velocity) < self.rest_velocity if restart is None else restart
         counts = (since >= _FEWEST) & ~resting
         rows = jnp.where(counts[:, None], rows / t1[:, None] ** 2, 0.0)
         fresh = self.start(position)
-        joints = lambda new, old: jnp.where(resting.reshape(-1, *[1] * (new.ndim - 1)), old, new)
-        past = lambda new, old: jax.vmap(joints)(new, old)
-        mix = lambda new, old: Integral(joints(new.value, old.value), past(new.past, old.past))
+
+        def restarted(new: Array, started: Array) -> Array:
+            return jnp.where(resting.reshape(-1, *[1] * (new.ndim - 1)), started, new)
+
+        def restarted_integral(new: Integral, started: Integral) -> Integral:
+            return Integral(restarted(new.value, started.value), jax.vmap(restarted)(new.past, started.past))
+
         grown = OnlineMemory(
-            joints(since, fresh.since),
-            position,
-            tuple(mix(a, b) for a, b in zip(once, fresh.single, strict=True)),
-            tuple(mix(a, b) for a, b in zip(twice, fresh.double, strict=True)),
-            tuple(joints(a, b) for a, b in zip((slope, twofold), fresh.held, strict=True)),
-            memory.normal + rows[:, :, None] * rows[:, None, :],
+            since=restarted(since, fresh.since),
+            position=position,
+            single=tuple(restarted_integral(a, b) for a, b in zip(once, fresh.single, strict=True)),
+            double=tuple(restarted_integral(a, b) for a, b in zip(twice, fresh.double, strict=True)),
+            held=(restarted(slope, fresh.held[0]), restarted(twofold, fresh.held[1])),
+            normal=memory.normal + rows[:, :, None] * rows[:, None, :],
         )
         return grown, rows
 
     def estimate(self, memory: OnlineMemory) -> OnlineEstimate:
-        """What the rows so far say; compiles, but is no part of a fast loop."""
+        """Solve the least-squares problem of the rows so far; compiles, but is not meant for a fast loop."""
         p = self.guess.size
-        # Of all unknowns and, last but one, the value; what is of no unknown goes into the last.
+
+        # Assemble the normal matrix of all unknowns; the last but one row is the value, and columns without
+        # an unknown go into the last.
         at = jnp.where(self.owner == p, p + 1, self.owner)
         at = jnp.concatenate([at, jnp.full((len(at), 1), p)], axis=1)
         whole = jnp.zeros((p + 2, p + 2)).at[at[:, :, None], at[:, None, :]].add(memory.normal)
         normal = whole[: p + 1, : p + 1]
+
+        # Scale it to a diagonal of one. Unknowns without effect are excluded.
         scale = jnp.sqrt(jnp.diagonal(normal)[:p])
-        seen = scale > 1e-9 * jnp.max(scale * jnp.abs(jnp.where(self.guess == 0, 1.0, self.guess)))
-        scale = jnp.where(seen, scale, 1.0)
-        matrix = jnp.where(jnp.outer(seen, seen), normal[:p, :p] / jnp.outer(scale, scale), 0.0)
+        active = scale > 1e-9 * jnp.max(scale * jnp.abs(jnp.where(self.guess == 0, 1.0, self.guess)))
+        scale = jnp.where(active, scale, 1.0)
+        matrix = jnp.where(jnp.outer(active, active), normal[:p, :p] / jnp.outer(scale, scale), 0.0)
         values, vectors = jnp.linalg.eigh(matrix)
         good = values > _ROUNDING * values[-1]
         inverse = (vectors * jnp.where(good, 1 / jnp.where(good, values, 1.0), 0.0)) @ vectors.T
         theta = -inverse @ (normal[:p, p] / scale) / scale
-        left = normal[p, p] + 2 * theta @ normal[:p, p] + theta @ normal[:p, :p] @ theta
-        moved = jnp.sqrt(jnp.maximum(left, 0.0) * jnp.diagonal(inverse)) / scale
-        blind = jnp.any((jnp.abs(vectors) > 0.1) & ~good, axis=1) | ~seen
-        relative = jnp.where(blind, jnp.inf, moved / jnp.maximum(jnp.abs(theta), 1e-300))
+
+        # Bound the error by the residual; unidentifiable unknowns have none.
+        squares = normal[p, p] + 2 * theta @ normal[:p, p] + theta @ normal[:p, :p] @ theta
+        moved = jnp.sqrt(jnp.maximum(squares, 0.0) * jnp.diagonal(inverse)) / scale
+        unidentifiable = jnp.any((jnp.abs(vectors) > 0.1) & ~good, axis=1) | ~active
+        relative = jnp.where(unidentifiable, jnp.inf, moved / jnp.maximum(jnp.abs(theta), 1e-300))
         return OnlineEstimate(theta, relative, relative < self.tolerance)
 
     def _functions(self, q: Array, t: Array, smooth: Array, twofold: Array) -> tuple[Array, ...]:
-        """What is integrated once: by the clock of each joint."""
+        """Return the functions that are integrated once, with the time of each joint's window."""
         t = t[:, None]
         every = jnp.broadcast_to(q, (q.size, q.size))
         return every, t * every, t**2 * every, t**2 * smooth, twofold, t * twofold
 
     def _columns(self, f: Callable[[Plant], Array]) -> Float[Array, "n c1"]:
-        """A balance that is linear in the unknowns as its derivatives and its value at zero."""
+        """Return a balance that is linear in the unknowns as its derivatives and its value at zero."""
         guess = jnp.asarray(self.guess)
 
         def residual(step: Array) -> tuple[Array, Array]:
@@ -287,12 +325,12 @@ class Online(eqx.Module):
         return plant.balance(q, v, a, u, jnp.zeros(()), plant.initial_states(u)).residual
 
     def _smooth(self, q: Array) -> Array:
-        """Columns of the balance at rest."""
+        """Return the columns of the balance at rest."""
         zero, none = jnp.zeros_like(q), jnp.zeros(self.gain.size)
         return self._columns(lambda plant: self._residual(plant, q, zero, zero, none))
 
     def _held(self, q: Array, v: Array, u: Array) -> Array:
-        """Columns of what jumps: the drive, and of velocity what is not linear."""
+        """Return the columns of the terms that jump: the drive, and forces nonlinear in the velocity."""
         zero, none = jnp.zeros_like(q), jnp.zeros_like(u)
 
         def beside(plant: Plant) -> Array:
@@ -302,12 +340,13 @@ class Online(eqx.Module):
         return self._columns(beside)
 
     def _damping(self, plant: Plant, q: Array) -> Array:
+        """Return the coefficients of the velocity: the mean slope at plus and minus `fast`, (n, n)."""
         zero, none = jnp.zeros_like(q), jnp.zeros(self.gain.size)
         slope = jax.jacfwd(lambda v: self._residual(plant, q, v, zero, none))
         return 0.5 * (slope(jnp.asarray(self.fast)) + slope(-jnp.asarray(self.fast)))
 
     def _motion(self, q: Array, second: Array, first: Array) -> Array:
-        """Columns of what is linear in acceleration and velocity, by parts."""
+        """Return the columns of the terms linear in acceleration and velocity, integrated by parts."""
         zero, none = jnp.zeros_like(q), jnp.zeros(self.gain.size)
 
         def linear(plant: Plant) -> Array:
@@ -319,7 +358,7 @@ class Online(eqx.Module):
 
 
 def _enters(plant: Plant, parameters: Parameters, joints: int, drives: int) -> Bool[np.ndarray, "n p"]:
-    """Which unknowns stand in the balance of which joints, by its derivatives along random motion."""
+    """Return the mask of the unknowns in the balance of each joint, by its derivatives at random motion."""
     random = np.random.default_rng(0)
     motion, u = random.uniform(0.5, 1.5, (3, joints)), random.uniform(0.5, 1.5, drives)
     guess = np.where(parameters.guess == 0, 1.0, parameters.guess)
@@ -328,53 +367,66 @@ def _enters(plant: Plant, parameters: Parameters, joints: int, drives: int) -> B
 
 @eqx.filter_jit
 def slopes(plant: Plant, places: tuple, theta: Array, motion: Array, u: Array) -> Float[Array, "n p"]:
-    """Derivative of the balance in the unknowns at one instant of a motion, (3, n)."""
+    """Return the derivative of the balance in the unknowns at one instant.
+
+    Args:
+        plant: The plant.
+        places: Paths of the unknowns in it.
+        theta: Values of the unknowns, (p,).
+        motion: Position, velocity and acceleration, (3, n).
+        u: Declared force of each drive, (m,) [N or N m].
+    """
 
     def residual(theta: Array) -> Array:
         moved = scatter(places, plant, theta)
-        return moved.balance(*motion, u, jnp.zeros(()), moved.initial_states(u)).residual
+        q, qd, qdd = motion
+        return moved.balance(q, qd, qdd, u, jnp.zeros(()), moved.initial_states(u)).residual
 
     return jax.jacfwd(residual)(jnp.asarray(theta))
 
 
 def check_linear(machine: Machine) -> None:
-    """Refuse what the recursion cannot hold.
+    """Check that the recursion can represent a machine.
 
     Raises:
-        InputError: If an effect remembers, delays or changes with time, or an unknown does not enter in
-            proportion.
+        InputError: If an effect has an internal state, delays the command or changes with time, or if the
+            balance is not linear in an unknown.
     """
     where = "algebraic, over one window"
     check_instant(machine, where)
-    odd = [machine.parameters.names[k] for k in np.flatnonzero(~linear_unknowns(machine))]
-    if odd:
+    nonlinear = [machine.parameters.names[k] for k in np.flatnonzero(~linear_unknowns(machine))]
+    if nonlinear:
         raise InputError(
-            f"{odd[0]} does not enter the balance in proportion",
+            f"the balance is not linear in {nonlinear[0]}",
             where=where,
-            hint="declare it known, friction by its level, or use inverse_dynamics",
+            hint="declare it known, state friction by its level, or use inverse_dynamics",
         )
 
 
 def check_instant(machine: Machine, where: str) -> None:
-    """Refuse a balance that one sample does not hold.
+    """Check that the balance depends on one instant only.
+
+    Args:
+        machine: The machine.
+        where: Place that the error message names.
 
     Raises:
-        InputError: If an effect remembers, delays or changes with time.
+        InputError: If an effect has an internal state, delays the command or changes with time.
     """
     for e in machine.plant.effects:
         if e.initial_state(jnp.zeros(())) is not None or not isinstance(e.command_delay(), float):
             hint = "leave it out, or use inverse_dynamics"
-            raise InputError(f"{e.kind} has a memory or a delay", where=where, hint=hint)
-    if _ages(machine):
+            raise InputError(f"{e.kind} has an internal state or a delay", where=where, hint=hint)
+    if _depends_on_time(machine):
         raise InputError(
             "the balance changes with time",
             where=where,
-            hint="leave out what does (friction_drift), or use inverse_dynamics",
+            hint="leave out the effect that changes (friction_drift), or use inverse_dynamics",
         )
 
 
-def _ages(machine: Machine) -> bool:
-    """Whether time stands in the balance, by its value along random motion now and later."""
+def _depends_on_time(machine: Machine) -> bool:
+    """Tell whether the balance depends on time, by its value at random motion at two times."""
     plant, parameters, random = machine.plant, machine.parameters, np.random.default_rng(0)
     theta = np.where(parameters.guess == 0, 1.0, parameters.guess)
     motion, u = plant.any_motion(random), random.uniform(0.5, 1.5, machine.gain.size)
@@ -387,7 +439,8 @@ def _value(
     plant: Plant, places: tuple, theta: Array, motion: Array, u: Array, t: Array
 ) -> Float[Array, " n"]:
     plant = scatter(places, plant, jnp.asarray(theta))
-    return plant.balance(*motion, u, t, plant.initial_states(u)).residual
+    q, qd, qdd = motion
+    return plant.balance(q, qd, qdd, u, t, plant.initial_states(u)).residual
 
 
 @eqx.filter_jit
@@ -397,7 +450,14 @@ def window_rows(
     command: Float[Array, "time m"],
     restart: Bool[Array, "time n"],
 ) -> tuple[OnlineMemory, Float[Array, "time n c1"]]:
-    """All rows of a log whose windows begin where `restart` says, and the memory at its end."""
+    """Compute all rows of a log, and the memory at its end.
+
+    Args:
+        online: The estimator.
+        position: Measured positions, (time, n) [m or rad].
+        command: Logged commands, (time, m).
+        restart: Mask of the samples at which each joint's window starts, (time, n).
+    """
 
     def step(memory: OnlineMemory, now: tuple) -> tuple[OnlineMemory, Array]:
         return online.update(memory, *now)

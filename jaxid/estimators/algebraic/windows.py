@@ -1,13 +1,12 @@
 """Algebraic identification: the balance weighted by powers of time and integrated by parts.
 
 Over a window that starts at t0, the balance is multiplied by (t - t0)^n and integrated n times, n
-being the order of the highest derivative. By parts, every derivative of the measurement that
-stands linearly turns into plain integrals of it, and every initial condition vanishes, because
-all weights are zero at t0. No derivative of a measurement is taken except where the physics is
-nonlinear in velocity (a sign, v |v|).
+being the order of the highest derivative. Integration by parts turns every linear derivative of the
+measurement into integrals of it, and all initial conditions vanish, because the weights are zero at t0. A
+derivative of a measurement is taken only for forces that are nonlinear in the velocity (a sign, v |v|).
 
-The columns are not written down a second time: the coefficients of acceleration and velocity are
-the plant's own balance, differentiated.
+The coefficients of acceleration and velocity are derivatives of the plant's balance, which is stated
+nowhere else.
 """
 
 from __future__ import annotations
@@ -34,17 +33,22 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import assess
 from jaxid.simulation.force_balance import ForceData, sharpened
 
-# Windows: so many periods of the band edge each, half overlapping. Shorter ones hold too little
-# motion to tell inertia from friction, longer ones too much of the noise's drift.
+# Length of a window in periods of the band edge; windows overlap by half. Shorter ones hold too little motion
+# to separate inertia from friction, longer ones too much drift of the noise.
 _WINDOW_PERIODS = 20
-# Part of a window for which the axis may rest.
+# Largest fraction of a window for which the axis may rest.
 _LARGEST_REST = 0.05
 
 
 def iterated_integral(x: Float[Array, "time k"], period: float, times: int) -> Float[Array, "time k"]:
-    """Integrate from the first sample on, so many times over.
+    """Integrate several times from the first sample on, to fourth order.
 
-    Fourth order: each interval is integrated under the cubic through its four nearest samples.
+    Each interval is integrated under the cubic through its four nearest samples.
+
+    Args:
+        x: Samples of the functions, (time, k).
+        period: Sampling time [s].
+        times: Number of integrations.
     """
     for _ in range(times):
         middle = (-x[:-3] + 13 * x[1:-2] + 13 * x[2:-1] - x[3:]) / 24
@@ -56,20 +60,24 @@ def iterated_integral(x: Float[Array, "time k"], period: float, times: int) -> F
 
 
 def second_by_parts(t: Array, x: Array, moment: Array, twofold: Array) -> Array:
-    """Double integral of t^2 x'' from x, the integral of t x and the double integral of x."""
+    """Return the double integral of t^2 x'' from x, the integral of t x and the double integral of x."""
     return t**2 * x - 4 * moment + 2 * twofold
 
 
 def first_by_parts(moment: Array, twofold: Array) -> Array:
-    """Double integral of t^2 x' from the integral of t^2 x and the double integral of t x."""
+    """Return the double integral of t^2 x' from the integral of t^2 x and the double integral of t x."""
     return moment - 2 * twofold
 
 
 def weak_motion(q: Float[Array, "time n"], period: float) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Double integrals of t^2 q'' and t^2 q' over a window, derivatives taken by parts.
+    """Compute the double integrals of t^2 q'' and t^2 q' over a window by parts.
+
+    Args:
+        q: Measured positions, (time, n) [m or rad].
+        period: Sampling time [s].
 
     Returns:
-        Both integrals up to the window's end.
+        Both integrals up to the window's end, (n,) each.
 
     Source:
         By parts: int int t^2 q'' = t^2 q - 4 int t q + 2 int int q, and
@@ -88,40 +96,40 @@ def weak_motion(q: Float[Array, "time n"], period: float) -> tuple[Float[Array, 
 def weak_residual(
     plant: Plant, data: ForceData, raw: Float[Array, "time n"], length: int
 ) -> Float[Array, "window n"]:
-    """Balance of each window, times (t - t0)^2 and integrated twice up to the window's end.
+    """Compute the balance of each window, times (t - t0)^2 and integrated twice up to the window's end.
 
-    The balance is M a + C v + rest, M and C constant over a window. What is linear in a and v is
-    taken from the measured position by parts; the rest sees the measured position and, where it
-    depends on velocity, the filtered one. C is the mean slope at plus and minus a high velocity:
-    any constant would do, since what it misses stays in the rest.
+    The balance is M a + C v + rest, with M and C constant over a window. The terms linear in a and v are
+    computed from the measured position by parts. The rest is evaluated at the measured position and the
+    filtered velocity. C is the mean slope at plus and minus a high velocity; any constant would do, because
+    its error is part of the rest.
 
     Args:
         plant: The plant.
-        data: The log, prepared.
-        raw: Measured positions, (time, n).
-        length: Samples of a window; windows overlap by half.
+        data: The filtered log.
+        raw: Measured positions, (time, n) [m or rad].
+        length: Number of samples in a window; windows overlap by half.
 
     Returns:
-        One row a window, over t^4 / 12: a weighted mean of the residual force [N or N m].
+        One row per window, over t^4 / 12: a weighted mean of the residual force, (window, n) [N or N m].
     """
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
-    own = integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
+    states = integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
     times = data.start + data.period * jnp.arange(raw.shape[0])
     fast = jnp.abs(data.qd).max(axis=0)
 
-    def split(q: Array, v: Array, u: Array, t: Array, own: tuple) -> tuple[Array, ...]:
+    def split(q: Array, v: Array, u: Array, t: Array, states: tuple) -> tuple[Array, ...]:
         def residual(v: Array, a: Array) -> Array:
-            return plant.balance(q, v, a, u, t, own).residual
+            return plant.balance(q, v, a, u, t, states).residual
 
         zero = jnp.zeros_like(v)
         mass = jax.jacfwd(residual, argnums=1)(v, zero)
         slope = jax.jacfwd(residual)
         damping = 0.5 * (slope(fast, zero) + slope(-fast, zero))
-        drive = plant.balance(q, v, zero, u, t, own).drive
+        drive = plant.balance(q, v, zero, u, t, states).drive
         return mass, damping, residual(v, zero) - damping @ v, drive
 
-    mass, damping, rest, drive = jax.vmap(split)(raw, data.qd, u, times, own)
+    mass, damping, rest, drive = jax.vmap(split)(raw, data.qd, u, times, states)
 
     def window(start: Array) -> Array:
         def cut(x: Array) -> Array:
@@ -160,36 +168,39 @@ def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
     """Fit the unknowns to windows of iterated integrals by least squares.
 
     Args:
-        machine: The machine.
-        log: The log: its measured positions are integrated as they are.
-        data: The same, prepared: filtered velocity for what is nonlinear in it.
+        machine: The machine whose unknowns are estimated.
+        log: The log, whose measured positions are integrated without a filter.
+        data: The same log, filtered: its velocity is used for forces that are nonlinear in it.
 
     Returns:
-        The estimate. Windows of which the axis rests for more than a twentieth are left out: the
-        force of a stuck axis is not in the balance.
+        The estimate. Windows in which the axis rests for more than a twentieth of the time are omitted: the
+        force that holds a stuck axis is not in the balance.
 
     Raises:
-        InputError: If too few windows are left.
+        InputError: If too few windows remain.
     """
     return run_alone(algebraic_steps(machine, log, data))
 
 
 def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimate]:
-    """`algebraic`, as what is to be solved."""
+    """Estimate like `algebraic`, one solve request at a time."""
     plant, arrays = sharpened(machine.plant, data), ForceData.of(data)
     cutoff = data.recipe.motion_hz(log.rate_hz)
     length = int(min(_WINDOW_PERIODS / (cutoff * log.period), log.samples / 8))
     starts = np.arange(0, log.samples - length + 1, length // 2)
+
+    # Windows with a rest do not count.
     slow = np.abs(data.qd) < np.asarray(data.recipe.rest_velocity)
     rests = np.stack([slow[k : k + length].mean(axis=0) for k in starts])
     rows = rests < _LARGEST_REST
     parameters = machine.parameters
     if rows.sum() < 2 * len(parameters.free):
         raise InputError(
-            f"only {int(rows.sum())} windows of {length * log.period:.3g} s hold no rest",
+            f"only {int(rows.sum())} windows of {length * log.period:.3g} s are without a rest",
             where=log.source,
             hint="take a log with longer motion, or use inverse_dynamics",
         )
+
     fit = yield SolveRequest(
         _solve,
         (
@@ -215,6 +226,7 @@ def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimat
         force * np.sqrt(rows.sum()),
         np.where(theta != 0, theta, 1.0),
     )
+
     converged = bool(fit.converged)
     return Estimate(
         method="algebraic",

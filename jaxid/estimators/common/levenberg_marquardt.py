@@ -263,7 +263,7 @@ def descend(
     bounds: tuple[Float[Array, " p"], Float[Array, " p"]],
     max_steps: Array | int,
     active: Bool[Array, " p"] | None = None,
-    tolerance: float = _TOLERANCE,
+    tolerance: Array | float = _TOLERANCE,
     floor: Array | float = -np.inf,
 ) -> Progress:
     """Go on with a descent; see `levenberg_marquardt`, but on the solver's scale.
@@ -295,7 +295,7 @@ def _advanced(
     jacobian: Array,
     bounds: tuple[Array, Array],
     moves: Bool[Array, " p"],
-    tolerance: float,
+    tolerance: Array | float,
     floor: Array | float,
 ) -> Progress:
     """Take or refuse the trial, given residual and Jacobian there, and choose the next."""

@@ -1,4 +1,4 @@
-"""The fewest numbers that the coefficients of a minimal model are made of."""
+"""The basis of a minimal model: the fewest independent numbers that determine its coefficients."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.model.unknowns import Parameters
 
-# Relative to the largest, below this a singular value is rounding.
+# A singular value below this, relative to the largest, is a rounding error.
 _RANK = 1e-9
 
 
 @dataclass(frozen=True)
 class Basis:
-    """c = constant + spread chi, of the unknown coefficients c of a model.
+    """The affine map c = constant + spread chi from the numbers chi to the unknown coefficients c.
 
     Args:
-        names: Of chi.
-        units: Labels.
-        spread: (terms, chi).
-        constant: (terms,).
+        names: Names of the numbers chi.
+        units: Labels of their units.
+        spread: Matrix of the map, (terms, chi).
+        constant: Coefficients for chi of zero, (terms,).
     """
 
     names: tuple[str, ...]
@@ -35,16 +35,22 @@ class Basis:
 
     @property
     def gather(self) -> Float[np.ndarray, "chi terms"]:
-        """Of chi = gather (c - constant)."""
+        """Matrix of the inverse map chi = gather (c - constant), (chi, terms)."""
         return np.linalg.pinv(self.spread)
 
 
 def basis_of(structure: Structure, samples: MinimalSamples, parameters: Parameters, units: Units) -> Basis:
-    """Regroup the coefficients of a model.
+    """Find the basis of a model's unknown coefficients.
 
-    Where they are linear in the unknowns these are the unknowns themselves, those with the same
-    column regrouped in the first. Else they are the coefficients, or, where rows share some, what
-    spans them at a plant whose offsets are zero.
+    If the coefficients are linear in the unknowns, the basis is the unknowns themselves, and unknowns with
+    dependent columns are regrouped with the first. Else it is the coefficients. If rows share some of them,
+    it is an independent set that spans the coefficients at a plant with offsets of zero.
+
+    Args:
+        structure: The structure of the model.
+        samples: Its coefficients at several values of the unknowns.
+        parameters: The unknowns.
+        units: Units of the plant, for labels.
 
     Source:
         Mayeda, Yoshida and Osuka (1990), Gautier and Khalil (1990) for regrouping by columns.
@@ -53,14 +59,20 @@ def basis_of(structure: Structure, samples: MinimalSamples, parameters: Paramete
     values, slopes = samples.of(structure.unknown, structure.leading)
     entries = [_entry(t, structure) for _, t in structure.unknown]
     labels = [_label(t, structure, units) for _, t in structure.unknown]
+
+    # Linear in the unknowns: the slopes are the same at all draws.
     if all(np.allclose(s, slopes[0], rtol=_RANK, atol=_RANK * np.abs(slopes[0]).max()) for s in slopes):
         kept, names = _regrouped(slopes[0], parameters.names)
-        own = [parameters.free[k].unit for k in kept]
-        return Basis(names, tuple(own), slopes[0][:, kept], values[-1] - slopes[-1] @ guess)
+        unit = tuple(parameters.free[k].unit for k in kept)
+        return Basis(names, unit, slopes[0][:, kept], values[-1] - slopes[-1] @ guess)
+
+    # Independent coefficients: they are the basis themselves.
     whole = np.concatenate([_unit_columns(s) for s in slopes[:-1]], axis=1)
     rank = np.linalg.matrix_rank(whole, tol=_RANK * np.linalg.norm(whole, 2))
     if rank == len(entries):
         return Basis(tuple(entries), tuple(labels), np.eye(rank), np.zeros(rank))
+
+    # Dependent coefficients, at the plant with offsets of zero: unknowns scaled by their largest coefficient.
     reference, columns = values[-2], slopes[-2]
     largest = np.abs(columns).argmax(axis=0)
     size = np.abs(columns[largest, np.arange(len(guess))])
@@ -77,6 +89,8 @@ def basis_of(structure: Structure, samples: MinimalSamples, parameters: Paramete
             spread,
             constant,
         )
+
+    # Else some of the coefficients themselves.
     pivots = _regrouped(whole.T, entries)[0]
     spread = whole @ np.linalg.pinv(whole[pivots])
     constant = reference - spread @ reference[pivots]
@@ -89,7 +103,15 @@ def _unit_columns(a: np.ndarray) -> np.ndarray:
 
 
 def _regrouped(columns: np.ndarray, names: list[str]) -> tuple[list[int], tuple[str, ...]]:
-    """Columns that are independent of those before them, and each with what depends on it as a name."""
+    """Return the columns that are independent of those before them, and names for the regrouped ones.
+
+    Args:
+        columns: Columns of the unknowns, (terms, p).
+        names: Names of the columns.
+
+    Returns:
+        Indices of the independent columns, and for each the sum of the names that depend on it.
+    """
     kept: list[int] = []
     groups: list[list[tuple[float, str]]] = []
     for k, column in enumerate(columns.T):
@@ -97,11 +119,11 @@ def _regrouped(columns: np.ndarray, names: list[str]) -> tuple[list[int], tuple[
         if norm == 0:
             continue
         share = np.zeros(0)
-        left = column
+        independent = column
         if kept:
             share = np.linalg.lstsq(columns[:, kept], column, rcond=None)[0]
-            left = column - columns[:, kept] @ share
-        if np.linalg.norm(left) > _RANK * norm:
+            independent = column - columns[:, kept] @ share
+        if np.linalg.norm(independent) > _RANK * norm:
             kept.append(k)
             groups.append([(1.0, names[k])])
             continue
@@ -120,18 +142,18 @@ def _sum(group: list[tuple[float, str]]) -> str:
 
 
 def _entry(term: Term, structure: Structure) -> str:
-    """Name of a coefficient: as the paper has them where there is one row and one signal of a kind."""
+    """Return the name of a coefficient, that of the paper for one row and one signal of a kind."""
     every = [t for _, t in structure.unknown]
-    alike = {t.index for t in every if t.signal == term.signal and t.row == term.row}
+    indices = {t.index for t in every if t.signal == term.signal and t.row == term.row}
     letter = {"position": "a", "acceleration": "d", "force": "b", "sign": "Fc", "one": "c"}[term.signal]
     order = "" if term.signal in ("sign", "one") else str(term.order)
-    place = f"[{term.index + 1}]" if len(alike) > 1 else ""
+    place = f"[{term.index + 1}]" if len(indices) > 1 else ""
     row = f", row {term.row + 1}" if structure.rows > 1 else ""
     return f"{letter}{order}{place}{row}"
 
 
 def _label(term: Term, structure: Structure, units: Units) -> str:
-    """Unit of a coefficient."""
+    """Return the label of a coefficient's unit."""
     leading = structure.leading[term.row]
     power = term.order - (0 if leading is None else leading[1].order)
     if term.signal == "force":
@@ -143,7 +165,7 @@ def _label(term: Term, structure: Structure, units: Units) -> str:
 
 
 def _per(units: Units, base: str, power: int) -> str:
-    """A unit times seconds to a power."""
+    """Return the label of a unit times seconds to a power."""
     if power == 0:
         return units.label(base)
     over, _, under = base.partition("/")
@@ -153,5 +175,12 @@ def _per(units: Units, base: str, power: int) -> str:
 
 
 def chi_of(plant: Plant, structure: Structure, gather: Array, constant: Array) -> Float[Array, " chi"]:
-    """Numbers of a basis at a plant, differentiable in its parameters."""
+    """Return the numbers chi of a plant, differentiable in its parameters.
+
+    Args:
+        plant: The plant.
+        structure: The structure of the model.
+        gather: Matrix from the coefficients to chi, (chi, terms).
+        constant: Coefficients for chi of zero, (terms,).
+    """
     return gather @ (structure.coefficients(plant) - constant)

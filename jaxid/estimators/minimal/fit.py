@@ -1,7 +1,7 @@
-"""Least squares on the minimal model that a log allows, and from its coefficients to the parameters.
+"""Identification by a minimal model: least squares for its coefficients, and the parameters from these.
 
-The coefficients chi are fitted by ordinary least squares, as published; then the parameters to the
-coefficients, which is a weighted least-squares problem of a handful of numbers.
+The coefficients chi are fitted by ordinary least squares, as published. The parameters are then fitted to the
+coefficients, a small weighted least-squares problem.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from jaxid.numerics.precision import assess
 if TYPE_CHECKING:
     from jaxid.session import Session
 
-# The band follows the natural frequency that is found, until that moves by less than this.
+# The band follows the estimated natural frequencies until they change by less than this fraction; passes at
+# most.
 _SETTLED = 0.1
 _PASSES = 4
-# Samples that a coefficient needs at least.
+# Least number of samples per coefficient.
 _A_COEFFICIENT = 5
 
 
@@ -49,21 +50,21 @@ def _linear_balance(plant: Plant, places: tuple, theta: Array) -> LinearBalance:
 def minimal_model_steps(
     session: Session, printed: bool = False, weight: float | None = None
 ) -> Steps[Estimate]:
-    """Fit the minimal model of what was measured.
+    """Identify the unknowns by the minimal model for the measured signals.
 
     Args:
-        session: Case and log: with motor and load position, load acceleration and motor position, or
-            motor position alone.
+        session: Case and log, with motor and load position, load acceleration and motor position, or motor
+            position alone.
         printed: Take the model with an acceleration as the paper prints it.
-        weight: On its rows that were differentiated twice, beside one on that of the forces [s^2].
-            Absent: 1 as printed, else what brings them to the size of a force at the resonance.
+        weight: Weight of its rows that were differentiated twice, over that of the row of forces [s^2].
+            Absent: 1 as printed, else the value at which both are of equal size at the resonance.
 
     Returns:
-        The estimate; `details["minimal"]` holds coefficients, statistics and the constraint's test.
+        The estimate; `details["minimal"]` has coefficients, statistics and the test of the constraint.
 
     Raises:
-        InputError: If the plant is not linear away from rest, the log does not suit, or too few samples
-            are left.
+        InputError: If the plant is not linear away from rest, the log is not suitable, or too few samples
+            remain.
 
     Source:
         Janot, Gautier, Jubien and Vandanjon, "Experimental joint stiffness identification depending on
@@ -76,6 +77,9 @@ def minimal_model_steps(
     parameters, coefficients = machine.parameters, model.guess
     theta = parameters.guess
     now = natural_frequencies(machine.plant, parameters.places, theta).hz
+
+    # The band depends on the natural frequencies, and these on the estimate.
+    results = None
     for k in range(_PASSES):
         natural = now
         spectrum = spectrum_of(
@@ -88,7 +92,7 @@ def minimal_model_steps(
         weights = _weights(form, model.structure.rows, natural, weight)
         fit = least_squares(model.basis.names, data, weights)
         options = (Transform.of(parameters), parameters.bounds)
-        found, chi, slopes = yield SolveRequest(
+        minimum, chi, slopes = yield SolveRequest(
             read_back,
             (
                 machine.plant,
@@ -102,24 +106,31 @@ def minimal_model_steps(
                 *options,
             ),
         )
-        chi, slopes, theta = (np.asarray(a) for a in (chi, slopes, found.theta))
+        chi, slopes, theta = (np.asarray(a) for a in (chi, slopes, minimum.theta))
+        results = (data, fit, weights, (minimum, chi, slopes), recipe, notes)
         coefficients = model.basis.constant + model.basis.spread @ chi
         now = natural_frequencies(machine.plant, parameters.places, theta).hz
         moved = np.abs(now / natural - 1) if natural.size else np.zeros(1)
-        # Where a hidden joint turns round is not known at the guesses.
+        # At the guesses the reversals of a hidden joint are not known: it needs a second pass.
         if k >= bool(form.hidden) and (moved.max() < _SETTLED or "cutoff_hz" in stated):
             break
-    constraint = yield from constraint_steps(machine.plant, parameters, model, fit, theta, slopes)
-    return _estimate(session, model, data, fit, weights, (found, chi, slopes), constraint, recipe, notes)
+    assert results is not None, "there is at least one pass"
+    data, fit, weights, solved, recipe, notes = results
+    constraint = yield from constraint_steps(machine.plant, parameters, model, fit, theta, solved[2])
+    return _estimate(session, model, data, fit, weights, solved, constraint, recipe, notes)
 
 
 def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Recipe, tuple[str, ...]]:
-    """Force and noise over frequency at a session's guesses, the recipe that follows, and why.
+    """Return the spectra of force and noise at a session's guesses, the recipe chosen by them, and notes.
 
-    Around an estimate (`session.with_machine(estimate.machine)`) it is the one that was used.
+    For a session at the estimate, `session.with_machine(estimate.machine)`, it is the recipe that was used.
+
+    Args:
+        session: Case and log.
+        printed: Take the model with an acceleration as the paper prints it.
 
     Raises:
-        InputError: As `minimal_model_steps`.
+        InputError: If the plant or the log does not suit a minimal model.
     """
     machine, log = session.machine, session.fit.log
     form = _form(session, printed)
@@ -133,7 +144,11 @@ def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Rec
 
 
 def _form(session: Session, printed: bool) -> Form:
-    """The model that the log allows; the plant suits it."""
+    """Choose the form of the model by the measured signals, and check that plant and log suit it.
+
+    Raises:
+        InputError: If they do not.
+    """
     plant, log, where = session.machine.plant, session.fit.log, str(session.case.path)
     require_linear(plant, where)
     if session.case.preprocess.get("derivatives") == "parabolic":
@@ -146,27 +161,29 @@ def _form(session: Session, printed: bool) -> Form:
     unknown = {f.path[1] for f in session.machine.parameters.free if f.path[0] == "effects"}
     if any(delays_command(e) and k in unknown for k, e in enumerate(plant.effects)):
         raise InputError(
-            "the delay of the command is unknown, which no minimal model holds",
+            "a minimal model cannot have an unknown delay of the command",
             where=where,
-            hint="give it as known, or use output_error",
+            hint="declare the delay known, or use output_error",
         )
+
     accelerated = log.load_acceleration is not None
     form = form_of(plant.joints, log.measured, accelerated, printed)
     if printed and not form.accelerated:
         raise InputError(
-            "minimal_model_printed is the model with the load's acceleration and the motor's position",
+            "minimal_model_printed needs the load's acceleration and the motor's position only",
             where=where,
             hint="name load_acceleration in [log] and leave out load_position, or use minimal_model",
         )
-    if form.accelerated and log.load_acceleration.shape[1] != len(form.hidden):
+    columns = 0 if log.load_acceleration is None else log.load_acceleration.shape[1]
+    if form.accelerated and columns != len(form.hidden):
         raise InputError(
-            f"load_acceleration has {log.load_acceleration.shape[1]} columns where {len(form.hidden)} belong",
+            f"load_acceleration has {columns} columns, and the case needs {len(form.hidden)}",
             where=log.source,
             hint="name the column of the load's accelerometer",
         )
     if form.accelerated and not rigid_rows_hold(plant):
         raise InputError(
-            "the model with an acceleration needs a machine that no spring ties to the ground",
+            "the model with an acceleration needs a machine without a spring to the ground",
             where=where,
             hint="leave out load_acceleration, or the spring",
         )
@@ -174,18 +191,24 @@ def _form(session: Session, printed: bool) -> Form:
 
 
 def _model(plant: Plant, parameters: Parameters, form: Form, session: Session, where: str) -> Model:
+    """Build the model of a form.
+
+    Raises:
+        InputError: If the gain of the drive is unknown, or a row has no scale.
+    """
     try:
         structure, samples = structure_of(plant, parameters, form)
     except ValueError as error:
         raise InputError(
-            f"{error}, and with it the scale of all other unknowns",
+            f"{error}, and then no other unknown has a scale",
             where=where,
-            hint="give actuator_gain as known, or use output_error",
+            hint="declare actuator_gain known, or use output_error",
         ) from error
+
     # A row from which a joint was eliminated has no scale without a force.
     if form.hidden and not form.accelerated and None in structure.leading:
         raise InputError(
-            "without the motion of some joints there is a row without a force",
+            "after elimination of the joints without an encoder, a row of the model has no force",
             where=where,
             hint="use inverse_dynamics or output_error",
         )
@@ -195,17 +218,18 @@ def _model(plant: Plant, parameters: Parameters, form: Form, session: Session, w
 
 
 def _require_samples(data: Regression, model: Model, source: str) -> None:
-    left = int(data.counts.sum())
-    if left < _A_COEFFICIENT * len(model.basis.names):
+    """Check that enough samples remain for the coefficients of a model."""
+    remaining = int(data.counts.sum())
+    if remaining < _A_COEFFICIENT * len(model.basis.names):
         raise InputError(
-            f"only {left} samples lie farther from rest than the filters reach",
+            f"only {remaining} samples are beyond the reach of the filters from rest",
             where=source,
             hint="take a log with longer moves, lower rest_velocity, or raise cutoff_hz",
         )
 
 
 def _weights(form: Form, rows: int, natural: np.ndarray, weight: float | None) -> np.ndarray:
-    """On each row; that of the forces is the last where others are differentiated twice."""
+    """Return the weight of each row; in a model with an acceleration the row of forces is the last."""
     if not form.accelerated:
         return np.ones(rows)
     if weight is None:
@@ -219,20 +243,36 @@ def _estimate(
     data: Regression,
     fit: MinimalFit,
     weight: np.ndarray,
-    found: tuple[Minimum, np.ndarray, np.ndarray],
+    solved: tuple[Minimum, np.ndarray, np.ndarray],
     constraint: Constraint | None,
     recipe: Recipe,
     notes: tuple[str, ...],
 ) -> Estimate:
+    """Build the estimate.
+
+    Args:
+        session: Case and log.
+        model: The model that was fitted.
+        data: Its regression.
+        fit: The fit of its coefficients.
+        weight: Weight of each row, (rows,).
+        solved: The fit of the parameters, their chi, and its slopes in the parameters.
+        constraint: Test of the coefficients against those of a plant, if there is one.
+        recipe: Filters of the log.
+        notes: Notes about the filters.
+    """
     machine, parameters = session.machine, session.machine.parameters
-    solved, chi, slopes = found
-    theta = np.asarray(solved.theta)
+    minimum, chi, slopes = solved
+    theta = np.asarray(minimum.theta)
+
+    # The residual of the model at the parameters, not at the free coefficients.
     w = np.where(data.counts[..., None], data.w * weight[:, None], 0.0)
     residual = fit.residual + w @ (fit.chi - chi)
     precision = assess(
         parameters.names, w @ slopes, residual, data.counts, fit.size, np.where(theta != 0, theta, 1.0)
     )
-    converged = bool(solved.converged) and bool(np.all(np.isfinite(theta)))
+
+    converged = bool(minimum.converged) and bool(np.all(np.isfinite(theta)))
     at = machine.with_estimate(theta)
     modes = _modes(at, precision.covariance)
     names = [n for n, t, low in zip(parameters.names, theta, parameters.bounds[0], strict=True) if t <= low]
@@ -244,20 +284,20 @@ def _estimate(
         theta=theta,
         precision=precision,
         converged=converged,
-        message="solved" if converged else f"no convergence within {int(solved.steps)} steps",
+        message="solved" if converged else f"no convergence within {int(minimum.steps)} steps",
         residual=np.where(data.counts, residual, np.nan),
         samples=int(data.counts.any(axis=1).sum()),
-        steps=int(solved.steps),
+        steps=int(minimum.steps),
         notes=(*notes, *minimal_notes(form, fit, model.basis, constraint), *pressed),
         details={"minimal": minimal_json(form, fit, model.basis, constraint, modes, recipe)},
     )
 
 
 def _modes(machine: Machine, covariance: np.ndarray) -> dict[str, list[tuple[float, float]]]:
-    """Natural frequencies at an estimate and their standard deviations [Hz]."""
+    """Return the natural frequencies of an estimate and their standard deviations [Hz]."""
     plant, parameters = machine.plant, machine.parameters
     out = {}
     for name, held in (("free", ()), ("motor_locked", plant.driven(plant.joints))):
-        found = natural_frequencies(plant, parameters.places, parameters.guess, held)
-        out[name] = list(zip(found.hz.tolist(), found.std(covariance).tolist(), strict=True))
+        modes = natural_frequencies(plant, parameters.places, parameters.guess, held)
+        out[name] = list(zip(modes.hz.tolist(), modes.std(covariance).tolist(), strict=True))
     return out

@@ -1,7 +1,8 @@
-"""The minimal models by what is measured: their coefficients as functions of a plant.
+"""Minimal models for the measured signals: their coefficients as functions of a plant.
 
-A model is rows of  sum of coefficient times derivative of a measured signal = force. Which of the
-coefficients are nothing, known or unknown is read off the plant at a few draws of its unknowns.
+A model is a set of rows, each a sum of coefficients times derivatives of measured signals that equals a
+force. Whether a coefficient is zero, known or unknown is found from the plant at a few random values of its
+unknowns.
 
 Source:
     Janot, Gautier, Jubien and Vandanjon, "Experimental joint stiffness identification depending on
@@ -25,11 +26,11 @@ from jaxid.estimators.minimal.polynomials import Matrix, adjugate, determinant, 
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
 
-# Signals that rows are made of, in this order.
+# Signals of which rows consist, in this order.
 SIGNALS = ("position", "acceleration", "force", "sign", "one")
-# Relative to the terms that it sums up, below this a coefficient is nothing.
+# A coefficient below this, relative to the terms that it sums, is zero.
 _NOTHING = 1e-9
-# Draws of the unknowns: enough for what is bilinear in them.
+# Random values of the unknowns, enough for coefficients that are bilinear in them.
 _DRAWS = 3
 
 
@@ -38,10 +39,10 @@ class Term:
     """A derivative of a signal in a row.
 
     Args:
-        row: Of the model.
-        signal: One of `SIGNALS`; "force" stands on the side of the motion, with its sign changed.
-        index: Joint or drive.
-        order: Of the derivative.
+        row: Index of the row of the model.
+        signal: One of `SIGNALS`; "force" is on the side of the motion, with its sign changed.
+        index: Index of the joint or drive.
+        order: Order of the derivative.
     """
 
     row: int
@@ -52,12 +53,12 @@ class Term:
 
 @dataclass(frozen=True)
 class Form:
-    """What a model is made for.
+    """The form of a model, by the measured signals.
 
     Args:
-        name: As in results.
-        equation: Of the paper.
-        hidden: Joints whose position nobody measured.
+        name: Name of the form in results.
+        equation: Number of the equation in the paper.
+        hidden: Indices of the joints whose position is not measured.
         accelerated: Whether their acceleration is measured.
         printed: Whether the rigid row is as the paper prints it, without the hidden joints.
     """
@@ -70,7 +71,14 @@ class Form:
 
 
 def form_of(joints: int, measured: tuple[bool, ...], accelerated: bool, printed: bool = False) -> Form:
-    """The model that a log allows."""
+    """Choose the form of the model for a log.
+
+    Args:
+        joints: Number of joints.
+        measured: Whether the position of each joint is measured.
+        accelerated: Whether the acceleration of the other joints is measured.
+        printed: Whether to take the model with an acceleration as the paper prints it.
+    """
     hidden = tuple(i for i in range(joints) if not measured[i])
     if joints == 1:
         return Form("rigid", "(1)")
@@ -85,7 +93,7 @@ def form_of(joints: int, measured: tuple[bool, ...], accelerated: bool, printed:
 
 
 def _rows(balance: LinearBalance, form: Form, sign: float = -1.0) -> dict[str, Matrix]:
-    """Coefficients of a model by signal, (orders, rows, index); `sign` as in `determinant`."""
+    """Return the coefficients of a model by signal, (orders, rows, index); `sign` as in `determinant`."""
     parts = {
         "position": balance.motion,
         "force": balance.force[None],
@@ -102,40 +110,55 @@ def _rows(balance: LinearBalance, form: Form, sign: float = -1.0) -> dict[str, M
 
 
 def _regrouped_signs(a: Matrix, hidden: tuple[int, ...]) -> Matrix:
+    """Move the friction of hidden joints to the measured joints whose direction they share."""
     rest = tuple(i for i in range(a.shape[2]) if i not in hidden)
+    out = jnp.asarray(a)
     for i in hidden:
-        a = a.at[:, :, neighbour(i, rest)].add(a[:, :, i]).at[:, :, i].set(0.0)
-    return a
+        out = out.at[:, :, neighbour(i, rest)].add(out[:, :, i]).at[:, :, i].set(0.0)
+    return out
 
 
 def _eliminated(parts: dict[str, Matrix], hidden: tuple[int, ...], sign: float) -> dict[str, Matrix]:
-    """Rows of the other joints, from which the hidden ones are eliminated by their own."""
+    """Return the rows of the measured joints, from which the hidden joints are eliminated by their rows.
+
+    The Schur complement of the hidden joints, times the determinant of their block.
+    """
     n = parts["position"].shape[1]
-    own, rest = _places(hidden), _places(tuple(i for i in range(n) if i not in hidden))
-    block = parts["position"][:, own][:, :, own]
+    inner, rest = _places(hidden), _places(tuple(i for i in range(n) if i not in hidden))
+    block = parts["position"][:, inner][:, :, inner]
     divisor = determinant(block, sign)
-    through = product(parts["position"][:, rest][:, :, own], adjugate(block, sign))
+    through = product(parts["position"][:, rest][:, :, inner], adjugate(block, sign))
     out = {}
     for name, a in parts.items():
         a = a[:, :, rest] if name == "position" else a
-        kept, moved = scaled(divisor, a[:, rest]), product(through, a[:, own])
+        kept, moved = scaled(divisor, a[:, rest]), product(through, a[:, inner])
         out[name] = total(kept, sign * moved)
-    # Of constants and of signs away from rest no derivative is left.
+    # The derivatives of constants, and of signs away from rest, are zero.
     return {k: v[:1] if k in ("sign", "one") else v for k, v in out.items()}
 
 
 def _with_acceleration(parts: dict[str, Matrix], form: Form) -> dict[str, Matrix]:
-    """All rows twice differentiated, and their sum as it is, where springs have dropped out.
+    """Return all rows differentiated twice, and their sum without derivatives, in which springs cancel.
 
-    In the sum hidden joints move with the velocity of those before them.
+    In the sum hidden joints move with the velocity of the measured joints nearest to them.
     """
     motion, hidden = parts["position"], _places(form.hidden)
     n = motion.shape[1]
     rest = tuple(i for i in range(n) if i not in form.hidden)
-    twice = lambda a: jnp.pad(a, ((2, 0), (0, 0), (0, 0)))
-    summed = lambda a: jnp.sum(a, axis=1, keepdims=True)
+
+    def twice(a: Matrix) -> Array:
+        return jnp.pad(a, ((2, 0), (0, 0), (0, 0)))
+
+    def summed(a: Matrix) -> Array:
+        return jnp.sum(a, axis=1, keepdims=True)
+
+    def none(a: Matrix) -> Array:
+        return jnp.zeros((1, n, a.shape[2]))
+
+    # The rigid row: the hidden joints' inertia times their acceleration, and their damping times the velocity
+    # of the measured joints.
     rigid = summed(motion)
-    known = rigid[:, :, _places(rest)]
+    known = jnp.asarray(rigid[:, :, _places(rest)])
     pushed = rigid[2:, :, hidden]
     if form.printed:
         pushed = jnp.zeros_like(pushed)
@@ -143,7 +166,7 @@ def _with_acceleration(parts: dict[str, Matrix], form: Form) -> dict[str, Matrix
         carriers = [rest.index(neighbour(i, rest)) for i in form.hidden]
         for k, i in zip(carriers, form.hidden, strict=True):
             known = known.at[1, 0, k].add(rigid[1, 0, i])
-    none = lambda a: jnp.zeros((1, n, a.shape[2]))
+
     return {
         "position": jnp.concatenate([twice(motion[:, :, _places(rest)]), _lengthened(known, 5)], axis=1),
         "acceleration": jnp.concatenate([motion[:, :, hidden], _lengthened(pushed, 3)], axis=1),
@@ -154,6 +177,7 @@ def _with_acceleration(parts: dict[str, Matrix], form: Form) -> dict[str, Matrix
 
 
 def _lengthened(a: Matrix, orders: int) -> Matrix:
+    """Return a matrix of polynomials padded by zeros to a number of orders."""
     return jnp.pad(a, ((0, orders - len(a)), (0, 0), (0, 0)))
 
 
@@ -162,18 +186,18 @@ def _places(joints: tuple[int, ...]) -> Array:
 
 
 def neighbour(joint: int, measured: tuple[int, ...]) -> int:
-    """The measured joint that stands for a hidden one: the nearest."""
+    """Return the measured joint that stands for a hidden one: the nearest."""
     return min(measured, key=lambda i: abs(i - joint))
 
 
 def rigid_rows_hold(plant: Plant) -> bool:
-    """Whether springs drop out of the sum of all rows, which the model with an acceleration needs."""
+    """Tell whether springs cancel in the sum of all rows, as the model with an acceleration needs."""
     stiffness = np.asarray(eqx.filter_jit(linear_balance)(plant).motion[0])
     return bool(np.all(np.abs(stiffness.sum(axis=0)) <= _NOTHING * np.abs(stiffness).sum(axis=0)))
 
 
 def _flat(plant: Plant, form: Form, magnitude: bool = False) -> Float[Array, " all"]:
-    """All coefficients of a model; with `magnitude`, how large the terms are that each sums up."""
+    """Return all coefficients of a model; with `magnitude`, the size of the terms that each sums."""
     balance = linear_balance(plant)
     if magnitude:
         balance = jax.tree.map(jnp.abs, balance)
@@ -182,7 +206,7 @@ def _flat(plant: Plant, form: Form, magnitude: bool = False) -> Float[Array, " a
 
 
 def _terms(plant: Plant, form: Form) -> list[Term]:
-    """What each of all coefficients is of."""
+    """Return the term of each coefficient of a model."""
     shapes = jax.eval_shape(lambda p: _rows(linear_balance(p), form), plant)
     joints = {
         "position": tuple(i for i in range(plant.joints) if i not in form.hidden),
@@ -202,14 +226,15 @@ def _terms(plant: Plant, form: Form) -> list[Term]:
 
 @dataclass(frozen=True)
 class Structure:
-    """Which coefficients of a model there are; hashable, so that compiled code can depend on it.
+    """The nonzero coefficients of a model; hashable, so that compiled code can depend on it.
 
     Args:
-        form: The model.
-        rows: How many.
-        leading: Of each row its force of the lowest order, by which it is divided; None: it has none.
-        unknown: Coefficients that depend on the unknowns: place among all, and term.
-        known: Others, beside the leading ones.
+        form: Form of the model.
+        rows: Number of rows.
+        leading: Force of the lowest order in each row, by which the row is divided: index among all
+            coefficients, and term; None: the row has no force.
+        unknown: Coefficients that depend on the unknowns: index among all, and term.
+        known: The other coefficients, beside the leading ones: index among all, and term.
     """
 
     form: Form
@@ -219,7 +244,7 @@ class Structure:
     known: tuple[tuple[int, Term], ...]
 
     def coefficients(self, plant: Plant) -> Float[Array, " terms"]:
-        """The unknown coefficients of a plant, each over its row's leading one; differentiable."""
+        """Return the unknown coefficients of a plant, each over its row's leading one; differentiable."""
         values, one = _flat(plant, self.form), jnp.ones(())
         divisors = [one if k is None else values[k[0]] for k in self.leading]
         return jnp.stack([values[k] / divisors[t.row] for k, t in self.unknown])
@@ -227,12 +252,12 @@ class Structure:
 
 @dataclass(frozen=True)
 class MinimalSamples:
-    """All coefficients of a model at some values of the unknowns.
+    """All coefficients of a model at several values of the unknowns.
 
     Args:
-        values: (draws, all).
-        slopes: (draws, all, p).
-        guess: The last draw: what the unknowns are guessed as. The one before has offsets of zero.
+        values: The coefficients, (draws, all).
+        slopes: Their derivatives in the unknowns, (draws, all, p).
+        guess: Guesses of the unknowns, which are the last draw, (p,). The draw before has offsets of zero.
     """
 
     values: Float[np.ndarray, "draws all"]
@@ -242,12 +267,18 @@ class MinimalSamples:
     def of(
         self, wanted: tuple[tuple[int, Term], ...], leading: tuple[tuple[int, Term] | None, ...]
     ) -> tuple[Float[np.ndarray, "draws terms"], Float[np.ndarray, "draws terms p"]]:
-        """Some coefficients over their rows' leading ones, and the slopes of that."""
+        """Return some coefficients over their rows' leading ones, and the derivatives of these ratios.
+
+        Args:
+            wanted: Index among all coefficients, and term, of the coefficients to return.
+            leading: Leading coefficient of each row.
+        """
         places = [k for k, _ in wanted]
         values, slopes = self.values[:, places], self.slopes[:, places]
         for j, (_, t) in enumerate(wanted):
-            if leading[t.row] is not None:
-                k = leading[t.row][0]
+            lead = leading[t.row]
+            if lead is not None:
+                k = lead[0]
                 values[:, j] /= self.values[:, k]
                 slopes[:, j] -= values[:, j, None] * self.slopes[:, k]
                 slopes[:, j] /= self.values[:, k, None]
@@ -256,7 +287,7 @@ class MinimalSamples:
 
 @eqx.filter_jit
 def _sampled(plant: Plant, places: tuple, form: Form, draws: Array) -> tuple[Array, ...]:
-    """All coefficients, their slopes, the size of their terms, and what a force does, by draw."""
+    """Return all coefficients, their derivatives, the size of their terms, and the matrix B, by draw."""
 
     def at(theta: Array) -> tuple[Array, tuple[Array, ...]]:
         moved = scatter(places, plant, theta)
@@ -268,12 +299,15 @@ def _sampled(plant: Plant, places: tuple, form: Form, draws: Array) -> tuple[Arr
 
 
 def structure_of(plant: Plant, parameters: Parameters, form: Form) -> tuple[Structure, MinimalSamples]:
-    """Read off a plant which coefficients of a model are nothing, known or unknown.
+    """Find from a plant which coefficients of a model are zero, known or unknown.
 
     Args:
         plant: The plant.
         parameters: Its unknowns.
-        form: The model.
+        form: Form of the model.
+
+    Returns:
+        The structure, and the coefficients at several values of the unknowns.
 
     Raises:
         ValueError: If the gain of the drive is among the unknowns.
@@ -284,27 +318,33 @@ def structure_of(plant: Plant, parameters: Parameters, form: Form) -> tuple[Stru
     random = np.random.default_rng(0)
     draws = scale * np.exp(random.uniform(-1.0, 1.0, (_DRAWS, len(guess))))
     draws = np.concatenate([draws, [np.where(offset, 0.0, scale), guess]])
+
     terms = _terms(plant, form)
     values, slopes, size, force = (np.asarray(a) for a in _sampled(plant, parameters.places, form, draws))
     if np.any(force != force[0]):
         raise ValueError("the gain between the declared force and the joints is unknown")
-    there = np.any(np.abs(values) > _NOTHING * size, axis=0)
+
+    nonzero = np.any(np.abs(values) > _NOTHING * size, axis=0)
     rows = 1 + max(t.row for t in terms)
-    leading = tuple(_leading(r, terms, there) for r in range(rows))
-    every = tuple((k, t) for k, t in enumerate(terms) if there[k] and (k, t) not in leading)
+    leading = tuple(_leading(r, terms, nonzero) for r in range(rows))
+    every = tuple((k, t) for k, t in enumerate(terms) if nonzero[k] and (k, t) not in leading)
+
+    # A coefficient is unknown if its ratio to the leading one changes with the unknowns.
     samples = MinimalSamples(values, slopes, guess)
-    own, steep = samples.of(every, leading)
-    moves = np.abs(steep * scale).max(axis=(0, 2), initial=0.0) > _NOTHING * np.abs(own).max(axis=0)
+    ratios, steep = samples.of(every, leading)
+    unknown = np.abs(steep * scale).max(axis=(0, 2), initial=0.0) > _NOTHING * np.abs(ratios).max(axis=0)
     return Structure(
-        form,
-        rows,
-        leading,
-        tuple(e for e, m in zip(every, moves, strict=True) if m),
-        tuple(e for e, m in zip(every, moves, strict=True) if not m),
+        form=form,
+        rows=rows,
+        leading=leading,
+        unknown=tuple(e for e, m in zip(every, unknown, strict=True) if m),
+        known=tuple(e for e, m in zip(every, unknown, strict=True) if not m),
     ), samples
 
 
-def _leading(row: int, terms: list[Term], there: np.ndarray) -> tuple[int, Term] | None:
-    """The force of lowest order in a row."""
-    own = [(t.order, k, t) for k, t in enumerate(terms) if there[k] and t.row == row and t.signal == "force"]
-    return None if not own else min(own, key=lambda o: o[:2])[1:]
+def _leading(row: int, terms: list[Term], nonzero: np.ndarray) -> tuple[int, Term] | None:
+    """Return the force of lowest order in a row: index among all coefficients, and term."""
+    forces = [
+        (t.order, k, t) for k, t in enumerate(terms) if nonzero[k] and t.row == row and t.signal == "force"
+    ]
+    return None if not forces else min(forces, key=lambda f: f[:2])[1:]

@@ -1,7 +1,7 @@
 """Algebra of small polynomial matrices in the derivative operator s.
 
-A polynomial is an array of coefficients, lowest order first, (orders,); a matrix of them is
-(orders, rows, columns). All is unrolled and differentiable: matrices here have a handful of rows.
+A polynomial is an array of coefficients, lowest order first, (orders,); a matrix of polynomials is
+(orders, rows, columns). All loops are unrolled and differentiable, because the matrices have few rows.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ Matrix = Float[Array, "orders rows columns"]
 
 
 def product(a: Matrix, b: Matrix) -> Matrix:
-    """Product of two matrices."""
+    """Return the product of two matrices."""
     out = [jnp.zeros((a.shape[1], b.shape[2]))] * (len(a) + len(b) - 1)
-    for i, left in enumerate(a):
-        for j, right in enumerate(b):
-            out[i + j] = out[i + j] + left @ right
+    for i, first in enumerate(a):
+        for j, second in enumerate(b):
+            out[i + j] = out[i + j] + first @ second
     return jnp.stack(out)
 
 
 def scaled(p: Polynomial, a: Matrix) -> Matrix:
-    """A matrix, each entry times one polynomial."""
+    """Return a matrix with each entry multiplied by one polynomial."""
     out = [jnp.zeros(a.shape[1:])] * (len(p) + len(a) - 1)
     for i in range(len(p)):
         for j in range(len(a)):
@@ -34,17 +34,17 @@ def scaled(p: Polynomial, a: Matrix) -> Matrix:
 
 
 def total(a: Matrix, b: Matrix) -> Matrix:
-    """Sum of two matrices of any orders."""
+    """Return the sum of two matrices of any orders."""
     orders = max(len(a), len(b))
     padded = (jnp.pad(x, ((0, orders - len(x)), (0, 0), (0, 0))) for x in (a, b))
     return sum(padded, jnp.zeros(()))
 
 
 def determinant(a: Matrix, sign: float = -1.0) -> Polynomial:
-    """Determinant of a square matrix by its first row; that of none is one.
+    """Return the determinant of a square matrix, expanded by its first row; that of an empty matrix is one.
 
-    With `sign` one it is the permanent, of matrices of magnitudes: how large the terms are that a
-    determinant adds up.
+    With `sign` = 1 it is the permanent. For a matrix of magnitudes that is the size of the terms that the
+    determinant sums.
     """
     n = a.shape[1]
     if n == 0:
@@ -54,7 +54,7 @@ def determinant(a: Matrix, sign: float = -1.0) -> Polynomial:
 
 
 def adjugate(a: Matrix, sign: float = -1.0) -> Matrix:
-    """Matrix whose product with `a` is its determinant times one; `sign` as in `determinant`."""
+    """Return the adjugate, whose product with `a` is its determinant; `sign` is that of `determinant`."""
     n = a.shape[1]
     if n == 0:
         return jnp.zeros((1, 0, 0))
@@ -66,6 +66,7 @@ def adjugate(a: Matrix, sign: float = -1.0) -> Matrix:
 
 
 def _minor(a: Matrix, row: int, column: int) -> Matrix:
+    """Return the matrix without one row and one column."""
     rows = jnp.asarray([i for i in range(a.shape[1]) if i != row], dtype=int)
     columns = jnp.asarray([j for j in range(a.shape[2]) if j != column], dtype=int)
     return a[:, rows][:, :, columns]

@@ -1,6 +1,6 @@
-"""From the coefficients of a minimal model to parameters, and whether they agree with any.
+"""Parameters from the coefficients of a minimal model, and a test of whether they can be those of a plant.
 
-A weighted least-squares problem of a handful of numbers, whose slopes are exact.
+Both are small weighted least-squares problems with exact derivatives.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps
 
-# Relative to the largest, below this a singular value of the scaled slopes is rounding.
+# A singular value of the scaled slopes below this, relative to the largest, is a rounding error.
 _RANK = 1e-6
 
 
@@ -32,10 +32,10 @@ class Model:
     """A minimal model of a machine.
 
     Args:
-        structure: Which coefficients there are.
-        basis: What they are made of.
-        known: Values of those that no unknown is in.
-        guess: Of the others at the guesses.
+        structure: The structure of the model: its nonzero coefficients.
+        basis: The basis of the unknown coefficients.
+        known: Values of the known coefficients, (known,).
+        guess: Values of the unknown coefficients at the guesses, (terms,).
     """
 
     structure: Structure
@@ -45,7 +45,7 @@ class Model:
 
     @property
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """For `chi_of`."""
+        """The arguments `gather` and `constant` of `chi_of`."""
         return self.basis.gather, self.basis.constant
 
 
@@ -62,9 +62,22 @@ def read_back(
     transform: Transform,
     bounds: tuple[Array, Array],
 ) -> tuple[Minimum, Array, Array]:
-    """Parameters whose chi is nearest to a target, that chi, and its slopes.
+    """Fit the parameters whose chi is nearest to a target.
 
-    `rest` is the norm of what no coefficients explain: by it the solver knows when it is done.
+    Args:
+        plant: The plant.
+        places: Paths of the unknowns in it.
+        structure: The structure of the model.
+        maps: Arguments `gather` and `constant` of `chi_of`.
+        target: The fitted chi, (k,).
+        root: Upper triangular weight of the difference of chi, (k, k).
+        rest: Norm of the residual that no coefficients explain; the solver's tolerance is relative to it.
+        theta: Start of the parameters, (p,).
+        transform: Scale of the solver.
+        bounds: Bounds on the parameters, (p,) each.
+
+    Returns:
+        The minimum, its chi, and the derivatives of chi in the parameters, (k, p).
     """
 
     def chi(theta: Array) -> Array:
@@ -80,9 +93,21 @@ def read_back(
 def constraint_steps(
     plant: Plant, parameters: Parameters, model: Model, fit: MinimalFit, theta: np.ndarray, slopes: np.ndarray
 ) -> Steps[Constraint | None]:
-    """Test whether the coefficients can be those of a plant, where there are more than a plant has.
+    """Test whether the coefficients can be those of a plant, if there are more of them than parameters.
 
-    Where there are not, friction of hidden joints is moved to the measured ones first, as published.
+    If there are not, friction of hidden joints is regrouped with that of the measured ones first, as
+    published.
+
+    Args:
+        plant: The plant.
+        parameters: Its unknowns.
+        model: The model.
+        fit: The fit of its coefficients.
+        theta: The fitted parameters, (p,).
+        slopes: Derivatives of chi in the parameters, (k, p).
+
+    Returns:
+        The test; None if no coefficient is to spare, or a coefficient is not identifiable.
     """
     covariance = fit.precision.covariance
     if not np.all(np.isfinite(covariance)):
@@ -95,15 +120,17 @@ def constraint_steps(
         pinned = () if form.accelerated else _regroupable(plant, parameters, form.hidden)
         if not pinned:
             return None
+
+    # Fit the remaining parameters to the coefficients, with the regrouped ones at zero.
     rest = tuple(k for k in range(len(theta)) if k not in pinned)
     bare = parameters.insert(plant, np.where(np.isin(np.arange(len(theta)), pinned), 0.0, theta))
     part = Parameters(tuple(parameters.free[k] for k in rest))
     wide = np.full(len(rest), np.inf)
-    # chi may lie beyond a bound by chance, which is not what is tested.
+    # By chance chi may belong to a parameter beyond its bound, which is not tested here.
     transform = Transform.of(part)
     floor = np.where(transform.log, part.bounds[0], -wide)
     root = np.linalg.cholesky(np.linalg.inv(covariance)).T
-    found, _, slopes = yield SolveRequest(
+    minimum, _, slopes = yield SolveRequest(
         read_back,
         (
             bare,
@@ -118,30 +145,30 @@ def constraint_steps(
             (floor, wide),
         ),
     )
-    freedom = len(fit.chi) - _rank(np.asarray(slopes), covariance, np.asarray(found.theta))
+    freedom = len(fit.chi) - _rank(np.asarray(slopes), covariance, np.asarray(minimum.theta))
     if freedom == 0:
         return None
-    square = max(2 * float(found.cost) - 1.0, 0.0)
+    square = max(2 * float(minimum.cost) - 1.0, 0.0)
     names = tuple(parameters.names[k] for k in pinned)
     return Constraint(square, freedom, chance(square, freedom), names)
 
 
 def _rank(slopes: np.ndarray, covariance: np.ndarray, theta: np.ndarray) -> int:
-    """Of the slopes of chi, each over its standard deviation, columns of one length."""
+    """Return the rank of the slopes of chi over its standard deviations, with columns of unit length."""
     scaled = slopes / np.sqrt(np.diag(covariance))[:, None]
     norm = np.linalg.norm(scaled, axis=0)
     return int(np.linalg.matrix_rank(scaled[:, norm > 0] / norm[norm > 0], tol=_RANK))
 
 
 def _regroupable(plant: Plant, parameters: Parameters, hidden: tuple[int, ...]) -> tuple[int, ...]:
-    """Unknown friction of hidden joints that a measured joint has too."""
+    """Return the indices of unknown friction of hidden joints of a kind that a measured joint has too."""
     kinds = [_friction(plant, f.path, f.index) for f in parameters.free]
-    seen = {kind for kind, joint in (k for k in kinds if k is not None) if joint not in hidden}
-    return tuple(k for k, at in enumerate(kinds) if at is not None and at[1] in hidden and at[0] in seen)
+    measured = {kind for kind, joint in (k for k in kinds if k is not None) if joint not in hidden}
+    return tuple(k for k, at in enumerate(kinds) if at is not None and at[1] in hidden and at[0] in measured)
 
 
-def _friction(plant: Plant, path: tuple, index: int | None) -> tuple[str, int] | None:
-    """Kind and joint of friction whose strength an unknown is."""
+def _friction(plant: Plant, path: tuple, index: int | tuple[int, int] | None) -> tuple[str, int] | None:
+    """Return kind and joint of the friction whose strength an unknown is; None for other unknowns."""
     if path[0] == "effects":
         effect = plant.effects[path[1]]
         regroups = effect.kind in ("viscous_friction", "coulomb_friction") and effect.port < plant.joints

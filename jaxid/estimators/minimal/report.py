@@ -1,4 +1,4 @@
-"""What is said of a minimal model: for result.json, and in words."""
+"""Report of a minimal model: the object of result.json, notes, and the rows of a table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,16 @@ def minimal_json(
     modes: dict[str, list[tuple[float, float]]],
     recipe: Recipe,
 ) -> dict[str, Any]:
-    """The `minimal` object of result.json."""
+    """Return the `minimal` object of result.json.
+
+    Args:
+        form: Form of the model.
+        fit: The fit of its coefficients.
+        basis: The basis of the coefficients.
+        constraint: Test of the coefficients against those of a plant, if there is one.
+        modes: Natural frequencies and their standard deviations by name [Hz].
+        recipe: Filters of the log.
+    """
     rows = zip(basis.names, basis.units, fit.chi, fit.precision.std, fit.white, fit.without, strict=True)
     return {
         "model": form.name,
@@ -50,7 +59,7 @@ def minimal_json(
             "regrouped": list(constraint.regrouped),
         },
         "natural_frequency_hz": {
-            name: [{"value": v, "std": s} for v, s in found] for name, found in modes.items()
+            name: [{"value": v, "std": s} for v, s in mode] for name, mode in modes.items()
         },
         "preprocess": {
             "cutoff_hz": recipe.cutoff_hz,
@@ -63,57 +72,68 @@ def minimal_json(
 
 
 def droppable(fit: MinimalFit, basis: Basis) -> list[str]:
-    """Coefficients without any one of which the residual's norm changes by less than 1 %."""
+    """Return the coefficients without which, one at a time, the residual's norm grows by less than 1 %."""
     return [n for n, g in zip(basis.names, fit.without, strict=True) if g - 1 < DROPPED]
 
 
 def minimal_notes(
     form: Form, fit: MinimalFit, basis: Basis, constraint: Constraint | None
 ) -> tuple[str, ...]:
-    """What a user should know of the model."""
+    """Return the notes about a model and its fit."""
     out = [f"minimal model {form.equation}: {form.name.replace('_', ' ')}"]
     if form.hidden:
         out.append("dry friction of joints without an encoder acts in the direction of the motor")
-    blind = [n for n, ok in zip(basis.names, fit.precision.identifiable, strict=True) if not ok]
-    if blind:
-        out.append(f"coefficients that this log cannot tell: {', '.join(blind)}")
+    unidentifiable = [n for n, ok in zip(basis.names, fit.precision.identifiable, strict=True) if not ok]
+    if unidentifiable:
+        out.append(f"coefficients that are not identifiable from this log: {', '.join(unidentifiable)}")
     if constraint is not None:
         names = ", ".join(constraint.regrouped)
         moved = f", {names} regrouped with the motor's" if names else ""
-        said = "are not" if constraint.p_value < 0.01 else "may be"
+        verdict = "are not" if constraint.p_value < 0.01 else "may be"
+        parameters = len(fit.chi) - constraint.freedom
         out.append(
-            f"{len(fit.chi)} coefficients {said} those of a plant with {len(fit.chi) - constraint.freedom} "
-            f"parameters{moved}: chi-square {constraint.chi_square:.3g}, p = {constraint.p_value:.2g}"
+            f"{len(fit.chi)} coefficients {verdict} those of a plant with {parameters} parameters{moved}: "
+            f"chi-square {constraint.chi_square:.3g}, p = {constraint.p_value:.2g}"
         )
     return tuple(out)
 
 
 def minimal_rows(content: dict[str, Any]) -> tuple[list[list[str]], list[str]]:
-    """Rows of the printed table, and lines below it."""
-    number = lambda x: "-" if x is None or not np.isfinite(x) else f"{x:.4g}"
-    percent = lambda x: "-" if x is None or not np.isfinite(x) else f"{100 * x:.3g} %"
+    """Return the rows of the printed table, and the lines below it.
+
+    Args:
+        content: The `minimal` object of result.json.
+    """
     rows = [["coefficient", "value", "std", "relative", "white", "unit", "without it"]]
     for name, c in content["coefficients"].items():
         rows.append(
             [
                 name,
-                number(c["value"]),
-                number(c["std"]),
-                percent(c["relative_std"]),
-                percent(c["relative_std_white"]),
+                _number(c["value"]),
+                _number(c["std"]),
+                _percent(c["relative_std"]),
+                _percent(c["relative_std_white"]),
                 c["unit"],
-                f"residual +{percent(c['residual_without'] - 1)}",
+                f"residual +{_percent(c['residual_without'] - 1)}",
             ]
         )
     free = content["natural_frequency_hz"]
     lines = [
         f"natural frequency, {name.replace('_', ' ')}: "
-        + ", ".join(f"{number(m['value'])} +- {number(m['std'])} Hz" for m in modes)
+        + ", ".join(f"{_number(m['value'])} +- {_number(m['std'])} Hz" for m in modes)
         for name, modes in free.items()
         if modes
     ]
     lines.append(
-        f"condition {number(content['condition'])} (columns of one length: "
-        f"{number(content['condition_scaled'])}), relative residual {percent(content['residual_norm'])}"
+        f"condition number {_number(content['condition'])} (columns of unit length: "
+        f"{_number(content['condition_scaled'])}), relative residual {_percent(content['residual_norm'])}"
     )
     return rows, lines
+
+
+def _number(x: float | None) -> str:
+    return "-" if x is None or not np.isfinite(x) else f"{x:.4g}"
+
+
+def _percent(x: float | None) -> str:
+    return "-" if x is None or not np.isfinite(x) else f"{100 * x:.3g} %"

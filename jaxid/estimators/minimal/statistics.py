@@ -1,4 +1,4 @@
-"""Least squares of a minimal model, with the statistics that are published of such fits."""
+"""Least squares for the coefficients of a minimal model, with the published statistics of such fits."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from jaxtyping import Float
 from jaxid.estimators.minimal.columns import Regression
 from jaxid.numerics.precision import Precision, assess
 
-# A coefficient can be dropped where the residual's norm grows by less than this part without it.
+# A coefficient can be dropped if the residual's norm grows by less than this fraction without it.
 DROPPED = 0.01
 
 
 @dataclass(frozen=True)
 class MinimalFit:
-    """What least squares says of the coefficients chi.
+    """Least-squares fit of the coefficients chi.
 
     Args:
-        chi: (k,).
-        precision: Under the residual's own colour.
+        chi: The fitted coefficients, (k,).
+        precision: Their precision, with the colour of the residual.
         white: Standard deviations as published, for white noise of one level in all rows, (k,).
-        residual: Of each row over its weight, (kept, rows); zero where it does not count.
+        residual: Weighted residual, zero for samples that do not count, (kept, rows).
         size: 2-norm of Y.
-        condition: Of W.
-        condition_scaled: Of W with columns of one length.
+        condition: Condition number of W.
+        condition_scaled: Condition number of W with columns of unit length.
         without: Norm of the residual without each coefficient, over that with all, (k,).
-        root: Upper triangle R of W = Q R, (k, k).
+        root: Upper triangular factor R of W = Q R, (k, k).
     """
 
     chi: Float[np.ndarray, " k"]
@@ -43,17 +43,17 @@ class MinimalFit:
 
     @property
     def relative(self) -> float:
-        """Norm of the residual over that of Y."""
+        """Norm of the residual over the norm of Y."""
         return float(np.linalg.norm(self.residual) / self.size)
 
 
 def least_squares(names: tuple[str, ...], data: Regression, weight: Float[np.ndarray, " rows"]) -> MinimalFit:
-    """Ordinary least squares of all rows, stacked.
+    """Fit the coefficients by ordinary least squares over all rows, stacked.
 
     Args:
-        names: Of the coefficients.
+        names: Names of the coefficients.
         data: The regression.
-        weight: On each row.
+        weight: Weight of each row of the model, (rows,).
 
     Source:
         Gautier (1997) for the white standard deviations, sigma^2 = |e|^2 / (rows - k).
@@ -64,14 +64,15 @@ def least_squares(names: tuple[str, ...], data: Regression, weight: Float[np.nda
     flat, target = w.reshape(-1, w.shape[-1]), y.ravel()
     norm = np.linalg.norm(flat, axis=0)
     norm = np.where(norm > 0, norm, 1.0)
-    root = np.linalg.qr(flat / norm, mode="r")
+    root = np.asarray(np.linalg.qr(flat / norm, mode="r"))
     chi = np.linalg.lstsq(flat / norm, target, rcond=None)[0] / norm
     residual = y - w @ chi
-    size, left = float(np.linalg.norm(y)), float(np.linalg.norm(residual))
+    size, remaining = float(np.linalg.norm(y)), float(np.linalg.norm(residual))
+
     inverse = np.linalg.pinv(root)
-    spread = left / np.sqrt(max(int(counts.sum()) - len(chi), 1))
+    spread = remaining / np.sqrt(max(int(counts.sum()) - len(chi), 1))
     white = spread * np.linalg.norm(inverse, axis=1) / norm
-    # Without one coefficient the squares grow by chi^2 / (W'W)^-1_jj.
+    # Without one coefficient the sum of squares grows by chi^2 / (W'W)^-1_jj.
     growth = (chi * norm / np.linalg.norm(inverse, axis=1)) ** 2
     return MinimalFit(
         chi=chi,
@@ -81,25 +82,25 @@ def least_squares(names: tuple[str, ...], data: Regression, weight: Float[np.nda
         size=size,
         condition=float(np.linalg.cond(root * norm)),
         condition_scaled=float(np.linalg.cond(root)),
-        without=np.sqrt(1 + growth / left**2),
+        without=np.sqrt(1 + growth / remaining**2),
         root=root * norm,
     )
 
 
 def chance(chi_square: float, freedom: int) -> float:
-    """Probability of a chi-square at least as large."""
+    """Return the probability of a chi-square at least as large."""
     return float(scipy.stats.chi2.sf(chi_square, freedom))
 
 
 @dataclass(frozen=True)
 class Constraint:
-    """Whether coefficients that are more than the parameters agree with them.
+    """Test of the coefficients against those of a plant, which has fewer parameters.
 
     Args:
-        chi_square: Distance of the coefficients from those of any plant, over their covariance.
-        freedom: How many coefficients there are to spare.
-        p_value: Probability of as much by chance.
-        regrouped: Parameters that were moved to others first, so that there were any to spare.
+        chi_square: Squared distance from the coefficients of the nearest plant, over their covariance.
+        freedom: Degrees of freedom: number of coefficients less the number of parameters.
+        p_value: Probability of a distance at least as large by chance.
+        regrouped: Names of parameters that were regrouped with others first, to have degrees of freedom.
     """
 
     chi_square: float

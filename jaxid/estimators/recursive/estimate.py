@@ -1,10 +1,10 @@
-"""Recursive estimation along a log: the rows of a plant's balance, taken one sample at a time.
+"""Recursive least squares along a log, on the rows of a plant's balance.
 
-What was corrected of the paper: its regularisation goes towards zero and fades (see
-`jaxid.estimators.recursive.recursion`); beta = 1 + T ln(0.5) / T_HL is the first order of the 2^(-T / T_HL)
-that is taken here; (49) lacks its root in our copy. The paper's gate and its sum of rows are over the whole
-sample. Here both go by row: where one joint slides and another sticks, the force that holds the second is
-in no model. What does not count does not forget either: the half-life is of motion.
+Corrections to the paper: its regularisation pulls towards zero and fades (see
+`jaxid.estimators.recursive.recursion`); its beta = 1 + T ln(0.5) / T_HL is the first-order expansion of
+2^(-T / T_HL), which is used here; (49) lacks its root in our copy. The paper's gate and its sum of rows apply
+to the whole sample. Here both apply to each row: if one joint slides and another sticks, the force that
+holds the second is in no model. Samples that do not count do not forget either: the half-life is of motion.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from jaxid.model.effect import carries_force
 from jaxid.model.parameter import parameters_of
 from jaxid.numerics.lanes import SolveRequest, Steps
 
-# So many samples the start counts as.
+# Weight of the start, in samples.
 REGULARIZATION = 1e-3
-# Instants at which a log's history is written down, at most.
+# Largest number of instants in the history of a log.
 _MOST = 200
-# Below this part of a row's force its right-hand side is nothing.
+# A right-hand side below this fraction of the row's force is zero.
 _NOTHING = 1e-9
 
 
 def start_of(machine: Machine) -> Float[np.ndarray, " p"]:
-    """Gains from one, friction and other forces from zero, and what is the plant's own from its guess."""
+    """Return the default start: one for gains, zero for friction and forces, and the plant's guesses."""
     out = machine.parameters.guess
     for k, f in enumerate(machine.parameters.free):
-        if f.path[0] == "effects":
-            effect = type(machine.plant.effects[f.path[1]])
-            gain = effect.in_drive and not carries_force(parameters_of(effect)[f.path[2]])
+        if f.effect is not None:
+            effect, name = type(machine.plant.effects[f.effect]), f.path[2]
+            assert isinstance(name, str), "a parameter of an effect has a name"
+            gain = effect.in_drive and not carries_force(parameters_of(effect)[name])
             out[k] = 1.0 if gain else 0.0
     return out
 
 
 def gains_of(machine: Machine) -> tuple[int | None, ...]:
-    """Which unknown is the gain of the drive of each joint."""
+    """Return the index of the unknown that is the gain of each joint's drive; None if it is known."""
     out: list[int | None] = [None] * machine.plant.joints
     for k, f in enumerate(machine.parameters.free):
-        effect = machine.plant.effects[f.path[1]] if f.path[0] == "effects" else None
+        effect = None if f.effect is None else machine.plant.effects[f.effect]
         if effect is not None and effect.kind == "actuator_gain":
             out[effect.port] = k
     return tuple(out)
@@ -64,35 +65,40 @@ def recursive_steps(
     """Estimate the unknowns sample by sample.
 
     Args:
-        machine: The machine. Its guesses matter for what is the plant's own, and where `start` says so.
-        data: The log, prepared.
+        machine: The machine. The guesses of the plant's parameters are their start, and those of the effects
+            too if `start` is "guess".
+        data: The filtered log.
         stated: Keys of the case's [recursive], each with a default: `half_life` [s of motion],
             `regularization` (samples), `gate_velocity`, `gate_acceleration`, `rows`, `start`, `instrument`.
-        saved: Memory of an earlier run, as `jaxid.estimators.recursive.memory` reads it; it goes on
-            from there.
+        saved: Memory of an earlier run to continue, as `jaxid.estimators.recursive.memory` reads it.
 
     Returns:
-        The estimate at the end. Standard deviations hold the residual's colour, the weights and how far the
-        start may still pull. `details` have the history and the memory.
+        The estimate at the end. Standard deviations include the residual's colour, the weights and the
+        remaining pull of the start. `details` has the history and the memory.
 
     Raises:
-        InputError: If the unknowns do not enter the balance in proportion, a gain has nothing known to be
-            told against, an instrument has no gain, or rows of unlike units are to be summed.
+        InputError: If the balance is not linear in the unknowns, a gain has no known term to scale it, an
+            instrument has no gain, or rows of different units are to be summed.
     """
     gains, noisy = gains_of(machine), stated.get("instrument") == "model"
     _check(machine, stated, gains, saved)
     full = yield from rows_steps(machine, data, _gates(data, stated))
     _check_rows(machine, full, gains)
+
     used = full.summed if stated.get("rows") == "summed" else full
     recursion, memory = _recursion(machine, data, used, stated, gains)
     if saved is not None:
         recursion = replace(recursion, start=saved["start"], information=saved["information"])
         memory = RecursiveMemory(**{k: jnp.asarray(v) for k, v in saved["memory"].items()})
+
     every = max(1, -(-len(full.rows) // _MOST))
-    memory, told, z = yield SolveRequest(run, (recursion, memory, full.rows, full.target, full.counts, every))
-    told, z = jax.tree.map(np.asarray, told), used.rows if z is None else np.asarray(z)
-    theta, times = told.theta[-1], data.times[instants(len(full.rows), every)]
-    precision, inflation = precision_of(machine, used, z, recursion, told, every, saved is None)
+    memory, history, z = yield SolveRequest(
+        run, (recursion, memory, full.rows, full.target, full.counts, every)
+    )
+    history, z = jax.tree.map(np.asarray, history), used.rows if z is None else np.asarray(z)
+    theta, times = history.theta[-1], data.times[instants(len(full.rows), every)]
+    precision, inflation = precision_of(machine, used, z, recursion, history, every, saved is None)
+
     converged = bool(np.all(np.isfinite(theta)))
     return Estimate(
         method="recursive",
@@ -104,50 +110,58 @@ def recursive_steps(
         residual=np.where(used.counts, used.rows @ theta - used.target, np.nan),
         samples=int(used.counts.sum()),
         notes=_notes(machine, theta, stated, noisy),
-        details={"recursive": details_of(machine, recursion, memory, told, times, inflation, stated)},
+        details={"recursive": details_of(machine, recursion, memory, history, times, inflation, stated)},
     )
 
 
 def _recursion(
     machine: Machine, data: Prepared, used: Rows, stated: Mapping[str, Any], gains: tuple
 ) -> tuple[Recursion, RecursiveMemory]:
-    """The estimator as the case states it, and its memory before the first sample."""
+    """Build the estimator that the case states, and its memory before the first sample."""
     period, half_life = data.period * data.recipe.decimation, stated.get("half_life", np.inf)
     recursion = Recursion(
-        machine.parameters.guess if stated.get("start") == "guess" else start_of(machine),
-        stated.get("regularization", REGULARIZATION) * _sizes(machine, used),
-        np.asarray(2.0 ** (-period / half_life)),
-        stated.get("rows") == "summed",
-        gains,
-        stated.get("instrument") == "model",
+        start=machine.parameters.guess if stated.get("start") == "guess" else start_of(machine),
+        information=stated.get("regularization", REGULARIZATION) * _sizes(machine, used),
+        forgetting=np.asarray(2.0 ** (-period / half_life)),
+        summed=stated.get("rows") == "summed",
+        gains=gains,
+        instrument=stated.get("instrument") == "model",
     )
     return recursion, recursion.memory()
 
 
 def _sizes(machine: Machine, used: Rows) -> Float[np.ndarray, " p"]:
-    """Mean square of each column over the samples that count; of one that never stirs, that of the force."""
+    """Return the mean square of each column over the samples that count, with a floor from the force."""
     natural = np.where(machine.parameters.guess == 0, 1.0, machine.parameters.guess)
     return np.asarray(column_squares(used.rows, used.counts, used.force, natural)[0])
 
 
 def _gates(data: Prepared, stated: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Stated gates by joint; an acceleration alone stands beside the recipe's rest velocity."""
+    """Return the stated gates by joint; the velocity gate defaults to the recipe's rest velocity."""
     if "gate_velocity" not in stated and "gate_acceleration" not in stated:
         return None
     joints = data.q.shape[1]
     velocity = stated.get("gate_velocity", data.recipe.rest_velocity)
     acceleration = stated.get("gate_acceleration", np.inf)
-    return tuple(np.broadcast_to(np.asarray(x, float), (joints,)) for x in (velocity, acceleration))
+    return _by_joint(velocity, joints), _by_joint(acceleration, joints)
+
+
+def _by_joint(value: float | list[float], joints: int) -> np.ndarray:
+    return np.broadcast_to(np.asarray(value, float), (joints,))
 
 
 def _check(
     machine: Machine, stated: Mapping[str, Any], gains: tuple, saved: Mapping[str, Any] | None
 ) -> None:
-    """Refuse what cannot be, whatever the log."""
+    """Check the settings, independently of the log.
+
+    Raises:
+        InputError: If settings contradict one another, the machine or the saved memory.
+    """
     rows, instrument = stated.get("rows", "full"), stated.get("instrument", "none")
     if instrument == "model" and not any(g is not None for g in gains):
         raise InputError(
-            'instrument = "model" is for gains of drives, and none is unknown',
+            'instrument = "model" needs an unknown gain of a drive',
             where="recursive",
             hint="leave it out, or add an effect actuator_gain with gain = { guess = 1.0 }",
         )
@@ -155,17 +169,23 @@ def _check(
         raise InputError(
             'rows = "summed" would add forces to torques', where="recursive", hint='take rows = "full"'
         )
-    was = saved and {"summed": rows == "summed", "instrument": instrument == "model"}
-    if was and any(saved[k] != v for k, v in was.items()):
+    settings = {"summed": rows == "summed", "instrument": instrument == "model"}
+    if saved and any(saved[k] != v for k, v in settings.items()):
         raise InputError(
-            "restart is of a run with other rows or another instrument",
+            "the run to restart from had other rows or another instrument",
             where="recursive",
-            hint="state rows and instrument as that run did",
+            hint="take the rows and instrument of that run",
         )
 
 
 def _check_rows(machine: Machine, rows: Rows, gains: tuple) -> None:
-    """Refuse rows that are too few, or of which all is unknown: zero then fits any log."""
+    """Check that there are enough rows, and that each gain is beside a known term.
+
+    If all terms of a balance are unknown, unknowns of zero fit any log.
+
+    Raises:
+        InputError: If there are too few rows, or a gain has no known term to scale it.
+    """
     names = machine.parameters.names
     if rows.counts.sum() <= len(names):
         raise InputError(
@@ -177,7 +197,7 @@ def _check_rows(machine: Machine, rows: Rows, gains: tuple) -> None:
         known = np.abs(np.where(rows.counts, rows.target, 0.0)[:, k]).max()
         if g is not None and known <= _NOTHING * np.abs(rows.force[:, k]).max():
             raise InputError(
-                f"{names[g]} has nothing known in its balance to be told against: any multiple of all "
+                f"{names[g]} is not identifiable: its balance has no known term, and any multiple of all "
                 "unknowns fits as well",
                 where="recursive",
                 hint="declare the inertia or the gain known",
@@ -187,11 +207,15 @@ def _check_rows(machine: Machine, rows: Rows, gains: tuple) -> None:
 def _notes(
     machine: Machine, theta: np.ndarray, stated: Mapping[str, Any], instrument: bool
 ) -> tuple[str, ...]:
+    """Return the notes about forgetting, bounds and instruments."""
     lower, upper = machine.parameters.bounds
     out = [n for n, o in zip(machine.parameters.names, (theta < lower) | (theta > upper), strict=True) if o]
-    notes = [f"beyond the bounds that sign or case set: {', '.join(out)}; no bound is kept"] if out else []
+    notes = (
+        [f"outside the bounds of sign or case, which this method ignores: {', '.join(out)}"] if out else []
+    )
     if instrument:
-        notes.append("instruments: the drive's force as the model of least squares asks for it")
+        notes.append("instruments: the drive's force that the model fitted by least squares predicts")
     half = stated.get("half_life")
-    what = "nothing is forgotten" if half is None else f"half of a sample's weight is left after {half:g} s"
-    return (f"{what} of motion", *notes) if half else (what, *notes)
+    if not half:
+        return ("nothing is forgotten", *notes)
+    return (f"the weight of a sample halves every {half:g} s of motion", *notes)

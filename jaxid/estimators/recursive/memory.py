@@ -1,4 +1,4 @@
-"""Where a recursive estimate goes on from: the memory in an earlier run's result.json."""
+"""The memory of an earlier recursive run, read from its result.json."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from jaxid.errors import InputError
 
 
 def read_memory(path: Path, names: list[str]) -> dict[str, Any]:
-    """Read what an earlier run of the method `recursive` has remembered.
+    """Read the memory of an earlier run of the method `recursive`.
 
-    JSON holds every bit of a float64, so that a run goes on as if it had never stopped.
+    JSON keeps every bit of a float64: a run continues as if it had not stopped.
 
     Args:
-        path: result.json of that run.
-        names: Of the unknowns, which must be the same.
+        path: The result.json of that run.
+        names: Names of the unknowns, which must be the same.
 
     Returns:
         The `restart` object, lists as arrays: `start`, `information`, `summed`, `instrument`, `memory`.
 
     Raises:
-        InputError: If the file is not there, is none of this method, or is about other unknowns.
+        InputError: If there is no such file, or it is the result of another method or of other unknowns.
     """
     hint = "name the result.json of a run of the method recursive"
     try:
@@ -34,14 +34,14 @@ def read_memory(path: Path, names: list[str]) -> dict[str, Any]:
     except OSError as error:
         raise InputError("no such file", where=f"restart = {path}", hint=hint) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError("holds no memory of the method recursive", where=str(path), hint=hint) from error
+        raise InputError("has no memory of the method recursive", where=str(path), hint=hint) from error
     if saved["names"] != names:
         raise InputError(
-            f"is about {', '.join(saved['names'])}; the case's unknowns are {', '.join(names)}",
+            f"has the unknowns {', '.join(saved['names'])}; those of the case are {', '.join(names)}",
             where=str(path),
-            hint="let both be the same, in the same order",
+            hint="make both the same, in the same order",
         )
     values = (*memory.values(), out["start"], out["information"])
     if any(v.dtype == object or not np.all(np.isfinite(v)) for v in values):
-        raise InputError("its memory is not finite", where=str(path), hint="begin anew, without restart")
+        raise InputError("its memory is not finite", where=str(path), hint="start again without restart")
     return out

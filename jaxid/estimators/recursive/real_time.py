@@ -1,6 +1,6 @@
-"""The method `recursive` one measured sample at a time, in the loop of a machine.
+"""The method `recursive` in real time, one measured sample after the other.
 
-Velocity and acceleration come from the sensors (a gyroscope, an accelerometer) or from filters of the user's;
+Velocity and acceleration come from sensors (a gyroscope, an accelerometer) or from filters of the user;
 nothing is filtered here.
 """
 
@@ -17,7 +17,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import check_instant, slopes
 from jaxid.estimators.recursive.estimate import gains_of, start_of
 from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, RecursiveMemory, column_squares
-from jaxid.estimators.recursive.rows import check_proportion, elsewhere
+from jaxid.estimators.recursive.rows import check_linearity, elsewhere
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
@@ -32,16 +32,17 @@ class RealTime(eqx.Module):
         memory = live.update(memory, q, qd, qdd, command)    # every millisecond
         live.estimate(memory).theta
 
-    A memory is a tree of arrays: saved as it is and given to `update` again, all goes on bit for bit.
+    A memory is a tree of arrays. It can be saved and given to `update` again, and the run continues bit for
+    bit.
 
     Args:
-        plant: The plant, its sign as sharp as the gate allows.
-        places: Of the unknowns.
-        guess: Any values of them: the balance is in proportion, they only fix the origin.
-        gain: Known force per unit of command, by drive.
-        gate_velocity, gate_acceleration: Of which a joint must exceed one for its row to count, (n,)
+        plant: The plant, its smoothed sign as sharp as the gate allows.
+        places: Paths of the unknowns in the plant.
+        guess: Any values of the unknowns, (p,): the balance is linear, and they only fix the origin.
+        gain: Known force per unit of command, by drive, (m,).
+        gate_velocity, gate_acceleration: Gates, one of which a joint must exceed for its row to count, (n,)
             [m/s, m/s^2 or in rad].
-        recursion: What takes the rows.
+        recursion: The recursive least squares.
     """
 
     plant: Plant
@@ -67,22 +68,22 @@ class RealTime(eqx.Module):
         instrument: bool = False,
         start: np.ndarray | None = None,
     ) -> RealTime:
-        """The estimator of a machine.
+        """Build the estimator of a machine.
 
         Args:
-            machine: The machine.
+            machine: The machine whose unknowns are estimated.
             period: Sampling time [s].
-            noise: Standard deviation of the force's noise and of what the model lacks [N or N m].
+            noise: Standard deviation of the force's noise, errors of the model included [N or N m].
             spread: Standard deviation of the start, (p,) [units of the unknowns].
-            gate_velocity, gate_acceleration: See `RealTime`; one for all joints, or one each.
-            half_life: Of a sample's weight [s of motion].
+            gate_velocity, gate_acceleration: Gates, see `RealTime`; one for all joints, or one each.
+            half_life: Time in which the weight of a sample halves [s of motion].
             summed: Whether the rows of a sample are summed to one.
             instrument: Whether the measured force is so noisy that its gain needs an instrument.
-            start: Absent: gains from one, forces from zero, the plant's own from its guesses.
+            start: Start of the estimate, (p,); absent: one for gains, zero for forces, the plant's guesses.
 
         Raises:
-            InputError: If a number is out of range, an effect remembers, delays or changes with time, or
-                an unknown does not enter in proportion.
+            InputError: If a number is out of range, an effect has an internal state, delays the command or
+                changes with time, or the balance is not linear in an unknown.
         """
         n, names, places = machine.plant.joints, machine.parameters.names, machine.parameters.places
         sizes = {"period": period, "noise": noise, "spread": spread, "half_life": half_life}
@@ -95,12 +96,13 @@ class RealTime(eqx.Module):
             raise InputError(what, where="RealTime", hint="it must be >= 0")
         for name, value in {"spread": spread, "start": spread if start is None else start}.items():
             if np.shape(value) != (len(names),):
-                hint = f"give one of each of {', '.join(names)}"
+                hint = f"give one value for each of {', '.join(names)}"
                 raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
         for name, value in {"gate_velocity": gate_velocity, "gate_acceleration": gate_acceleration}.items():
             if np.shape(value) not in ((), (1,), (n,)):
-                hint = f"give one for all joints, or {n}"
+                hint = f"give one value for all joints, or {n}"
                 raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
+
         check_instant(machine, "RealTime")
         velocity, acceleration = (
             np.broadcast_to(np.asarray(x, float), (n,)) for x in (gate_velocity, gate_acceleration)
@@ -108,22 +110,33 @@ class RealTime(eqx.Module):
         plant = machine.plant.smoothed(
             np.asarray(1 / 3), typical_velocity(machine.plant, velocity[None], np.min)
         )
+
+        # Linearity in the unknowns is checked at one random instant of motion.
         random, guess = np.random.default_rng(0), machine.parameters.guess
         motion, u = plant.any_motion(random), random.uniform(0.5, 1.5, machine.gain.size)
         here, there = (np.asarray(slopes(plant, places, x, motion, u)) for x in (guess, elsewhere(guess)))
-        check_proportion(names, here, there)
+        check_linearity(names, here, there)
+
         recursion = Recursion(
-            start_of(machine) if start is None else np.asarray(start, float),
-            np.square(noise / np.asarray(spread, float)),
-            np.asarray(2.0 ** (-period / half_life)),
-            summed,
-            gains_of(machine),
-            instrument,
+            start=start_of(machine) if start is None else np.asarray(start, float),
+            information=np.square(noise / np.asarray(spread, float)),
+            forgetting=np.asarray(2.0 ** (-period / half_life)),
+            summed=summed,
+            gains=gains_of(machine),
+            instrument=instrument,
         )
-        return cls(plant, places, guess, machine.gain, velocity, acceleration, recursion)
+        return cls(
+            plant=plant,
+            places=places,
+            guess=guess,
+            gain=machine.gain,
+            gate_velocity=velocity,
+            gate_acceleration=acceleration,
+            recursion=recursion,
+        )
 
     def memory(self) -> RecursiveMemory:
-        """Before the first sample."""
+        """Return the memory before the first sample."""
         return self.recursion.memory()
 
     def rows(
@@ -133,7 +146,12 @@ class RealTime(eqx.Module):
         qdd: Float[Array, " n"],
         command: Float[Array, " m"],
     ) -> tuple[Float[Array, "n p"], Float[Array, " n"], Bool[Array, " n"]]:
-        """Rows, right-hand side and which rows count of one sample."""
+        """Return rows, right-hand side and the mask of the rows that count, of one sample.
+
+        Args:
+            q, qd, qdd: Measured motion of all joints, (n,) each [m, m/s, m/s^2 or in rad].
+            command: Measured command by drive, in the command's unit, (m,).
+        """
         u, guess = self.gain * command, jnp.asarray(self.guess)
 
         def residual(theta: Array) -> tuple[Array, Array]:
@@ -148,7 +166,13 @@ class RealTime(eqx.Module):
     def sizes(
         self, rows: Float[Array, "time n p"], counts: Bool[Array, "time n"], force: Float[Array, "time n"]
     ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-        """Mean square of each column, and root mean square of the force, of samples that count."""
+        """Return the mean square of each column, and the root mean square of the force.
+
+        Args:
+            rows: Rows of many samples, (time, n, p).
+            counts: Mask of the rows that count, (time, n).
+            force: Force of the drives in each row, (time, n) [N or N m].
+        """
         natural = jnp.where(self.guess == 0, 1.0, jnp.asarray(self.guess))
         square, force = column_squares(rows, counts, force, natural)
         return square, jnp.sqrt(force)
@@ -162,16 +186,16 @@ class RealTime(eqx.Module):
         qdd: Float[Array, " n"],
         command: Float[Array, " m"],
     ) -> RecursiveMemory:
-        """Take one sample more.
+        """Add one sample.
 
         Args:
-            memory: So far.
-            q, qd, qdd: Measured motion of all joints.
-            command: Measured, in its units, by drive.
+            memory: The memory so far.
+            q, qd, qdd: Measured motion of all joints, (n,) each [m, m/s, m/s^2 or in rad].
+            command: Measured command by drive, in the command's unit, (m,).
         """
         return self.recursion.update(memory, *self.rows(q, qd, qdd, command))[0]
 
     @eqx.filter_jit
     def estimate(self, memory: RecursiveMemory) -> RecursiveEstimate:
-        """What the samples so far say."""
+        """Return estimate and precision from the samples so far."""
         return self.recursion.estimate(memory)

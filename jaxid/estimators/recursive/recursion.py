@@ -4,18 +4,18 @@ After n samples the estimate minimises
 
     sum_k beta^(n-k) |Y_k theta - r_k|^2 + (theta - theta_0)' L_n (theta - theta_0),
 
-with L_n the diagonal `information` of the start, within the (1 - beta^p) that one round over the p unknowns
-takes. The paper's regularisation is beta^n lambda |theta|^2: it is printed towards zero, where gains start at
-one, and it fades, so that what is not excited for long runs away (its covariance grows as beta^-n). Here one
-unknown a sample is reminded of its start, in turn, with as much weight as all have forgotten meanwhile: the
-covariance never exceeds that of the start by more than that round.
+with L_n the diagonal `information` of the start, up to the (1 - beta^p) of one round over the p unknowns. The
+paper's regularisation is beta^n lambda |theta|^2. As printed it pulls towards zero, although gains start at
+one, and it fades: an unknown that is not excited for long runs away, because its covariance grows as beta^-n.
+Here the start of one unknown per sample is added again as a row, in turn, with the weight that was forgotten
+since its last turn. The covariance exceeds that of the start by no more than the forgetting of one round.
 
-A row changes the covariance P by Woodbury's identity, which for a single row needs no inverse. It acts on a
-square root S of P = S S' (Potter), so that P stays symmetric and positive however long it goes on; a plain P
-loses that after a start far less certain than the data. Several rows a sample are taken one after the other,
-which is the same.
+A row changes the covariance P by Woodbury's identity, which needs no inverse for a single row. It is applied
+to a square root S of P = S S' (Potter), so that P stays symmetric and positive definite; an update of P
+itself loses that after a start that is far less certain than the data. Several rows per sample are taken one
+after the other, which is equivalent.
 
-Nothing here knows of plants: rows come from `jaxid.estimators.recursive.estimate`.
+This module is independent of plants: rows come from `jaxid.estimators.recursive.estimate`.
 
 Source:
     Righettini et al. (2025), Robotics 14, 36, (14) and (49); Potter (1963) in Bierman (1977), Factorization
@@ -34,29 +34,28 @@ from jaxtyping import Bool, Float, Int
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import eliminated
 
-# Of the variance with which an unknown starts, what may be left where the rows tell it: it is then by less
-# than a hundredth of the start's own error off.
+# An unknown is identifiable if its variance is below this fraction of the variance of its start: the error of
+# the start then contributes less than a hundredth of itself.
 IDENTIFIED = 0.01
-# Below this part of the force a column is nothing.
+# A column below this fraction of the force is zero.
 _NOTHING = 1e-9
-# A gain below this part of its start makes no model of the drive's force.
+# A gain below this fraction of its start is not used to model the drive's force.
 _LEAST_GAIN = 0.1
 
 
 class RecursiveMemory(eqx.Module):
-    """What is kept from sample to sample, and all that a warm restart needs.
+    """State of the estimator between samples, which is all that a warm restart needs.
 
     Args:
-        theta: Estimate of least squares, (p,).
+        theta: Estimate by least squares, (p,).
         root: S, with S S' the covariance for rows of unit noise, (p, p).
-        spread: Sum of beta^2(n-k) z z': what noise of the rows does, (p, p).
-        cost: Weighted squares of the residual at the estimate.
+        spread: Sum of beta^2(n-k) z z', by which noise of the rows spreads, (p, p).
+        cost: Weighted sum of squares of the residual at the estimate.
         weight: Sum of the weights of all rows.
-        squares: Sum of the squares of what each row left after its own update; not forgotten.
-        rows: How many that were.
-        samples: That counted.
-        normal, moment: Sums of z y' and z r, start included, (p, p) and (p,); of no use without
-            instruments.
+        squares: Sum of squares of each row's residual after its update, without forgetting.
+        rows: Number of rows that counted.
+        samples: Number of samples that counted.
+        normal, moment: Sums of z y' and z r, start included, (p, p) and (p,); used with instruments only.
     """
 
     theta: Float[Array, " p"]
@@ -72,16 +71,17 @@ class RecursiveMemory(eqx.Module):
 
 
 class RecursiveEstimate(eqx.Module):
-    """What a memory says.
+    """Estimate and precision from a memory.
 
     Args:
-        theta: Estimate, by instruments where there are any.
-        covariance: For white noise, and the square of `pull`; says nothing of unknowns that are not `told`.
-        pull: By how much the start holds the estimate back, to first order, (p,).
-        identifiable: Whether the rows, and not the start, determine an unknown.
-        noise: Standard deviation of a row's noise.
-        residual: Root mean square of what every row left after its own update, (49).
-        effective: Sum of the weights of all rows.
+        theta: Estimate, by instruments if there are any, (p,).
+        covariance: Covariance for white noise plus the square of `pull`, (p, p); meaningless for unknowns
+            that are not `identifiable`.
+        pull: Bias of the estimate towards the start, to first order, (p,).
+        identifiable: Mask of the unknowns that are determined by the rows and not by the start, (p,).
+        noise: Standard deviation of a row's noise [N or N m].
+        residual: Root mean square of each row's residual after its update, (49) [N or N m].
+        effective: Sum of the weights of all rows, the effective number of rows.
     """
 
     theta: Float[Array, " p"]
@@ -94,23 +94,23 @@ class RecursiveEstimate(eqx.Module):
 
     @property
     def std(self) -> Float[Array, " p"]:
-        """Standard deviations; NaN where not told."""
+        """Standard deviations, NaN for unknowns that are not identifiable, (p,)."""
         return jnp.sqrt(
             jnp.where(self.identifiable, jnp.diagonal(self.covariance, axis1=-2, axis2=-1), jnp.nan)
         )
 
 
 class Recursion(eqx.Module):
-    """The estimator; `update` may stand in a scan.
+    """Recursive least squares with forgetting; `update` may stand in a scan.
 
     Args:
-        start: theta_0, (p,).
-        information: Of the start: variance of a row's noise over that of the start, (p,).
-        forgetting: beta, weight that a sample keeps when the next comes; 1: nothing is forgotten.
-        summed: Whether the rows of a sample are summed to one before all else.
-        gains: For instruments, which unknown is the gain of the drive in each row; None where none is.
+        start: Start of the estimate, theta_0, (p,).
+        information: Variance of a row's noise over the variance of the start, (p,).
+        forgetting: Factor beta of a sample's weight when the next sample comes; 1: nothing is forgotten.
+        summed: Whether the rows of a sample are summed to one row first.
+        gains: For instruments, index of the unknown that is the gain of the drive in each row, or None.
         instrument: Whether the drive's force is noisy, so that its columns need an instrument: the force
-            that the model of least squares so far asks for along the measured motion.
+            that the model predicts along the measured motion, by the estimate so far.
     """
 
     start: Float[Array, " p"]
@@ -121,21 +121,21 @@ class Recursion(eqx.Module):
     instrument: bool = eqx.field(static=True, default=False)
 
     def memory(self) -> RecursiveMemory:
-        """Before the first sample."""
+        """Return the memory before the first sample."""
         p = self.start.size
         zero, square = jnp.zeros(()), jnp.zeros((p, p))
         information = jnp.asarray(self.information)
         return RecursiveMemory(
-            jnp.asarray(self.start),
-            jnp.diag(1 / jnp.sqrt(information)),
-            square,
-            zero,
-            zero,
-            zero,
-            zero,
-            jnp.zeros((), int),
-            jnp.diag(information),
-            information * self.start,
+            theta=jnp.asarray(self.start),
+            root=jnp.diag(1 / jnp.sqrt(information)),
+            spread=square,
+            cost=zero,
+            weight=zero,
+            squares=zero,
+            rows=zero,
+            samples=jnp.zeros((), int),
+            normal=jnp.diag(information),
+            moment=information * self.start,
         )
 
     def update(
@@ -145,80 +145,98 @@ class Recursion(eqx.Module):
         target: Float[Array, " m"],
         counts: Bool[Array, " m"],
     ) -> tuple[RecursiveMemory, Float[Array, "k p"]]:
-        """Take one sample more.
+        """Add one sample.
 
         Args:
-            memory: So far.
-            rows: Y of this sample.
-            target: r of this sample.
-            counts: Which of its rows count; where none does, the memory stays bit for bit what it was.
+            memory: The memory so far.
+            rows: Rows Y of this sample, (m, p).
+            target: Right-hand side r of this sample, (m,) [N or N m].
+            counts: Mask of the rows that count, (m,); if none does, the memory stays the same bit for bit.
 
         Returns:
-            The new memory, and the rows' instruments, k = 1 where summed (the rows themselves without).
+            The new memory, and the instruments of the rows, (k, p), or the rows themselves if there are none;
+            k = 1 if the rows are summed, else m.
         """
         z = self._instruments(memory.theta, rows, target)
-        rows, target, z = (jnp.where(_alike(counts, x), x, 0.0) for x in (rows, target, z))
+        rows, target, z = (jnp.where(_expanded(counts, x), x, 0.0) for x in (rows, target, z))
         moved = jnp.any(counts)
         number = jnp.sum(counts).astype(float)
         if self.summed:
             rows, target, z = (jnp.sum(x, axis=0)[None] for x in (rows, target, z))
             number = moved.astype(float)
+
+        # Forget, then update by one row after the other, and add the start of one unknown again.
         beta = jnp.where(moved, self.forgetting, 1.0)
         theta, root, cost = memory.theta, memory.root / jnp.sqrt(beta), beta * memory.cost
         for y, r in zip(rows, target, strict=True):
-            theta, root, left = _taken(theta, root, y, r)
-            cost = cost + left
-        theta, root = self._reminded(theta, root, beta, memory.samples)
+            theta, root, added = _updated(theta, root, y, r)
+            cost = cost + added
+        theta, root = self._with_start_of_one(theta, root, beta, memory.samples)
+
         square = jnp.sum((rows @ theta - target) ** 2)
         kept = jnp.diag((1 - beta) * self.information)
         return RecursiveMemory(
-            theta,
-            root,
-            beta**2 * memory.spread + z.T @ z,
-            cost,
-            beta * memory.weight + number,
-            memory.squares + square,
-            memory.rows + number,
-            memory.samples + moved,
-            beta * memory.normal + kept + z.T @ rows,
-            beta * memory.moment + (1 - beta) * self.information * self.start + z.T @ target,
+            theta=theta,
+            root=root,
+            spread=beta**2 * memory.spread + z.T @ z,
+            cost=cost,
+            weight=beta * memory.weight + number,
+            squares=memory.squares + square,
+            rows=memory.rows + number,
+            samples=memory.samples + moved,
+            normal=beta * memory.normal + kept + z.T @ rows,
+            moment=beta * memory.moment + (1 - beta) * self.information * self.start + z.T @ target,
         ), z
 
     def estimate(self, memory: RecursiveMemory) -> RecursiveEstimate:
-        """What a memory says."""
+        """Return estimate and precision from a memory."""
         inverse = memory.root @ memory.root.T
         noise = memory.weight - jnp.sum(inverse * memory.spread)
         variance = jnp.where(noise > 0, memory.cost / jnp.where(noise > 0, noise, 1.0), jnp.nan)
-        told = jnp.diagonal(inverse) * self.information < IDENTIFIED
+        identifiable = jnp.diagonal(inverse) * self.information < IDENTIFIED
+
+        # With instruments the estimate solves their normal equations, scaled to a diagonal of one.
         theta = memory.theta
         if self.instrument:
             scale = jnp.sqrt(jnp.abs(jnp.diagonal(memory.normal)))
             both = jnp.concatenate([memory.moment[:, None], jnp.eye(scale.size)], axis=1) / scale[:, None]
             both = eliminated(memory.normal / jnp.outer(scale, scale), both) / scale[:, None]
             theta, inverse = both[:, 0], both[:, 1:]
-        pull = inverse @ (self.information * (theta - self.start))
-        covariance = variance * inverse @ memory.spread @ inverse.T + jnp.outer(pull, pull)
-        residual = jnp.sqrt(memory.squares / jnp.maximum(memory.rows, 1.0))
-        return RecursiveEstimate(theta, covariance, pull, told, jnp.sqrt(variance), residual, memory.weight)
 
-    def _reminded(self, theta: Array, root: Array, beta: Array, samples: Array) -> tuple[Array, Array]:
-        """One unknown's start as a row, with what it has lost since its last turn."""
+        pull = inverse @ (self.information * (theta - self.start))
+        covariance = variance * inverse @ memory.spread @ inverse.T + jnp.outer(pull, jnp.asarray(pull))
+        residual = jnp.sqrt(memory.squares / jnp.maximum(memory.rows, 1.0))
+        return RecursiveEstimate(
+            theta=theta,
+            covariance=covariance,
+            pull=pull,
+            identifiable=identifiable,
+            noise=jnp.sqrt(variance),
+            residual=residual,
+            effective=memory.weight,
+        )
+
+    def _with_start_of_one(
+        self, theta: Array, root: Array, beta: Array, samples: Array
+    ) -> tuple[Array, Array]:
+        """Update by the start of one unknown as a row, with the weight forgotten since its last turn."""
         p = theta.size
         turn = samples % p
         size = jnp.sqrt((1 - beta**p) * self.information[turn])
         unit = size * (jnp.arange(p) == turn)
-        return _taken(theta, root, unit, size * self.start[turn])[:2]
+        theta, root, _ = _updated(theta, root, unit, size * self.start[turn])
+        return theta, root
 
     def _instruments(self, theta: Array, rows: Array, target: Array) -> Array:
-        """The rows with the drive's columns as the model at theta has them.
+        """Return the rows with the force that the model predicts at theta in the columns of the gains.
 
         Let c be the column of a gain g, minus the measured force. The model's force is the one at which the
-        row's residual e vanishes: its column is c - e / g. Noise of the measured force is in c and in e / g
-        alike: the difference has none.
+        row's residual e vanishes: its column is c - e / g. The noise of the measured force is the same in c
+        and in e / g, and the difference has none.
         """
         if not self.instrument:
             return rows
-        out = rows
+        out = jnp.asarray(rows)
         for k, g in enumerate(self.gains):
             if g is not None:
                 sound = jnp.abs(theta[g]) > _LEAST_GAIN * jnp.abs(self.start[g])
@@ -227,8 +245,8 @@ class Recursion(eqx.Module):
         return out
 
 
-def _taken(theta: Array, root: Array, y: Array, r: Array) -> tuple[Array, Array, Array]:
-    """Estimate and root with one row more, and what the row adds to the cost."""
+def _updated(theta: Array, root: Array, y: Array, r: Array) -> tuple[Array, Array, Array]:
+    """Return estimate and root after one more row, and the cost that the row adds."""
     f = y @ root
     grown = 1.0 + f @ f
     e = r - y @ theta
@@ -237,7 +255,8 @@ def _taken(theta: Array, root: Array, y: Array, r: Array) -> tuple[Array, Array,
     return theta + gain * e, root, e * e / grown
 
 
-def _alike(counts: Array, x: Array) -> Array:
+def _expanded(counts: Array, x: Array) -> Array:
+    """Return a mask with as many axes as x."""
     return counts.reshape(-1, *[1] * (x.ndim - 1))
 
 
@@ -250,21 +269,21 @@ def run(
     counts: Bool[Array, "time m"],
     every: int = 1,
 ) -> tuple[RecursiveMemory, RecursiveEstimate, Array | None]:
-    """Take all samples of a log.
+    """Run the estimator over all samples of a log.
 
     Args:
         recursion: The estimator.
-        memory: Where it goes on from.
-        rows, target, counts: As `Recursion.update` takes them, by sample.
-        every: After so many samples, and at the end, it is written down what was told.
+        memory: The memory to continue from.
+        rows, target, counts: Arguments of `Recursion.update` by sample.
+        every: Number of samples between the estimates of the history; the end is included.
 
     Returns:
-        The memory at the end; what was told, (times, ...), see `instants`; and the instruments of all
-        rows, (time, k, p), None where there are none.
+        The memory at the end; the history of estimates, (times, ...), see `instants`; and the instruments of
+        all rows, (time, k, p), None if there are none.
     """
     time = len(rows)
     blocks = -(-time // every)
-    # Samples that do not count change nothing.
+    # The last block is filled up with samples that do not count, which change nothing.
     more = [(0, blocks * every - time)]
     padded = [jnp.pad(x, more + [(0, 0)] * (x.ndim - 1)) for x in (rows, target, counts)]
     padded = [x.reshape(blocks, every, *x.shape[1:]) for x in padded]
@@ -277,8 +296,8 @@ def run(
         memory, z = jax.lax.scan(sample, memory, now)
         return memory, (recursion.estimate(memory), z)
 
-    memory, (told, z) = jax.lax.scan(block, memory, padded)
-    return memory, told, None if z is None else z.reshape(-1, *z.shape[2:])[:time]
+    memory, (history, z) = jax.lax.scan(block, memory, padded)
+    return memory, history, None if z is None else z.reshape(-1, *z.shape[2:])[:time]
 
 
 def column_squares(
@@ -287,12 +306,13 @@ def column_squares(
     force: Float[Array, "time m"],
     natural: Float[Array, " p"],
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-    """Mean square of each column, and of the force, over the samples that count.
+    """Return the mean square of each column, and of the force, over the samples that count.
 
     Args:
-        rows, counts: As `Recursion.update` takes them, by sample.
-        force: Of the drives in each row.
-        natural: Sizes of the unknowns: a column that never stirs is a billionth of the force over it.
+        rows, counts: Arguments of `Recursion.update` by sample.
+        force: Force of the drives in each row, (time, m) [N or N m].
+        natural: Natural sizes of the unknowns, (p,). The floor of a column, times its unknown's size, is a
+            billionth of the force.
     """
     moved = jnp.maximum(jnp.any(counts, axis=1).sum(), 1)
     square = jnp.sum(jnp.where(counts[..., None], rows, 0.0) ** 2, axis=(0, 1)) / moved
@@ -301,6 +321,6 @@ def column_squares(
 
 
 def instants(samples: int, every: int) -> np.ndarray:
-    """Index of the last sample that each of `run`'s told values has seen."""
+    """Return the index of the last sample before each estimate in the history of `run`."""
     ends = np.arange(every, samples + every, every)
     return np.minimum(ends, samples) - 1

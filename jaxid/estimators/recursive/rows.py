@@ -1,8 +1,8 @@
 """Rows of a linear regression along a log: the Jacobian of the plant's balance in its unknowns.
 
-The right-hand side is what is left where all unknowns are zero. It is the residual at the load, not over the
-drive's gain as in `inverse_dynamics`, so that a gain enters in proportion. Whether all unknowns do so
-together is tested on the log itself.
+The right-hand side is minus the residual for unknowns of zero. The residual is taken at the load and not
+divided by the drive's gain as in `inverse_dynamics`, so that it is linear in the gain. The linearity in all
+unknowns together is checked on the log itself.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.simulation.force_balance import ForceData, measured_force, sharpened, whole_motion
 
-# Part of itself by which a column may differ elsewhere among the unknowns: of rounding.
+# Relative difference of a column between two values of the unknowns that is a rounding error.
 _LINEAR = 1e-6
 
 
@@ -35,10 +35,10 @@ class Rows:
     """A linear regression, by sample.
 
     Args:
-        rows: Y, (kept, m, p).
-        target: r, (kept, m) [N or N m at the load].
-        counts: Which rows count, (kept, m).
-        force: Force of the drives in each row, (kept, m): how large a residual is, is seen beside it.
+        rows: Rows Y, (kept, m, p).
+        target: Right-hand side r, (kept, m) [N or N m at the load].
+        counts: Mask of the rows that count, (kept, m).
+        force: Force of the drives in each row, to which residuals are compared, (kept, m) [N or N m].
     """
 
     rows: Float[np.ndarray, "kept m p"]
@@ -48,24 +48,31 @@ class Rows:
 
     @property
     def summed(self) -> Rows:
-        """One row a sample: the sum of those that count."""
+        """The regression with one row per sample, the sum of the rows that count."""
         rows = np.sum(np.where(self.counts[..., None], self.rows, 0.0), axis=1, keepdims=True)
         target, force = (
             np.sum(np.where(self.counts, x, 0.0), axis=1, keepdims=True) for x in (self.target, self.force)
         )
-        return Rows(rows, target, self.moved[:, None], force)
+        return Rows(rows, target, np.asarray(self.moved)[:, None], force)
 
     @property
     def moved(self) -> Bool[np.ndarray, " kept"]:
-        """Samples of which any row counts."""
-        return self.counts.any(axis=1)
+        """Mask of the samples of which any row counts."""
+        return np.any(self.counts, axis=1)
 
 
 @eqx.filter_jit
 def load_columns(
     plant: Plant, places: tuple, data: ForceData, theta: Array
 ) -> tuple[Float[Array, "kept n"], Float[Array, "kept n p"]]:
-    """Residual of the balance at the load and its Jacobian in the unknowns, filtered and decimated."""
+    """Return the residual of the balance at the load and its Jacobian, filtered and decimated.
+
+    Args:
+        plant: The plant.
+        places: Paths of the unknowns in it.
+        data: The filtered log.
+        theta: Values of the unknowns, (p,).
+    """
 
     def residual(theta: Array) -> tuple[Array, Array]:
         moved = scatter(places, plant, theta)
@@ -79,23 +86,23 @@ def load_columns(
 
 
 def rows_steps(machine: Machine, data: Prepared, gates: tuple[np.ndarray, np.ndarray] | None) -> Steps[Rows]:
-    """Rows of a log.
+    """Compute the rows of a log.
 
     Args:
-        machine: The machine.
-        data: The log, prepared.
+        machine: The machine whose unknowns are estimated.
+        data: The filtered log.
         gates: Velocity and acceleration, by joint, one of which a sample must exceed; None: the samples
             that `inverse_dynamics` fits.
 
     Raises:
-        InputError: If the unknowns do not enter the balance in proportion.
+        InputError: If the balance is not linear in the unknowns.
     """
     plant, names, places = sharpened(machine.plant, data), machine.parameters.names, machine.parameters.places
     arrays, guess = ForceData.of(data, data.fitted), machine.parameters.guess
     e, columns = yield SolveRequest(load_columns, (plant, places, arrays, guess))
     _, there = yield SolveRequest(load_columns, (plant, places, arrays, elsewhere(guess)))
     e, columns = np.asarray(e), np.asarray(columns)
-    check_proportion(names, columns, np.asarray(there))
+    check_linearity(names, columns, np.asarray(there))
     force = yield SolveRequest(_measured_force, (plant, arrays))
     counts = data.fitted if gates is None else gated(data, *gates)
     target = columns @ guess - e
@@ -103,44 +110,50 @@ def rows_steps(machine: Machine, data: Prepared, gates: tuple[np.ndarray, np.nda
 
 
 def elsewhere(guess: np.ndarray) -> np.ndarray:
-    """Other values of all unknowns, to see whether the columns are the same there."""
+    """Return other values of all unknowns, at which the columns of a linear balance are the same."""
     return 1.5 * np.where(guess == 0, 1.0, guess)
 
 
-def check_proportion(names: list[str], columns: np.ndarray, there: np.ndarray) -> None:
-    """Refuse unknowns whose columns depend on the unknowns; (..., p) at two places.
+def check_linearity(names: list[str], columns: np.ndarray, there: np.ndarray) -> None:
+    """Check that the balance is linear in the unknowns: its columns do not depend on them.
+
+    Args:
+        names: Names of the unknowns.
+        columns: Columns of the unknowns, (..., p).
+        there: Columns at other values of the unknowns, (..., p).
 
     Raises:
-        InputError: If there are any.
+        InputError: If any column depends on the unknowns.
     """
-    odd = _out_of_proportion(columns, there)
-    if odd.any():
-        several = " and ".join(n for n, o in zip(names, odd, strict=True) if o)
+    nonlinear = _nonlinear(columns, there)
+    if nonlinear.any():
+        several = " and ".join(n for n, o in zip(names, nonlinear, strict=True) if o)
         raise InputError(
-            f"the balance is not in proportion to {several}",
+            f"the balance is not linear in {several}",
             where="recursive",
-            hint=f"declare {'one of them' if odd.sum() > 1 else 'it'} known, or use inverse_dynamics",
+            hint=f"declare {'one of them' if nonlinear.sum() > 1 else 'it'} known, or use inverse_dynamics",
         )
 
 
-def _out_of_proportion(columns: np.ndarray, there: np.ndarray) -> Bool[np.ndarray, " p"]:
+def _nonlinear(columns: np.ndarray, there: np.ndarray) -> Bool[np.ndarray, " p"]:
+    """Return the mask of the unknowns whose columns differ between two values of the unknowns."""
     rows = tuple(range(columns.ndim - 1))
     return np.abs(there - columns).max(axis=rows) > _LINEAR * np.abs(columns).max(axis=rows)
 
 
-def in_proportion_steps(machine: Machine, data: Prepared) -> Steps[Machine]:
-    """The machine with only those unknowns that enter the balance in proportion; the rest at their guesses.
+def keep_linear_steps(machine: Machine, data: Prepared) -> Steps[Machine]:
+    """Keep the unknowns in which the balance is linear, and fix the others at their guesses.
 
     Args:
-        machine: The machine.
-        data: The log, prepared.
+        machine: The machine whose unknowns are checked.
+        data: The filtered log.
     """
     free, guess = machine.parameters.free, machine.parameters.guess
     args = (sharpened(machine.plant, data), machine.parameters.places, ForceData.of(data, data.fitted))
     _, columns = yield SolveRequest(load_columns, (*args, guess))
     _, there = yield SolveRequest(load_columns, (*args, elsewhere(guess)))
-    odd = _out_of_proportion(np.asarray(columns), np.asarray(there))
-    kept = tuple(f for f, o in zip(free, odd, strict=True) if not o)
+    nonlinear = _nonlinear(np.asarray(columns), np.asarray(there))
+    kept = tuple(f for f, o in zip(free, nonlinear, strict=True) if not o)
     return machine.with_plant(machine.plant, Parameters(kept))
 
 
@@ -148,11 +161,11 @@ _measured_force = eqx.filter_jit(measured_force)
 
 
 def gated(data: Prepared, velocity: np.ndarray, acceleration: np.ndarray) -> Bool[np.ndarray, "kept n"]:
-    """Kept samples that are fast, or speed up or slow down; not what filters smear of the others.
+    """Return the mask of the kept samples that exceed a gate, beyond the reach of the filters.
 
     Args:
-        data: The log, prepared.
-        velocity, acceleration: Of which a sample must exceed one, by joint [m/s, m/s^2 or in rad].
+        data: The filtered log.
+        velocity, acceleration: Gates by joint, one of which a sample must exceed [m/s, m/s^2 or in rad].
     """
     stuck = (np.abs(data.qd) <= velocity) & (np.abs(data.qdd) <= acceleration)
     return ~smeared(stuck, data.recipe.decimator.reach)[data.kept] & data.measured

@@ -1,1 +1,1 @@
-"""Output error under a prior, in the directions that a short log can identify."""
+"""Output error under a prior, in the subspace of unknowns that a short log identifies."""

@@ -1,9 +1,9 @@
-"""Output error in the directions that a log tells; the rest stays at its prior.
+"""Output error under a prior, in the directions that a log identifies.
 
-A short log cannot tell all unknowns. Fitted all the same they run away along what is flat, and what is
-told goes with them. Here each guess is a prior of a stated relative width; combinations of unknowns that
-the log tells better than that are fitted, the others follow their prior: they move only where guesses and
-log together are more probable.
+A short log does not identify all unknowns. If they were all fitted, they would run away along flat
+directions of the cost, and take identifiable ones with them. Here each guess is the centre of a prior with a
+stated relative width. Combinations of unknowns that the log identifies better than the prior are fitted; the
+others move only as far as prior and log together make more probable.
 """
 
 from __future__ import annotations
@@ -17,41 +17,54 @@ from jaxtyping import Float
 
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, notes_of
-from jaxid.estimators.within_prior.posterior import loss_of, most_probable, past_kinks, quadratic, spread
+from jaxid.estimators.within_prior.evaluations import BLOCK, DRAWS, linearise, precompile_residuals_at
+from jaxid.estimators.within_prior.multistart import (
+    fit_from_many_starts,
+    likeliest_prior_draws,
+    random_starts,
+)
+from jaxid.estimators.within_prior.posterior import (
+    laplace_covariance,
+    maximum_a_posteriori,
+    negative_log_posterior,
+    posterior_second_moment,
+    restarted_maximum_a_posteriori,
+)
 from jaxid.estimators.within_prior.precision import (
-    DirectionPrecision,
+    SubspacePrecision,
     add_profiles,
-    assessed,
-    hessian_of,
+    cost_hessian,
+    parameter_precision,
     precision_of_directions,
-    with_guesses,
+    with_prior,
 )
-from jaxid.estimators.within_prior.problem import (
-    AT_ONCE,
-    DRAWN,
-    STAYS,
-    Problem,
-    RoundsResult,
-    at_each_soon,
-    read,
+from jaxid.estimators.within_prior.problem import Problem
+from jaxid.estimators.within_prior.quantisation import (
+    fit_with_quantisation,
+    omits_quantisation,
+    precompile_quantised,
+    quantised_residuals,
 )
-from jaxid.estimators.within_prior.rounding import draws_soon, rounded, rounds, through_rounding
-from jaxid.estimators.within_prior.rounds import identifiable_directions, in_rounds
-from jaxid.estimators.within_prior.starts import likely_points, many_starts, starts_within
+from jaxid.estimators.within_prior.subspace import (
+    KEPT_STD,
+    SubspaceFit,
+    fit_in_subspace,
+    identifiable_directions,
+)
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import Precision
 from jaxid.simulation.replay import Numerics
 
-# Points from which the fit begins where the guesses tell nothing.
-_ELSEWHERE = 3
-# A simulation without rounding follows a loop in which that moves what is compared by this part of its
-# variance at most.
-_FOLLOWED = 0.1
+# Number of random points from which the fit restarts if no direction is identifiable at the guesses.
+_RESTARTS = 3
+# A simulation without quantisation represents the loop if quantisation moves the output by at most this
+# fraction of its variance.
+_REPRESENTED = 0.1
 
 
-def directions_steps(
+def within_prior_steps(
     machine: Machine,
     log: Log,
     *,
@@ -66,239 +79,294 @@ def directions_steps(
     begin: np.ndarray | None = None,
     drawn: bool = True,
 ) -> Steps[Estimate]:
-    """Fit what a log tells of the unknowns in the loop, and leave the rest to the guesses.
+    """Fit the identifiable combinations of the unknowns in the loop, and leave the others to the prior.
 
     Args:
         machine: The machine; its controller closes the loop, which begins at rest.
-        log: The log.
+        log: The log to fit.
         prior: Relative standard deviation of the guesses.
-        on: "position", "force" or "both". On the latter two the loop is simulated without rounding of the
-            readings: which count a simulated reading falls on is a coin toss for a coarse encoder, and
-            a cost with it a bed of needles.
-        starts: Starts drawn within `prior` of the guesses, to see that all end alike.
-        others: More starts: values of the unknowns.
+        on: Output that is compared: "position", "force" or "both". For the latter two the loop is simulated
+            without quantisation of the readings: the count of a simulated reading is random for a coarse
+            encoder, and the cost with quantisation has many narrow local minima.
+        starts: Number of starts within `prior` of the guesses, to check that they reach the same optimum.
+        others: More starts, each as values of the unknowns, (p,).
         hessian: Take the curvature from the full Hessian in place of Gauss-Newton's.
-        profile: Also take profile likelihoods of the fitted directions.
-        numerics: How to integrate.
-        widths: Standard deviations of single guesses, by name; of what must be positive of its logarithm.
-        begin: Values of the unknowns to begin at; absent: the best of many points about the guesses.
-        drawn: Draw what else is as probable, and what rounding does. Without it deviations are those of the
-            quadratic picture, of a loop that does not round, in a fraction of the time.
+        profile: Add profile likelihoods of the fitted directions.
+        numerics: Integration settings; chosen from machine and log if absent.
+        widths: Standard deviations of single guesses, by name; of the logarithm for positive unknowns.
+        begin: Start of the fit, as values of the unknowns; absent: the best of many points about the guesses.
+        drawn: Sample the posterior, and simulate encoder quantisation. Without it standard deviations are
+            those of Laplace's approximation for a loop without quantisation, in a fraction of the time.
 
     Returns:
-        The estimate. Standard deviations hold what is left of the prior along other directions, and what
-        those do to the fitted ones; `details["directions"]` has the combinations with their own.
+        The estimate. Standard deviations include what remains of the prior along other directions, and its
+        effect on the fitted ones; `details["directions"]` has the combinations and their standard deviations.
 
     Raises:
         InputError: If the loop cannot be simulated, or a guess is zero.
 
     Source:
-        Precision: Bogdan and Abba, (12)-(27), with the residual's colour where they take white noise.
+        Precision: Bogdan and Abba, (12)-(27), with the residual's colour in place of white noise.
         (27) lacks the inverse of B: 100 (sigma^2 diag B^-1)^(1/2) / theta.
     """
     numerics = numerics or choose_numerics(machine, log)
     problem = Problem.of(machine, log, prior, on, numerics, widths)
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     first = None if begin is None else problem.prior.inward(problem.padded(begin))
-    found, told, many = yield from _searched(machine, problem, first, starts, given, drawn)
-    simulated = drawn and rounds(machine, problem)
-    unknowns = len(problem.places)
-    remarks = [f"{found.count} directions of {unknowns} unknowns fitted, the rest left to the guesses"]
-    if told is not None and not simulated and hessian:
-        told, said = yield from _by_hessian(found, told)
-        remarks += said
-    precision, stated = assessed(machine, found, told)
-    if told is not None and not simulated and profile:
-        remarks += yield from add_profiles(found, found.problem.noise(found.minimum, found.count), stated)
-    if rounds(machine, problem):
-        remarks += _of_rounding(drawn, told is not None, hessian or profile)
-    notes = (*notes_of(machine, numerics, log, on), *remarks)
-    return _estimate(machine, found, precision, notes, {"directions": stated} | many)
+    fit, precision, multistart = yield from _search(machine, problem, first, starts, given, drawn)
+
+    quantised = omits_quantisation(machine, problem)
+    # Hessian and profiles are of the loop without quantisation.
+    exact = precision is not None and not (drawn and quantised)
+    notes = [
+        f"{fit.count} directions of {len(problem.places)} unknowns fitted, the others are left to the prior"
+    ]
+    if precision is not None and exact and hessian:
+        precision, remarks = yield from _with_full_hessian(fit, precision)
+        notes += remarks
+    whole, stated = parameter_precision(machine, fit, precision)
+    if exact and profile:
+        notes += yield from add_profiles(fit, fit.problem.noise(fit.minimum, fit.count), stated)
+    if quantised:
+        notes += _quantisation_notes(drawn, precision is not None, hessian or profile)
+
+    notes = (*notes_of(machine, numerics, log, on), *notes)
+    return _estimate(machine, fit, whole, notes, {"directions": stated} | multistart)
 
 
-def _of_rounding(drawn: bool, told: bool, more: bool) -> list[str]:
-    """What to remark of a loop whose readings round; `more`: a Hessian or profiles were asked for."""
+def _quantisation_notes(drawn: bool, identifiable: bool, more: bool) -> list[str]:
+    """Return the notes about a loop with quantised readings.
+
+    Args:
+        drawn: Whether quantisation was simulated.
+        identifiable: Whether any direction is identifiable.
+        more: Whether a Hessian or profiles were asked for.
+    """
     if not drawn:
-        return ["drawn = false: what rounding of the readings does is in no value, nor deviation"]
-    if not told:
+        return ["drawn = false: values and standard deviations leave out the quantisation of the readings"]
+    if not identifiable:
         return []
-    words = [
-        "what rounding of the readings does on average was taken off; criterion and residual are those of "
-        "the fit before that"
+    notes = [
+        "the mean effect of the quantisation of the readings was removed; criterion and residual are those "
+        "of the fit before that"
     ]
     if more:
-        words.append("rounding was simulated: neither Hessian nor profiles say anything beside it")
-    return words
+        notes.append("quantisation was simulated: Hessian and profiles do not apply and were not computed")
+    return notes
 
 
 def _estimate(
     machine: Machine,
-    found: RoundsResult,
+    fit: SubspaceFit,
     precision: Precision,
     notes: tuple[str, ...],
     details: dict[str, Any],
 ) -> Estimate:
-    """The fit as a result."""
-    problem, minimum = found.problem, found.minimum
-    theta = np.asarray(problem.prior.outward(found.point))[: len(problem.places)]
+    """Build the estimate from a fit and its precision."""
+    problem, minimum = fit.problem, fit.minimum
+    theta = np.asarray(problem.prior.outward(fit.point))[: len(problem.places)]
     e, counts = np.asarray(minimum.residual).reshape(problem.measured.shape), problem.weight > 0
-    message = "converged" if found.settled else "the fit within the prior did not settle"
-    if not found.settled and not (np.isfinite(float(minimum.cost)) and np.all(np.isfinite(minimum.jacobian))):
-        message = "the simulation is not finite where the fit ended"
-    of_cost = {"criterion_percent": problem.criterion(minimum), "effective_parameters": found.effective}
+    message = "converged" if fit.settled else "the fit within the prior did not converge"
+    if not fit.settled and not (np.isfinite(float(minimum.cost)) and np.all(np.isfinite(minimum.jacobian))):
+        message = "the simulation is not finite at the end of the fit"
+    of_cost = {"criterion_percent": problem.criterion(minimum), "effective_parameters": fit.effective}
     return Estimate(
         method="output_error",
         machine=machine.with_estimate(theta),
         theta=theta,
         precision=precision,
-        converged=found.settled,
+        converged=fit.settled,
         message=message,
         residual=np.where(counts, e / np.where(counts, problem.weight, 1.0), np.nan),
         samples=int(counts.sum()),
-        steps=found.evaluations,
+        steps=fit.evaluations,
         notes=notes,
         details=details | of_cost,
     )
 
 
-def _by_hessian(found: RoundsResult, told: DirectionPrecision) -> Steps[tuple[DirectionPrecision, list[str]]]:
-    """With the full Hessian's quadratic picture, where it has one; and what to remark."""
-    z, noise = np.asarray(found.minimum.theta), found.problem.noise(found.minimum, found.count)
-    args = (*found.problem.args, found.problem.ladder[-1], found.vectors, z)
-    full = np.asarray((yield SolveRequest(hessian_of, args))) / noise**2 + np.eye(z.size)
+def _with_full_hessian(
+    fit: SubspaceFit, precision: SubspacePrecision
+) -> Steps[tuple[SubspacePrecision, list[str]]]:
+    """Return the precision by the full Hessian, if it is positive definite, and notes."""
+    z, noise = np.asarray(fit.minimum.theta), fit.problem.noise(fit.minimum, fit.count)
+    args = (fit.problem.residual, fit.problem.sharpnesses[-1], fit.vectors, z)
+    full = np.asarray((yield SolveRequest(cost_hessian, args))) / noise**2 + np.eye(z.size)
     if np.linalg.eigvalsh(full)[0] <= 0.0:
-        return told, ["the cost does not curve upwards everywhere: its curvature was not taken"]
-    return with_guesses(
-        found, precision_of_directions(found), found.vectors @ np.linalg.inv(full) @ found.vectors.T
-    ), []
+        return precision, ["the full Hessian is not positive definite and was not used"]
+    covariance = fit.vectors @ np.linalg.inv(full) @ fit.vectors.T
+    return with_prior(fit, precision_of_directions(fit), covariance), []
 
 
-def _searched(
+def _search(
     machine: Machine,
     problem: Problem,
     first: np.ndarray | None,
     starts: int,
     given: Sequence[np.ndarray],
     drawn: bool,
-) -> Steps[tuple[RoundsResult, DirectionPrecision | None, dict[str, Any]]]:
-    """Where the fit ends, how well its directions are told, and what is to be stated of its starts."""
-    if drawn or first is None:
-        yield at_each_soon(problem)
-    most = problem.prior.base.size
-    if rounds(machine, problem):
-        # What rounding does leaves few directions told in the end, and others many valleys.
-        most = AT_ONCE
-        if drawn:
-            yield draws_soon(machine, problem)
-    nowhere = np.zeros(problem.prior.base.size)
-    found = yield from in_rounds(problem, nowhere if first is None else first, most, look=first is None)
-    many: dict[str, Any] = {}
-    if starts > 1 or given:
-        found, many = yield from many_starts(found, np.array([*given, *starts_within(problem, starts)]), most)
-    found, told = yield from _most_probable(machine, found, drawn)
-    if told is None and not many:
-        # A machine that sticks at the guesses, or nearly, shows nothing, nor does it near them.
-        found = yield from _begun_elsewhere(found, drawn)
-        found, told = yield from _most_probable(machine, found, drawn)
-    return found, told, many
+) -> Steps[tuple[SubspaceFit, SubspacePrecision | None, dict[str, Any]]]:
+    """Search for the optimum from all starts.
 
+    Args:
+        machine: The machine to fit.
+        problem: The problem to fit.
+        first: Start in whitened coordinates; None: the best of many points about the guesses.
+        starts: Number of random starts.
+        given: More starts, in whitened coordinates.
+        drawn: Sample the posterior, and simulate quantisation.
 
-def _begun_elsewhere(found: RoundsResult, drawn: bool) -> Steps[RoundsResult]:
-    """The most probable of where the fit ends from a few likely points, and of where it did.
-
-    Points that do not simulate are passed over, and so is where it did if that does not.
+    Returns:
+        The fit; its precision, None if no direction is identifiable; and the details of the multistart.
     """
-    problem, best = found.problem, found
-    for w in (yield from likely_points(problem, _ELSEWHERE)):
-        here = yield from read(problem, problem.ladder[-1], w)
+    if drawn or first is None:
+        yield precompile_residuals_at(problem)
+    most = problem.prior.base.size
+    if omits_quantisation(machine, problem):
+        # Quantisation leaves few directions identifiable in the end, and the others with many local minima.
+        most = BLOCK
+        if drawn:
+            yield precompile_quantised(machine, problem)
+
+    start = np.zeros(problem.prior.base.size) if first is None else first
+    fit = yield from fit_in_subspace(problem, start, most, search_start=first is None)
+    multistart: dict[str, Any] = {}
+    if starts > 1 or given:
+        points = np.array([*given, *random_starts(problem, starts)])
+        fit, multistart = yield from fit_from_many_starts(fit, points, most)
+
+    fit, precision = yield from _posterior_fit(machine, fit, drawn)
+    if precision is None and not multistart:
+        # A machine that sticks at the guesses or close to them gives no gradient there.
+        fit = yield from _restarted(fit, drawn)
+        fit, precision = yield from _posterior_fit(machine, fit, drawn)
+    return fit, precision, multistart
+
+
+def _restarted(fit: SubspaceFit, drawn: bool) -> Steps[SubspaceFit]:
+    """Fit from a few likely points too and return the most probable of all fits.
+
+    Points at which the simulation is not finite are skipped, and so is the given fit if its own is not.
+    """
+    problem, best = fit.problem, fit
+    for w in (yield from likeliest_prior_draws(problem, _RESTARTS)):
+        here = yield from linearise(problem, problem.sharpnesses[-1], w)
         if not np.all(np.isfinite(here.jacobian)):
             continue
         if not np.all(np.isfinite(best.minimum.jacobian)):
-            best = found = RoundsResult(problem, np.eye(w.size), 0, here, found.evaluations, False)
+            best = fit = SubspaceFit(
+                problem=problem,
+                vectors=np.eye(w.size),
+                count=0,
+                minimum=here,
+                evaluations=fit.evaluations,
+                settled=False,
+            )
         noise = best.noise
-        found = yield from _ended(found, w, drawn)
-        best = min(best, found, key=lambda f: loss_of(noise, f.minimum, f.point))
-    return replace(best, evaluations=found.evaluations)
+        fit = yield from _maximum_a_posteriori_fit(fit, w, drawn)
+        best = min(best, fit, key=lambda f: negative_log_posterior(noise, f.minimum, f.point))
+    return replace(best, evaluations=fit.evaluations)
 
 
-def expected_steps(
-    machine: Machine, problem: Problem, own: Float[np.ndarray, " k"]
+def expected_covariance_steps(
+    machine: Machine, problem: Problem, noise: Float[np.ndarray, " k"]
 ) -> Steps[Float[np.ndarray, "q q"]]:
-    """How well a log will tell the unknowns of a machine whose readings round, simulated at the guesses.
+    """Predict the posterior covariance for a loop with quantised readings, simulated at the guesses.
 
     Args:
-        machine: The machine.
-        problem: What is to be compared, with nothing measured: zeros.
-        own: Noise beside what rounding does, by column, over what the problem weighs it by.
+        machine: The machine, whose sensor quantises.
+        problem: The problem to be fitted, with a measured output of zero.
+        noise: Standard deviation of the sensor noise beside quantisation, by column, over the weight, (k,).
 
     Returns:
-        Covariance of all unknowns in units of the prior; the prior's where nothing is told, and where
-        rounding moves the loop so far that a fit which simulates it without will not find its way.
+        Covariance of all unknowns in whitened coordinates, (q, q). It is the prior's if nothing is
+        identifiable, or if quantisation moves the loop so far that a fit without it does not converge.
     """
-    rng, here = np.random.default_rng(0), np.zeros((DRAWN, problem.prior.base.size))
-    # A residual is of what is measured less what is simulated.
-    exact = -(yield from rounded(machine, problem, np.random.default_rng(4)))[0]
+    rng, guesses = np.random.default_rng(0), np.zeros((DRAWS, problem.prior.base.size))
+    # A residual is the measured output less the simulated one, and the measured output is zero.
+    exact = -(yield from quantised_residuals(machine, problem, np.random.default_rng(4)))[0]
     exact = exact.reshape(problem.measured.shape)
-    log = exact + own * rng.standard_normal(exact.shape)
+    log = exact + noise * rng.standard_normal(exact.shape)
     problem = replace(problem, measured=log / problem.weight)
-    minimum = yield from read(problem, problem.ladder[-1], here[0])
-    followed = log - np.asarray(minimum.residual).reshape(log.shape)
-    if np.any(np.var(exact - followed, axis=0) > _FOLLOWED * np.var(followed, axis=0)):
-        return np.eye(len(here[0]))
+
+    minimum = yield from linearise(problem, problem.sharpnesses[-1], guesses[0])
+    without = log - np.asarray(minimum.residual).reshape(log.shape)
+    if np.any(np.var(exact - without, axis=0) > _REPRESENTED * np.var(without, axis=0)):
+        return np.eye(len(guesses[0]))
+
     jacobian = np.asarray(minimum.jacobian)
     vectors, count = identifiable_directions(jacobian / problem.noise(minimum, 0), 0)
-    minimum = replace(minimum, theta=vectors.T @ here[0], jacobian=jacobian @ vectors)
+    minimum = replace(minimum, theta=vectors.T @ guesses[0], jacobian=jacobian @ vectors)
     if count:
-        _, told = yield from through_rounding(
-            machine, RoundsResult(problem, vectors, count, minimum, 1, True)
+        fit = SubspaceFit(
+            problem=problem, vectors=vectors, count=count, minimum=minimum, evaluations=1, settled=True
         )
-        if told is not None:
-            return told.whole
+        _, precision = yield from fit_with_quantisation(machine, fit)
+        if precision is not None and precision.whitened_covariance is not None:
+            return precision.whitened_covariance
     return np.eye(len(vectors))
 
 
-def _most_probable(
-    machine: Machine, found: RoundsResult, drawn: bool
-) -> Steps[tuple[RoundsResult, DirectionPrecision | None]]:
-    """On to where guesses and log agree, and how well directions are told there by both."""
-    if not np.all(np.isfinite(found.minimum.jacobian)):
-        return found, None
-    found = yield from _ended(found, found.point, drawn)
-    if not found.count:
-        return found, None
-    if drawn and rounds(machine, found.problem):
-        return (yield from through_rounding(machine, found))
+def _posterior_fit(
+    machine: Machine, fit: SubspaceFit, drawn: bool
+) -> Steps[tuple[SubspaceFit, SubspacePrecision | None]]:
+    """Move a fit to the maximum a posteriori and compute the precision of its directions there.
+
+    Args:
+        machine: The machine to fit.
+        fit: The fit in the subspace.
+        drawn: Sample the posterior, and simulate quantisation; else take Laplace's approximation.
+    """
+    if not np.all(np.isfinite(fit.minimum.jacobian)):
+        return fit, None
+    fit = yield from _maximum_a_posteriori_fit(fit, fit.point, drawn)
+    if not fit.count:
+        return fit, None
+    if drawn and omits_quantisation(machine, fit.problem):
+        return (yield from fit_with_quantisation(machine, fit))
+
     if drawn:
-        whole, best = yield from spread(found, found.noise)
-        if np.any(best != found.point):
-            # It ended in a valley that is not the best.
-            found = yield from _ended(found, best, drawn)
-            whole, _ = yield from spread(found, found.noise)
+        covariance, best = yield from posterior_second_moment(fit, fit.noise)
+        if np.any(best != fit.point):
+            # The descent ended in a local minimum that is not the best.
+            fit = yield from _maximum_a_posteriori_fit(fit, best, drawn)
+            covariance, _ = yield from posterior_second_moment(fit, fit.noise)
     else:
-        whole = quadratic(found, found.noise)
-    while found.count:
-        told = with_guesses(found, precision_of_directions(found), whole)
-        stays = told.std <= STAYS
-        if np.all(stays):
-            return found, told
-        # What noise of the residual's colour leaves too wide goes behind those that stay.
-        order = np.argsort(~np.append(stays, np.zeros(len(whole) - found.count, bool)), kind="stable")
-        found = _along(found, found.vectors[:, order], int(stays.sum()))
-    return found, None
+        covariance = laplace_covariance(fit, fit.noise)
+
+    while fit.count:
+        precision = with_prior(fit, precision_of_directions(fit), covariance)
+        kept = precision.std <= KEPT_STD
+        if np.all(kept):
+            return fit, precision
+        # Directions that coloured noise leaves too uncertain go behind those that are kept.
+        order = np.argsort(~np.append(kept, np.zeros(len(covariance) - fit.count, bool)), kind="stable")
+        fit = _in_directions(fit, fit.vectors[:, order], int(kept.sum()))
+    return fit, None
 
 
-def _ended(found: RoundsResult, w: Float[np.ndarray, " q"], drawn: bool) -> Steps[RoundsResult]:
-    """The fit taken from a point to the most probable one, its directions those that are told there."""
-    noise = found.problem.noise(found.minimum, found.count)
-    w, here, settled = yield from (past_kinks if drawn else most_probable)(found.problem, noise, w)
-    vectors, count = identifiable_directions(np.asarray(here.jacobian) / noise, found.count)
-    spent = found.evaluations + int(here.steps)
-    return _along(RoundsResult(found.problem, np.eye(len(w)), count, here, spent, settled), vectors, count)
+def _maximum_a_posteriori_fit(
+    fit: SubspaceFit, w: Float[np.ndarray, " q"], drawn: bool
+) -> Steps[SubspaceFit]:
+    """Descend from a point to the maximum a posteriori, and recompute the identifiable directions there."""
+    noise = fit.problem.noise(fit.minimum, fit.count)
+    descend = restarted_maximum_a_posteriori if drawn else maximum_a_posteriori
+    w, here, settled = yield from descend(fit.problem, noise, w)
+    vectors, count = identifiable_directions(np.asarray(here.jacobian) / noise, fit.count)
+    moved = SubspaceFit(
+        problem=fit.problem,
+        vectors=np.eye(len(w)),
+        count=count,
+        minimum=here,
+        evaluations=fit.evaluations + int(here.steps),
+        settled=settled,
+    )
+    return _in_directions(moved, vectors, count)
 
 
-def _along(found: RoundsResult, vectors: np.ndarray, count: int) -> RoundsResult:
-    """The same point along other directions, of which so many are fitted."""
-    turn = vectors.T @ found.vectors
-    minimum = found.minimum
+def _in_directions(fit: SubspaceFit, vectors: np.ndarray, count: int) -> SubspaceFit:
+    """Return the fit at the same point in other directions, the first `count` of which are fitted."""
+    turn = vectors.T @ fit.vectors
+    minimum = fit.minimum
     minimum = replace(minimum, theta=turn @ minimum.theta, jacobian=np.asarray(minimum.jacobian) @ turn.T)
-    return replace(found, vectors=vectors, count=count, minimum=minimum)
+    return replace(fit, vectors=vectors, count=count, minimum=minimum)

@@ -1,4 +1,4 @@
-"""How well a fit within a prior tells each combination of unknowns, and each unknown."""
+"""Precision of a fit within a prior: of each identifiable direction, and of each unknown."""
 
 from __future__ import annotations
 
@@ -10,44 +10,53 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Array
-from jaxid.estimators.within_prior.posterior import loss_of, most_probable
-from jaxid.estimators.within_prior.problem import RoundsResult, residual_of
+from jaxid.estimators.within_prior.posterior import maximum_a_posteriori, negative_log_posterior
+from jaxid.estimators.within_prior.problem import WeightedResidual
+from jaxid.estimators.within_prior.subspace import SubspaceFit
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision, assess, full_hessian
 
-# A parameter is told where what is left of its prior is less than this.
-_TOLD = 0.5
-# Entries of a combination below this are left out when it is named.
+# An unknown is identifiable if its posterior standard deviation is below this, in those of its prior.
+_IDENTIFIABLE_STD = 0.5
+# Entries of a unit vector below this are omitted from the named combination.
 _NEGLIGIBLE = 0.1
-# A profile is taken at so many standard deviations of the quadratic picture.
-_PROFILED = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-# Variances by which one may end below the fit, which is not told to the last digit.
+# Offsets at which a profile likelihood is taken, in posterior standard deviations.
+_PROFILE_AT = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+# Rise of twice the negative log-posterior by which a profile may be below the fit: an optimum is not
+# converged to the last digit.
 _BELOW = 0.1
 
 
 @eqx.filter_jit
-def hessian_of(*args: Any) -> Array:
-    """Of the cost, in the directions' coordinates, at a sharpness."""
-    replay, places, plant, *rest, sharpness, vectors, z = args
-    return full_hessian(residual_of(replay, places, plant.smoothed(sharpness), *rest, vectors), z)
+def cost_hessian(compared: WeightedResidual, sharpness: Array, vectors: Array, z: Array) -> Array:
+    """Return the full Hessian of the cost in the coordinates of some directions, (k, k).
+
+    Args:
+        compared: The residual, half of whose sum of squares is the cost.
+        sharpness: Sharpness of the smoothed sign.
+        vectors: Directions as columns, (q, k).
+        z: Coordinates of the point, (k,).
+    """
+    return full_hessian(compared.at_sharpness(sharpness).along(vectors), z)
 
 
 @dataclass(frozen=True)
-class DirectionPrecision:
-    """How well the fitted directions are told.
+class SubspacePrecision:
+    """Precision of the fitted directions.
 
     Args:
-        covariance: Of their coordinates, (r, r).
-        white: Standard deviations by the log alone, as if noise were white, (r,).
-        information: See `Precision`.
-        whole: Covariance of all unknowns in units of the prior; none where what is held counts as its prior.
+        covariance: Covariance of their coordinates, (r, r).
+        white_std: Standard deviations from the log alone, as if the noise were white, (r,).
+        information: Eigenvalues of the scaled information matrix, see `jaxid.numerics.precision.Precision`.
+        whitened_covariance: Posterior covariance of all unknowns in whitened coordinates, (q, q); None: that
+            of the fitted directions, and the prior along the others.
     """
 
     covariance: np.ndarray
-    white: np.ndarray
+    white_std: np.ndarray
     information: np.ndarray
-    whole: np.ndarray | None = None
+    whitened_covariance: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:
@@ -55,15 +64,19 @@ class DirectionPrecision:
         return np.sqrt(np.diag(self.covariance))
 
 
-def precision_of_directions(found: RoundsResult) -> DirectionPrecision:
-    """Precision of the fitted directions, one at least, by the log alone: from the residual's own colour."""
-    problem, r = found.problem, found.count
+def precision_of_directions(fit: SubspaceFit) -> SubspacePrecision:
+    """Compute the precision of the fitted directions from the log alone, with the residual's colour.
+
+    Args:
+        fit: The fit, of at least one direction.
+    """
+    problem, r = fit.problem, fit.count
     shape, counts = problem.measured.shape, problem.weight > 0
-    jacobian = np.asarray(found.minimum.jacobian).reshape(*shape, -1)[..., :r]
-    e = np.asarray(found.minimum.residual).reshape(shape)
+    jacobian = np.asarray(fit.minimum.jacobian).reshape(*shape, -1)[..., :r]
+    e = np.asarray(fit.minimum.residual).reshape(shape)
     deviation = problem.weight * (problem.measured - problem.measured.mean(axis=0))
     signal = float(np.linalg.norm(deviation))
-    told = assess(
+    coloured = assess(
         [f"direction {k + 1}" for k in range(r)],
         jacobian,
         e,
@@ -72,92 +85,116 @@ def precision_of_directions(found: RoundsResult) -> DirectionPrecision:
         np.ones(r),
         crossed=problem.on == "both",
     )
-    # Of the triangle: some directions are told a million times better than others.
+
+    # The triangular factor keeps digits that the normal matrix loses: the precision of directions differs by
+    # factors of a million.
     triangle = np.linalg.qr(jacobian.reshape(-1, r), mode="r")
-    white = problem.noise(found.minimum, r) * np.linalg.norm(np.linalg.inv(triangle), axis=1)
-    # A colour read off a hundred samples is itself uncertain: never less than white noise would leave.
-    larger = np.maximum(1.0, white / told.std)
-    of_seen = told.covariance * np.outer(larger, larger)
-    return DirectionPrecision(of_seen, white, told.information)
+    white = problem.noise(fit.minimum, r) * np.linalg.norm(np.linalg.inv(triangle), axis=1)
+
+    # A colour that is estimated from a hundred samples is itself uncertain: the standard deviation is never
+    # less than with white noise.
+    larger = np.maximum(1.0, white / coloured.std)
+    return SubspacePrecision(coloured.covariance * np.outer(larger, larger), white, coloured.information)
 
 
-def with_guesses(found: RoundsResult, told: DirectionPrecision, whole: np.ndarray) -> DirectionPrecision:
-    """With the guesses counted in.
+def with_prior(
+    fit: SubspaceFit, precision: SubspacePrecision, whitened_covariance: np.ndarray
+) -> SubspacePrecision:
+    """Return the precision with the prior included.
 
     Args:
-        found: The fit.
-        told: By the log alone.
-        whole: Covariance of all unknowns by guesses and log, as if noise were white.
+        fit: The fit.
+        precision: Precision of the fitted directions from the log alone.
+        whitened_covariance: Posterior covariance of all unknowns as if the noise were white, (q, q).
     """
-    seen = found.vectors[:, : found.count]
-    along = np.eye(len(whole)) + (seen * (told.std / told.white - 1.0)) @ seen.T
-    whole = along @ whole @ along.T
-    return replace(told, covariance=seen.T @ whole @ seen, whole=whole)
+    fitted = fit.vectors[:, : fit.count]
+    # The colour of the noise widens the fitted directions.
+    widening = np.eye(len(whitened_covariance))
+    widening = widening + (fitted * (precision.std / precision.white_std - 1.0)) @ fitted.T
+    covariance = widening @ whitened_covariance @ widening.T
+    return replace(precision, covariance=fitted.T @ covariance @ fitted, whitened_covariance=covariance)
 
 
-def assessed(
-    machine: Machine, found: RoundsResult, told: DirectionPrecision | None
+def parameter_precision(
+    machine: Machine, fit: SubspaceFit, precision: SubspacePrecision | None
 ) -> tuple[Precision, list[dict[str, Any]]]:
-    """Precision of the parameters, and of the directions; None where no direction is told."""
-    problem, r = found.problem, found.count
-    if told is None:
-        return _nothing_told(machine)
+    """Compute the precision of the parameters, and the entry `directions` of the details.
+
+    Args:
+        machine: The machine whose unknowns were fitted.
+        fit: The fit.
+        precision: Precision of the fitted directions; None if no direction is identifiable.
+    """
+    problem, r = fit.problem, fit.count
+    if precision is None:
+        return _nothing_identifiable(machine)
+
     names = [*machine.parameters.names, *problem.nuisances]
-    z = np.asarray(found.minimum.theta)
-    seen, held = found.vectors[:, :r], found.vectors[:, r:]
-    whole = seen @ told.covariance @ seen.T + held @ held.T if told.whole is None else told.whole
-    slope = problem.prior.slope(np.asarray(problem.prior.outward(found.point)))
+    z = np.asarray(fit.minimum.theta)
+    fitted, unidentifiable = fit.vectors[:, :r], fit.vectors[:, r:]
+    whitened = precision.whitened_covariance
+    if whitened is None:
+        whitened = fitted @ precision.covariance @ fitted.T + unidentifiable @ unidentifiable.T
+
+    slope = problem.prior.slope(np.asarray(problem.prior.outward(fit.point)))
     p = len(problem.places)
-    left = np.sqrt(np.diag(whole))[:p]
-    identifiable = left < _TOLD
-    covariance = (whole * np.outer(slope, slope))[:p, :p]
+    identifiable = np.sqrt(np.diag(whitened))[:p] < _IDENTIFIABLE_STD
+    covariance = (whitened * np.outer(slope, slope))[:p, :p]
     covariance[~identifiable] = covariance[:, ~identifiable] = np.nan
+
     stated = [
         {
-            "combination": dict(zip(names, found.vectors[:, k].tolist(), strict=True)),
+            "combination": dict(zip(names, fit.vectors[:, k].tolist(), strict=True)),
             "value": float(z[k]),
-            "std": float(told.std[k]),
-            "std_white": float(told.white[k]),
+            "std": float(precision.std[k]),
+            "std_white": float(precision.white_std[k]),
         }
         for k in range(r)
     ]
-    blind = [c for c in (_named(names, v) for v in held.T) if any(n in c for n in names[:p])]
-    return Precision(covariance, identifiable, blind, told.information), stated
+    combinations = [_named(names, v) for v in unidentifiable.T]
+    combinations = [c for c in combinations if any(n in c for n in names[:p])]
+    return Precision(covariance, identifiable, combinations, precision.information), stated
 
 
-def _nothing_told(machine: Machine) -> tuple[Precision, list[dict[str, Any]]]:
-    """Of a log that tells no combination better than the guesses."""
+def _nothing_identifiable(machine: Machine) -> tuple[Precision, list[dict[str, Any]]]:
+    """Return the precision after a log that identifies no direction better than the prior."""
     names = machine.parameters.names
     p = len(names)
-    blind = [{n: 1.0} for n in names]
-    return Precision(np.full((p, p), np.nan), np.zeros(p, bool), blind, np.zeros(0)), []
+    combinations = [{n: 1.0} for n in names]
+    return Precision(np.full((p, p), np.nan), np.zeros(p, bool), combinations, np.zeros(0)), []
 
 
 def _named(names: Sequence[str], vector: np.ndarray) -> dict[str, float]:
     return {n: float(v) for n, v in zip(names, vector, strict=True) if abs(v) > _NEGLIGIBLE}
 
 
-def add_profiles(found: RoundsResult, noise: float, stated: list[dict[str, Any]]) -> Steps[list[str]]:
-    """Add to each direction its profile: twice the nats by which guess and log speak against it elsewhere.
+def add_profiles(fit: SubspaceFit, noise: float, stated: list[dict[str, Any]]) -> Steps[list[str]]:
+    """Add a profile likelihood to each direction: the rise of twice the negative log-posterior.
+
+    Args:
+        fit: The fit, at the maximum a posteriori.
+        noise: Standard deviation of its residual, taken as white.
+        stated: The entry `directions` of the details, to which `profile` is added.
 
     Returns:
-        What to remark: profiles that fall below the fit.
+        Notes about profiles that fall below the fit.
     """
-    best, words = found.point, []
+    best, notes = fit.point, []
     below = "the profile of direction {} falls below the fit: there is a better optimum beside it"
     for k, direction in enumerate(stated):
-        along, rise = found.vectors[:, k], np.full(_PROFILED.size, np.nan)
-        lowest = loss_of(noise, found.minimum, best)
-        # From the fit outwards: each begins where its neighbour ended.
-        for side in (_PROFILED < 0, _PROFILED > 0):
+        along, rise = fit.vectors[:, k], np.full(_PROFILE_AT.size, np.nan)
+        lowest = negative_log_posterior(noise, fit.minimum, best)
+        # From the fit outwards: each descent begins at the optimum of its neighbour.
+        for side in (_PROFILE_AT < 0, _PROFILE_AT > 0):
             w, before = best, 0.0
             places = np.flatnonzero(side)
-            for i in places[np.argsort(np.abs(_PROFILED[places]))]:
-                w = w + (_PROFILED[i] - before) * direction["std"] * along
-                before = _PROFILED[i]
-                w, here, _ = yield from most_probable(found.problem, noise, w, held=along)
-                rise[i] = 2 * (loss_of(noise, here, w) - lowest)
-        direction["profile"] = {"at_std": _PROFILED.tolist(), "rise": rise.tolist()}
+            for i in places[np.argsort(np.abs(_PROFILE_AT[places]))]:
+                w = w + (_PROFILE_AT[i] - before) * direction["std"] * along
+                before = _PROFILE_AT[i]
+                w, here, _ = yield from maximum_a_posteriori(fit.problem, noise, w, held=along)
+                rise[i] = 2 * (negative_log_posterior(noise, here, w) - lowest)
+
+        direction["profile"] = {"at_std": _PROFILE_AT.tolist(), "rise": rise.tolist()}
         if np.nanmin(rise) < -_BELOW:
-            words.append(below.format(k + 1))
-    return words
+            notes.append(below.format(k + 1))
+    return notes

@@ -1,4 +1,4 @@
-"""Guesses as a prior of the unknowns: how far from each the truth may be."""
+"""Prior distribution of the unknowns: the guesses of a case and their standard deviations."""
 
 from __future__ import annotations
 
@@ -16,9 +16,16 @@ from jaxid.machine import Machine
 
 
 class Prior(eqx.Module):
-    """Guesses and how far from them the unknowns may be: physical values, and in units of that.
+    """Independent prior of each unknown, and the whitening by it.
 
-    What must be positive is log-normal about its guess, the rest normal.
+    Unknowns that must be positive are log-normal about their guess, the others are normal. Whitened
+    coordinates `w` have a standard normal prior: zero is the guess, one is a standard deviation.
+
+    Args:
+        base: Median of each unknown, its guess, (p,) [units of the unknowns].
+        scale: Standard deviation, of the logarithm if `log`, else in the unknown's unit, (p,).
+        log: Mask of the unknowns that are log-normal, (p,).
+        lower, upper: Bounds on the physical values, (p,) [units of the unknowns].
     """
 
     base: Float[Array, " p"]
@@ -28,17 +35,17 @@ class Prior(eqx.Module):
     upper: Float[Array, " p"]
 
     def outward(self, w: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Physical values, within their bounds."""
+        """Return the physical values at whitened coordinates, clipped to their bounds."""
         moved = jnp.where(self.log, self.base * jnp.exp(self.scale * w), self.base + self.scale * w)
         return jnp.clip(moved, self.lower, self.upper)
 
     def inward(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """In units of the prior."""
+        """Return the whitened coordinates of physical values."""
         ratio = np.where(self.log, np.maximum(theta, 1e-300) / np.where(self.log, self.base, 1.0), 1.0)
         return np.where(self.log, np.log(ratio), theta - self.base) / self.scale
 
     def slope(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """Physical change for a change of one prior."""
+        """Return the derivative of each physical value in its whitened coordinate."""
         return np.where(self.log, theta, 1.0) * self.scale
 
     @classmethod
@@ -47,31 +54,39 @@ class Prior(eqx.Module):
         machine: Machine,
         width: float,
         nuisance: Float[np.ndarray, " k"],
-        own: Mapping[str, float] | None = None,
+        widths: Mapping[str, float] | None = None,
     ) -> Prior:
-        """Of a machine's guesses, a relative width around each or its own, and of nuisances about zero.
+        """Build the prior of a machine's unknowns, followed by nuisance parameters about zero.
+
+        Args:
+            machine: The machine, whose guesses are the medians.
+            width: Relative standard deviation of the guesses.
+            nuisance: Standard deviations of the nuisance parameters, (k,).
+            widths: Standard deviations of single unknowns by name, in place of `width`.
 
         Raises:
-            InputError: If a guess is zero, of which nothing can be a part.
+            InputError: If a guess is zero and `widths` has no standard deviation for it.
         """
         free = machine.parameters.free
-        own = own or {}
+        widths = widths or {}
         for f in free:
-            if f.guess == 0.0 and f.name not in own:
+            if f.guess == 0.0 and f.name not in widths:
                 raise InputError(
-                    f"{f.name} has a guess of zero, which a relative prior says nothing of",
+                    f"a relative prior needs a nonzero guess, and {f.name} has guess = 0",
                     where="[output_error] prior",
                     hint="give it a guess of its natural size",
                 )
+
         guess, (lower, upper) = machine.parameters.guess, machine.parameters.bounds
         log = Transform.of(machine.parameters).log
-        none = np.zeros(nuisance.size)
         scale = np.where(log, width, width * np.abs(guess))
-        scale = np.array([own.get(f.name, s) for f, s in zip(free, scale, strict=True)])
+        scale = np.array([widths.get(f.name, s) for f, s in zip(free, scale, strict=True)])
+
+        none = np.zeros(nuisance.size)
         return cls(
-            np.concatenate([guess, none]),
-            np.concatenate([scale, nuisance]),
-            np.concatenate([log, none.astype(bool)]),
-            np.concatenate([lower, none - np.inf]),
-            np.concatenate([upper, none + np.inf]),
+            base=np.concatenate([guess, none]),
+            scale=np.concatenate([scale, nuisance]),
+            log=np.concatenate([log, none.astype(bool)]),
+            lower=np.concatenate([lower, none - np.inf]),
+            upper=np.concatenate([upper, none + np.inf]),
         )

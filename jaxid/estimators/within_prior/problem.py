@@ -1,69 +1,90 @@
-"""What a fit within a prior compares: a residual in units of the prior, and the way down its cost."""
+"""The residual of a fit within a prior, in whitened coordinates of the unknowns."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.estimators.common.levenberg_marquardt import Minimum, Progress, descend
-from jaxid.estimators.output_error import (
-    choose_numerics,
-    measured_output,
-    output_residual,
-    turning_steps,
-)
+from jaxid.estimators.common.levenberg_marquardt import Minimum
+from jaxid.estimators.output_error import measured_output, output_residual, turning_steps
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
-from jaxid.numerics.lanes import ParallelCalls, Precompile, SolveRequest, Steps
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.replay import Numerics, Replay, from_rest, make_replay, with_sensor
 from jaxid.simulation.step_size import steps_with_numerical_damping, with_numerical_damping
 
-# In parts of the variance of one sample: where a fit has settled, and where it is near enough to go on
-# sharper.
-SETTLED = 0.02
-NEAR = 1.0
-# Farther from its guess than so many priors no unknown is taken.
-FAR = 8.0
-# Coordinates of a compiled fit come in multiples of this: few directions are told, and each costs as much
-# as the simulation itself.
-AT_ONCE = 4
-# What is left of the prior along a direction that was fitted and stays.
-STAYS = 0.6
-# Points that are drawn at a time, and those at which one compiled call simulates.
-DRAWN, _PART = 512, 128
-# No pull towards the guesses.
-NO_PULL = np.zeros(())
-# Friction that rises with speeding up lets a velocity stand, and costs have a kink wherever it does: such
-# a machine is fitted with that rounded over these parts of it. At most so many evaluations at each.
-_LADDER = (1.0, 0.3, 0.1)
-_A_RUNG = 25
-# Evaluations in a compiled call.
-_A_CALL = 4
+# Friction that acts only while the speed grows can hold a velocity constant, and the cost has a kink at
+# each such point. Such a machine is fitted by continuation: this friction is smoothed over these fractions
+# of its width, one after the other.
+_SHARPNESSES = (1.0, 0.3, 0.1)
+
+
+class WeightedResidual(eqx.Module):
+    """The simulated log less the measured one, weighted; a tree of arrays for compiled functions.
+
+    Args:
+        replay: The simulation of the log: the loop, or the plant under the measured force.
+        places: Paths of the unknowns in the plant.
+        plant: The plant, at any values of the unknowns.
+        measured: Measured output, (time, k) [units of the columns].
+        weight: Weight of each entry, zero for entries that do not count, (time, k).
+        prior: Prior of the unknowns, followed by that of the nuisance parameters.
+        on: Output that is compared: "position", "force" or "both".
+    """
+
+    replay: Replay
+    places: tuple
+    plant: Plant
+    measured: Array
+    weight: Array
+    prior: Prior
+    on: str
+
+    def at_sharpness(self, sharpness: Array) -> WeightedResidual:
+        """Return the residual with the smoothed sign of the friction at another sharpness."""
+        return replace(self, plant=self.plant.smoothed(sharpness))
+
+    def from_start(self, start: Array) -> WeightedResidual:
+        """Return the residual from shifted initial positions of the joints with an encoder."""
+        return replace(self, replay=self.replay.started(start))
+
+    def along(self, vectors: Array, origin: Array | float = 0.0) -> Callable[[Array], Array]:
+        """Return the residual as a function of coordinates z, at the whitened point origin + vectors z."""
+        physical = output_residual(self.replay, self.places, self.plant, self.measured, self.weight, self.on)
+
+        def residual(z: Array) -> Array:
+            # The nuisance parameters behind the unknowns are initial positions; initial velocities are
+            # known to be those of the log.
+            theta, start = jnp.split(self.prior.outward(origin + vectors @ z), [len(self.places)])
+            if start.size:
+                start = self.replay.follow @ start
+            return physical(jnp.concatenate([theta, start, jnp.zeros_like(start)]))
+
+        return residual
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is compared, as arrays.
+    """A fit within a prior, as arrays.
 
     Args:
-        replay: The loop, or the input.
-        places, plant: Of the unknowns.
-        measured, weight: (time, k).
-        prior: Of the unknowns, nuisances behind them.
-        on: What of the simulation is compared.
-        ladder: Sharpnesses at which to fit, one after the other.
-        encoders: Joints that have one.
+        replay: The simulation of the log: the loop, or the plant under the measured force.
+        places: Paths of the unknowns in the plant.
+        plant: The plant, at any values of the unknowns.
+        measured: Measured output, (time, k) [units of the columns].
+        weight: Weight of each entry, zero for entries that do not count, (time, k).
+        prior: Prior of the unknowns, followed by that of the nuisance parameters.
+        on: Output that is compared: "position", "force" or "both".
+        sharpnesses: Sharpness of the smoothed sign at each step of the continuation.
+        encoders: Indices of the joints that have an encoder.
     """
 
     replay: Replay
@@ -73,13 +94,21 @@ class Problem:
     weight: np.ndarray
     prior: Prior
     on: str
-    ladder: tuple[np.ndarray, ...]
+    sharpnesses: tuple[np.ndarray, ...]
     encoders: tuple[int, ...]
 
     @property
-    def args(self) -> tuple:
-        """For the compiled functions."""
-        return (self.replay, self.places, self.plant, self.measured, self.weight, self.prior, self.on)
+    def residual(self) -> WeightedResidual:
+        """The residual, as an argument of compiled functions."""
+        return WeightedResidual(
+            replay=self.replay,
+            places=self.places,
+            plant=self.plant,
+            measured=self.measured,
+            weight=self.weight,
+            prior=self.prior,
+            on=self.on,
+        )
 
     @classmethod
     def of(
@@ -91,12 +120,16 @@ class Problem:
         numerics: Numerics,
         widths: Mapping[str, float] | None = None,
     ) -> Problem:
-        """Of a machine and its log, from rest; see `jaxid.estimators.within_prior.fit.directions_steps`.
+        """Set up the fit of a machine to a log that begins at rest.
+
+        The arguments are those of `jaxid.estimators.within_prior.fit.within_prior_steps`.
 
         Raises:
             InputError: If a guess is zero, or the loop cannot be simulated.
         """
         n, encoders = log.position.shape[1], tuple(np.flatnonzero(log.measured).tolist())
+
+        # Numerical damping of unresolved springs allows larger steps.
         plant = with_numerical_damping(machine.plant, jnp.asarray(log.filled[0]), log.period)
         if plant is not machine.plant and numerics.set_valued:
             fewer = max(steps_with_numerical_damping(numerics.substeps, on), turning_steps(machine, log))
@@ -104,272 +137,72 @@ class Problem:
         replay = from_rest(make_replay(machine, log, numerics))
         if on != "position":
             replay = with_sensor(replay, Sensor())
-        measured, counts = measured_output(machine, log, on)
+
+        # The initial positions are nuisance parameters, known to the standard deviation of the sensor.
         std = machine.sensor.position_std
         start = np.zeros(0) if std is None else np.broadcast_to(np.asarray(std), n)[[*encoders]]
-        whole = Prior.of(machine, prior, start, widths)
-        weight = np.tile(counts.astype(float), (len(measured), 1))
+        measured, counts = measured_output(machine, log, on)
         m = log.force.shape[1]
-        ladder = _LADDER if _rises(plant, np.zeros(n), np.zeros(m)) else (plant.smoothing.sharpness,)
-        sharp = tuple(np.asarray(s) for s in ladder)
-        places = machine.parameters.places
-        return cls(replay, places, plant, measured, weight, whole, on, sharp, encoders)
+        rises = _rises(plant, np.zeros(n), np.zeros(m))
+        sharpnesses = _SHARPNESSES if rises else (plant.smoothing.sharpness,)
+        return cls(
+            replay=replay,
+            places=machine.parameters.places,
+            plant=plant,
+            measured=measured,
+            weight=np.tile(counts.astype(float), (len(measured), 1)),
+            prior=Prior.of(machine, prior, start, widths),
+            on=on,
+            sharpnesses=tuple(np.asarray(s) for s in sharpnesses),
+            encoders=encoders,
+        )
 
     @property
     def nuisances(self) -> list[str]:
-        """Names of what is unknown behind the machine's own unknowns."""
+        """Names of the nuisance parameters, which follow the machine's unknowns."""
         count = self.prior.base.size - len(self.places)
         return [f"start position {k + 1}" for k in self.encoders[:count]]
 
     def padded(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " q"]:
-        """Unknowns with all nuisances at zero."""
+        """Return values of the unknowns followed by nuisance parameters of zero."""
         return np.concatenate([theta, np.zeros(self.prior.base.size - len(theta))])
 
-    def weighed(self, minimum: Minimum) -> tuple[Problem, Minimum]:
-        """Columns of the residual by their own spread, where there are several; the minimum likewise."""
+    def reweighted(self, minimum: Minimum) -> tuple[Problem, Minimum]:
+        """Weight each column of the residual by its standard deviation, if there are several.
+
+        Args:
+            minimum: A minimum of this problem.
+
+        Returns:
+            The problem with the new weights, and the minimum rescaled to them.
+        """
         counts = self.weight[0] > 0
         if counts.sum() == 1:
             return self, minimum
+
         e = np.asarray(minimum.residual).reshape(self.measured.shape)[:, counts] / self.weight[0, counts]
         least = 1e-12 * np.std(self.measured[:, counts], axis=0)
         row, factor = np.zeros(len(counts)), np.zeros(len(counts))
         row[counts] = 1.0 / np.maximum(np.std(e, axis=0), least)
         factor[counts] = row[counts] / self.weight[0, counts]
+
         by = np.tile(factor, len(self.measured))
         e, jacobian = by * np.asarray(minimum.residual), by[:, None] * np.asarray(minimum.jacobian)
-        weighed = replace(minimum, residual=e, jacobian=jacobian, cost=np.asarray(0.5 * e @ e))
-        return replace(self, weight=np.tile(row, (len(self.measured), 1))), weighed
+        rescaled = replace(minimum, residual=e, jacobian=jacobian, cost=np.asarray(0.5 * e @ e))
+        return replace(self, weight=np.tile(row, (len(self.measured), 1))), rescaled
 
     def noise(self, minimum: Minimum, count: float) -> float:
-        """Standard deviation of a weighted residual of which so many unknowns are fitted."""
+        """Return the standard deviation of the weighted residual, with `count` fitted parameters."""
         samples = int(np.sum(self.weight > 0))
         return float(np.sqrt(2 * float(minimum.cost) / max(samples - count, 1)))
 
     def criterion(self, minimum: Minimum) -> float:
-        """(11) of Bogdan and Abba: squared residual over squared deviation from the mean, percent."""
+        """Return (11) of Bogdan and Abba: squared residual over squared deviation from the mean [%]."""
         spread = np.sum((self.weight * (self.measured - self.measured.mean(axis=0))) ** 2)
         return float(100 * 2 * float(minimum.cost) / spread)
 
 
 @eqx.filter_jit
 def _rises(plant: Plant, q: Array, u: Array) -> bool:
-    """Whether any friction acts only while speed grows; known when it is compiled."""
+    """Tell whether any friction acts only while the speed grows; decided when this is compiled."""
     return bool(plant.balance(q, q, q, u, jnp.zeros(()), plant.initial_states(u)).rises)
-
-
-def signed(vectors: Float[np.ndarray, "q k"]) -> Float[np.ndarray, "q k"]:
-    """Columns that come with either sign, with their largest entry positive."""
-    largest = np.argmax(np.abs(vectors), axis=0)
-    return vectors * np.sign(vectors[largest, np.arange(vectors.shape[1])])
-
-
-def columns(vectors: Float[np.ndarray, "q q"], count: int) -> Float[np.ndarray, "q k"]:
-    """The first directions, so many at least, in a number that compiled code is made for."""
-    return vectors[:, : AT_ONCE * max(1, -(-count // AT_ONCE))]
-
-
-def residual_of(
-    replay: Replay,
-    places: tuple,
-    plant: Plant,
-    measured: Array,
-    weight: Array,
-    prior: Prior,
-    on: str,
-    vectors: Array,
-    origin: Array | float = 0.0,
-) -> Any:
-    """Residual as a function of the directions' coordinates, counted from a point in units of the prior."""
-    physical = output_residual(replay, places, plant, measured, weight, on)
-
-    def residual(z: Array) -> Array:
-        # Behind the unknowns stand positions at the start; velocities there are known to be those of the log.
-        theta, start = jnp.split(prior.outward(origin + vectors @ z), [len(places)])
-        if start.size:
-            start = replay.follow @ start
-        return physical(jnp.concatenate([theta, start, jnp.zeros_like(start)]))
-
-    return residual
-
-
-@eqx.filter_jit
-def residual_at_each(*args: Any) -> Array:
-    """Residuals at many points in units of the prior, from as many starts; `Problem.args` first."""
-    *problem, sharpness, w, starts = args
-    replay, places, plant, *rest = problem
-    plant = plant.smoothed(sharpness)
-    at = lambda w, start: residual_of(replay.started(start), places, plant, *rest, jnp.eye(w.size))(w)
-    return eqx.filter_vmap(at)(w, starts)
-
-
-def at_each(
-    problem: Problem, w: Float[np.ndarray, "draws q"], starts: Float[np.ndarray, "draws k"] | None = None
-) -> Steps[Float[np.ndarray, "draws rows"]]:
-    """Residuals at so many points as `DRAWN`, from rest at zero if no starts are given."""
-    if starts is None:
-        starts = _at_rest(problem, len(w))
-    cut = range(_PART, len(w), _PART)
-    some = zip(np.split(w, cut), np.split(starts, cut), strict=True)
-    found = yield ParallelCalls(residual_at_each, [(*problem.args, problem.ladder[-1], *at) for at in some])
-    return np.concatenate([np.asarray(e) for e in found]).reshape(len(w), -1)
-
-
-def at_each_soon(problem: Problem) -> Precompile:
-    """What `at_each` will ask for."""
-    points = np.zeros((_PART, problem.prior.base.size)), _at_rest(problem, _PART)
-    args = (*problem.args, problem.ladder[-1], *points)
-    return Precompile(
-        residual_at_each, args, (residual_at_each, jax.tree.structure(args), problem.measured.shape)
-    )
-
-
-def _at_rest(problem: Problem, draws: int) -> np.ndarray:
-    return np.zeros((draws, problem.replay.follow.shape[1]))
-
-
-def _goes_on(*args: Any) -> Progress:
-    """Down the cost; `pull`, the noise that a prior is held against, keeps the way near the guesses."""
-    replay, places, plant, *rest, sharpness, pull, origin, vectors, active, tolerance, stop, progress = args
-    bound = jnp.full(active.shape, FAR)
-    compared = residual_of(replay, places, plant.smoothed(sharpness), *rest, vectors, origin)
-    residual = jax.jit(lambda z: jnp.concatenate([compared(z).ravel(), pull * z]))
-    return descend(residual, progress, (-bound, bound), stop, active, tolerance)
-
-
-_go_on = eqx.filter_jit(_goes_on)
-
-
-def descent(
-    problem: Problem,
-    sharpness: np.ndarray,
-    pull: np.ndarray,
-    origin: np.ndarray,
-    vectors: np.ndarray,
-    z: Float[np.ndarray, " k"],
-    active: Bool[np.ndarray, " k"],
-    settled: float = SETTLED,
-) -> Steps[Minimum]:
-    """Fit from one start, a few evaluations at a time: side by side no run then waits long for another.
-
-    Args:
-        problem: The problem.
-        sharpness: Of the smoothed sign.
-        pull: See `_goes_on`.
-        origin: Point in units of the prior from which coordinates are counted.
-        vectors: Directions, as columns.
-        z: Coordinates along them.
-        active: Which are fitted.
-        settled: In parts of a sample's variance, what the cost may still fall.
-    """
-    progress = _begun(z, problem.measured.size)
-    tolerance = np.asarray(0.1 * settled / len(problem.measured))
-    args = (*problem.args, sharpness, pull, origin, vectors, active, tolerance)
-    while not progress.done and progress.steps < _A_RUNG:
-        stop = np.minimum(progress.steps + _A_CALL, _A_RUNG)
-        progress = yield SolveRequest(_go_on, (*args, stop, progress))
-    return _compared(progress)
-
-
-def _begun(z: Array, size: int) -> Progress:
-    xp = np if isinstance(z, np.ndarray) else jnp
-    return Progress.at(z, xp.where(z == 0, 1.0, xp.abs(z)), size + z.size)
-
-
-def _compared(progress: Progress) -> Minimum:
-    """The minimum, without the pull; the solver's scale is that of the coordinates."""
-    e, jacobian = (x[: -progress.x.size] for x in progress.kept)
-    cost = 0.5 * e @ e
-    sound = progress.done & (abs(cost) < np.inf)
-    return Minimum(progress.x, cost, progress.steps, sound, e, jacobian)
-
-
-def read(problem: Problem, sharpness: np.ndarray, w: Float[np.ndarray, " q"]) -> Steps[Minimum]:
-    """Residual and its Jacobian in all coordinates at a point in units of the prior; nothing moves.
-
-    By the compiled fit, a few columns at a time: code of its own would take as long again to compile.
-    """
-    size, width = w.size, min(w.size, AT_ONCE)
-    vectors = np.eye(size, -(-size // width) * width)
-    still = (np.zeros(width), np.zeros(width, bool))
-    found = []
-    for first in range(0, size, width):
-        some = vectors[:, first : first + width]
-        found.append((yield from descent(problem, sharpness, NO_PULL, w, some, *still)))
-    jacobian = np.concatenate([np.asarray(m.jacobian) for m in found], axis=1)[:, :size]
-    return replace(found[0], theta=w, jacobian=jacobian)
-
-
-@eqx.filter_jit
-def fit_each(*args: Any) -> tuple[Array, Array, Array, Array]:
-    """From many starts, or with many things held: coordinates, cost, convergence and steps of each.
-
-    Args as of `descent`, with `Problem.args` first, and many of the last two.
-    """
-    *problem, z, active = args
-    size, tolerance = problem[3].size, 0.1 * SETTLED / len(problem[3])
-
-    def one(z: Array, active: Array) -> tuple:
-        found = _compared(_goes_on(*problem, active, tolerance, _A_RUNG, _begun(z, size)))
-        return found.theta, found.cost, found.converged, found.steps
-
-    return eqx.filter_vmap(one)(z, active)
-
-
-@dataclass(frozen=True)
-class RoundsResult:
-    """Where the rounds ended: problem, directions (columns), how many are fitted, and the minimum.
-
-    The minimum is in the coordinates of the first directions, or of all; those of others are zero.
-    Evaluations are those that it took.
-    """
-
-    problem: Problem
-    vectors: np.ndarray
-    count: int
-    minimum: Minimum
-    evaluations: int
-    settled: bool
-
-    @property
-    def first(self) -> np.ndarray:
-        """Directions that compiled code is made for."""
-        return columns(self.vectors, self.count)
-
-    @property
-    def point(self) -> np.ndarray:
-        """In units of the prior."""
-        theta = np.asarray(self.minimum.theta)
-        return self.vectors[:, : theta.size] @ theta
-
-    @property
-    def effective(self) -> float:
-        """Effective number of parameters: of each direction the part in which it follows the log.
-
-        Source:
-            Hastie, Tibshirani and Friedman, "The elements of statistical learning", 7.6: the trace of what
-            maps the measured to the fitted, here with the guesses as the penalty.
-        """
-        jacobian = np.asarray(self.minimum.jacobian) / self.problem.noise(self.minimum, self.count)
-        if not np.all(np.isfinite(jacobian)):
-            return 0.0
-        told = np.linalg.svd(np.linalg.qr(jacobian, mode="r"), compute_uv=False) ** 2
-        return float(np.sum(told / (1.0 + told)))
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the residual, white, of which so many parameters are effective."""
-        return self.problem.noise(self.minimum, self.effective)
-
-
-def criterion_steps(
-    machine: Machine,
-    log: Log,
-    theta: Float[np.ndarray, " p"],
-    *,
-    on: str = "position",
-    numerics: Numerics | None = None,
-) -> Steps[float]:
-    """Criterion of the same simulation at given unknowns, percent; nothing is fitted."""
-    problem = Problem.of(machine, log, 1.0, on, numerics or choose_numerics(machine, log))
-    w = problem.prior.inward(problem.padded(theta))
-    return problem.criterion((yield from read(problem, problem.ladder[-1], w)))

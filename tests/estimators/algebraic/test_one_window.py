@@ -133,13 +133,21 @@ def test_forms_on_a_polynomial():
 
 
 FAULTS = {
-    "too short": ("[0.0, 0.02]", "", "holds 21 samples; let it hold at least 48"),
+    "too short": ("[0.0, 0.02]", "", "holds 21 samples; choose a window of at least 48"),
     "backwards": ("[0.1, 0.0]", "", "is not a range"),
-    "not in the log": ("[5.0, 6.0]", "", "not within the log, which runs from 0 to 0.099 s; choose one"),
+    "not in the log": (
+        "[5.0, 6.0]",
+        "",
+        "not within the log, which runs from 0 to 0.099 s; choose a window within",
+    ),
     "beyond its end": ("[0.05, 0.2]", "", "not within the log"),
     "before its start": ("[-0.1, 0.1]", "", "not within the log"),
-    "memory": ("[0.0, 0.1]", 'kind = "hysteresis"\nlevel = 1.0\nstiffness = 1e5', "has a memory"),
-    "unknown delay": ("[0.0, 0.1]", 'kind = "input_delay"\ndelay = { guess = 1e-3 }', "has a memory"),
+    "memory": ("[0.0, 0.1]", 'kind = "hysteresis"\nlevel = 1.0\nstiffness = 1e5', "has an internal state"),
+    "unknown delay": (
+        "[0.0, 0.1]",
+        'kind = "input_delay"\ndelay = { guess = 1e-3 }',
+        "has an internal state",
+    ),
     "drift": ("[0.0, 0.1]", 'kind = "friction_drift"\nrate = 0.1', "changes with time; leave out"),
     "unknown drift": ("[0.0, 0.1]", 'kind = "friction_drift"\nrate = { guess = 0.0 }', "changes with time"),
 }
@@ -158,7 +166,7 @@ def test_windows_that_cannot_be(tmp_path, name):
 def test_friction_by_coefficient_is_not_in_proportion(tmp_path):
     path = case(tmp_path)
     path.write_text(path.read_text().replace("level = [\n  {", "friction_coefficient = [\n  {"))
-    with pytest.raises(InputError, match="not enter the balance in proportion; .* friction by its level"):
+    with pytest.raises(InputError, match="the balance is not linear in .*; .* friction by its level"):
         identify(path, first_instants(), method="algebraic")
 
 
@@ -171,5 +179,5 @@ def test_nothing_moves(tmp_path):
         reference=np.concatenate([rest, log.reference]),
         source="late",
     )
-    with pytest.raises(InputError, match="nothing moves between 0 and 0.06 s"):
+    with pytest.raises(InputError, match="no joint moves between 0 and 0.06 s"):
         identify(case(tmp_path, "[0.0, 0.06]"), late, method="algebraic")

@@ -134,7 +134,7 @@ def test_why_a_log_is_filtered_so(log):
 
 def test_the_published_filter_folds_and_says_so(log):
     estimate = fitted(log, "positions", extra=PUBLISHED)
-    assert any("folds what lies above 41.7 Hz" in n for n in estimate.notes)
+    assert any("folds frequencies above 41.7 Hz" in n for n in estimate.notes)
     assert estimate.details["minimal"]["preprocess"]["order"] == 4
     own = fitted(log, "positions", extra=PUBLISHED.replace("12", "6"))
     assert not any("folds" in n for n in own.notes)

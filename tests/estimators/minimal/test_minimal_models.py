@@ -146,8 +146,8 @@ WRONG = {
     "stribeck": (EFFECT.format("stribeck_friction", "joint = 1\nlevel = 1.0\nvelocity = 0.01"), "not linear"),
     "drag": (EFFECT.format("quadratic_drag", "joint = 2\ncoefficient = 1.0"), r"quadratic_drag\[2\]"),
     "backlash": (EFFECT.format("backlash", "spring = 1\ngap = 1e-5"), "not linear"),
-    "memory": (EFFECT.format("hysteresis", "joint = 1\nstiffness = 1e6\nlevel = 5.0"), "memory"),
-    "lag": (EFFECT.format("actuator_lag", "joint = 1\ntime_constant = 0.001"), "memory"),
+    "memory": (EFFECT.format("hysteresis", "joint = 1\nstiffness = 1e6\nlevel = 5.0"), "internal state"),
+    "lag": (EFFECT.format("actuator_lag", "joint = 1\ntime_constant = 0.001"), "internal state"),
     "delay": (EFFECT.format("input_delay", "joint = 1\ndelay = { guess = 0.001 }"), "delay"),
     "gain": (EFFECT.format("actuator_gain", "joint = 1\ngain = { guess = 1.1 }"), "gain"),
 }

@@ -62,11 +62,14 @@ def test_real_time_refuses(live):
     for change, message in (
         ({"half_life": 0.0}, "half_life = 0.0 is not positive"),
         ({"noise": -1.0}, "noise = -1.0 is not positive"),
-        ({"spread": [1.0]}, "give one of each of inertia"),
+        ({"spread": [1.0]}, "give one value for each of inertia"),
         ({"gate_velocity": 0.0}, "gate_velocity = 0.0 is not positive"),
-        ({"gate_velocity": [1e-3, 1e-3]}, r"gate_velocity has shape \(2,\); give one for all joints, or 1"),
+        (
+            {"gate_velocity": [1e-3, 1e-3]},
+            r"gate_velocity has shape \(2,\); give one value for all joints, or 1",
+        ),
         ({"gate_acceleration": -1.0}, "gate_acceleration = -1.0 is negative"),
-        ({"start": [80.0]}, r"start has shape \(1,\); give one of each of inertia"),
+        ({"start": [80.0]}, r"start has shape \(1,\); give one value for each of inertia"),
     ):
         with pytest.raises(InputError, match=message):
             RealTime.of(machine, 1e-3, **(good | change))

@@ -22,10 +22,10 @@ REFUSED = {
     "a start that does not count": ("regularization = 0", "regularization = 0 is not positive"),
     "a negative gate": ("gate_velocity = -1.0", "gate_velocity = -1.0 is negative"),
     "rows of a third kind": ('rows = "half"', 'rows = "half" is unknown'),
-    "an instrument without a gain": ('instrument = "model"', "for gains of drives, and none is unknown"),
+    "an instrument without a gain": ('instrument = "model"', "needs an unknown gain of a drive"),
     "nothing passes": ("gate_velocity = 1e3", "0 samples pass the gate, for 3 unknowns; lower"),
     "no memory": ('restart = "none.json"', "none.json: no such file"),
-    "another memory": ('restart = "case.toml"', "holds no memory of the method recursive"),
+    "another memory": ('restart = "case.toml"', "has no memory of the method recursive"),
     "a restart with a start": ('restart = "a"\nstart = "guess"', "start does not go with restart"),
 }
 
@@ -43,13 +43,16 @@ def test_refuses_in_one_line(fault, axis, tmp_path):
 NOT_IN_PROPORTION = {
     "a velocity": (
         ("stribeck_friction", {"level": 5.0, "velocity": 0.01}),
-        "not in proportion to stribeck_friction.level and stribeck_friction.velocity; declare one",
+        "not linear in stribeck_friction.level and stribeck_friction.velocity; declare one",
     ),
     "a rate and its level": (
         ("friction_drift", {"rate": 0.01}),
-        "not in proportion to coulomb_friction.level and friction_drift.rate; declare one",
+        "not linear in coulomb_friction.level and friction_drift.rate; declare one",
     ),
-    "a gain with nothing known": (GAIN, "actuator_gain.gain has nothing known in its balance"),
+    "a gain with nothing known": (
+        GAIN,
+        "actuator_gain.gain is not identifiable: its balance has no known term",
+    ),
 }
 
 
@@ -87,8 +90,8 @@ def test_a_restart_about_other_unknowns(axis, tmp_path):
     identify(*axis, method="recursive").save(tmp_path / "first")
     text = case_text(slide(), [VISCOUS, COULOMB], off=2.0, inertia_known=True)
     path = write_case(tmp_path, text + '\n[recursive]\nrestart = "first/result.json"\n')
-    with pytest.raises(InputError, match="is about inertia, .* let both be the same"):
+    with pytest.raises(InputError, match="has the unknowns inertia, .* make both the same"):
         estimate(path, axis[1])
     path = with_table(tmp_path, axis, '\n[recursive]\nrestart = "first/result.json"\nrows = "summed"\n')
-    with pytest.raises(InputError, match="restart is of a run with other rows"):
+    with pytest.raises(InputError, match="the run to restart from had other rows"):
         estimate(path, axis[1])

@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 
 from jaxid.estimators.common.levenberg_marquardt import Minimum
-from jaxid.estimators.within_prior import (
-    fit as directions,
+from jaxid.estimators.within_prior import fit, posterior, quantisation, subspace
+from jaxid.estimators.within_prior.posterior import (
+    maximum_a_posteriori,
+    negative_log_posterior,
+    posterior_second_moment,
+    restarted_maximum_a_posteriori,
 )
-from jaxid.estimators.within_prior import (
-    posterior as directions_posterior,
-)
-from jaxid.estimators.within_prior import (
-    rounding as directions_rounding,
-)
-from jaxid.estimators.within_prior import (
-    rounds as directions_rounds,
-)
-from jaxid.estimators.within_prior.posterior import loss_of, most_probable, past_kinks, spread
-from jaxid.estimators.within_prior.precision import DirectionPrecision, add_profiles
-from jaxid.estimators.within_prior.problem import RoundsResult
+from jaxid.estimators.within_prior.precision import SubspacePrecision, add_profiles
+from jaxid.estimators.within_prior.subspace import SubspaceFit
 from jaxid.numerics.lanes import run_alone
 
 NOISE = 0.3
@@ -31,7 +25,7 @@ def problem_of(residual, jacobian, size, rows):
     return SimpleNamespace(
         residual=residual,
         jacobian=jacobian,
-        ladder=(1.0,),
+        sharpnesses=(1.0,),
         prior=SimpleNamespace(base=np.ones(size)),
         replay=SimpleNamespace(position=np.zeros(1)),
         measured=np.zeros((rows, 1)),
@@ -42,18 +36,18 @@ def problem_of(residual, jacobian, size, rows):
 
 @pytest.fixture(autouse=True)
 def simulated(monkeypatch):
-    def read(problem, sharpness, w):
+    def linearise(problem, sharpness, w):
         e, jacobian = problem.residual(w), problem.jacobian(w)
         return Minimum(w, np.asarray(0.5 * e @ e), np.asarray(1), np.asarray(True), e, jacobian)
         yield
 
-    def at_each(problem, w, starts=None):
+    def residuals_at(problem, w, starts=None):
         return np.array([problem.residual(x) for x in w])
         yield
 
-    monkeypatch.setattr(directions_posterior, "read", read)
-    for module in (directions_posterior, directions_rounds):
-        monkeypatch.setattr(module, "at_each", at_each)
+    monkeypatch.setattr(posterior, "linearise", linearise)
+    for module in (posterior, subspace):
+        monkeypatch.setattr(module, "residuals_at", residuals_at)
 
 
 def linear(rng, size=4, rows=30):
@@ -63,7 +57,7 @@ def linear(rng, size=4, rows=30):
 
 def test_a_line_ends_where_guesses_and_log_agree():
     problem, a, b = linear(np.random.default_rng(0))
-    w, here, settled = run_alone(most_probable(problem, NOISE, np.array([3.0, -2.0, 1.0, 1.0])))
+    w, here, settled = run_alone(maximum_a_posteriori(problem, NOISE, np.array([3.0, -2.0, 1.0, 1.0])))
     assert settled
     np.testing.assert_allclose(w, np.linalg.solve(a.T @ a + np.eye(4), a.T @ b), atol=2e-3)
     np.testing.assert_allclose(here.residual / NOISE, a @ w - b)
@@ -73,7 +67,7 @@ def test_a_held_direction_stays():
     problem, a, b = linear(np.random.default_rng(1))
     along = np.array([0.6, 0.8, 0.0, 0.0])
     start = 0.7 * along + np.array([0.0, 0.0, 1.0, -1.0])
-    w, _, settled = run_alone(most_probable(problem, NOISE, start, held=along))
+    w, _, settled = run_alone(maximum_a_posteriori(problem, NOISE, start, held=along))
     assert settled
     assert along @ w == pytest.approx(0.7, abs=1e-9)
     slope = a.T @ (a @ w - b) + w
@@ -85,7 +79,9 @@ def test_a_cost_with_a_kink_ends_all_the_same():
     """Where the derivative jumps no step keeps what it promises."""
     residual = lambda w: np.array([4.0 * abs(w[0] - 0.4) + 1.0, 3.0 * (w[1] - 0.2)])
     jacobian = lambda w: np.diag([4.0 * np.sign(w[0] - 0.4), 3.0])
-    w, _, _ = run_alone(most_probable(problem_of(residual, jacobian, 2, 2), NOISE, np.array([0.9, -1.0])))
+    w, _, _ = run_alone(
+        maximum_a_posteriori(problem_of(residual, jacobian, 2, 2), NOISE, np.array([0.9, -1.0]))
+    )
     np.testing.assert_allclose(w, [0.4, 0.2], atol=0.1)
 
 
@@ -98,13 +94,13 @@ def test_a_fit_goes_on_along_a_valley_with_a_kink_at_its_floor():
     floor = np.linspace(-3.0, 3.0, 10_001)
     guessed = 0.5 * (floor**2 + floor**4)
     least = np.min(guessed + 0.5 * (1.0 + (1.5 * (floor - 2.0)) ** 2) / NOISE**2)
-    w, here, settled = run_alone(most_probable(problem, NOISE, start))
+    w, here, settled = run_alone(maximum_a_posteriori(problem, NOISE, start))
     assert not settled
-    assert loss_of(NOISE, here, w) > least + 3.0
-    on, there, settled = run_alone(past_kinks(problem, NOISE, start))
+    assert negative_log_posterior(NOISE, here, w) > least + 3.0
+    on, there, settled = run_alone(restarted_maximum_a_posteriori(problem, NOISE, start))
     assert settled
     # No point drawn about it is half a nat more probable; the least may be a little further.
-    assert loss_of(NOISE, there, on) < least + 1.0
+    assert negative_log_posterior(NOISE, there, on) < least + 1.0
     assert int(there.steps) > int(here.steps)
 
 
@@ -112,13 +108,13 @@ def found_at(problem, w, told):
     jacobian = problem.jacobian(w)
     e = problem.residual(w)
     minimum = Minimum(w, np.asarray(0.5 * e @ e), np.asarray(1), np.asarray(True), e, jacobian)
-    return RoundsResult(problem, np.eye(w.size), told, minimum, 1, True)
+    return SubspaceFit(problem, np.eye(w.size), told, minimum, 1, True)
 
 
 def test_the_spread_of_a_line_is_the_quadratic_pictures():
     problem, a, b = linear(np.random.default_rng(2))
     whole = np.linalg.inv(a.T @ a + np.eye(4))
-    found = run_alone(spread(found_at(problem, whole @ (a.T @ b), 2), NOISE))[0]
+    found = run_alone(posterior_second_moment(found_at(problem, whole @ (a.T @ b), 2), NOISE))[0]
     # Directions of the linear problem are not quite the axes: fitted ones and others are correlated.
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(whole)), rtol=0.15)
 
@@ -132,7 +128,7 @@ def test_the_spread_of_what_is_held_wrongly_is_found():
         1,
     )
     best = np.zeros(2)
-    found, _ = run_alone(spread(found_at(problem, best, 1), NOISE))
+    found, _ = run_alone(posterior_second_moment(found_at(problem, best, 1), NOISE))
     x, y = np.meshgrid(np.linspace(-8, 3, 2201), np.linspace(-5, 5, 801), indexing="ij")
     nats = -0.5 * (10.0 * (x + 0.5 * y**2) / NOISE) ** 2 - 0.5 * x**2 - 0.5 * y**2
     weight = np.exp(nats - nats.max())
@@ -152,7 +148,7 @@ def test_of_two_valleys_the_spread_has_both_and_knows_the_better():
     weight = np.exp(nats - nats.max())
     for start in (-0.99, 0.99):
         exact = np.sqrt(np.sum(weight * (place - start) ** 2) / weight.sum())
-        whole, best = run_alone(spread(found_at(problem, np.array([start]), 1), NOISE))
+        whole, best = run_alone(posterior_second_moment(found_at(problem, np.array([start]), 1), NOISE))
         assert np.sqrt(whole[0, 0]) == pytest.approx(exact, rel=0.3)
         assert best[0] == pytest.approx(place[np.argmax(nats)], abs=0.01)
 
@@ -162,14 +158,14 @@ def test_a_fit_in_the_worse_valley_goes_on_from_the_better(monkeypatch):
     residual = lambda w: np.array([2.0 * (w[0] ** 2 - 1.0), 0.7 * (w[0] - 1.0)])
     problem = problem_of(residual, lambda w: np.array([[4.0 * w[0]], [0.7]]), 1, 2)
     problem.noise, problem.on = lambda minimum, count: NOISE, "position"
-    white = lambda found: DirectionPrecision(
+    white = lambda found: SubspacePrecision(
         1e-3 * np.eye(found.count), np.full(found.count, 0.03), np.zeros(0)
     )
-    monkeypatch.setattr(directions, "precision_of_directions", white)
+    monkeypatch.setattr(fit, "precision_of_directions", white)
     machine = SimpleNamespace(sensor=SimpleNamespace(position_resolution=None))
     for drawn, end in ((True, 1.0), (False, -1.0)):
         start = found_at(problem, np.array([-0.9]), 1)
-        found, told = run_alone(directions._most_probable(machine, start, drawn))
+        found, told = run_alone(fit._posterior_fit(machine, start, drawn))
         assert found.point[0] == pytest.approx(end, abs=0.1)
         assert told.std[0] == pytest.approx(NOISE / 4.0, rel=0.3)
 
@@ -194,11 +190,11 @@ def test_a_fit_begins_in_the_deeper_valley():
     depth = lambda x: np.array([np.where(x < 0.4, 3.0 + abs(x), 5.0 * abs(x - 1.1))])
     problem = problem_of(lambda w: depth(w[0]), None, 3, 1)
     told = np.eye(3)[:, :1]
-    w = run_alone(directions_rounds._looked(problem, told, np.array([0.0, 0.3, -0.2])))
+    w = run_alone(subspace._best_start(problem, told, np.array([0.0, 0.3, -0.2])))
     assert w[0] == pytest.approx(1.1, abs=0.1)
     np.testing.assert_allclose(w[1:], [0.3, -0.2])
     # And stays where nothing is better.
-    w = run_alone(directions_rounds._looked(problem, told, np.array([1.1, 0.0, 0.0])))
+    w = run_alone(subspace._best_start(problem, told, np.array([1.1, 0.0, 0.0])))
     np.testing.assert_allclose(w[0], 1.1)
 
 
@@ -218,8 +214,8 @@ def test_guesses_that_do_not_simulate_are_left_for_points_that_do(monkeypatch, l
         return points
         yield
 
-    monkeypatch.setattr(directions, "likely_points", likely)
-    monkeypatch.setattr(directions, "read", directions_posterior.read)
+    monkeypatch.setattr(fit, "likeliest_prior_draws", likely)
+    monkeypatch.setattr(fit, "linearise", posterior.linearise)
     gone = Minimum(
         np.zeros(4),
         np.asarray(np.nan),
@@ -228,7 +224,7 @@ def test_guesses_that_do_not_simulate_are_left_for_points_that_do(monkeypatch, l
         np.full(30, np.nan),
         np.full((30, 4), np.nan),
     )
-    found = run_alone(directions._begun_elsewhere(RoundsResult(problem, np.eye(4), 0, gone, 5, False), False))
+    found = run_alone(fit._restarted(SubspaceFit(problem, np.eye(4), 0, gone, 5, False), False))
     if len(lost) == len(points):
         np.testing.assert_array_equal(found.minimum.jacobian, gone.jacobian)
         return
@@ -262,22 +258,22 @@ def through(
     best = np.zeros(unknowns) if best is None else best
     minimum = Minimum(best, np.asarray(0.0), np.asarray(1), np.asarray(True), e, jacobian)
 
-    def at_each(problem, w, starts):
+    def residuals_at(problem, w, starts):
         rounded = np.tile(e, (len(w), 1))
         some = residual(w, starts)
         rounded[:, : some.shape[1]] = some
         return rounded
         yield
 
-    monkeypatch.setattr(directions_rounding, "at_each", at_each)
-    monkeypatch.setattr(directions_rounding, "_rounding", lambda machine, problem: problem)
-    white = lambda found: DirectionPrecision(np.eye(found.count), np.ones(found.count), np.zeros(0))
-    monkeypatch.setattr(directions_rounding, "precision_of_directions", white)
+    monkeypatch.setattr(quantisation, "residuals_at", residuals_at)
+    monkeypatch.setattr(quantisation, "_with_quantisation", lambda machine, problem: problem)
+    white = lambda found: SubspacePrecision(np.eye(found.count), np.ones(found.count), np.zeros(0))
+    monkeypatch.setattr(quantisation, "precision_of_directions", white)
     machine = SimpleNamespace(
         sensor=SimpleNamespace(position_resolution=0.1), unknown_reference=unknown_reference
     )
-    found = RoundsResult(problem, np.eye(unknowns) if vectors is None else vectors, told, minimum, 1, True)
-    return run_alone(directions_rounding.through_rounding(machine, found))
+    found = SubspaceFit(problem, np.eye(unknowns) if vectors is None else vectors, told, minimum, 1, True)
+    return run_alone(quantisation.fit_with_quantisation(machine, found))
 
 
 def test_where_the_machine_stood_counts_once(monkeypatch):
@@ -292,7 +288,7 @@ def test_where_the_machine_stood_counts_once(monkeypatch):
     assert found.point[0] == pytest.approx(0.1 / 0.8, abs=0.01)
     assert told.std[0] == pytest.approx(2 * 0.1 / np.sqrt(12) / 0.8, rel=0.1)
     np.testing.assert_allclose(found.vectors, np.eye(2), atol=1e-12)
-    np.testing.assert_allclose(told.whole, np.diag([told.std[0] ** 2, 1.0]))
+    np.testing.assert_allclose(told.whitened_covariance, np.diag([told.std[0] ** 2, 1.0]))
     # Where it is the start alone that the log tells nothing of the machine is.
     found, told = through(monkeypatch, residual, vectors=np.eye(2)[::-1], places=1)
     assert (found.count, told) == (0, None)
@@ -304,7 +300,7 @@ def test_rounding_is_drawn_over_what_is_held_too(monkeypatch):
     assert found.point[0] == pytest.approx(0.0, abs=0.05)
     # Beside the guess: a variance of 1 / 4 and one of 1.
     assert told.std[0] == pytest.approx(np.sqrt(1 / 5), rel=0.1)
-    np.testing.assert_allclose(np.diag(told.whole), [told.std[0] ** 2, 1.0])
+    np.testing.assert_allclose(np.diag(told.whitened_covariance), [told.std[0] ** 2, 1.0])
 
 
 @pytest.mark.parametrize(("little", "count"), [(1e-3, 2), (5e-4, 1)])
@@ -319,7 +315,7 @@ def test_what_is_told_a_little_is_seen_with_what_is_told_well(monkeypatch, littl
     # Of w1 its guess, its reading, with noise as in the residual of the fit, and the guess of w0 = -w1 / 2.
     noise = np.mean((1e-3 * np.random.default_rng(0).standard_normal(8)) ** 2)
     covariance = np.array([[0.25, -0.5], [-0.5, 1.0]]) / (1.0 + little**2 / noise + 0.25)
-    np.testing.assert_allclose(told.whole, covariance, rtol=0.1)
+    np.testing.assert_allclose(told.whitened_covariance, covariance, rtol=0.1)
 
 
 def test_settled_logs_are_drawn_where_the_truth_may_be(monkeypatch):
@@ -351,13 +347,13 @@ def test_noise_fills_what_rounding_leaves_of_the_measured():
     measured = rng.standard_normal((4000, 2)) * [1.0, 0.1]
     size = rng.uniform(0.0, 2.0, (500, 1, 1))
     drawn = size * measured[::-1]
-    noise, alike = directions_rounding._noise_missing(drawn, measured)
+    noise, alike = quantisation._missing_noise(drawn, measured)
     np.testing.assert_array_equal(alike, size[:, 0, 0] <= 1.0)
     # Of one minus the square, a tenth at least, between zero and one.
     np.testing.assert_allclose(noise, 0.67 * np.mean(measured**2, axis=0), rtol=0.05)
     # Where all leave more, those of least count.
-    _, alike = directions_rounding._noise_missing(2.0 + drawn, 0.1 * measured)
-    assert alike.sum() == directions_rounding._LIKE
+    _, alike = quantisation._missing_noise(2.0 + drawn, 0.1 * measured)
+    assert alike.sum() == quantisation._CLOSEST
     over = np.max(np.mean((2.0 + drawn) ** 2, axis=1) / np.mean(measured**2, axis=0), axis=1)
     assert over[alike].max() < over[~alike].min()
 
@@ -396,11 +392,11 @@ def numbers_of(samples, draws):
     at = rng.standard_normal((draws, 1))
     left = at * seen[0] + 9.0 * rng.standard_normal((draws, 1)) * most + rng.standard_normal((draws, samples))
     none = dict.fromkeys(("problem", "resolution", "axes", "count", "point", "noise", "step", "along"))
-    summary = directions_rounding._Summary(
+    summary = quantisation._SummaryStatistics(
         **none, residual=np.zeros(samples), jacobian=5.0 * seen.T, shifts=False
     )
-    drawn = directions_rounding._Drawn(at, left, np.ones(samples))
-    return summary.numbers(drawn, np.zeros(1)), seen, most / np.linalg.norm(most)
+    drawn = quantisation._SimulatedLogs(at, left, np.ones(samples))
+    return summary.basis(drawn, np.zeros(1)), seen, most / np.linalg.norm(most)
 
 
 def test_a_log_is_seen_in_all_its_samples_or_in_those_numbers_that_the_draws_tell():
@@ -463,4 +459,4 @@ def test_what_rounding_leaves_hardly_told_is_let_go(monkeypatch):
     assert found.count == 1
     np.testing.assert_allclose(np.abs(found.vectors[:, 0]), [1.0, 0.0, 0.0], atol=0.02)
     assert told.std[0] < 0.01
-    assert np.sqrt(told.whole[1, 1]) > 0.6
+    assert np.sqrt(told.whitened_covariance[1, 1]) > 0.6

@@ -14,9 +14,9 @@ from jaxid.cli import main
 from jaxid.commands.identify import identify_many
 from jaxid.estimators import _beside_the_guesses, steps_of
 from jaxid.estimators.common.levenberg_marquardt import Minimum
-from jaxid.estimators.within_prior import rounds as directions_rounds
+from jaxid.estimators.within_prior import subspace
+from jaxid.estimators.within_prior.evaluations import criterion_steps
 from jaxid.estimators.within_prior.prior import Prior
-from jaxid.estimators.within_prior.problem import criterion_steps
 from jaxid.logs.log import Log
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import run_alone
@@ -183,11 +183,11 @@ def test_an_unknown_at_its_bound_does_not_take_the_others_with_it(tmp_path):
 def test_a_point_whose_slopes_are_not_finite_is_kept(monkeypatch, unknowns):
     """Cost and residual there are reported; of more unknowns than coordinates, too."""
     minimum = Minimum(*[np.zeros(())] * 5, np.full((1, unknowns), np.nan))
-    monkeypatch.setattr(directions_rounds, "read", lambda *args: _returned(minimum))
-    problem = SimpleNamespace(prior=SimpleNamespace(base=np.ones(unknowns)), ladder=(1.0,))
-    problem.weighed = lambda found: (problem, found)
+    monkeypatch.setattr(subspace, "linearise", lambda *args: _returned(minimum))
+    problem = SimpleNamespace(prior=SimpleNamespace(base=np.ones(unknowns)), sharpnesses=(1.0,))
+    problem.reweighted = lambda found: (problem, found)
     for w in (np.zeros(unknowns), np.arange(1.0, unknowns + 1)):
-        found = run_alone(directions_rounds.in_rounds(problem, w, unknowns))
+        found = run_alone(subspace.fit_in_subspace(problem, w, unknowns))
         assert found.count == 0
         np.testing.assert_allclose(found.point, w, rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(unknowns), atol=1e-12)
@@ -225,7 +225,7 @@ def test_rounding_widens_what_it_moves(tmp_path):
         text = stages.text(1, resolution=count, more=STATED)
         (tmp_path / "case.toml").write_text(text)
         estimate = jaxid.identify(tmp_path / "case.toml", log).estimate
-        assert any("rounding" in note and "taken off" in note for note in estimate.notes)
+        assert any("quantisation" in note and "was removed" in note for note in estimate.notes)
         second = estimate.details["directions"][1]
         sigma.append(second["std"] / second["std_white"])
     assert sigma[1] > 1.3 * sigma[0]
@@ -254,7 +254,7 @@ def test_without_draws_deviations_are_the_quadratic_pictures(folder, fitted, tmp
         assert 0.5 * one["std_white"] < one["std"] < other["std"]
     text = text.replace("[output_error]", f"[sensor]\nposition_resolution = {stages.COUNT}\n[output_error]")
     (tmp_path / "case.toml").write_text(text + "drawn = false\n")
-    assert "what rounding of the readings does is in no value" in str(
+    assert "values and standard deviations leave out the quantisation of the readings" in str(
         jaxid.identify(tmp_path / "case.toml", logged(0)).estimate.notes
     )
 
@@ -347,7 +347,7 @@ def test_wrong_priors_are_refused(folder, tmp_path, capsys):
         (text.replace("prior = 0.5", "prior = 0.5\nstarts = 0"), "starts"),
         (text.replace("prior = 0.5", "profile = true"), "profile goes with prior only"),
         (text.replace("prior = 0.5", "drawn = false"), "drawn goes with prior only"),
-        (_without_guess(text), "cogging[2].phase has a guess of zero"),
+        (_without_guess(text), "cogging[2].phase has guess = 0"),
         (text[:start] + text[end:], "[output_error] prior needs a loop"),
         (text, "solver 'tsit5' does not go with [output_error] prior", "--solver", "tsit5"),
         # A prior is no help to a method that knows of none.
