@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Bool, Float, PyTree
 
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky
 from jaxid.arrays import Array
@@ -118,6 +122,8 @@ class Minimum(eqx.Module):
         converged: Whether the cost could fall no further.
         residual: At theta, flat; empty where not kept.
         jacobian: Of the residual in the physical values; empty where not kept.
+        failure: Why a solver of optimistix did not converge, see `jaxid.estimators.common.minimise`; None of
+            jaxid's own solver.
     """
 
     theta: Float[Array, " p"]
@@ -126,6 +132,7 @@ class Minimum(eqx.Module):
     converged: Array
     residual: Array
     jacobian: Array
+    failure: Array | None = None
 
 
 class Progress(eqx.Module):
@@ -139,6 +146,7 @@ class Progress(eqx.Module):
         own: Sizes of the unknowns at the start. `nothing`: of the residual, what counts as nothing.
         steps: Evaluations so far.
         done: Whether the cost can fall no further, or is not finite.
+        aux: Auxiliary output of the residual at the best point; None if it has none.
     """
 
     trial: Array
@@ -154,6 +162,7 @@ class Progress(eqx.Module):
     nothing: Array
     steps: Array
     done: Array
+    aux: Any = None
 
     @classmethod
     def at(cls, x: Array, own: Array, size: int, damping: float = DAMPING) -> Progress:
@@ -251,10 +260,14 @@ def levenberg_marquardt(
     bounds = transform.bounds(jnp.asarray(lower), jnp.asarray(upper))
     x0 = jnp.clip(transform.inward(theta), *bounds)
     own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
-    size = jax.eval_shape(residual, theta).size if keep else 0
-    start = Progress.at(x0, own, size, damping)
     on_scale = lambda x: residual(transform.outward(x))
-    return descend(on_scale, start, bounds, max_steps, active, tolerance, floor).minimum(transform)
+    solver = BoundedLevenbergMarquardt(rtol=tolerance, damping=damping, keep=keep)
+    options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor, "scale": own}
+    solution = optx.least_squares(
+        lambda x, args: on_scale(x), solver, x0, options=options, max_steps=max_steps, throw=False
+    )
+    # The value is that of the state; implicit differentiation goes through the value alone.
+    return replace(solution.state, x=solution.value).minimum(transform)
 
 
 def descend(
@@ -276,26 +289,131 @@ def descend(
         active, tolerance: As there.
         floor: What the cost is known not to fall below: near enough to it, it has converged too.
     """
-    moves = jnp.ones(progress.x.size, bool) if active is None else active
-
-    def flat(x: Array) -> tuple[Array, Array]:
-        e = residual(x).ravel()
-        return e, e
+    solver = BoundedLevenbergMarquardt(rtol=tolerance)
+    options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor}
+    fn = lambda x, args: (residual(x), None)
 
     def advance(p: Progress) -> Progress:
-        jacobian, e = jax.jacfwd(flat, has_aux=True)(p.trial)
-        return _advanced(p, e, jacobian, bounds, moves, tolerance, floor)
+        return solver.step(fn, p.x, None, options, p, frozenset())[1]
 
     return jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, progress)
+
+
+class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt within bounds, as a solver of `optimistix.least_squares`.
+
+    Marquardt's scaling, Nielsen's damping; steps are projected on the bounds, and unknowns that press against
+    a bound rest. Each step evaluates the residual and its forward-mode Jacobian once.
+
+    Supports the following `options` of `optimistix.least_squares`, each optional:
+
+    - `lower`, `upper`: bounds, trees like the unknowns.
+    - `active`: which unknowns may move, a tree of booleans like the unknowns.
+    - `scale`: sizes of the unknowns, a tree like them; an unknown whose size moves the residual by less than
+      1e-12 of its first norm rests. Default: the absolute values at the start, one for zeros.
+    - `floor`: a value below which the cost is known not to fall.
+
+    Args:
+        rtol: The solve ends if half the sum of squares can fall by no more than this part of itself.
+        atol: The solve also ends if that can fall by no more than this.
+        damping: Damping of the first step, relative to the diagonal of the normal matrix.
+        keep: Whether the state holds residual and Jacobian at the best point; without, batches are smaller.
+        norm: Required by optimistix and not used: the cost alone decides.
+
+    Source:
+        Marquardt (1963); damping after Nielsen (1999), IMM-REP-1999-05.
+    """
+
+    rtol: float | Array = _TOLERANCE
+    atol: float | Array = 0.0
+    damping: float | Array = DAMPING
+    keep: bool = eqx.field(static=True, default=True)
+    norm: Callable[[PyTree], Array] = eqx.field(static=True, default=optx.max_norm)
+
+    def init(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        args: Any,
+        options: dict[str, Any],
+        f_struct: PyTree[jax.ShapeDtypeStruct],
+        aux_struct: PyTree[jax.ShapeDtypeStruct],
+        tags: frozenset[object],
+    ) -> Progress:
+        x = jnp.clip(ravel_pytree(y)[0], *_bounds_of(options, y))
+        scale = options.get("scale")
+        scale = jnp.where(x == 0, 1.0, jnp.abs(x)) if scale is None else ravel_pytree(scale)[0]
+        size = sum(f.size for f in jax.tree.leaves(f_struct)) if self.keep else 0
+        aux = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), aux_struct)
+        return replace(Progress.at(x, scale, size, self.damping), aux=aux)
+
+    def step(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        args: Any,
+        options: dict[str, Any],
+        state: Progress,
+        tags: frozenset[object],
+    ) -> tuple[PyTree, Progress, Any]:
+        unravel = ravel_pytree(y)[1]
+        active = options.get("active")
+        moves = jnp.ones(state.x.size, bool) if active is None else ravel_pytree(active)[0]
+
+        def flat(x: Array) -> tuple[Array, tuple[Array, Any]]:
+            out, aux = fn(unravel(x), args)
+            e = ravel_pytree(out)[0]
+            return e, (e, aux)
+
+        jacobian, (e, aux) = jax.jacfwd(flat, has_aux=True)(state.trial)
+        tolerances = (self.rtol, self.atol, options.get("floor", -np.inf))
+        state = _advanced(state, e, aux, jacobian, _bounds_of(options, y), moves, *tolerances)
+        return unravel(state.x), state, state.aux
+
+    def terminate(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        args: Any,
+        options: dict[str, Any],
+        state: Progress,
+        tags: frozenset[object],
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        lost = state.done & ~jnp.isfinite(state.cost)
+        return state.done, optx.RESULTS.where(lost, optx.RESULTS.nonfinite, optx.RESULTS.successful)
+
+    def postprocess(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        aux: Any,
+        args: Any,
+        options: dict[str, Any],
+        state: Progress,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[PyTree, Any, dict[str, Any]]:
+        return y, aux, {}
+
+
+def _bounds_of(options: dict[str, Any], y: PyTree) -> tuple[Array | float, Array | float]:
+    """Return the bounds of a solve, flat; infinite where none are given."""
+    lower, upper = options.get("lower"), options.get("upper")
+    return (
+        -np.inf if lower is None else ravel_pytree(lower)[0],
+        np.inf if upper is None else ravel_pytree(upper)[0],
+    )
 
 
 def _advanced(
     p: Progress,
     e: Array,
+    aux: Any,
     jacobian: Array,
-    bounds: tuple[Array, Array],
+    bounds: tuple[Array | float, Array | float],
     moves: Bool[Array, " p"],
-    tolerance: float,
+    rtol: Array | float,
+    atol: Array | float,
     floor: Array | float,
 ) -> Progress:
     """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
@@ -306,10 +424,10 @@ def _advanced(
     ratio = (p.cost - cost) / jnp.maximum(p.predicted, 1e-300)
     shrink = jnp.where(first, 1.0, jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
     damping = jnp.clip(p.damping * jnp.where(better, shrink, p.growth), 1e-15, 1e20)
-    x, cost, gradient, normal, kept = jax.tree.map(
+    x, cost, gradient, normal, kept, aux = jax.tree.map(
         lambda new, old: jnp.where(better, new, old),
-        (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept),
-        (p.x, p.cost, p.gradient, p.normal, p.kept),
+        (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept, aux),
+        (p.x, p.cost, p.gradient, p.normal, p.kept, p.aux),
     )
     nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
     # Asked at every step: a velocity of which a level of zero leaves no trace has one as soon as that moves.
@@ -321,7 +439,7 @@ def _advanced(
     change = trial - x
     predicted = -change @ gradient - 0.5 * change @ normal @ change
     # A step cut short by a bound says little of what is left: its unknown rests from now on.
-    small = (predicted <= tolerance * cost) & jnp.all(trial == aim)
+    small = (predicted <= rtol * cost + atol) & jnp.all(trial == aim)
     # A step that a bound bent may promise less than nothing.
     flat = (p.damping < _WHOLE) & (p.predicted > 0) & (p.predicted <= _FLAT * p.cost)
     rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))
@@ -341,6 +459,7 @@ def _advanced(
         nothing,
         p.steps + 1,
         small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
+        aux,
     )
 
 
