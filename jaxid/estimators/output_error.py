@@ -16,7 +16,9 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.errors import InputError
-from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
+from jaxid.estimators.common.minimise import failure_text, minimise
+from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import SHORT
 from jaxid.logs.log import Log
@@ -116,9 +118,10 @@ def _fit(
     bounds: tuple[Array, Array],
     on: str,
     active: Array,
+    minimiser: Minimiser | None,
 ) -> Minimum:
     residual = output_residual(replay, places, plant, measured, weight, on)
-    return levenberg_marquardt(residual, theta, transform, *bounds, active)
+    return minimise(residual, theta, transform, *bounds, active, minimiser)
 
 
 @eqx.filter_jit
@@ -163,6 +166,7 @@ def output_error(
     numerics: Numerics | None = None,
     hessian: bool = False,
     on: str = "position",
+    minimiser: str | Minimiser | None = None,
 ) -> Estimate:
     """Fit the unknowns so that the simulated position, or force, meets the measured one.
 
@@ -174,14 +178,20 @@ def output_error(
         hessian: Take the covariance from the full Hessian in place of Gauss-Newton's.
         on: One of `OUTPUTS`. Both: each column over the standard deviation that a fit of the position
             leaves in it. The force is that of a closed loop; an open loop is given its own.
+        minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix; absent:
+            `jaxid.estimators.common.levenberg_marquardt`.
 
     Returns:
         The estimate; its covariance takes the residual's colour into account.
 
     Raises:
-        InputError: If the force is to be met and there is no loop that makes one.
+        InputError: If there is no loop that makes the force to be met, or the minimiser is not known.
     """
-    return run_alone(output_error_steps(machine, log, start=start, numerics=numerics, hessian=hessian, on=on))
+    return run_alone(
+        output_error_steps(
+            machine, log, start=start, numerics=numerics, hessian=hessian, on=on, minimiser=minimiser
+        )
+    )
 
 
 def output_error_steps(
@@ -192,8 +202,10 @@ def output_error_steps(
     numerics: Numerics | None = None,
     hessian: bool = False,
     on: str = "position",
+    minimiser: str | Minimiser | None = None,
 ) -> Steps[Estimate]:
-    """`output_error`, one solve at a time."""
+    """Run `output_error`, one solve at a time."""
+    solver = minimiser_of(minimiser)
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
     machine = machine if start is None else machine.with_estimate(start)
@@ -208,32 +220,32 @@ def output_error_steps(
     problem = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
     if machine.unknown_reference is not None:
         # A machine bent to follow another reference ends nowhere: first what is unknown of that alone.
-        minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active)))
+        minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active), solver))
         problem = (*problem[:5], minimum.theta, *problem[6:])
-    minimum = yield SolveRequest(_fit, (*problem, active))
+    minimum = yield SolveRequest(_fit, (*problem, active, solver))
     if on == "both":
         problem = _problem(machine.with_estimate(np.asarray(minimum.theta)[:p]), replay, log, nuisance, on)
         e = yield SolveRequest(_residual, (*problem[:6], on))
         spread = np.maximum(np.std(np.asarray(e), axis=0), 1e-12 * np.std(problem[3], axis=0))
         problem = (*problem[:4], problem[4] / spread, *problem[5:])
-        minimum = yield SolveRequest(_fit, (*problem, active))
+        minimum = yield SolveRequest(_fit, (*problem, active, solver))
     if looped and not nuisance and not numerics.segment:
         left = np.asarray(minimum.residual).reshape(problem[3].shape)
         if start_shows(left[:, problem[4][0] > 0]):
             # A log that begins with a jerk from rest: its first readings are no velocity.
             rested = (from_rest(problem[0]), *problem[1:5], minimum.theta, *problem[6:])
-            other = yield SolveRequest(_fit, (*rested, active))
+            other = yield SolveRequest(_fit, (*rested, active, solver))
             if bool(other.converged) and float(other.cost) < float(minimum.cost):
                 problem, minimum = rested, other
     if nuisance and looped:
         every = np.ones(p + nuisance, bool)
-        freed = yield SolveRequest(_fit, (*problem, every))
+        freed = yield SolveRequest(_fit, (*problem, every, solver))
         spare = _CLEARLY * nuisance / max(problem[3].size - p - nuisance, 1)
         if bool(freed.converged) and float(freed.cost) * (1 + spare) < float(minimum.cost):
             minimum, active = freed, every
     elif nuisance:
         problem, active = _with_start(machine, log, problem, minimum)
-        minimum = yield SolveRequest(_fit, (*problem, active))
+        minimum = yield SolveRequest(_fit, (*problem, active, solver))
     measured, weight = problem[3], problem[4]
     e = np.asarray(minimum.residual).reshape(measured.shape)
     counts = np.broadcast_to(weight[0] > 0, e.shape)
@@ -258,11 +270,11 @@ def output_error_steps(
         theta=theta[:p],
         precision=precision,
         converged=converged,
-        message="converged" if converged else _failure(minimum),
+        message="converged" if converged else _failure(minimum, minimiser),
         residual=np.where(counts, e, np.nan),
         samples=int(counts.sum()),
         steps=int(minimum.steps),
-        notes=notes_of(machine, numerics, log, on),
+        notes=notes_of(machine, numerics, log, on, minimiser),
     )
 
 
@@ -375,14 +387,22 @@ def _sharp_steps(machine: Machine, log: Log) -> int:
     return needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
 
 
-def _failure(minimum: Minimum) -> str:
+def _failure(minimum: Minimum, minimiser: str | Minimiser | None) -> str:
     if not np.isfinite(float(minimum.cost)):
         return "the simulation diverged from these starting values"
+    if minimum.failure is not None:
+        return failure_text(minimum, minimiser_name(minimiser))
     return f"no convergence within {int(minimum.steps)} steps"
 
 
-def notes_of(machine: Machine, numerics: Numerics, log: Log, on: str) -> tuple[str, ...]:
-    """How it was simulated, for a user."""
+def notes_of(
+    machine: Machine,
+    numerics: Numerics,
+    log: Log,
+    on: str,
+    minimiser: str | Minimiser | None = None,
+) -> tuple[str, ...]:
+    """State how it was simulated and minimised, for a user."""
     where = "in the loop" if machine.controller is not None else "open loop"
     how = "sticks exactly" if numerics.sticks else "is smoothed"
     steps = f"{numerics.substeps} step(s) a sample"
@@ -394,4 +414,6 @@ def notes_of(machine: Machine, numerics: Numerics, log: Log, on: str) -> tuple[s
     if numerics.segment:
         seconds = numerics.segment * log.period
         notes.append(f"restarted from the log every {seconds:.3g} s: it drifts off otherwise")
+    if minimiser_of(minimiser) is not None:
+        notes.append(f"minimised by {minimiser_name(minimiser)}")
     return tuple(notes)

@@ -20,6 +20,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.estimators import steps_of
+from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.within_prior.fit import directions_steps
 from jaxid.gap import gaps, noise_floor
 from jaxid.machine import Machine
@@ -118,16 +119,19 @@ def _fit(
     drawn: bool,
 ) -> LoopFit:
     """A fit within the prior from some values of the unknowns; `drawn`: as of `directions_steps`."""
-    stated = session.case.output_error
+    stated, log = session.case.output_error, session.fit.log
+    numerics = choose_numerics(machine, log, solver=stated.get("solver"))
     found = run_alone(
         directions_steps(
             machine,
-            session.fit.log,
+            log,
             prior=stated["prior"],
             on=stated.get("on", "position"),
+            numerics=numerics,
             widths=widths,
             begin=begin,
             drawn=drawn,
+            minimiser=stated.get("minimiser"),
         )
     )
     return LoopFit.of(session, machine, widths, found)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.within_prior.posterior import loss_of, most_probable, past_kinks, quadratic, spread
@@ -65,6 +66,7 @@ def directions_steps(
     widths: Mapping[str, float] | None = None,
     begin: np.ndarray | None = None,
     drawn: bool = True,
+    minimiser: str | Minimiser | None = None,
 ) -> Steps[Estimate]:
     """Fit what a log tells of the unknowns in the loop, and leave the rest to the guesses.
 
@@ -84,6 +86,8 @@ def directions_steps(
         begin: Values of the unknowns to begin at; absent: the best of many points about the guesses.
         drawn: Draw what else is as probable, and what rounding does. Without it deviations are those of the
             quadratic picture, of a loop that does not round, in a fraction of the time.
+        minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix, for the
+            descents from one start; absent: `jaxid.estimators.common.levenberg_marquardt`.
 
     Returns:
         The estimate. Standard deviations hold what is left of the prior along other directions, and what
@@ -97,7 +101,9 @@ def directions_steps(
         (27) lacks the inverse of B: 100 (sigma^2 diag B^-1)^(1/2) / theta.
     """
     numerics = numerics or choose_numerics(machine, log)
-    problem = Problem.of(machine, log, prior, on, numerics, widths)
+    problem = replace(
+        Problem.of(machine, log, prior, on, numerics, widths), minimiser=minimiser_of(minimiser)
+    )
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     first = None if begin is None else problem.prior.inward(problem.padded(begin))
     found, told, many = yield from _searched(machine, problem, first, starts, given, drawn)
@@ -112,7 +118,7 @@ def directions_steps(
         remarks += yield from add_profiles(found, found.problem.noise(found.minimum, found.count), stated)
     if rounds(machine, problem):
         remarks += _of_rounding(drawn, told is not None, hessian or profile)
-    notes = (*notes_of(machine, numerics, log, on), *remarks)
+    notes = (*notes_of(machine, numerics, log, on, minimiser), *remarks)
     return _estimate(machine, found, precision, notes, {"directions": stated} | many)
 
 

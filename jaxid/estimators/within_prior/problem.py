@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Progress, descend
+from jaxid.estimators.common.minimise import minimise_on_scale
+from jaxid.estimators.common.minimisers import Minimiser
 from jaxid.estimators.output_error import (
     choose_numerics,
     measured_output,
@@ -64,6 +66,7 @@ class Problem:
         on: What of the simulation is compared.
         ladder: Sharpnesses at which to fit, one after the other.
         encoders: Joints that have one.
+        minimiser: A solver of optimistix for `descent`; None: jaxid's Levenberg-Marquardt.
     """
 
     replay: Replay
@@ -75,6 +78,7 @@ class Problem:
     on: str
     ladder: tuple[np.ndarray, ...]
     encoders: tuple[int, ...]
+    minimiser: Minimiser | None = None
 
     @property
     def args(self) -> tuple:
@@ -227,16 +231,33 @@ def _at_rest(problem: Problem, draws: int) -> np.ndarray:
     return np.zeros((draws, problem.replay.follow.shape[1]))
 
 
+def _pulled(args: tuple, sharpness: Array, pull: Array, origin: Array, vectors: Array) -> Any:
+    """Return the residual as a function of the coordinates, and behind it their pull towards zero."""
+    replay, places, plant, *rest = args
+    compared = residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors, origin)
+    return jax.jit(lambda z: jnp.concatenate([compared(z).ravel(), pull * z]))
+
+
 def _goes_on(*args: Any) -> Progress:
     """Down the cost; `pull`, the noise that a prior is held against, keeps the way near the guesses."""
-    replay, places, plant, *rest, sharpness, pull, origin, vectors, active, tolerance, stop, progress = args
+    *problem, sharpness, pull, origin, vectors, active, tolerance, stop, progress = args
     bound = jnp.full(active.shape, FAR)
-    compared = residual_of(replay, places, replace(plant, sharpness=sharpness), *rest, vectors, origin)
-    residual = jax.jit(lambda z: jnp.concatenate([compared(z).ravel(), pull * z]))
+    residual = _pulled(tuple(problem), sharpness, pull, origin, vectors)
     return descend(residual, progress, (-bound, bound), stop, active, tolerance)
 
 
 _go_on = eqx.filter_jit(_goes_on)
+
+
+@eqx.filter_jit
+def _by_minimiser(*args: Any) -> Minimum:
+    """Minimise from one start by a solver of optimistix; arguments as of `_goes_on`, that solver first."""
+    minimiser, *problem, sharpness, pull, origin, vectors, active, z = args
+    bound = jnp.full(active.shape, FAR)
+    residual = _pulled(tuple(problem), sharpness, pull, origin, vectors)
+    size = jnp.where(z == 0, 1.0, jnp.abs(z))
+    progress, failure = minimise_on_scale(minimiser, residual, z, size, (-bound, bound), active)
+    return replace(_compared(progress), failure=failure)
 
 
 def descent(
@@ -261,6 +282,9 @@ def descent(
         active: Which are fitted.
         settled: In parts of a sample's variance, what the cost may still fall.
     """
+    if problem.minimiser is not None and np.any(active):
+        args = (problem.minimiser, *problem.args, sharpness, pull, origin, vectors, active, z)
+        return (yield SolveRequest(_by_minimiser, args))
     progress = _begun(z, problem.measured.size)
     tolerance = np.asarray(0.1 * settled / len(problem.measured))
     args = (*problem.args, sharpness, pull, origin, vectors, active, tolerance)
