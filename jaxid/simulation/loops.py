@@ -269,6 +269,27 @@ def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[A
     return jnp.sum(weight * past, axis=0), past
 
 
+def initial_state(
+    plant: Plant,
+    position: Float[Array, " n"],
+    velocity: Float[Array, " n"] | None = None,
+    force: Float[Array, " m"] | None = None,
+) -> State:
+    """Return the state of a plant from its motion, the effects' internal states those of a constant force.
+
+    Args:
+        plant: The plant.
+        position: Coordinates, (n,) [m or rad].
+        velocity: Their rates, (n,); absent: at rest.
+        force: Declared force under which the drives have long been, (m,) [N or N m]; absent: zero.
+    """
+    position = jnp.asarray(position, dtype=jnp.float64)
+    velocity = jnp.zeros_like(position) if velocity is None else jnp.asarray(velocity, dtype=jnp.float64)
+    drives = len(plant.driven(position.size))
+    u = jnp.zeros(drives) if force is None else jnp.asarray(force, dtype=jnp.float64)
+    return State(position, velocity, plant.initial_states(u))
+
+
 def with_diffrax(
     plant: Plant,
     force: Callable[[Array], Array],
