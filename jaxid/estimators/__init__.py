@@ -42,7 +42,7 @@ def _output_error(
     from jaxid.estimators.output_error import choose_numerics, need_loop, output_error_steps
 
     log, stated = session.fit.log, session.case.output_error
-    on = on or stated.get("on", "position")
+    on = str(on or stated.get("on", "position"))
     solver = solver or stated.get("solver")
     minimiser = minimiser or stated.get("minimiser")
     if "prior" in stated:

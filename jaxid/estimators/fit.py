@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from jaxid.arrays import Array
@@ -233,7 +234,7 @@ def _columns(x: Array) -> Float[Array, "time k"]:
 
 def _period(time: Array | float, samples: int) -> float:
     """Return the sampling period, which compiled code is made for."""
-    if isinstance(time, jax.core.Tracer):
+    if isinstance(time, Tracer):
         raise InputError("time is traced", hint="close over it, or give the sampling period as a number")
     stamps = np.asarray(time, dtype=np.float64)
     if stamps.ndim == 0:
@@ -280,7 +281,7 @@ def _places(
         numbers = jax.tree.unflatten(structure, range(len(leaves)))
         picked = jax.tree.leaves(free(numbers))
         names = [n for k in picked for n, ((path, _), _) in every.items() if leaf(numbers, path) == k]
-        if len({leaf(numbers, every[n][0][0]) for n in names}) != len(set(picked)):
+        if len({int(leaf(numbers, every[n][0][0])) for n in names}) != len(set(picked)):
             raise InputError("free picks a leaf that is no parameter", hint=", ".join(every))
     else:
         names = [free] if isinstance(free, str) else list(free)

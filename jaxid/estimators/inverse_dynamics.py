@@ -86,7 +86,7 @@ def inverse_dynamics_steps(
     whole = all(data.measured)
     places, (transform, damping) = parameters.places, linear_scale(machine, whole)
     options = (transform, parameters.bounds, damping)
-    fits = []
+    fits, size = [], np.zeros(())
     for at in _starts(machine, theta):
         fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
@@ -148,14 +148,21 @@ def _linear(plant: Plant, free: Free) -> bool:
         return False
     if free.path[0] != "effects":
         return True
-    effect = type(plant.effects[free.path[1]])
+    effect = type(plant.effects[_number(free)])
     return effect.adds_force and effect.initial_state is Effect.initial_state
 
 
 def _info(plant: Plant, free: Free) -> ParameterInfo | None:
     """What its owner says of an unknown."""
-    owner = plant.effects[free.path[1]] if free.path[0] == "effects" else plant
-    return parameters_of(type(owner)).get(free.path[-1])
+    owner = plant.effects[_number(free)] if free.path[0] == "effects" else plant
+    return parameters_of(type(owner)).get(str(free.path[-1]))
+
+
+def _number(free: Free) -> int:
+    """Return which effect of its plant an unknown belongs to."""
+    number = free.path[1]
+    assert isinstance(number, int), "the path of an effect's parameter goes through its number"
+    return number
 
 
 def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
@@ -178,9 +185,9 @@ def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> 
     """The same with the dry friction of all joints shared otherwise between those with an encoder and not."""
     effects = machine.plant.effects
     levels = [
-        (k, effects[f.path[1]].port)
+        (k, effects[_number(f)].port)
         for k, f in enumerate(machine.parameters.free)
-        if f.path[0] == "effects" and effects[f.path[1]].kind == "coulomb_friction" and f.path[2] == "level"
+        if f.path[0] == "effects" and effects[_number(f)].kind == "coulomb_friction" and f.path[2] == "level"
     ]
     seen = [k for k, port in levels if port < len(measured) and measured[port]]
     hidden = [k for k, port in levels if port < len(measured) and not measured[port]]

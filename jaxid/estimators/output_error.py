@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -70,7 +71,10 @@ def output_residual(
         extra = theta[len(places) :]
         nudge = extra if extra.size else None
         run = replay.following(places, theta)(scatter(places, plant, theta), nudge)
-        outputs = {"position": (run.position,), "force": (replay.drive.gain * run.command,)}
+        outputs: dict[str, tuple[Array, ...]] = {
+            "position": (run.position,),
+            "force": (replay.drive.gain * run.command,),
+        }
         outputs["both"] = outputs["position"] + outputs["force"]
         return weight * (measured - jnp.concatenate(outputs[on], axis=1))
 
@@ -217,7 +221,7 @@ def output_error_steps(
     nuisance = 0 if fixed else 2 * log.position.shape[1]
     p = len(machine.parameters.free)
     active = np.arange(p + nuisance) < p
-    problem = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
+    problem: tuple[Any, ...] = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
     if machine.unknown_reference is not None:
         # A machine bent to follow another reference ends nowhere: first what is unknown of that alone.
         minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active), solver))

@@ -196,7 +196,12 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = assess(
-        parameters.names, jacobian, e, rows, unit * np.sqrt(rows.sum()), np.where(theta != 0, theta, 1.0)
+        parameters.names,
+        jacobian,
+        e,
+        np.asarray(rows),
+        float(unit * np.sqrt(rows.sum())),
+        np.where(theta != 0, theta, 1.0),
     )
     converged = bool(fit.converged) and bool(np.all(np.isfinite(theta)))
     length = 2 * windows.half * data.period

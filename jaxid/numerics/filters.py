@@ -8,13 +8,13 @@ from functools import cache, lru_cache
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 import scipy.ndimage
 import scipy.optimize
 import scipy.signal
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.numerics.fft import fast_length, irfft, rfft
 
 # Periods of the cut-off over which a signal fades out beyond its ends: by then the roll-off's own
 # memory is 10^-4.
@@ -92,8 +92,8 @@ def parabolic_derivatives(
         period: Sampling time [s].
         reach: Samples on each side.
     """
-    fit = lambda order: scipy.signal.savgol_filter(
-        x, 2 * reach + 1, 2, deriv=order, delta=period, axis=0, mode="interp"
+    fit = lambda order: np.asarray(
+        scipy.signal.savgol_filter(x, 2 * reach + 1, 2, deriv=order, delta=period, axis=0, mode="interp")
     )
     return fit(1), fit(2)
 
@@ -120,7 +120,8 @@ def parabolic_response(f: np.ndarray, reach: int, order: int) -> np.ndarray:
 def parabolic_cutoff(reach: int) -> float:
     """Where half of the parabola's velocity is left [cycles a sample]."""
     left = lambda f: float(parabolic_response(np.array([f]), reach, 1)[0]) - 0.5
-    return float(scipy.optimize.brentq(left, 1e-3 / reach, 1 / (2 * reach + 1)))
+    root = scipy.optimize.brentq(left, 1e-3 / reach, 1 / (2 * reach + 1))
+    return float(root)  # pyright: ignore[reportArgumentType]  # stubs: also the full output
 
 
 def spectral_derivatives(
@@ -141,12 +142,12 @@ def spectral_derivatives(
     rise = x[-1] - x[0]
     cubic = np.stack([x[0], first, 3 * rise - 2 * first - last, first + last - 2 * rise])
     rest = _tapered(x - powers @ cubic, int(_MEMORY / (cutoff_hz * period)))
-    f = scipy.fft.rfftfreq(len(rest), period)[:, None]
+    f = np.fft.rfftfreq(len(rest), period)[:, None]
     f = f[f[:, 0] < cutoff_hz]
-    spectrum = scipy.fft.rfft(rest, axis=0)[: len(f)] * roll_off(f, cutoff_hz)
+    spectrum = rfft(rest, axis=0)[: len(f)] * roll_off(f, cutoff_hz)
     out = []
     for _ in range(orders + 1):
-        out.append(scipy.fft.irfft(spectrum, len(rest), axis=0)[:n] + powers[:, : len(cubic)] @ cubic)
+        out.append(irfft(spectrum, len(rest), axis=0)[:n] + powers[:, : len(cubic)] @ cubic)
         spectrum = spectrum * (2j * np.pi * f)
         cubic = cubic[1:] * np.arange(1, len(cubic))[:, None] / span
     return tuple(out)
@@ -159,7 +160,7 @@ def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
     """
     pad = min(pad, len(x) - 2)
     fade = 0.5 * (1 + np.cos(np.pi * np.arange(1, pad + 1) / (pad + 1)))[:, None]
-    gap = scipy.fft.next_fast_len(len(x) + 2 * pad, real=True) - len(x) - 2 * pad
+    gap = fast_length(len(x) + 2 * pad) - len(x) - 2 * pad
     after, before = -x[-2 : -pad - 2 : -1] * fade, -x[pad:0:-1] * fade[::-1]
     return np.concatenate([x, after, np.zeros((gap, x.shape[1])), before])
 
@@ -245,7 +246,10 @@ class Decimator:
             return 10.0 ** -np.square(2 * frequency / (rate_hz * self.edge))
         # 0.05 dB of ripple, pass band to 0.8 of the new Nyquist frequency.
         sos = scipy.signal.cheby1(8, 0.05, self.pass_band, output="sos")
-        _, h = scipy.signal.freqz_sos(sos, worN=2 * np.pi * frequency / rate_hz)
+        _, h = scipy.signal.freqz_sos(
+            sos,
+            worN=2 * np.pi * frequency / rate_hz,  # pyright: ignore[reportArgumentType]  # stubs: int
+        )
         return np.abs(h) ** 2
 
     def _low_pass(self, x: Array) -> Array:
@@ -270,7 +274,7 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
     n = x.shape[0]
     lead, pad = min(n - 1, pad + every - 1) // every * every, min(n - 1, pad)
     head, tail = 2 * x[0] - x[lead:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
-    few = scipy.fft.next_fast_len(-(-(n + lead + 2 * pad) // every), real=True)
+    few = fast_length(-(-(n + lead + 2 * pad) // every))
     gap = every * few - n - lead - pad
     s = 0.5 * (1 - jnp.cos(jnp.pi * (jnp.arange(gap) + 1) / (gap + 1)))[:, None]
     ahead = head[0] if lead else x[0]
@@ -316,7 +320,7 @@ def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
     exponential distribution: lines and a few bad frequencies do not move it.
     """
     window = _hann(len(x))
-    spectrum = scipy.fft.rfft(window[:, None] * scipy.signal.detrend(x, axis=0), axis=0)
+    spectrum = rfft(window[:, None] * scipy.signal.detrend(x, axis=0), axis=0)
     f = np.arange(len(spectrum)) / len(x)
     band = spectrum[(f > 0.3) & (f < 0.475)]
     # `scipy.signal.periodogram` says the same, five times slower: studies ask it of every run, twice.
@@ -326,4 +330,4 @@ def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
 
 @lru_cache(maxsize=4)
 def _hann(size: int) -> np.ndarray:
-    return scipy.signal.get_window("hann", size)
+    return np.asarray(scipy.signal.get_window("hann", size))

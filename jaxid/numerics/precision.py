@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 import scipy.linalg
 import scipy.signal
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
+from jaxid.numerics.fft import fast_length, irfft, rfft
 
 # A combination of parameters counts as untold where its standard deviation, seen as force or
 # position, exceeds this part of the measured signal itself.
@@ -105,29 +105,29 @@ class NoiseModel:
 
     def density(self, size: int) -> Float[np.ndarray, " frequency"]:
         """Variance per rfft bin of a unit-normalised transform of length `size`."""
-        a = np.concatenate([[1.0], -self.coefficients])
+        a = np.concatenate([np.ones(1), -self.coefficients])
         return self.innovation**2 / np.abs(np.fft.rfft(a, size)) ** 2
 
     def sample(self, rng: np.random.Generator, size: int, runs: int) -> np.ndarray:
         """Draw residuals of this colour, (runs, size)."""
         burn = 20 * (len(self.coefficients) + 5)
         white = self.innovation * rng.standard_normal((runs, size + burn))
-        a = np.concatenate([[1.0], -self.coefficients])
-        return scipy.signal.lfilter([1.0], a, white, axis=1)[:, burn:]
+        a = np.concatenate([np.ones(1), -self.coefficients])
+        return np.asarray(scipy.signal.lfilter([1.0], a, white, axis=1))[:, burn:]
 
 
 def _lagged(x: np.ndarray, largest: int) -> np.ndarray:
     """Sums of x[k] x[k + lag] for lags up to `largest`."""
-    size = scipy.fft.next_fast_len(len(x) + largest + 1, real=True)
-    return scipy.fft.irfft(np.abs(scipy.fft.rfft(x, size)) ** 2, size)[: largest + 1]
+    size = fast_length(len(x) + largest + 1)
+    return irfft(np.abs(rfft(x, size)) ** 2, size)[: largest + 1]
 
 
 def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[np.ndarray, "p p"]:
     """J' R J with R the covariance of the residual: its colour seen through the regressor."""
-    size = scipy.fft.next_fast_len(len(jacobian) + min(len(jacobian), _REMEMBERED), real=True)
+    size = fast_length(len(jacobian) + min(len(jacobian), _REMEMBERED))
     weight = noise.density(size)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    spectrum, root = scipy.fft.rfft(jacobian, size, axis=0), np.sqrt(weight)[:, None]
+    spectrum, root = rfft(jacobian, size, axis=0), np.sqrt(weight)[:, None]
     real, imaginary = spectrum.real * root, spectrum.imag * root
     return (real.T @ real + imaginary.T @ imaginary) / size
 
@@ -143,18 +143,16 @@ def cross_sandwich(
     tapered, between the two models.
     """
     time = len(jacobians[0])
-    size = scipy.fft.next_fast_len(time + min(time, _REMEMBERED), real=True)
+    size = fast_length(time + min(time, _REMEMBERED))
     one, two = (n.whiten(e[:, None])[:, 0] for n, e in zip(noises, residuals, strict=True))
-    product = scipy.fft.rfft(one, 2 * size) * np.conj(scipy.fft.rfft(two, 2 * size))
+    product = rfft(one, 2 * size) * np.conj(rfft(two, 2 * size))
     lags = np.arange(-_COMMON, _COMMON + 1)
     common = np.zeros(size)
-    common[lags] = scipy.fft.irfft(product, 2 * size)[lags] / time * (1 - np.abs(lags) / (_COMMON + 1))
-    first, second = (
-        n.innovation / scipy.fft.rfft(np.concatenate([[1.0], -n.coefficients]), size) for n in noises
-    )
-    weight = scipy.fft.rfft(common) * first * np.conj(second)
+    common[lags] = irfft(product, 2 * size)[lags] / time * (1 - np.abs(lags) / (_COMMON + 1))
+    first, second = (n.innovation / rfft(np.concatenate([np.ones(1), -n.coefficients]), size) for n in noises)
+    weight = rfft(common) * first * np.conj(second)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    spectra = [scipy.fft.rfft(j, size, axis=0) for j in jacobians]
+    spectra = [rfft(j, size, axis=0) for j in jacobians]
     return np.real(np.conj(spectra[0]).T @ (weight[:, None] * spectra[1])) / size
 
 
@@ -282,8 +280,10 @@ def _sparse(vectors: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
     """
     if vectors.shape[1] < 2:
         return vectors
-    own = scipy.linalg.qr(vectors.T, mode="r", pivoting=True)[1][: vectors.shape[1]]
-    basis = np.linalg.solve(vectors[np.sort(own)].T, vectors.T).T
+    factors = scipy.linalg.qr(vectors.T, mode="r", pivoting=True)
+    order = np.asarray(factors[-1])
+    chosen = np.sort(order[: vectors.shape[1]])
+    basis = np.linalg.solve(vectors[chosen].T, vectors.T).T
     return basis / np.linalg.norm(basis, axis=0)
 
 

@@ -94,7 +94,10 @@ class Drive(eqx.Module):
         def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
             if not self.set_valued:
                 return step(plant, x, hold_polynomial(ends), t, h)
-            bound = None if flow is None else lambda x, *reaction: flow(x, ends, *reaction)
+            if flow is None:
+                return set_valued_step(plant, x, hold_polynomial(ends), t, h)[0]
+            whole_step = flow
+            bound = lambda x, *reaction: whole_step(x, ends, *reaction)
             return set_valued_step(plant, x, hold_polynomial(ends), t, h, bound)[0]
 
         def several(x: State, ends: tuple[Array, ...], t: Array) -> State:
@@ -222,6 +225,7 @@ def closed_loop(
 
     def sensed(x: State, reading: Array, moved: tuple, noise: Array | None, renews: Array) -> tuple:
         """Velocity and acceleration by inertial sensors, whether they are new, and what is to be kept."""
+        assert inertial is not None, "asked only with inertial sensors"
         before, v, a = moved
         mean = (x.qd - before) / drive.period
         raw = inertial.read(plant, x.q, x.qd, mean, noise)
@@ -243,7 +247,9 @@ def closed_loop(
         u, memory = controller.command(seen, memory, disturbance)
         force, past = _delayed_force(plant, drive, u, past)
         new = advance(x, (force,), t)
-        last = None if last is None else sensor.read_command(u, noise[n : n + m])
+        if last is not None:
+            assert noise is not None, "a command is measured only with noise"
+            last = sensor.read_command(u, noise[n : n + m])
         return (new, memory, past, last, held, moved), (x.q, x.qd, u, reading, controller.learned(memory))
 
     fresh = None if sensor.hold == 1 else jnp.arange(len(times)) % sensor.hold == 0
@@ -336,11 +342,12 @@ def with_diffrax(
         step_length,
         x0,
         args=(plant, force),
-        saveat=diffrax.SaveAt(ts=times),
+        saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
         stepsize_controller=controller,
         adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
         max_steps=max_steps,
     )
+    assert isinstance(solution.ys, State), "states are saved as they are"
     return solution.ys.q, solution.ys.qd
 
 

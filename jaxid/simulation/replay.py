@@ -99,6 +99,8 @@ class Replay(eqx.Module):
             q, v = q + nudge[: q.size], v + nudge[q.size :]
         if self.controller is not None:
             reference = self.reference() if isinstance(self.reference, UnknownReference) else self.reference
+            assert reference is not None, "make_replay gives a loop its reference"
+            assert self.disturbance is not None, "and its disturbance, which may be zero"
             run = closed_loop(
                 plant,
                 self.drive,
@@ -110,6 +112,7 @@ class Replay(eqx.Module):
                 self.sensor,
             )
         else:
+            assert self.command is not None, "make_replay gives an open loop its command"
             run = open_loop(plant, self.drive, self.command, q, v, None, self.restart)
         return jax.tree.map(lambda a: a[:: self.every], run)
 
@@ -162,6 +165,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         )
     ticks = log.time[0] + period * np.arange((log.samples - 1) * every + 1)
     if log.reference is None:
+        assert machine.unknown_reference is not None, "refused above"
         reference, times = machine.unknown_reference.at(ticks - log.time[0]), ticks
     elif every == 1:
         reference, times = log.reference, log.time
@@ -236,6 +240,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     if replay.controller is not None or replay.restart is not None:
         return replay
     count = min(samples, log.samples)
+    assert replay.command is not None, "make_replay gives an open loop its command"
     short = eqx.tree_at(lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1])
     nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
     n = replay.position.size
@@ -295,7 +300,7 @@ def _refined(command: np.ndarray) -> np.ndarray:
     whole = np.concatenate(
         [2 * command[0] - command[pad:0:-1], command, 2 * command[-1] - command[-2 : -pad - 2 : -1]]
     )
-    fine = scipy.signal.resample(whole, len(whole) * _REFINE, axis=0)
+    fine = np.asarray(scipy.signal.resample(whole, len(whole) * _REFINE, axis=0))
     return fine[pad * _REFINE : (pad + n - 1) * _REFINE + 1]
 
 
@@ -331,15 +336,14 @@ def local_line(
         noise: Standard deviation of a reading, by joint; absent: read off the log.
     """
     noise = signals.high_band_std(log.filled) if noise is None else noise
-    position = velocity = low = high = None
-    for reach in _REACHES:
+    position, velocity, size = _parabola(log, k, _REACHES[0])
+    # Wide enough that rounding alone, in a log without noise, is no disagreement.
+    spread = _STRAY * size * noise + 1e-12 * np.abs(velocity)
+    low, high = velocity - spread, velocity + spread
+    going = np.ones(position.shape, bool)
+    for reach in _REACHES[1:]:
         q, v, size = _parabola(log, k, reach)
-        # Wide enough that rounding alone, in a log without noise, is no disagreement.
         spread = _STRAY * size * noise + 1e-12 * np.abs(v)
-        if velocity is None:
-            position, velocity, low, high = q, v, v - spread, v + spread
-            going = np.ones(q.shape, bool)
-            continue
         low, high = np.maximum(low, v - spread), np.minimum(high, v + spread)
         going = going & (low <= high)
         position, velocity = np.where(going, q, position), np.where(going, v, velocity)

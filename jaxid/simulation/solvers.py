@@ -10,6 +10,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from jaxid.arrays import Array
@@ -89,6 +90,7 @@ class AdaptiveStep(eqx.Module):
         return jax.tree.map(lambda y: jnp.where(good, y[0], jnp.nan), solution.ys)
 
 
-def _rate(since: Array, x: State, args: tuple) -> State:
+def _rate(since: ArrayLike, x: State, args: tuple) -> State:
     plant, ends, t, h = args
+    since = jnp.asarray(since)
     return derivative(plant, x, hold_polynomial(ends)(since / h), t + since)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Bool, Float, PyTree
+from jaxtyping import Bool, Float, PyTree, Scalar
 
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky
 from jaxid.arrays import Array
@@ -69,8 +69,8 @@ class Transform(eqx.Module):
         """The transform of a set of unknowns."""
         log = np.asarray([f.sign == "positive" for f in parameters.free], dtype=bool)
         bodies = parameters.bodies
-        bounds = (np.array([getattr(b, s) for b in bodies]).reshape(-1, 10) for s in ("lower", "upper"))
-        return cls(log, *bounds, tuple(b.places for b in bodies))
+        lower, upper = (np.array([getattr(b, s) for b in bodies]).reshape(-1, 10) for s in ("lower", "upper"))
+        return cls(log, lower, upper, tuple(b.places for b in bodies))
 
     def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
         """Physical to solver."""
@@ -91,7 +91,7 @@ class Transform(eqx.Module):
         for bound, own in ((lower, self.lower), (upper, self.upper)):
             bound = plain.inward(bound)
             for places, values in zip(self.bodies, own, strict=True):
-                bound = bound.at[np.array(places)].set(values)
+                bound = jnp.asarray(bound).at[np.array(places)].set(values)
             out.append(bound)
         return out[0], out[1]
 
@@ -104,7 +104,7 @@ class Transform(eqx.Module):
 
     def _with_bodies(self, out: Array, f: Callable[[Array], Array], values: Array) -> Array:
         for places in map(np.array, self.bodies):
-            out = out.at[places].set(f(values[places]))
+            out = jnp.asarray(out).at[places].set(f(values[places]))
         return out
 
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -165,7 +165,7 @@ class Progress(eqx.Module):
     aux: Any = None
 
     @classmethod
-    def at(cls, x: Array, own: Array, size: int, damping: float = DAMPING) -> Progress:
+    def at(cls, x: Array, own: Array, size: int, damping: Array | float = DAMPING) -> Progress:
         """At a start; `size`: of the residual that is kept, zero for none.
 
         Of numpy's arrays where x is one: to make jax's outside of compiled code takes longer.
@@ -328,7 +328,7 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     atol: float | Array = 0.0
     damping: float | Array = DAMPING
     keep: bool = eqx.field(static=True, default=True)
-    norm: Callable[[PyTree], Array] = eqx.field(static=True, default=optx.max_norm)
+    norm: Callable[[PyTree], Scalar] = eqx.field(static=True, default=optx.max_norm)
 
     def init(
         self,
@@ -358,17 +358,17 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ) -> tuple[PyTree, Progress, Any]:
         unravel = ravel_pytree(y)[1]
         active = options.get("active")
-        moves = jnp.ones(state.x.size, bool) if active is None else ravel_pytree(active)[0]
+        moves = jnp.ones(state.x.size, bool) if active is None else jnp.asarray(ravel_pytree(active)[0])
 
         def flat(x: Array) -> tuple[Array, tuple[Array, Any]]:
-            out, aux = fn(unravel(x), args)
+            out, aux = fn(unravel(jnp.asarray(x)), args)
             e = ravel_pytree(out)[0]
             return e, (e, aux)
 
         jacobian, (e, aux) = jax.jacfwd(flat, has_aux=True)(state.trial)
         tolerances = (self.rtol, self.atol, options.get("floor", -np.inf))
         state = _advanced(state, e, aux, jacobian, _bounds_of(options, y), moves, *tolerances)
-        return unravel(state.x), state, state.aux
+        return unravel(jnp.asarray(state.x)), state, state.aux
 
     def terminate(
         self,
@@ -378,9 +378,10 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         options: dict[str, Any],
         state: Progress,
         tags: frozenset[object],
-    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+    ) -> tuple[Bool[jax.Array, ""], optx.RESULTS]:
         lost = state.done & ~jnp.isfinite(state.cost)
-        return state.done, optx.RESULTS.where(lost, optx.RESULTS.nonfinite, optx.RESULTS.successful)
+        result = optx.RESULTS.where(lost, optx.RESULTS.nonfinite, optx.RESULTS.successful)
+        return jnp.asarray(state.done), result
 
     def postprocess(
         self,
@@ -484,7 +485,7 @@ def eliminated(matrix: Float[Array, "p p"], b: Float[Array, "p k"]) -> Float[Arr
     def eliminate(k: Array, rows: Array) -> Array:
         pivot = rows[k] / rows[k, k]
         rows = rows - rows[:, k, None] * pivot
-        return rows.at[k].set(pivot)
+        return jnp.asarray(rows).at[k].set(pivot)
 
     rows = jnp.concatenate([matrix, b], axis=1)
     return jax.lax.fori_loop(0, len(b), eliminate, rows)[:, len(b) :]

@@ -122,7 +122,7 @@ def best_step(
     if not parameters.bodies:
         return bounded_step(columns, e, theta, parameters.bounds)
     # As many rows as unknowns hold all that a sum of squares does.
-    triangle = np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r"))
     minimum = _best_bodies(triangle, Transform.of(parameters), parameters.guess, parameters.bounds)
     return np.asarray(minimum.theta) - theta
 
