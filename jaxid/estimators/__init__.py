@@ -80,7 +80,7 @@ def _output_error(
 
 
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
-    """Another start of a fit within a prior: what a method finds of the unknowns, the rest at the guesses.
+    """Return another start of a fit within a prior: the estimates of a method, the rest at the guesses.
 
     Of sums that it cannot tell apart both parts move; what does not enter in proportion stays.
     """
@@ -98,7 +98,7 @@ def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
 
 
 def _start(session: Session) -> Steps[np.ndarray | None]:
-    """Where output error starts: at what another method found where that tells all unknowns of the plant.
+    """Return the start of output error: the estimates of another method if it identifies all unknowns.
 
     Else at the guesses (None). Links that are kept to bodies are told well enough: what no log tells of them
     is that of a body, and moves nothing. Inverse dynamics keeps the bounds, and may end at one; what does not
@@ -162,7 +162,7 @@ def _algebraic(session: Session) -> Steps[Estimate]:
 
 
 def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
-    """One of the forms that solve a joint's equations by themselves."""
+    """Return the steps of a form that solves each joint's equations alone."""
 
     def steps(session: Session) -> Steps[Estimate]:
         from jaxid.estimators.algebraic.one_window import FORMS

@@ -45,26 +45,26 @@ class Estimate:
 
     @property
     def names(self) -> list[str]:
-        """Of the parameters."""
+        """Names of the parameters."""
         return self.machine.parameters.names
 
     @property
     def std(self) -> Float[np.ndarray, " p"]:
-        """Standard deviations; NaN where the log cannot tell."""
+        """Standard deviations; NaN of parameters that are not identifiable."""
         return self.precision.std
 
     @property
     def identifiable(self) -> Bool[np.ndarray, " p"]:
-        """Which parameters the log can tell."""
+        """Mask of the parameters that the log identifies."""
         return self.precision.identifiable
 
     @property
     def all_identified(self) -> bool:
-        """Whether the solver converged and the log tells all parameters."""
+        """Whether the solver converged and all parameters are identifiable."""
         return self.converged and bool(np.all(self.identifiable))
 
     def value(self, name: str) -> float:
-        """Estimate of one parameter.
+        """Return the estimate of one parameter.
 
         Raises:
             KeyError: If there is none of that name.

@@ -62,7 +62,7 @@ _SEGMENTS = 40
 def output_residual(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, on: str = "position"
 ) -> Callable[[Array], Array]:
-    """Measured minus simulated output as a function of the unknowns, (time, k), weighted.
+    """Return measured minus simulated output as a function of the unknowns, (time, k), weighted.
 
     In open loop the start's position and velocity may be unknowns too, behind the others.
     """
@@ -102,7 +102,7 @@ def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
 
 
 def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
-    """What a log holds of an output, (time, k), and which columns count; see `output_residual`."""
+    """Return a log's output, (time, k), and the mask of columns that count; see `output_residual`."""
     force = log.force * machine.gain
     outputs = {"position": (log.filled,), "force": (force,), "both": (log.filled, force)}
     counts = {"position": log.measured, "force": (True,) * force.shape[1]}
@@ -143,7 +143,7 @@ def _residual(
 
 
 def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndarray:
-    """Derivative of the simulated position in the unknowns where they stand, (time, n, p).
+    """Return the derivative of the simulated position by the unknowns at their guesses, (time, n, p).
 
     Args:
         machine: The machine.
@@ -283,14 +283,14 @@ def output_error_steps(
 
 
 def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
-    """Which unknowns are those of the reference."""
+    """Return a mask of the unknowns of the reference."""
     own = np.zeros_like(active)
     own[: len(machine.parameters.free)] = [path[0] == REFERENCE for path, _ in machine.parameters.places]
     return own
 
 
 def _with_start(machine: Machine, log: Log, problem: tuple, minimum: Minimum) -> tuple[tuple, np.ndarray]:
-    """A fit from a start that suits the fitted plant; of the start too where noise is all that is left."""
+    """Return a fit from a start that suits the fitted plant, with the start unknown if only noise remains."""
     p = len(machine.parameters.free)
     fitted = machine.with_estimate(np.asarray(minimum.theta)[:p])
     replay = with_fitted_start(problem[0], fitted.plant, log)
@@ -324,7 +324,7 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str)
 def choose_numerics(
     machine: Machine, log: Log, *, segments: bool = True, solver: str | None = None
 ) -> Numerics:
-    """Integration that suits a machine and its log.
+    """Choose the integration that suits a machine and its log.
 
     Dry friction sticks exactly: its gradient is exact too, because the force is continuous where
     sliding starts. Break-away friction breaks that, and is smoothed; so does a solver of diffrax.
@@ -357,7 +357,7 @@ def choose_numerics(
 
 
 def turning_steps(machine: Machine, log: Log) -> int:
-    """Steps a sample by which what a step misses where dry friction turns stays below the noise.
+    """Return the steps a sample that keep the error at reversals of dry friction below the noise.
 
     A joint that comes to rest within a step h is off by about 0.04 F / m h^2 afterwards, F its dry
     friction; a tenth of a reading's noise is little enough for thousands of samples.
@@ -377,13 +377,13 @@ def turning_steps(machine: Machine, log: Log) -> int:
 
 @eqx.filter_jit
 def _levels(plant: Plant, q: Array, v: Array, u: Array) -> Array:
-    """Dry friction at rest, what it takes to break away included."""
+    """Return the level of dry friction at rest, break-away included."""
     levels = plant.balance(q, v, v, u, jnp.zeros(()), plant.initial_states(u))
     return levels.dry + levels.stick
 
 
 def _sharp_steps(machine: Machine, log: Log) -> int:
-    """Steps a sample that the smoothed sign asks for: a coarser one gives garbage for a gradient."""
+    """Return the steps a sample that the smoothed sign needs; with fewer the gradient is garbage."""
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)

@@ -24,7 +24,7 @@ _MEMORY = 30
 def butterworth_zero_phase(
     x: Float[np.ndarray, "time k"], cutoff_hz: float, order: int, rate_hz: float
 ) -> Float[np.ndarray, "time k"]:
-    """Low-pass forwards and backwards with a Butterworth filter of the given order.
+    """Filter forwards and backwards by a Butterworth low-pass of the given order.
 
     Run twice, the filter is 6 dB down at the cut-off and has no phase.
 
@@ -42,12 +42,12 @@ def butterworth_zero_phase(
 
 
 def central_difference(x: Float[np.ndarray, "time k"], period: float) -> Float[np.ndarray, "time k"]:
-    """Second-order central difference, one-sided at the two ends."""
+    """Return the second-order central difference, one-sided at the two ends."""
     return np.gradient(x, period, axis=0, edge_order=2)
 
 
 def running_median(x: Float[np.ndarray, "time k"], width: int) -> Float[np.ndarray, "time k"]:
-    """Median of each sample and its neighbours, `width` in all, which must be odd.
+    """Return the median of each sample and its neighbours, `width` in all, which must be odd.
 
     The windows that would reach beyond an end are replaced by Tukey's rule: the median of the
     sample, of the first full window, and of the line through the first two full windows, as far
@@ -71,7 +71,7 @@ def running_median(x: Float[np.ndarray, "time k"], width: int) -> Float[np.ndarr
 
 @cache
 def median_noise(width: int) -> float:
-    """What `high_band_std` sees of white noise of standard deviation one behind a running median.
+    """Return the `high_band_std` of white noise of standard deviation one behind a running median.
 
     Of noise that is larger than the signal's rise from sample to sample; found on Gaussian noise.
     """
@@ -82,7 +82,7 @@ def median_noise(width: int) -> float:
 def parabolic_derivatives(
     x: Float[np.ndarray, "time k"], period: float, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First and second derivative of the parabola through 2 reach + 1 samples about each one.
+    """Return the first and second derivative of the parabola through 2 reach + 1 samples about each one.
 
     The parabola is fitted by least squares (Savitzky and Golay); it is not causal and has no phase.
     At the ends the first and the last one are read off the middle.
@@ -99,7 +99,7 @@ def parabolic_derivatives(
 
 
 def parabolic_response(f: np.ndarray, reach: int, order: int) -> np.ndarray:
-    """Gain of the parabola's derivative of order 1 or 2 over the exact one.
+    """Return the gain of the parabola's derivative of order 1 or 2 over the exact one.
 
     Args:
         f: Frequencies [cycles a sample].
@@ -118,7 +118,7 @@ def parabolic_response(f: np.ndarray, reach: int, order: int) -> np.ndarray:
 
 @cache
 def parabolic_cutoff(reach: int) -> float:
-    """Where half of the parabola's velocity is left [cycles a sample]."""
+    """Return the frequency at which half of the parabola's velocity remains [cycles a sample]."""
     left = lambda f: float(parabolic_response(np.array([f]), reach, 1)[0]) - 0.5
     root = scipy.optimize.brentq(left, 1e-3 / reach, 1 / (2 * reach + 1))
     return float(root)  # pyright: ignore[reportArgumentType]  # stubs: also the full output
@@ -154,7 +154,7 @@ def spectral_derivatives(
 
 
 def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
-    """A signal that is zero at both ends, then its odd continuation that fades out, then zeros.
+    """Return a signal that is zero at both ends, then its odd continuation that fades out, then zeros.
 
     The length suits a transform: one with a large prime factor takes ten times as long.
     """
@@ -166,12 +166,12 @@ def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
 
 
 def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
-    """One up to 0.6 of the cut-off, zero beyond it, a half cosine between."""
+    """Return one up to 0.6 of the cut-off, zero beyond it, a half cosine between."""
     return 0.5 * (1 + np.cos(np.pi * np.clip((f / cutoff_hz - 0.6) / 0.4, 0.0, 1.0)))
 
 
 def _end_slope(x: np.ndarray, period: float) -> np.ndarray:
-    """Slope at the first sample from a line through the first few."""
+    """Return the slope at the first sample from a line through the first few."""
     k = min(8, len(x))
     t = period * (np.arange(k) - 0.5 * (k - 1))
     return t @ x[:k] / (t @ t)
@@ -202,13 +202,13 @@ class Decimator:
     band: float | None = None
 
     def __call__(self, x: Float[Array, "time k"]) -> Float[Array, "kept k"]:
-        """Filter along the first axis, decimate and trim."""
+        """Return the filter along the first axis, decimate and trim."""
         if self.filters:
             x = self._low_pass(x)
         return x[self.trim : x.shape[0] - self.trim]
 
     def kept(self, samples: int) -> np.ndarray:
-        """Indices, in the undecimated log, of the samples that remain."""
+        """Return the indices, in the undecimated log, of the samples that remain."""
         every = np.arange(0, samples, self.factor)
         return every[self.trim : len(every) - self.trim]
 
@@ -228,18 +228,18 @@ class Decimator:
 
     @property
     def reach(self) -> int:
-        """Samples of the log over which an event spreads: beyond, 10^-4 of it is left."""
+        """Samples of the log over which an event spreads: beyond, 10^-4 of it remains."""
         if self.edge is None:
             return self.factor - 1 if self.filters else 0
         # Four standard deviations of the Gaussian in time.
         return int(np.ceil(4 * np.sqrt(2 * np.log(10)) / (np.pi * self.edge)))
 
     def band_hz(self, rate_hz: float) -> float:
-        """Edge of the pass band."""
+        """Return the edge of the pass band."""
         return 0.5 * rate_hz * self.pass_band
 
     def response(self, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
-        """Gain at each frequency [Hz]."""
+        """Return the gain at each frequency [Hz]."""
         if not self.filters:
             return np.ones_like(frequency)
         if self.edge is not None:
@@ -291,7 +291,7 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
 
 
 def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: float) -> Float[Array, "time m"]:
-    """Mean force around each sample of a command that acts `delay` later.
+    """Return the mean force around each sample of a command that acts `delay` later.
 
     A command that is held acts from its sample on: seen at the samples it lags by half the time
     for which it is held. Left out, that half looks like a delay, and a delay like damping.
@@ -314,7 +314,7 @@ def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: flo
 
 
 def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
-    """Standard deviation of white noise that would fill the top of the spectrum as x does.
+    """Return the standard deviation of white noise that would fill the top of the spectrum as x does.
 
     The median of the periodogram between 0.6 and 0.95 of Nyquist, over the median of an
     exponential distribution: lines and a few bad frequencies do not move it.

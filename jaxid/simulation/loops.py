@@ -75,7 +75,7 @@ class Drive(eqx.Module):
     def stepper(
         self, plant: Plant, x: State, ends: tuple[Array, ...]
     ) -> Callable[[State, tuple[Array, ...], Array], State]:
-        """What advances a state by one sample, given the force at its ends, and the time.
+        """Return a function that advances a state by one sample, given the force at its ends, and the time.
 
         To be called outside the loop over the samples: where the plant's forces are affine, its
         flow is one matrix, worked out here once.
@@ -161,7 +161,7 @@ def open_loop(
 
 
 def interval_forces(plant: Plant, drive: Drive, command: Float[Array, "time m"]) -> tuple[Array, Array]:
-    """Declared force at the start and the end of every interval, delay applied.
+    """Return the declared force at the start and the end of every interval, delay applied.
 
     A delay that is no whole number of samples is averaged over the interval: taken literally, a
     held command has zero gradient in it.
@@ -224,7 +224,7 @@ def closed_loop(
     inertial, m = sensor.inertial, drive.gain.size
 
     def sensed(x: State, reading: Array, moved: tuple, noise: Array | None, renews: Array) -> tuple:
-        """Velocity and acceleration by inertial sensors, whether they are new, and what is to be kept."""
+        """Return velocity and acceleration by inertial sensors, whether they are new, and the memory."""
         assert inertial is not None, "asked only with inertial sensors"
         before, v, a = moved
         mean = (x.qd - before) / drive.period
@@ -263,7 +263,7 @@ def closed_loop(
 
 
 def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[Array, Array]:
-    """Declared force over the coming interval, and the updated memory of past ones."""
+    """Return the declared force over the coming interval, and the updated memory of past ones."""
     force = drive.gain * u
     if drive.longest_delay == 0:
         return force, past
@@ -352,7 +352,7 @@ def with_diffrax(
 
 
 def needed_substeps(plant: Plant, drive: Drive, q: Array, v: Array, u: Array) -> int:
-    """Integration steps a sample that the smoothed sign asks for along a motion.
+    """Return the integration steps a sample that the smoothed sign needs along a motion.
 
     Past that, the trajectory still looks plausible while its gradient is garbage: level times
     step over (mass times width) must not exceed about one.

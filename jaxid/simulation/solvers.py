@@ -48,7 +48,7 @@ class AdaptiveStep(eqx.Module):
 
     @classmethod
     def sized(cls, name: str, *sizes: float) -> AdaptiveStep:
-        """The solver of that name for a motion of such position and velocity.
+        """Return the solver of that name for a motion of such position and velocity.
 
         Raises:
             InputError: If there is no such solver.

@@ -23,7 +23,7 @@ _RANGE = 1e3
 
 
 def need_bodies(session: Session) -> Session:
-    """The same session, the unknown links of its arm kept to what bodies can be.
+    """Return the session with the unknown links of its arm restricted to parameters of real bodies.
 
     Of other machines inertias are positive anyway.
 
@@ -74,7 +74,7 @@ def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -
 
 
 def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
-    """A fit whose estimate says what its links are, where the log tells sums of their parameters too."""
+    """Run a fit and add the parameters of each link to its estimate, identifiable or not."""
     estimate = yield from steps
     if not estimate.machine.plant.linked:
         return estimate
@@ -87,7 +87,7 @@ def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
 
 
 def links_of(plant: Plant) -> list[dict[str, object]]:
-    """Each link's parameters, and the least eigenvalue of its pseudo-inertia over the largest."""
+    """Return the each link's parameters, and the least eigenvalue of its pseudo-inertia over the largest."""
     ten = bodies_of(plant)
     values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten))))
     return [
@@ -97,5 +97,5 @@ def links_of(plant: Plant) -> list[dict[str, object]]:
 
 
 def bodies_of(plant: Plant) -> Float[np.ndarray, "n 10"]:
-    """The ten parameters of every link."""
+    """Return the ten parameters of every link."""
     return np.stack([np.asarray(getattr(plant, name)) for name in TEN], axis=-1)

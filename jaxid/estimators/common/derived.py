@@ -34,7 +34,7 @@ class Derived:
 
 
 def dry_friction(estimate: Estimate) -> list[Derived]:
-    """Of every Coulomb friction the level where its coefficient is a parameter, and the reverse.
+    """Return the level of each Coulomb friction given by its coefficient, and the reverse.
 
     The normal force is the plant's own, m g: a weight, by which a coefficient has its meaning.
     """
@@ -66,7 +66,7 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
 
 
 def natural_frequency(estimate: Estimate) -> list[Derived]:
-    """Of an axis with an elastic coupling, declared or found: the fastest swing, nothing held [Hz]."""
+    """Return the natural frequency of an axis with an elastic coupling, its joints free [Hz]."""
     plant, parameters = estimate.machine.plant, estimate.machine.parameters
     kinds = {e.kind for e in plant.effects}
     if plant.load is None and "joint_flexibility" not in kinds or "backlash" in kinds:
@@ -80,5 +80,5 @@ def natural_frequency(estimate: Estimate) -> list[Derived]:
 
 
 def _before(plant: Plant, k: int) -> Plant:
-    """The plant with its first k effects: by these the next is numbered."""
+    """Return the plant with its first k effects, which number the next one."""
     return eqx.tree_at(lambda p: p.effects, plant, plant.effects[:k])

@@ -25,7 +25,7 @@ def inner_start(
     bodies: tuple[tuple[int, ...], ...],
     solve: Callable[[Array, Array], Array],
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-    """The least squares of columns @ theta + rest among bodies, from a body of any kind.
+    """Minimise the squares of columns @ theta + rest among bodies, from any body.
 
     Minus the logarithms of the determinants of the pseudo-inertias, over those at the start, times a weight
     that falls, keep what is sought inside. Newton's steps, damped by their own length, never leave it. The

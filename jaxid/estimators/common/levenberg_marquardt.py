@@ -66,26 +66,26 @@ class Transform(eqx.Module):
 
     @classmethod
     def of(cls, parameters: Parameters) -> Transform:
-        """The transform of a set of unknowns."""
+        """Return the transform of a set of unknowns."""
         log = np.asarray([f.sign == "positive" for f in parameters.free], dtype=bool)
         bodies = parameters.bodies
         lower, upper = (np.array([getattr(b, s) for b in bodies]).reshape(-1, 10) for s in ("lower", "upper"))
         return cls(log, lower, upper, tuple(b.places for b in bodies))
 
     def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Physical to solver."""
+        """Return physical values on the solver's scale."""
         return self._with_bodies(
             jnp.where(self.log, jnp.log(jnp.where(self.log, theta, 1.0)), theta), log_cholesky, theta
         )
 
     def outward(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Solver to physical."""
+        """Return physical values from those on the solver's scale."""
         return self._with_bodies(
             jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x), of_log_cholesky, x
         )
 
     def bounds(self, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> tuple[Array, Array]:
-        """Bounds on the physical values as those of the solver; bodies keep to their own."""
+        """Return bounds on the physical values on the solver's scale; bodies have separate ones."""
         plain = Transform(self.log)
         out = []
         for bound, own in ((lower, self.lower), (upper, self.upper)):
@@ -96,7 +96,7 @@ class Transform(eqx.Module):
         return out[0], out[1]
 
     def physical(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
-        """A Jacobian in the solver's values as one in the physical ones, at some of these."""
+        """Return a Jacobian by physical values from one by the solver's, at some physical values."""
         out = jacobian / self.slope(theta)
         for places in map(np.array, self.bodies):
             out = out.at[:, places].set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
@@ -108,7 +108,7 @@ class Transform(eqx.Module):
         return out
 
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """D physical / d solver, for Jacobians; of what is part of no body."""
+        """Return d physical / d solver, for Jacobians, of unknowns that are part of no body."""
         return jnp.where(self.log, theta, 1.0)
 
 
@@ -166,7 +166,7 @@ class Progress(eqx.Module):
 
     @classmethod
     def at(cls, x: Array, own: Array, size: int, damping: Array | float = DAMPING) -> Progress:
-        """At a start; `size`: of the residual that is kept, zero for none.
+        """Return the state at a start; `size` is that of the residual kept, zero for none.
 
         Of numpy's arrays where x is one: to make jax's outside of compiled code takes longer.
         """
@@ -188,7 +188,7 @@ class Progress(eqx.Module):
         )
 
     def minimum(self, transform: Transform) -> Minimum:
-        """As a result."""
+        """Return the best point as a result."""
         theta = transform.outward(self.x)
         return Minimum(
             theta,
@@ -465,7 +465,7 @@ def _advanced(
 
 
 def _step(gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"]) -> Array:
-    """Damped step of the free unknowns."""
+    """Return the damped step of the free unknowns."""
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
     normal = jnp.where(jnp.outer(free, free), normal / jnp.outer(scale, scale), 0.0)
