@@ -202,7 +202,7 @@ def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> 
 
 def force_precision(
     machine: Machine,
-    size: Array,
+    size: Array | float,
     theta: np.ndarray,
     e: np.ndarray,
     jacobian: np.ndarray,

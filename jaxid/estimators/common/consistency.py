@@ -35,16 +35,16 @@ def need_bodies(session: Session) -> Session:
         return session
     unknown, bodies = machine.parameters.free, []
     for link in range(machine.plant.joints):
-        own = {f.path[0]: k for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
-        if own:
-            bodies.append(_body(link, own, unknown, f"{where}, link {link + 1}"))
+        indices = {f.path[0]: k for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
+        if indices:
+            bodies.append(_body(link, indices, unknown, f"{where}, link {link + 1}"))
     return session.with_machine(
         machine.with_plant(machine.plant, replace(machine.parameters, bodies=tuple(bodies)))
     )
 
 
-def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -> Body:
-    known = [name for name in TEN if name not in own]
+def _body(link: int, indices: dict[str, int], unknown: Sequence[Free], where: str) -> Body:
+    known = [name for name in TEN if name not in indices]
     if known:
         hint = "let all ten be unknown and start at those of a body; base parameters alone are of none"
         raise InputError(
@@ -53,7 +53,7 @@ def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -
             where=where,
             hint=hint,
         )
-    places = tuple(own[name] for name in TEN)
+    places = tuple(indices[name] for name in TEN)
     bounded = [unknown[k].name for k in places if np.isfinite([unknown[k].lower, unknown[k].upper]).any()]
     if bounded:
         what = f"{bounded[0]} has min or max, which physically_consistent does not keep"

@@ -29,8 +29,8 @@ _TOLERANCE = 1e-12
 # Only a step that is damped by less than this says so: a short one promises little anywhere.
 _FLAT = 1e-8
 _WHOLE = 1e-2
-# Bodies take more evaluations, and have converged earlier: of what no force tells their coordinates go a long
-# way along curves.
+# Bodies take more evaluations, and have converged earlier: their unidentifiable coordinates move far along
+# curves.
 _BODY_STEPS = 500
 _BODY_TOLERANCE = 1e-9
 # And where it is above what it is known not to fall below by no more than this over the residual's entries: a
@@ -39,8 +39,8 @@ _SURE = 1e-4
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
 _ROUGH = 1e-6
 _STUCK = 1e3
-# An unknown whose own size moves the residual by less than this part of the first one is without effect: what
-# its column holds is rounding, and dividing by it sends the unknown to 1e15.
+# An unknown whose size moves the residual by less than this part of the first one is without effect: its
+# column holds rounding, and dividing by it sends the unknown to 1e15.
 _NOTHING = 1e-12
 
 
@@ -49,7 +49,7 @@ class Transform(eqx.Module):
 
     What must be positive is fitted as its logarithm (in the force domain only what the balance is not in
     proportion to); the ten parameters of a body as its `log_cholesky`; the rest as it is. Scaling to order
-    one is the solver's own (it scales by the columns of the Jacobian).
+    one is the solver's (it scales by the columns of the Jacobian).
 
     Args:
         log: Which are fitted as their logarithms, (p,).
@@ -88,16 +88,16 @@ class Transform(eqx.Module):
         """Return bounds on the physical values on the solver's scale; bodies have separate ones."""
         plain = Transform(self.log)
         out = []
-        for bound, own in ((lower, self.lower), (upper, self.upper)):
+        for bound, coordinates in ((lower, self.lower), (upper, self.upper)):
             bound = plain.inward(bound)
-            for places, values in zip(self.bodies, own, strict=True):
+            for places, values in zip(self.bodies, coordinates, strict=True):
                 bound = jnp.asarray(bound).at[np.array(places)].set(values)
             out.append(bound)
         return out[0], out[1]
 
     def physical(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
         """Return a Jacobian by physical values from one by the solver's, at some physical values."""
-        out = jacobian / self.slope(theta)
+        out = jnp.asarray(jacobian / self.slope(theta))
         for places in map(np.array, self.bodies):
             out = out.at[:, places].set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
         return out
@@ -123,7 +123,7 @@ class Minimum(eqx.Module):
         residual: At theta, flat; empty where not kept.
         jacobian: Of the residual in the physical values; empty where not kept.
         failure: Why a solver of optimistix did not converge, see `jaxid.estimators.common.minimise`; None of
-            jaxid's own solver.
+            jaxid's solver.
     """
 
     theta: Float[Array, " p"]
@@ -136,14 +136,16 @@ class Minimum(eqx.Module):
 
 
 class Progress(eqx.Module):
-    """Where a descent stands, on the solver's scale: cut short anywhere, it goes on to the same bits.
+    """The state of a descent on the solver's scale: cut short anywhere, it goes on to the same bits.
 
     Args:
-        trial: Point to evaluate next, and by how much the cost should fall there (`predicted`).
-        x, cost, gradient, normal: Best point, and the quadratic picture of the cost there.
+        trial: Point to evaluate next.
+        predicted: Predicted fall of the cost there.
+        x, cost, gradient, normal: Best point, and the quadratic model of the cost there.
         kept: Residual and Jacobian there; empty where not kept.
-        damping, growth: Of the steps.
-        own: Sizes of the unknowns at the start. `nothing`: of the residual, what counts as nothing.
+        damping, growth: Damping of the next step, and its factor after a refused one.
+        scale: Sizes of the unknowns at the start.
+        nothing: 2-norm of a change of the residual that counts as none.
         steps: Evaluations so far.
         done: Whether the cost can fall no further, or is not finite.
         aux: Auxiliary output of the residual at the best point; None if it has none.
@@ -158,14 +160,14 @@ class Progress(eqx.Module):
     kept: tuple[Array, Array]
     damping: Array
     growth: Array
-    own: Array
+    scale: Array
     nothing: Array
     steps: Array
     done: Array
     aux: Any = None
 
     @classmethod
-    def at(cls, x: Array, own: Array, size: int, damping: Array | float = DAMPING) -> Progress:
+    def at(cls, x: Array, scale: Array, size: int, damping: Array | float = DAMPING) -> Progress:
         """Return the state at a start; `size` is that of the residual kept, zero for none.
 
         Of numpy's arrays where x is one: to make jax's outside of compiled code takes longer.
@@ -181,7 +183,7 @@ class Progress(eqx.Module):
             (xp.zeros(size), xp.zeros((size, p))),
             xp.asarray(damping),
             xp.asarray(2.0),
-            own,
+            scale,
             xp.asarray(0.0),
             xp.asarray(0),
             xp.asarray(False),
@@ -219,16 +221,15 @@ def levenberg_marquardt(
     residual's Jacobian in it (a second copy doubles the compile time): vmap it over starts or data.
 
     Args:
-        residual: Residual as a function of the physical unknowns; entries that are not to count
-            are zero.
-        theta: Start.
+        residual: Residual as a function of the physical unknowns; entries that do not count are zero.
+        theta: Physical values at the start.
         transform: Scale of the solver.
         lower, upper: Bounds on the physical values.
-        active: Which unknowns may move; absent: all.
+        active: Mask of the unknowns that may move; absent: all.
         max_steps: Most evaluations; absent: 60, or with bodies 500.
         keep: Return residual and Jacobian; without, batches need less memory.
-        damping: At the start, relative to the diagonal. What is linear asks for none.
-        tolerance: It has converged where the cost can fall by no more than this part of itself.
+        damping: Damping at the start, relative to the diagonal; a linear problem needs none.
+        tolerance: The fit has converged if the cost can fall by no more than this part of itself.
 
     Returns:
         The minimum; `converged` is false where the steps ran out or the residual is not finite.
@@ -259,10 +260,10 @@ def levenberg_marquardt(
     max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
     bounds = transform.bounds(jnp.asarray(lower), jnp.asarray(upper))
     x0 = jnp.clip(transform.inward(theta), *bounds)
-    own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
+    scale = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
     on_scale = lambda x: residual(transform.outward(x))
     solver = BoundedLevenbergMarquardt(rtol=tolerance, damping=damping, keep=keep)
-    options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor, "scale": own}
+    options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor, "scale": scale}
     solution = optx.least_squares(
         lambda x, args: on_scale(x), solver, x0, options=options, max_steps=max_steps, throw=False
     )
@@ -282,12 +283,12 @@ def descend(
     """Go on with a descent; see `levenberg_marquardt`, but on the solver's scale.
 
     Args:
-        residual: Of the solver's unknowns.
-        progress: Where it stands.
-        bounds: On the solver's unknowns.
+        residual: Residual as a function of the solver's unknowns.
+        progress: State of the descent.
+        bounds: Lower and upper bounds on the solver's unknowns.
         max_steps: Evaluations at which to stop, those so far among them.
-        active, tolerance: As there.
-        floor: What the cost is known not to fall below: near enough to it, it has converged too.
+        active, tolerance: Options of `levenberg_marquardt`.
+        floor: Lower bound of the cost: near enough to it, the descent has converged too.
     """
     solver = BoundedLevenbergMarquardt(rtol=tolerance)
     options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor}
@@ -432,7 +433,7 @@ def _advanced(
     )
     nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
     # Asked at every step: a velocity of which a level of zero leaves no trace has one as soon as that moves.
-    moves = moves & (p.own * jnp.sqrt(jnp.diag(normal)) > nothing)
+    moves = moves & (p.scale * jnp.sqrt(jnp.diag(normal)) > nothing)
     pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     aim = x + _step(gradient, normal, damping, moves & ~pressed)
     trial = jnp.clip(aim, lower, upper)
@@ -456,7 +457,7 @@ def _advanced(
         kept,
         damping,
         growth,
-        p.own,
+        p.scale,
         nothing,
         p.steps + 1,
         small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
@@ -468,8 +469,8 @@ def _step(gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"
     """Return the damped step of the free unknowns."""
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
-    normal = jnp.where(jnp.outer(free, free), normal / jnp.outer(scale, scale), 0.0)
-    # A trace of damping keeps directions that the data cannot tell where they are.
+    normal = jnp.where(jnp.outer(jnp.asarray(free), jnp.asarray(free)), normal / jnp.outer(scale, scale), 0.0)
+    # A trace of damping keeps unidentifiable directions at rest.
     matrix = normal + jnp.diag(jnp.where(free, damping + 1e-13, 1.0))
     gradient = jnp.where(free, gradient / scale, 0.0)
     return -eliminated(matrix, gradient[:, None])[:, 0] / scale
