@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Array
-from jaxid.case.case import Case
+from jaxid.case.case import Case, load_case
 from jaxid.case.declared import EffectEntry
 from jaxid.case.reference import info_of
 from jaxid.case.tables import ON_LINE
@@ -71,6 +72,19 @@ def build_machine(case: Case, *, at_truth: bool = False, period: float | None = 
         hold=case.log.get("hold", "zero_order"),
         unknown_reference=unknown_reference,
     )
+
+
+def make_plant(case: Case | str | Path, *, at_truth: bool = False) -> Plant:
+    """Build the plant of a case with its effects, and nothing that drives, closes or measures it.
+
+    Args:
+        case: The case, or its file.
+        at_truth: Take the `true` values where there are any, in place of the guesses.
+
+    Raises:
+        InputError: If the case is unsound.
+    """
+    return _plant(case if isinstance(case, Case) else load_case(case), at_truth)[0]
 
 
 def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:

@@ -30,6 +30,18 @@ METHODS = (
 )
 OUTPUTS = ("position", "force", "both")
 SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
+MINIMISERS = (
+    "levenberg_marquardt",
+    "optimistix.LevenbergMarquardt",
+    "optimistix.IndirectLevenbergMarquardt",
+    "optimistix.GaussNewton",
+    "optimistix.Dogleg",
+    "optimistix.BFGS",
+    "optimistix.DFP",
+    "optimistix.LBFGS",
+    "optimistix.NonlinearCG",
+    "optimistix.NelderMead",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -138,6 +150,30 @@ def _validate(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _numerics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--solver",
+        metavar="NAME",
+        help="let diffrax integrate in output_error, dry friction smoothed: "
+        f"{', '.join(SOLVERS)}; absent: as the case says, or fixed steps, dry friction exact",
+    )
+    parser.add_argument(
+        "--minimiser",
+        metavar="NAME",
+        help=f"minimiser of output_error: {', '.join(MINIMISERS)}; absent: as the case says, or the first",
+    )
+
+
+def _need_numerics(args: argparse.Namespace) -> None:
+    """Refuse a solver or a minimiser of another name before JAX is loaded."""
+    if args.solver is not None and args.solver not in SOLVERS:
+        raise InputError(f"solver {args.solver!r} is not known", hint=suggest(args.solver, SOLVERS))
+    if args.minimiser is not None and args.minimiser not in MINIMISERS:
+        raise InputError(
+            f"minimiser {args.minimiser!r} is not known", hint=suggest(args.minimiser, MINIMISERS)
+        )
+
+
 def _check(commands: argparse._SubParsersAction) -> None:
     what = "before any fit: is the log sound, does it excite what is asked, what can be told apart"
     _logs(_add(commands, "check", what, _run_check))
@@ -153,12 +189,7 @@ def _identify(commands: argparse._SubParsersAction) -> None:
         help=f"what output_error fits in a closed loop: {', '.join(OUTPUTS)}; absent: as the case says, "
         "or position",
     )
-    parser.add_argument(
-        "--solver",
-        metavar="NAME",
-        help="let diffrax integrate in output_error, dry friction smoothed: "
-        f"{', '.join(SOLVERS)}; absent: fixed steps, dry friction exact",
-    )
+    _numerics(parser)
     _validate(parser)
 
 
@@ -168,6 +199,7 @@ def _discover(commands: argparse._SubParsersAction) -> None:
     _logs(parser)
     _validate(parser)
     parser.add_argument("--max-effects", metavar="N", type=int, default=5, help="default: 5")
+    _numerics(parser)
     parser.add_argument(
         "--experiments",
         action=argparse.BooleanOptionalAction,
@@ -277,8 +309,7 @@ def _run_check(args: argparse.Namespace) -> int:
 def _run_identify(args: argparse.Namespace) -> int:
     if args.method not in METHODS:
         raise InputError(f"method {args.method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
-    if args.solver is not None and args.solver not in SOLVERS:
-        raise InputError(f"solver {args.solver!r} is not known", hint=suggest(args.solver, SOLVERS))
+    _need_numerics(args)
     if args.on is not None and args.on not in OUTPUTS:
         raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
     _ready(args, "result.json", "report.html")
@@ -291,6 +322,7 @@ def _run_identify(args: argparse.Namespace) -> int:
             args.log,
             method=args.method,
             solver=args.solver,
+            minimiser=args.minimiser,
             on=args.on,
             validate=args.validate,
             progress=tell,
@@ -302,6 +334,7 @@ def _run_identify(args: argparse.Namespace) -> int:
 def _run_discover(args: argparse.Namespace) -> int:
     if args.max_effects < 0:
         raise InputError(f"--max-effects is {args.max_effects}", hint="give zero or more")
+    _need_numerics(args)
     # An experiment's name follows from what is found: any that is there already may be meant.
     there = [] if args.o is None else [p.name for p in Path(args.o).glob("separate_*.csv")]
     _ready(args, "discovery.json", "report.html", *there)
@@ -314,6 +347,8 @@ def _run_discover(args: argparse.Namespace) -> int:
             args.log,
             validate=args.validate,
             max_effects=args.max_effects,
+            solver=args.solver,
+            minimiser=args.minimiser,
             experiments=args.experiments,
             progress=tell,
         )

@@ -299,7 +299,7 @@ def _checked_transmission(
 
 def _checked_output_error(given: dict[str, Any], file: str) -> dict[str, Any]:
     """Refuse what only a fit within a prior does where there is none."""
-    lost = [key for key in given if key not in ("on", "prior", "start")]
+    lost = [key for key in given if key not in ("on", "prior", "start", "solver", "minimiser")]
     if lost and "prior" not in given:
         hint = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
         raise Spot(file, "[output_error]", lost[0]).fault("goes with prior only", hint)

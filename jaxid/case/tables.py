@@ -40,6 +40,19 @@ METHODS = (
     "output_error",
     "didim",
 )
+SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
+MINIMISERS = (
+    "levenberg_marquardt",
+    "optimistix.LevenbergMarquardt",
+    "optimistix.IndirectLevenbergMarquardt",
+    "optimistix.GaussNewton",
+    "optimistix.Dogleg",
+    "optimistix.BFGS",
+    "optimistix.DFP",
+    "optimistix.LBFGS",
+    "optimistix.NonlinearCG",
+    "optimistix.NelderMead",
+)
 # What a trajectory of `jaxid design` is improved for.
 CRITERIA = ("determinant", "condition")
 DERIVATIVES = ("central", "spectral", "parabolic")
@@ -98,6 +111,8 @@ ALGEBRAIC: Keys = {"window": Key(span(), "from and to [s]; absent: many windows 
 OUTPUT_ERROR: Keys = {
     "on": Key(choice(("position", "force", "both"))),
     "start": Key(choice(("inverse_dynamics", "recursive", "guess"))),
+    "solver": Key(choice(SOLVERS)),
+    "minimiser": Key(choice(MINIMISERS)),
     "prior": Key(number("positive"), "relative standard deviation of the guesses; fits what the log tells"),
     "starts": Key(whole(1), "how many, drawn within the prior"),
     "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),

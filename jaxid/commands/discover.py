@@ -21,16 +21,19 @@ from jaxid.discovery.separating.propose import proposals
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where, locate
 from jaxid.effects.friction import StaticFriction
+from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_known_reference
+from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.estimators.output_error import output_error
+from jaxid.estimators.output_error import choose_numerics, output_error
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.unknowns import free_effect
 from jaxid.session import Session, open_session
 from jaxid.simulation.force_balance import ForceData
+from jaxid.simulation.solvers import SOLVERS
 from jaxid.simulation.step_size import TooStiffError
 
 # A refit in simulation may cost this factor in the force domain, not more: then it has bent the
@@ -50,6 +53,8 @@ def discover(
     max_effects: int = 5,
     refit: bool = True,
     experiments: bool | None = None,
+    solver: str | None = None,
+    minimiser: str | Minimiser | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
     """Find the effects that a case's model is missing, on a log.
@@ -62,12 +67,19 @@ def discover(
         refit: Refit the parameters in simulation too; without, they are inverse dynamics'.
         experiments: Whether experiments are designed that tell rivals apart. Absent: not where joints push
             one another, as of an arm, whose simulation takes minutes to compile for it.
+        solver, minimiser: Numerics of the fits in simulation, as of `identify`; None: as the case says.
         progress: Called with a line at every stage.
 
     Raises:
-        InputError: If case or log are unsound.
+        InputError: If case, log, solver or minimiser are unsound.
     """
+    if solver is not None and solver not in SOLVERS:
+        raise InputError(f"solver {solver!r} is not known", hint=suggest(solver, SOLVERS))
+    minimiser_of(minimiser)
     session = open_session(case, log, validate, align_hold=True, method="discover")
+    stated = {"solver": solver, "minimiser": minimiser}
+    stated = session.case.output_error | {k: v for k, v in stated.items() if v is not None}
+    session = replace(session, case=replace(session.case, output_error=stated))
     return explore(session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress)
 
 
@@ -250,7 +262,9 @@ def _refit(session: Session, start: Estimate) -> Estimate:
     if blind or session.fit.log.reference is None and session.machine.controller is not None:
         return start
     try:
-        estimate = output_error(session.machine, session.fit.log)
+        stated, log = session.case.output_error, session.fit.log
+        numerics = choose_numerics(session.machine, log, solver=stated.get("solver"))
+        estimate = output_error(session.machine, log, numerics=numerics, minimiser=stated.get("minimiser"))
     except TooStiffError as error:
         return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
     if not estimate.converged or not np.all(np.isfinite(estimate.theta)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxid.case.case import Case, load_case
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import METHODS, steps_of
+from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import OUTPUTS
 from jaxid.gap import Gap, gaps, noise_floor
@@ -68,6 +69,7 @@ def identify(
     *,
     method: str = "output_error",
     solver: str | None = None,
+    minimiser: str | Minimiser | None = None,
     on: str | None = None,
     validate: Sequence[Log | str | Path] = (),
     progress: Callable[[str], None] = lambda text: None,
@@ -81,19 +83,25 @@ def identify(
         solver: For `output_error`, one of `jaxid.simulation.solvers.SOLVERS`: diffrax then integrates between
             samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
             of the fixed steps either way.
+        minimiser: For `output_error`, one of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of
+            optimistix; None: as the case says, or jaxid's Levenberg-Marquardt.
         on: For `output_error`, what of the simulated loop is to meet its log: one of
             `jaxid.estimators.output_error.OUTPUTS`; None: as the case says, or position.
         validate: Logs to validate on, beside the case's own.
         progress: Called with a line at every stage.
 
     Raises:
-        InputError: If case, log, method, solver or `on` are unsound.
+        InputError: If case, log, method, solver, minimiser or `on` are unsound.
     """
     if method not in METHODS:
         raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     options = {}
     if solver is not None:
         options["solver"] = _checked("solver", solver, SOLVERS, method)
+    if minimiser is not None:
+        _need_output_error("minimiser", minimiser_name(minimiser), method)
+        minimiser_of(minimiser)
+        options["minimiser"] = minimiser
     if on is not None:
         options["on"] = _checked("on", on, OUTPUTS, method)
     session = open_session(case, log, validate, method=method)
@@ -151,15 +159,19 @@ def identify_many(
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
 
-def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
+def _checked(option: str, value: str, known: Iterable[str], method: str) -> str:
+    _need_output_error(option, value, method)
+    if value not in known:
+        raise InputError(f"{option} {value!r} is not known", hint=suggest(value, known))
+    return value
+
+
+def _need_output_error(option: str, value: str, method: str) -> None:
     if method != "output_error":
         raise InputError(
             f"{option} {value!r} goes only with output_error",
             hint=f"leave out {option}, or method {method!r}",
         )
-    if value not in known:
-        raise InputError(f"{option} {value!r} is not known", hint=suggest(value, known))
-    return value
 
 
 # Samples beyond which the gap would take memory beside the fit that a fit may need.

@@ -20,6 +20,7 @@ from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:
     from jaxid.case.case import Case
+    from jaxid.estimators.common.minimisers import Minimiser
     from jaxid.session import Session
     from jaxid.simulation.replay import Numerics
 
@@ -34,40 +35,52 @@ def _output_error(
     session: Session,
     *,
     solver: str | None = None,
+    minimiser: str | Minimiser | None = None,
     on: str | None = None,
     numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
     from jaxid.estimators.output_error import choose_numerics, need_loop, output_error_steps
 
-    log, on = session.fit.log, on or session.case.output_error.get("on", "position")
-    if "prior" in session.case.output_error:
+    log, stated = session.fit.log, session.case.output_error
+    on = str(on or stated.get("on", "position"))
+    solver = solver or stated.get("solver")
+    minimiser = minimiser or stated.get("minimiser")
+    if "prior" in stated:
         from jaxid.estimators.within_prior.fit import within_prior_steps
 
-        if solver is not None:
-            raise InputError(
-                f"solver {solver!r} does not go with [output_error] prior",
-                where=str(session.case.path),
-                hint="leave one of them out: a fit within a prior takes fixed steps",
-            )
         need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
-        stated = {k: v for k, v in session.case.output_error.items() if k not in ("on", "start")}
+        if solver is not None and numerics is None:
+            numerics = choose_numerics(session.machine, log, solver=solver)
         others = yield from _beside_the_guesses(session)
-        asked = within_prior_steps(session.machine, log, on=on, numerics=numerics, others=others, **stated)
-        return (yield from asked)
+        options = {k: v for k, v in stated.items() if k not in ("on", "start", "solver", "minimiser")}
+        return (
+            yield from within_prior_steps(
+                session.machine,
+                log,
+                on=on,
+                numerics=numerics,
+                others=others,
+                minimiser=minimiser,
+                **options,
+            )
+        )
+
     start = yield from _start(session)
-    if solver is not None:
+    if solver is not None and numerics is None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, log, solver=solver)
-    found = yield from output_error_steps(session.machine, log, start=start, numerics=numerics, on=on)
+    result = yield from output_error_steps(
+        session.machine, log, start=start, numerics=numerics, on=on, minimiser=minimiser
+    )
     if start is None or all(log.measured):
-        return found
+        return result
     # Without an encoder on every joint inverse dynamics may end far off, of coarse readings above all.
-    other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on)
-    return min((found, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
+    other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on, minimiser=minimiser)
+    return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
 
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
-    """Another start of a fit within a prior: what a method finds of the unknowns, the rest at the guesses.
+    """Return another start of a fit within a prior: the estimates of a method, the rest at the guesses.
 
     Of sums that it cannot tell apart both parts move; what does not enter in proportion stays.
     """
@@ -85,7 +98,7 @@ def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
 
 
 def _start(session: Session) -> Steps[np.ndarray | None]:
-    """Where output error starts: at what another method found where that tells all unknowns of the plant.
+    """Return the start of output error: the estimates of another method if it identifies all unknowns.
 
     Else at the guesses (None). Links that are kept to bodies are told well enough: what no log tells of them
     is that of a body, and moves nothing. Inverse dynamics keeps the bounds, and may end at one; what does not
@@ -149,7 +162,7 @@ def _algebraic(session: Session) -> Steps[Estimate]:
 
 
 def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
-    """One of the forms that solve a joint's equations by themselves."""
+    """Return the steps of a form that solves each joint's equations alone."""
 
     def steps(session: Session) -> Steps[Estimate]:
         from jaxid.estimators.algebraic.one_window import FORMS

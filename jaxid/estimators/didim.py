@@ -98,7 +98,7 @@ class _Look(NamedTuple):
 
     @property
     def seen(self) -> np.ndarray:
-        """Slope as far as the regressor sees it: with that the formulas of least squares hold."""
+        """Slope projected on the regressor, for which the formulas of least squares hold."""
         basis = span(self.regressor[self.rows])
         out = np.zeros_like(self.slope)
         out[self.rows] = basis @ (basis.T @ self.slope[self.rows])
@@ -108,7 +108,7 @@ class _Look(NamedTuple):
 def didim_steps(
     machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
 ) -> Steps[Estimate]:
-    """`didim`, one solve at a time."""
+    """Run `didim`, one solve at a time."""
     if machine.controller is None:
         raise InputError(
             "didim simulates the loop, and the controller is not known",
@@ -187,7 +187,7 @@ def _look(
 def _slope(
     replay: Replay, places: tuple, plant: Plant, data: ForceData, theta: Array
 ) -> Float[Array, "kept n p"]:
-    """Derivative of the force of the simulated loop, by joint, seen and filtered as the logged one."""
+    """Return the derivative of the simulated loop's force, by joint, filtered as the logged one."""
 
     def force(theta: Array) -> Array:
         u = replay.drive.gain * replay(scatter(places, plant, theta)).command
@@ -199,7 +199,7 @@ def _slope(
 
 
 def _nothing(machine: Machine, log: Log) -> Estimate:
-    """What is said where not even the guesses can be simulated."""
+    """Build the estimate of a machine that cannot be simulated even at the guesses."""
     p = len(machine.parameters.free)
     blank = Precision(np.full((p, p), np.nan), np.zeros(p, bool), [], np.zeros(p))
     return Estimate(

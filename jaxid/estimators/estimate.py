@@ -1,4 +1,4 @@
-"""What every estimator returns."""
+"""The result that every estimator returns."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from jaxid.numerics.precision import Precision
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters, how well they are known, and what the solver said.
+    """Parameters, their precision, and the state in which the solver ended.
 
     Args:
         method: Name of the estimator.
         machine: The machine with the estimates in its plant.
         theta: Estimates, in the order of `machine.parameters`.
-        precision: Covariance, and what cannot be told.
-        converged: Whether the solver did.
-        message: What it said.
-        residual: What the estimator minimised, at its samples; NaN where a sample does not count.
-        samples: How many samples counted.
-        steps: Evaluations of the Jacobian.
-        notes: What a user should know of how it was done.
-        details: What the method has to say of its own, by the key under which results hold it.
+        precision: Covariance, and which parameters are not identifiable.
+        converged: Whether the solver converged.
+        message: Message of the solver.
+        residual: Minimised residual, (time, n); NaN for a sample that does not count.
+        samples: Number of samples that counted.
+        steps: Number of evaluations of the Jacobian.
+        notes: Remarks for a user on how the fit was done.
+        details: Further results of the method, by their key in `result.json`.
     """
 
     method: str
@@ -45,29 +45,29 @@ class Estimate:
 
     @property
     def names(self) -> list[str]:
-        """Of the parameters."""
+        """Names of the parameters."""
         return self.machine.parameters.names
 
     @property
     def std(self) -> Float[np.ndarray, " p"]:
-        """Standard deviations; NaN where the log cannot tell."""
+        """Standard deviations; NaN of parameters that are not identifiable."""
         return self.precision.std
 
     @property
     def identifiable(self) -> Bool[np.ndarray, " p"]:
-        """Which parameters the log can tell."""
+        """Mask of the parameters that the log identifies."""
         return self.precision.identifiable
 
     @property
     def all_identified(self) -> bool:
-        """Whether the solver converged and the log tells all parameters."""
+        """Whether the solver converged and all parameters are identifiable."""
         return self.converged and bool(np.all(self.identifiable))
 
     def value(self, name: str) -> float:
-        """Estimate of one parameter.
+        """Return the estimate of one parameter.
 
         Raises:
-            KeyError: If there is none of that name.
+            KeyError: If no parameter has that name.
         """
         if name not in self.names:
             raise KeyError(f"{name!r} is not among {', '.join(self.names)}.")
@@ -78,6 +78,6 @@ class Estimate:
         for f, v, s, ok in zip(
             self.machine.parameters.free, self.theta, self.std, self.identifiable, strict=True
         ):
-            told = f"{v:.6g} ± {s:.2g} {f.unit}" if ok else "cannot be told from this log"
-            lines.append(f"{f.name:32s} {told}")
+            text = f"{v:.6g} ± {s:.2g} {f.unit}" if ok else "not identifiable from this log"
+            lines.append(f"{f.name:32s} {text}")
         return "\n".join(lines)

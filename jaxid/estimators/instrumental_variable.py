@@ -62,7 +62,7 @@ def instrumental_variable(
 def instrumental_variable_steps(
     machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
 ) -> Steps[Estimate]:
-    """`instrumental_variable`, one solve at a time."""
+    """Run `instrumental_variable`, one solve at a time."""
     first = yield from inverse_dynamics_steps(machine, data)
     # Of bodies what no log tells is that of a body, and moves nothing.
     within = bool(machine.parameters.bodies) and first.converged
@@ -123,7 +123,7 @@ def _search(
     theta: np.ndarray,
     size: float,
 ) -> Steps[_Found]:
-    """Instruments at the estimate, the estimate by the instruments, until it stays where it is."""
+    """Alternate between instruments at the estimate and the estimate by these, until it settles."""
     places = unknown.places
 
     def along(data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
@@ -162,6 +162,6 @@ def _search(
 
 
 def _lost(run: Prepared, log: Log) -> bool:
-    """Whether a simulated motion has drifted away from the measured one."""
+    """Return whether a simulated motion has drifted away from the measured one."""
     off = np.sqrt(np.mean((run.q - log.filled) ** 2, axis=0))
     return bool(np.any(off > _LOST * np.std(log.filled, axis=0)))

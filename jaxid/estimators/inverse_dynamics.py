@@ -43,7 +43,7 @@ def _solve(
     bounds: tuple[Array, Array],
     damping: float,
 ) -> tuple[Minimum, Array]:
-    """The fit, and the size of the force that it explains."""
+    """Return the fit, and the size of the force that it explains."""
 
     def residual(theta: Array) -> Array:
         return data.weight * force_residual(scatter(places, plant, theta), data)
@@ -77,7 +77,7 @@ def inverse_dynamics(
 def inverse_dynamics_steps(
     machine: Machine, data: Prepared, *, reweighted: bool = False, start: np.ndarray | None = None
 ) -> Steps[Estimate]:
-    """`inverse_dynamics`, one solve at a time."""
+    """Run `inverse_dynamics`, one solve at a time."""
     plant = sharpened(machine.plant, data)
     rows = data.fitted
     arrays = ForceData.of(data, rows)
@@ -86,7 +86,7 @@ def inverse_dynamics_steps(
     whole = all(data.measured)
     places, (transform, damping) = parameters.places, linear_scale(machine, whole)
     options = (transform, parameters.bounds, damping)
-    fits = []
+    fits, size = [], np.zeros(())
     for at in _starts(machine, theta):
         fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
@@ -123,7 +123,7 @@ def inverse_dynamics_steps(
 
 
 def linear_scale(machine: Machine, whole: bool = True) -> tuple[Transform, float]:
-    """A solver's scale on which what enters the balance in proportion is fitted as it is, and its damping.
+    """Return a solver's scale on which linear unknowns are fitted as they are, and its damping.
 
     As its logarithm, a mass that starts at two thirds of its value takes five evaluations for two.
     Bounds keep it positive. Where all unknowns are so, no damping is needed. Nothing is so where some
@@ -137,29 +137,36 @@ def linear_scale(machine: Machine, whole: bool = True) -> tuple[Transform, float
 
 
 def linear_unknowns(machine: Machine) -> Bool[np.ndarray, " p"]:
-    """Which unknowns the balance is in proportion to."""
+    """Return a mask of the unknowns in which the balance is linear."""
     return np.array([_linear(machine.plant, f) for f in machine.parameters.free], dtype=bool)
 
 
 def _linear(plant: Plant, free: Free) -> bool:
-    """Whether the residual is in proportion to an unknown, as far as its owner says."""
+    """Return whether the residual is linear in an unknown, by the declaration of its owner."""
     info = _info(plant, free)
     if info is None or not carries_force(info):
         return False
     if free.path[0] != "effects":
         return True
-    effect = type(plant.effects[free.path[1]])
+    effect = type(plant.effects[_number(free)])
     return effect.adds_force and effect.initial_state is Effect.initial_state
 
 
 def _info(plant: Plant, free: Free) -> ParameterInfo | None:
-    """What its owner says of an unknown."""
-    owner = plant.effects[free.path[1]] if free.path[0] == "effects" else plant
-    return parameters_of(type(owner)).get(free.path[-1])
+    """Return the declaration of an unknown in its plant or effect."""
+    owner = plant.effects[_number(free)] if free.path[0] == "effects" else plant
+    return parameters_of(type(owner)).get(str(free.path[-1]))
+
+
+def _number(free: Free) -> int:
+    """Return which effect of its plant an unknown belongs to."""
+    number = free.path[1]
+    assert isinstance(number, int), "the path of an effect's parameter goes through its number"
+    return number
 
 
 def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
-    """The guesses, and the same with each shape (a width, a lag, a period) smaller and larger.
+    """Return the guesses, and the same with each shape (a width, a lag, a period) smaller and larger.
 
     What enters in proportion is solved in one step from anywhere; a shape that starts far off lets
     the strength beside it fall to zero, and is then without a slope.
@@ -175,12 +182,12 @@ def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
 
 
 def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> list[np.ndarray]:
-    """The same with the dry friction of all joints shared otherwise between those with an encoder and not."""
+    """Return starts that divide dry friction otherwise between joints with and without an encoder."""
     effects = machine.plant.effects
     levels = [
-        (k, effects[f.path[1]].port)
+        (k, effects[_number(f)].port)
         for k, f in enumerate(machine.parameters.free)
-        if f.path[0] == "effects" and effects[f.path[1]].kind == "coulomb_friction" and f.path[2] == "level"
+        if f.path[0] == "effects" and effects[_number(f)].kind == "coulomb_friction" and f.path[2] == "level"
     ]
     seen = [k for k, port in levels if port < len(measured) and measured[port]]
     hidden = [k for k, port in levels if port < len(measured) and not measured[port]]
@@ -195,20 +202,20 @@ def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> 
 
 def force_precision(
     machine: Machine,
-    size: Array,
+    size: Array | float,
     theta: np.ndarray,
     e: np.ndarray,
     jacobian: np.ndarray,
     rows: np.ndarray,
 ) -> Precision:
-    """Precision of a fit in the force domain; `size` is what `force_size` says."""
+    """Return the precision of a fit in the force domain; `size` is that of `force_size`."""
     guess = machine.parameters.guess
     scale = np.where(guess != 0, guess, 1.0)
     return assess(machine.parameters.names, jacobian, e, rows, float(size), scale)
 
 
 def _robust(e: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Weights of residuals: of a joint one over their spread, on the mean of all, and the bisquare's root."""
+    """Return weights of residuals: one over each joint's spread, on their mean, times the bisquare's root."""
     middle = [np.median(np.abs(x[c])) if c.any() else 0.0 for x, c in zip(e.T, counts.T, strict=True)]
     spread = 1.4826 * np.array(middle)
     spread = np.where(spread > 0, spread, 1.0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +17,9 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.errors import InputError
-from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
+from jaxid.estimators.common.minimise import failure_text, minimise
+from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import SHORT
 from jaxid.logs.log import Log
@@ -59,7 +62,7 @@ _SEGMENTS = 40
 def output_residual(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, on: str = "position"
 ) -> Callable[[Array], Array]:
-    """Measured minus simulated output as a function of the unknowns, (time, k), weighted.
+    """Return measured minus simulated output as a function of the unknowns, (time, k), weighted.
 
     In open loop the start's position and velocity may be unknowns too, behind the others.
     """
@@ -68,7 +71,10 @@ def output_residual(
         extra = theta[len(places) :]
         nudge = extra if extra.size else None
         run = replay.following(places, theta)(scatter(places, plant, theta), nudge)
-        outputs = {"position": (run.position,), "force": (replay.drive.gain * run.command,)}
+        outputs: dict[str, tuple[Array, ...]] = {
+            "position": (run.position,),
+            "force": (replay.drive.gain * run.command,),
+        }
         outputs["both"] = outputs["position"] + outputs["force"]
         return weight * (measured - jnp.concatenate(outputs[on], axis=1))
 
@@ -96,7 +102,7 @@ def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
 
 
 def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
-    """What a log holds of an output, (time, k), and which columns count; see `output_residual`."""
+    """Return a log's output, (time, k), and the mask of columns that count; see `output_residual`."""
     force = log.force * machine.gain
     outputs = {"position": (log.filled,), "force": (force,), "both": (log.filled, force)}
     counts = {"position": log.measured, "force": (True,) * force.shape[1]}
@@ -116,9 +122,10 @@ def _fit(
     bounds: tuple[Array, Array],
     on: str,
     active: Array,
+    minimiser: Minimiser | None,
 ) -> Minimum:
     residual = output_residual(replay, places, plant, measured, weight, on)
-    return levenberg_marquardt(residual, theta, transform, *bounds, active)
+    return minimise(residual, theta, transform, *bounds, active, minimiser)
 
 
 @eqx.filter_jit
@@ -136,7 +143,7 @@ def _residual(
 
 
 def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndarray:
-    """Derivative of the simulated position in the unknowns where they stand, (time, n, p).
+    """Return the derivative of the simulated position by the unknowns at their guesses, (time, n, p).
 
     Args:
         machine: The machine.
@@ -163,6 +170,7 @@ def output_error(
     numerics: Numerics | None = None,
     hessian: bool = False,
     on: str = "position",
+    minimiser: str | Minimiser | None = None,
 ) -> Estimate:
     """Fit the unknowns so that the simulated position, or force, meets the measured one.
 
@@ -174,14 +182,20 @@ def output_error(
         hessian: Take the covariance from the full Hessian in place of Gauss-Newton's.
         on: One of `OUTPUTS`. Both: each column over the standard deviation that a fit of the position
             leaves in it. The force is that of a closed loop; an open loop is given its own.
+        minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix; absent:
+            `jaxid.estimators.common.levenberg_marquardt`.
 
     Returns:
         The estimate; its covariance takes the residual's colour into account.
 
     Raises:
-        InputError: If the force is to be met and there is no loop that makes one.
+        InputError: If there is no loop that makes the force to be met, or the minimiser is not known.
     """
-    return run_alone(output_error_steps(machine, log, start=start, numerics=numerics, hessian=hessian, on=on))
+    return run_alone(
+        output_error_steps(
+            machine, log, start=start, numerics=numerics, hessian=hessian, on=on, minimiser=minimiser
+        )
+    )
 
 
 def output_error_steps(
@@ -192,8 +206,10 @@ def output_error_steps(
     numerics: Numerics | None = None,
     hessian: bool = False,
     on: str = "position",
+    minimiser: str | Minimiser | None = None,
 ) -> Steps[Estimate]:
-    """`output_error`, one solve at a time."""
+    """Run `output_error`, one solve at a time."""
+    solver = minimiser_of(minimiser)
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
     machine = machine if start is None else machine.with_estimate(start)
@@ -205,35 +221,35 @@ def output_error_steps(
     nuisance = 0 if fixed else 2 * log.position.shape[1]
     p = len(machine.parameters.free)
     active = np.arange(p + nuisance) < p
-    problem = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
+    problem: tuple[Any, ...] = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
     if machine.unknown_reference is not None:
         # A machine bent to follow another reference ends nowhere: first what is unknown of that alone.
-        minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active)))
+        minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active), solver))
         problem = (*problem[:5], minimum.theta, *problem[6:])
-    minimum = yield SolveRequest(_fit, (*problem, active))
+    minimum = yield SolveRequest(_fit, (*problem, active, solver))
     if on == "both":
         problem = _problem(machine.with_estimate(np.asarray(minimum.theta)[:p]), replay, log, nuisance, on)
         e = yield SolveRequest(_residual, (*problem[:6], on))
         spread = np.maximum(np.std(np.asarray(e), axis=0), 1e-12 * np.std(problem[3], axis=0))
         problem = (*problem[:4], problem[4] / spread, *problem[5:])
-        minimum = yield SolveRequest(_fit, (*problem, active))
+        minimum = yield SolveRequest(_fit, (*problem, active, solver))
     if looped and not nuisance and not numerics.segment:
         left = np.asarray(minimum.residual).reshape(problem[3].shape)
         if start_shows(left[:, problem[4][0] > 0]):
             # A log that begins with a jerk from rest: its first readings are no velocity.
             rested = (from_rest(problem[0]), *problem[1:5], minimum.theta, *problem[6:])
-            other = yield SolveRequest(_fit, (*rested, active))
+            other = yield SolveRequest(_fit, (*rested, active, solver))
             if bool(other.converged) and float(other.cost) < float(minimum.cost):
                 problem, minimum = rested, other
     if nuisance and looped:
         every = np.ones(p + nuisance, bool)
-        freed = yield SolveRequest(_fit, (*problem, every))
+        freed = yield SolveRequest(_fit, (*problem, every, solver))
         spare = _CLEARLY * nuisance / max(problem[3].size - p - nuisance, 1)
         if bool(freed.converged) and float(freed.cost) * (1 + spare) < float(minimum.cost):
             minimum, active = freed, every
     elif nuisance:
         problem, active = _with_start(machine, log, problem, minimum)
-        minimum = yield SolveRequest(_fit, (*problem, active))
+        minimum = yield SolveRequest(_fit, (*problem, active, solver))
     measured, weight = problem[3], problem[4]
     e = np.asarray(minimum.residual).reshape(measured.shape)
     counts = np.broadcast_to(weight[0] > 0, e.shape)
@@ -258,23 +274,23 @@ def output_error_steps(
         theta=theta[:p],
         precision=precision,
         converged=converged,
-        message="converged" if converged else _failure(minimum),
+        message="converged" if converged else _failure(minimum, minimiser),
         residual=np.where(counts, e, np.nan),
         samples=int(counts.sum()),
         steps=int(minimum.steps),
-        notes=notes_of(machine, numerics, log, on),
+        notes=notes_of(machine, numerics, log, on, minimiser),
     )
 
 
 def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
-    """Which unknowns are those of the reference."""
+    """Return a mask of the unknowns of the reference."""
     own = np.zeros_like(active)
     own[: len(machine.parameters.free)] = [path[0] == REFERENCE for path, _ in machine.parameters.places]
     return own
 
 
 def _with_start(machine: Machine, log: Log, problem: tuple, minimum: Minimum) -> tuple[tuple, np.ndarray]:
-    """A fit from a start that suits the fitted plant; of the start too where noise is all that is left."""
+    """Return a fit from a start that suits the fitted plant, with the start unknown if only noise remains."""
     p = len(machine.parameters.free)
     fitted = machine.with_estimate(np.asarray(minimum.theta)[:p])
     replay = with_fitted_start(problem[0], fitted.plant, log)
@@ -308,7 +324,7 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str)
 def choose_numerics(
     machine: Machine, log: Log, *, segments: bool = True, solver: str | None = None
 ) -> Numerics:
-    """Integration that suits a machine and its log.
+    """Choose the integration that suits a machine and its log.
 
     Dry friction sticks exactly: its gradient is exact too, because the force is continuous where
     sliding starts. Break-away friction breaks that, and is smoothed; so does a solver of diffrax.
@@ -341,7 +357,7 @@ def choose_numerics(
 
 
 def turning_steps(machine: Machine, log: Log) -> int:
-    """Steps a sample by which what a step misses where dry friction turns stays below the noise.
+    """Return the steps a sample that keep the error at reversals of dry friction below the noise.
 
     A joint that comes to rest within a step h is off by about 0.04 F / m h^2 afterwards, F its dry
     friction; a tenth of a reading's noise is little enough for thousands of samples.
@@ -361,13 +377,13 @@ def turning_steps(machine: Machine, log: Log) -> int:
 
 @eqx.filter_jit
 def _levels(plant: Plant, q: Array, v: Array, u: Array) -> Array:
-    """Dry friction at rest, what it takes to break away included."""
+    """Return the level of dry friction at rest, break-away included."""
     levels = plant.balance(q, v, v, u, jnp.zeros(()), plant.initial_states(u))
     return levels.dry + levels.stick
 
 
 def _sharp_steps(machine: Machine, log: Log) -> int:
-    """Steps a sample that the smoothed sign asks for: a coarser one gives garbage for a gradient."""
+    """Return the steps a sample that the smoothed sign needs; with fewer the gradient is garbage."""
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
@@ -375,14 +391,22 @@ def _sharp_steps(machine: Machine, log: Log) -> int:
     return needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
 
 
-def _failure(minimum: Minimum) -> str:
+def _failure(minimum: Minimum, minimiser: str | Minimiser | None) -> str:
     if not np.isfinite(float(minimum.cost)):
         return "the simulation diverged from these starting values"
+    if minimum.failure is not None:
+        return failure_text(minimum, minimiser_name(minimiser))
     return f"no convergence within {int(minimum.steps)} steps"
 
 
-def notes_of(machine: Machine, numerics: Numerics, log: Log, on: str) -> tuple[str, ...]:
-    """How it was simulated, for a user."""
+def notes_of(
+    machine: Machine,
+    numerics: Numerics,
+    log: Log,
+    on: str,
+    minimiser: str | Minimiser | None = None,
+) -> tuple[str, ...]:
+    """State how it was simulated and minimised, for a user."""
     where = "in the loop" if machine.controller is not None else "open loop"
     how = "sticks exactly" if numerics.sticks else "is smoothed"
     steps = f"{numerics.substeps} step(s) a sample"
@@ -394,4 +418,6 @@ def notes_of(machine: Machine, numerics: Numerics, log: Log, on: str) -> tuple[s
     if numerics.segment:
         seconds = numerics.segment * log.period
         notes.append(f"restarted from the log every {seconds:.3g} s: it drifts off otherwise")
+    if minimiser_of(minimiser) is not None:
+        notes.append(f"minimised by {minimiser_name(minimiser)}")
     return tuple(notes)

@@ -69,7 +69,7 @@ class PowerData(eqx.Module):
 
 
 def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]:
-    """Energy that is missing for balance in every window, over its weight [N or N m].
+    """Return the energy missing for balance in every window, over its weight [N or N m].
 
     A column a joint where the mass is diagonal, else one for the machine.
 
@@ -98,7 +98,7 @@ def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]
 
 
 def window(s: np.ndarray) -> np.ndarray:
-    """A window that is open at 1 and closed at 0 and 2, with no corner in its slope.
+    """Return a window that is open at 1 and closed at 0 and 2, with no corner in its slope.
 
     Of smoother ones the plain sum over samples is the integral, to fourth order in their distance.
     """
@@ -106,12 +106,12 @@ def window(s: np.ndarray) -> np.ndarray:
 
 
 def window_slope(s: np.ndarray) -> np.ndarray:
-    """Derivative of `window`."""
+    """Return the derivative of `window`."""
     return 2 * np.pi * np.sin(0.5 * np.pi * s) ** 3 * np.cos(0.5 * np.pi * s)
 
 
 def _energies(plant: Plant, data: ForceData) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
-    """Kinetic energy [J], and the power of all else less half the rate of the mass [W].
+    """Return the kinetic energy [J], and the power of all else less half the rate of the mass [W].
 
     In declared units: over the ratio of the force at the load to the declared one.
     """
@@ -177,7 +177,7 @@ def power(machine: Machine, data: Prepared) -> Estimate:
 
 
 def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
-    """`power`, as what is to be solved."""
+    """Run `power`, one solve at a time."""
     windows, unit = _windows(machine, data)
     plant, parameters = sharpened(machine.plant, data), machine.parameters
     transform, damping = linear_scale(machine)
@@ -197,7 +197,12 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = assess(
-        parameters.names, jacobian, e, rows, unit * np.sqrt(rows.sum()), np.where(theta != 0, theta, 1.0)
+        parameters.names,
+        jacobian,
+        e,
+        np.asarray(rows),
+        float(unit * np.sqrt(rows.sum())),
+        np.where(theta != 0, theta, 1.0),
     )
     converged = bool(fit.converged) and bool(np.all(np.isfinite(theta)))
     length = 2 * windows.half * data.period
@@ -216,7 +221,7 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
 
 
 def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
-    """Windows over a log, and the RMS force of its drives [N or N m].
+    """Return the windows over a log, and the RMS force of its drives [N or N m].
 
     A window's energy is taken over the root of its integrals of w^2 and (w qd)^2: what is left is
     then a force, whose noise is as large in slow windows as in fast ones. In one equation for all joints
@@ -252,7 +257,7 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
 
 
 def _asked(machine: Machine) -> int:
-    """How many numbers an equation is to tell: of bodies only sums count, as many as there are."""
+    """Return the number of unknowns of an equation; of bodies only identifiable sums count."""
     unknown = machine.parameters
     if not unknown.bodies:
         return len(unknown.free)
@@ -262,7 +267,7 @@ def _asked(machine: Machine) -> int:
 
 
 def _noise_shares(data: Prepared) -> Float[np.ndarray, " n"]:
-    """Noise of each joint's force over that of all, from its high band; one each where it cannot be had."""
+    """Return the noise of each joint's force over that of all, from its high band; ones if unavailable."""
     noise = signals.high_band_std(data.force)
     if noise.size != data.q.shape[1] or not np.all(noise > 0):
         return np.ones(data.q.shape[1])
@@ -270,7 +275,7 @@ def _noise_shares(data: Prepared) -> Float[np.ndarray, " n"]:
 
 
 def _halts(plant: Plant, data: Prepared) -> Bool[np.ndarray, "time n"]:
-    """Samples at which a joint with dry friction rests or turns.
+    """Return the samples at which a joint with dry friction rests or turns.
 
     Friction jumps there, or holds; its velocity, limited to a band, is neither zero nor reverses
     quite when the machine does, so that energy seems to be lost. A stated recipe keeps what only
@@ -295,7 +300,7 @@ def _halts(plant: Plant, data: Prepared) -> Bool[np.ndarray, "time n"]:
 
 
 def _half(data: Prepared) -> int:
-    """Half the length of a window, in samples: of the joint whose speed rises and falls fastest."""
+    """Return half the length of a window [samples], from the joint whose speed changes fastest."""
     shortest = []
     for v in np.abs(data.qd).T:
         hills, _ = scipy.signal.find_peaks(v, prominence=_HILL * np.sqrt(np.mean(v**2)))

@@ -44,7 +44,7 @@ class Affine(eqx.Module):
     matrices: Any
 
     def __call__(self, *args: Any) -> Any:
-        """The value at some arguments; the last ones may be left out where they are zero."""
+        """Return the value at some arguments; the last ones may be left out if they are zero."""
         leaves, treedef = jax.tree.flatten(self.offset)
         entering = jax.tree.leaves(args)
         out = []
@@ -57,7 +57,7 @@ class Affine(eqx.Module):
 
 
 def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
-    """The function as a matrix where it is affine; None where it is not, or may not be.
+    """Return a function as a matrix if it is affine; None if it is not, or may not be.
 
     Args:
         f: Called with `args` and `fixed`; trees of arrays in and out.
@@ -84,7 +84,7 @@ def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
 
 
 def is_affine(f: Callable, args: tuple, fixed: tuple = ()) -> bool:
-    """Whether `affine` finds a matrix; cheaper where that is not asked for."""
+    """Return whether `affine` finds a matrix, without computing it."""
     zeros = jax.tree.map(jnp.zeros_like, args)
     closed = jax.make_jaxpr(f)(*zeros, *fixed)
     entering = [_AFFINE] * len(jax.tree.leaves(args)) + [_OTHER] * len(jax.tree.leaves(fixed))
@@ -92,14 +92,14 @@ def is_affine(f: Callable, args: tuple, fixed: tuple = ()) -> bool:
 
 
 def depends(f: Callable, args: tuple) -> bool:
-    """Whether what a function returns depends on its arguments, or may."""
+    """Return whether the result of a function depends on its arguments, or may."""
     closed = jax.make_jaxpr(f)(*jax.tree.map(jnp.zeros_like, args))
     entering = [_OTHER] * len(jax.tree.leaves(args))
     return max(_follow(closed.jaxpr, entering), default=_CONSTANT) != _CONSTANT
 
 
 def _follow(jaxpr: Jaxpr, entering: list[int]) -> list[int]:
-    """What becomes of the arguments in each output of a trace."""
+    """Return how each output of a trace depends on the arguments."""
     seen = dict(zip(jaxpr.invars, entering, strict=True))
 
     def of(variable: Any) -> int:
@@ -116,7 +116,7 @@ def _follow(jaxpr: Jaxpr, entering: list[int]) -> list[int]:
 
 
 def _after(step: Any, kinds: list[int]) -> int:
-    """What one operation makes of it."""
+    """Return the dependence of one operation's result."""
     name, worst = step.primitive.name, max(kinds, default=_CONSTANT)
     if worst == _CONSTANT:
         return _CONSTANT

@@ -8,13 +8,13 @@ from functools import cache, lru_cache
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 import scipy.ndimage
 import scipy.optimize
 import scipy.signal
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.numerics.fft import fast_length, irfft, rfft
 
 # Periods of the cut-off over which a signal fades out beyond its ends: by then the roll-off's own
 # memory is 10^-4.
@@ -24,7 +24,7 @@ _MEMORY = 30
 def butterworth_zero_phase(
     x: Float[np.ndarray, "time k"], cutoff_hz: float, order: int, rate_hz: float
 ) -> Float[np.ndarray, "time k"]:
-    """Low-pass forwards and backwards with a Butterworth filter of the given order.
+    """Filter forwards and backwards by a Butterworth low-pass of the given order.
 
     Run twice, the filter is 6 dB down at the cut-off and has no phase.
 
@@ -42,12 +42,12 @@ def butterworth_zero_phase(
 
 
 def central_difference(x: Float[np.ndarray, "time k"], period: float) -> Float[np.ndarray, "time k"]:
-    """Second-order central difference, one-sided at the two ends."""
+    """Return the second-order central difference, one-sided at the two ends."""
     return np.gradient(x, period, axis=0, edge_order=2)
 
 
 def running_median(x: Float[np.ndarray, "time k"], width: int) -> Float[np.ndarray, "time k"]:
-    """Median of each sample and its neighbours, `width` in all, which must be odd.
+    """Return the median of each sample and its neighbours, `width` in all, which must be odd.
 
     The windows that would reach beyond an end are replaced by Tukey's rule: the median of the
     sample, of the first full window, and of the line through the first two full windows, as far
@@ -71,7 +71,7 @@ def running_median(x: Float[np.ndarray, "time k"], width: int) -> Float[np.ndarr
 
 @cache
 def median_noise(width: int) -> float:
-    """What `high_band_std` sees of white noise of standard deviation one behind a running median.
+    """Return the `high_band_std` of white noise of standard deviation one behind a running median.
 
     Of noise that is larger than the signal's rise from sample to sample; found on Gaussian noise.
     """
@@ -82,7 +82,7 @@ def median_noise(width: int) -> float:
 def parabolic_derivatives(
     x: Float[np.ndarray, "time k"], period: float, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First and second derivative of the parabola through 2 reach + 1 samples about each one.
+    """Return the first and second derivative of the parabola through 2 reach + 1 samples about each one.
 
     The parabola is fitted by least squares (Savitzky and Golay); it is not causal and has no phase.
     At the ends the first and the last one are read off the middle.
@@ -92,14 +92,14 @@ def parabolic_derivatives(
         period: Sampling time [s].
         reach: Samples on each side.
     """
-    fit = lambda order: scipy.signal.savgol_filter(
-        x, 2 * reach + 1, 2, deriv=order, delta=period, axis=0, mode="interp"
+    fit = lambda order: np.asarray(
+        scipy.signal.savgol_filter(x, 2 * reach + 1, 2, deriv=order, delta=period, axis=0, mode="interp")
     )
     return fit(1), fit(2)
 
 
 def parabolic_response(f: np.ndarray, reach: int, order: int) -> np.ndarray:
-    """Gain of the parabola's derivative of order 1 or 2 over the exact one.
+    """Return the gain of the parabola's derivative of order 1 or 2 over the exact one.
 
     Args:
         f: Frequencies [cycles a sample].
@@ -118,9 +118,10 @@ def parabolic_response(f: np.ndarray, reach: int, order: int) -> np.ndarray:
 
 @cache
 def parabolic_cutoff(reach: int) -> float:
-    """Where half of the parabola's velocity is left [cycles a sample]."""
+    """Return the frequency at which half of the parabola's velocity remains [cycles a sample]."""
     left = lambda f: float(parabolic_response(np.array([f]), reach, 1)[0]) - 0.5
-    return float(scipy.optimize.brentq(left, 1e-3 / reach, 1 / (2 * reach + 1)))
+    root = scipy.optimize.brentq(left, 1e-3 / reach, 1 / (2 * reach + 1))
+    return float(root)  # pyright: ignore[reportArgumentType]  # stubs: also the full output
 
 
 def spectral_derivatives(
@@ -141,36 +142,36 @@ def spectral_derivatives(
     rise = x[-1] - x[0]
     cubic = np.stack([x[0], first, 3 * rise - 2 * first - last, first + last - 2 * rise])
     rest = _tapered(x - powers @ cubic, int(_MEMORY / (cutoff_hz * period)))
-    f = scipy.fft.rfftfreq(len(rest), period)[:, None]
+    f = np.fft.rfftfreq(len(rest), period)[:, None]
     f = f[f[:, 0] < cutoff_hz]
-    spectrum = scipy.fft.rfft(rest, axis=0)[: len(f)] * roll_off(f, cutoff_hz)
+    spectrum = rfft(rest, axis=0)[: len(f)] * roll_off(f, cutoff_hz)
     out = []
     for _ in range(orders + 1):
-        out.append(scipy.fft.irfft(spectrum, len(rest), axis=0)[:n] + powers[:, : len(cubic)] @ cubic)
+        out.append(irfft(spectrum, len(rest), axis=0)[:n] + powers[:, : len(cubic)] @ cubic)
         spectrum = spectrum * (2j * np.pi * f)
         cubic = cubic[1:] * np.arange(1, len(cubic))[:, None] / span
     return tuple(out)
 
 
 def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
-    """A signal that is zero at both ends, then its odd continuation that fades out, then zeros.
+    """Return a signal that is zero at both ends, then its odd continuation that fades out, then zeros.
 
     The length suits a transform: one with a large prime factor takes ten times as long.
     """
     pad = min(pad, len(x) - 2)
     fade = 0.5 * (1 + np.cos(np.pi * np.arange(1, pad + 1) / (pad + 1)))[:, None]
-    gap = scipy.fft.next_fast_len(len(x) + 2 * pad, real=True) - len(x) - 2 * pad
+    gap = fast_length(len(x) + 2 * pad) - len(x) - 2 * pad
     after, before = -x[-2 : -pad - 2 : -1] * fade, -x[pad:0:-1] * fade[::-1]
     return np.concatenate([x, after, np.zeros((gap, x.shape[1])), before])
 
 
 def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
-    """One up to 0.6 of the cut-off, zero beyond it, a half cosine between."""
+    """Return one up to 0.6 of the cut-off, zero beyond it, a half cosine between."""
     return 0.5 * (1 + np.cos(np.pi * np.clip((f / cutoff_hz - 0.6) / 0.4, 0.0, 1.0)))
 
 
 def _end_slope(x: np.ndarray, period: float) -> np.ndarray:
-    """Slope at the first sample from a line through the first few."""
+    """Return the slope at the first sample from a line through the first few."""
     k = min(8, len(x))
     t = period * (np.arange(k) - 0.5 * (k - 1))
     return t @ x[:k] / (t @ t)
@@ -201,13 +202,13 @@ class Decimator:
     band: float | None = None
 
     def __call__(self, x: Float[Array, "time k"]) -> Float[Array, "kept k"]:
-        """Filter along the first axis, decimate and trim."""
+        """Return the filter along the first axis, decimate and trim."""
         if self.filters:
             x = self._low_pass(x)
         return x[self.trim : x.shape[0] - self.trim]
 
     def kept(self, samples: int) -> np.ndarray:
-        """Indices, in the undecimated log, of the samples that remain."""
+        """Return the indices, in the undecimated log, of the samples that remain."""
         every = np.arange(0, samples, self.factor)
         return every[self.trim : len(every) - self.trim]
 
@@ -227,25 +228,28 @@ class Decimator:
 
     @property
     def reach(self) -> int:
-        """Samples of the log over which an event spreads: beyond, 10^-4 of it is left."""
+        """Samples of the log over which an event spreads: beyond, 10^-4 of it remains."""
         if self.edge is None:
             return self.factor - 1 if self.filters else 0
         # Four standard deviations of the Gaussian in time.
         return int(np.ceil(4 * np.sqrt(2 * np.log(10)) / (np.pi * self.edge)))
 
     def band_hz(self, rate_hz: float) -> float:
-        """Edge of the pass band."""
+        """Return the edge of the pass band."""
         return 0.5 * rate_hz * self.pass_band
 
     def response(self, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
-        """Gain at each frequency [Hz]."""
+        """Return the gain at each frequency [Hz]."""
         if not self.filters:
             return np.ones_like(frequency)
         if self.edge is not None:
             return 10.0 ** -np.square(2 * frequency / (rate_hz * self.edge))
         # 0.05 dB of ripple, pass band to 0.8 of the new Nyquist frequency.
         sos = scipy.signal.cheby1(8, 0.05, self.pass_band, output="sos")
-        _, h = scipy.signal.freqz_sos(sos, worN=2 * np.pi * frequency / rate_hz)
+        _, h = scipy.signal.freqz_sos(
+            sos,
+            worN=2 * np.pi * frequency / rate_hz,  # pyright: ignore[reportArgumentType]  # stubs: int
+        )
         return np.abs(h) ** 2
 
     def _low_pass(self, x: Array) -> Array:
@@ -270,7 +274,7 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
     n = x.shape[0]
     lead, pad = min(n - 1, pad + every - 1) // every * every, min(n - 1, pad)
     head, tail = 2 * x[0] - x[lead:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
-    few = scipy.fft.next_fast_len(-(-(n + lead + 2 * pad) // every), real=True)
+    few = fast_length(-(-(n + lead + 2 * pad) // every))
     gap = every * few - n - lead - pad
     s = 0.5 * (1 - jnp.cos(jnp.pi * (jnp.arange(gap) + 1) / (gap + 1)))[:, None]
     ahead = head[0] if lead else x[0]
@@ -287,7 +291,7 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
 
 
 def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: float) -> Float[Array, "time m"]:
-    """Mean force around each sample of a command that acts `delay` later.
+    """Return the mean force around each sample of a command that acts `delay` later.
 
     A command that is held acts from its sample on: seen at the samples it lags by half the time
     for which it is held. Left out, that half looks like a delay, and a delay like damping.
@@ -310,13 +314,13 @@ def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: flo
 
 
 def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
-    """Standard deviation of white noise that would fill the top of the spectrum as x does.
+    """Return the standard deviation of white noise that would fill the top of the spectrum as x does.
 
     The median of the periodogram between 0.6 and 0.95 of Nyquist, over the median of an
     exponential distribution: lines and a few bad frequencies do not move it.
     """
     window = _hann(len(x))
-    spectrum = scipy.fft.rfft(window[:, None] * scipy.signal.detrend(x, axis=0), axis=0)
+    spectrum = rfft(window[:, None] * scipy.signal.detrend(x, axis=0), axis=0)
     f = np.arange(len(spectrum)) / len(x)
     band = spectrum[(f > 0.3) & (f < 0.475)]
     # `scipy.signal.periodogram` says the same, five times slower: studies ask it of every run, twice.
@@ -326,4 +330,4 @@ def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
 
 @lru_cache(maxsize=4)
 def _hann(size: int) -> np.ndarray:
-    return scipy.signal.get_window("hann", size)
+    return np.asarray(scipy.signal.get_window("hann", size))

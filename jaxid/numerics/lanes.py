@@ -110,7 +110,7 @@ def _called(soon: Precompile) -> None:
 
 
 def in_threads(function: Callable[..., T], args: Sequence[tuple]) -> list[T]:
-    """What each of many calls returns, one to a core at a time: compiled code leaves Python's lock alone.
+    """Return the results of many calls, one call a core at a time: compiled code releases Python's lock.
 
     The first of its kind goes ahead of the others, which would all compile what it does. A call must not ask
     for the same in its turn.
@@ -131,7 +131,7 @@ def _threads() -> ThreadPoolExecutor:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -177,7 +177,7 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
 
 
 def _parted(asked: SolveRequest) -> tuple[Any, list[np.ndarray]]:
-    """What two runs must share to be solved together, and the arrays of one."""
+    """Return the key that runs solved together share, and the arrays of this one."""
     leaves, structure = jax.tree.flatten(asked.args)
     arrays = [np.asarray(x) for x in leaves if isinstance(x, _ARRAYS)]
     static = tuple(_Hole if isinstance(x, _ARRAYS) else x for x in leaves)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 import scipy.linalg
 import scipy.signal
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
+from jaxid.numerics.fft import fast_length, irfft, rfft
 
 # A combination of parameters counts as untold where its standard deviation, seen as force or
 # position, exceeds this part of the measured signal itself.
@@ -45,7 +45,7 @@ class NoiseModel:
     def fit(
         cls, e: Float[np.ndarray, " time"], counts: Bool[np.ndarray, " time"], largest: int = 40
     ) -> NoiseModel:
-        """Yule-Walker fit to the samples that count, order by Akaike's criterion.
+        """Fit by Yule and Walker to the samples that count, the order by Akaike's criterion.
 
         Args:
             e: Residual; entries that do not count are ignored.
@@ -77,7 +77,7 @@ class NoiseModel:
 
     @classmethod
     def of_density(cls, power: Float[np.ndarray, " f"], rate_hz: float, order: int) -> NoiseModel:
-        """Model of noise with a known spectrum.
+        """Return the model of noise with a known spectrum.
 
         Args:
             power: One-sided density at equal steps from zero to half the sampling rate [1/Hz].
@@ -89,14 +89,14 @@ class NoiseModel:
         return cls(a, float(np.sqrt(r[0] - a @ r[1:])))
 
     def whiten(self, x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, "time k"]:
-        """Innovation of each column, over its standard deviation."""
+        """Return the innovation of each column, over its standard deviation."""
         out = x.copy()
         for i, a in enumerate(self.coefficients, start=1):
             out[i:] -= a * x[:-i]
         return out / self.innovation
 
     def whitened_counts(self, counts: Bool[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
-        """Samples whose whole past, as far as the model reaches, counts."""
+        """Return the samples whose whole past, as far as the model reaches, counts."""
         out = counts.copy()
         for i in range(1, len(self.coefficients) + 1):
             out[i:] &= counts[:-i]
@@ -104,30 +104,30 @@ class NoiseModel:
         return out
 
     def density(self, size: int) -> Float[np.ndarray, " frequency"]:
-        """Variance per rfft bin of a unit-normalised transform of length `size`."""
-        a = np.concatenate([[1.0], -self.coefficients])
+        """Return the variance per rfft bin of a unit-normalised transform of length `size`."""
+        a = np.concatenate([np.ones(1), -self.coefficients])
         return self.innovation**2 / np.abs(np.fft.rfft(a, size)) ** 2
 
     def sample(self, rng: np.random.Generator, size: int, runs: int) -> np.ndarray:
-        """Draw residuals of this colour, (runs, size)."""
+        """Return the draw residuals of this colour, (runs, size)."""
         burn = 20 * (len(self.coefficients) + 5)
         white = self.innovation * rng.standard_normal((runs, size + burn))
-        a = np.concatenate([[1.0], -self.coefficients])
-        return scipy.signal.lfilter([1.0], a, white, axis=1)[:, burn:]
+        a = np.concatenate([np.ones(1), -self.coefficients])
+        return np.asarray(scipy.signal.lfilter([1.0], a, white, axis=1))[:, burn:]
 
 
 def _lagged(x: np.ndarray, largest: int) -> np.ndarray:
-    """Sums of x[k] x[k + lag] for lags up to `largest`."""
-    size = scipy.fft.next_fast_len(len(x) + largest + 1, real=True)
-    return scipy.fft.irfft(np.abs(scipy.fft.rfft(x, size)) ** 2, size)[: largest + 1]
+    """Return the sums of x[k] x[k + lag] for lags up to `largest`."""
+    size = fast_length(len(x) + largest + 1)
+    return irfft(np.abs(rfft(x, size)) ** 2, size)[: largest + 1]
 
 
 def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[np.ndarray, "p p"]:
-    """J' R J with R the covariance of the residual: its colour seen through the regressor."""
-    size = scipy.fft.next_fast_len(len(jacobian) + min(len(jacobian), _REMEMBERED), real=True)
+    """Return J' R J with R the covariance of the residual: its colour seen through the regressor."""
+    size = fast_length(len(jacobian) + min(len(jacobian), _REMEMBERED))
     weight = noise.density(size)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    spectrum, root = scipy.fft.rfft(jacobian, size, axis=0), np.sqrt(weight)[:, None]
+    spectrum, root = rfft(jacobian, size, axis=0), np.sqrt(weight)[:, None]
     real, imaginary = spectrum.real * root, spectrum.imag * root
     return (real.T @ real + imaginary.T @ imaginary) / size
 
@@ -137,24 +137,22 @@ def cross_sandwich(
     noises: tuple[NoiseModel, NoiseModel],
     residuals: tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]],
 ) -> Float[np.ndarray, "p p"]:
-    """J1' R12 J2 with R12 the covariance between two residuals.
+    """Return J1' R12 J2 with R12 the covariance between two residuals.
 
     Each is whitened by its own model; what their innovations have in common is a short covariance,
     tapered, between the two models.
     """
     time = len(jacobians[0])
-    size = scipy.fft.next_fast_len(time + min(time, _REMEMBERED), real=True)
+    size = fast_length(time + min(time, _REMEMBERED))
     one, two = (n.whiten(e[:, None])[:, 0] for n, e in zip(noises, residuals, strict=True))
-    product = scipy.fft.rfft(one, 2 * size) * np.conj(scipy.fft.rfft(two, 2 * size))
+    product = rfft(one, 2 * size) * np.conj(rfft(two, 2 * size))
     lags = np.arange(-_COMMON, _COMMON + 1)
     common = np.zeros(size)
-    common[lags] = scipy.fft.irfft(product, 2 * size)[lags] / time * (1 - np.abs(lags) / (_COMMON + 1))
-    first, second = (
-        n.innovation / scipy.fft.rfft(np.concatenate([[1.0], -n.coefficients]), size) for n in noises
-    )
-    weight = scipy.fft.rfft(common) * first * np.conj(second)
+    common[lags] = irfft(product, 2 * size)[lags] / time * (1 - np.abs(lags) / (_COMMON + 1))
+    first, second = (n.innovation / rfft(np.concatenate([np.ones(1), -n.coefficients]), size) for n in noises)
+    weight = rfft(common) * first * np.conj(second)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    spectra = [scipy.fft.rfft(j, size, axis=0) for j in jacobians]
+    spectra = [rfft(j, size, axis=0) for j in jacobians]
     return np.real(np.conj(spectra[0]).T @ (weight[:, None] * spectra[1])) / size
 
 
@@ -181,13 +179,13 @@ class Precision:
         return np.sqrt(np.diag(self.covariance))
 
     def first(self, names: list[str]) -> Precision:
-        """Of the parameters of these names, which come first: the rest were nuisances."""
+        """Return the precision of the first parameters, of these names: the rest were nuisances."""
         p = len(names)
         told = [c for c in self.unidentifiable if any(n in names for n in c)]
         return Precision(self.covariance[:p, :p], self.identifiable[:p], told, self.information)
 
     def beside(self, std: float) -> Precision:
-        """With one parameter more, known from elsewhere to a standard deviation."""
+        """Return the precision with one parameter more, known from elsewhere to a standard deviation."""
         p = len(self.covariance)
         covariance = np.zeros((p + 1, p + 1))
         covariance[:p, :p], covariance[p, p] = self.covariance, std**2
@@ -206,7 +204,7 @@ def assess(
     hessian: Float[np.ndarray, "p p"] | None = None,
     crossed: bool = False,
 ) -> Precision:
-    """Covariance of a least-squares fit under coloured noise, and its blind directions.
+    """Return the covariance of a least-squares fit under coloured noise, and its blind directions.
 
     Args:
         names: Of the parameters.
@@ -258,12 +256,12 @@ def assess(
 
 
 def held(directions: Float[np.ndarray, "p k"]) -> Bool[np.ndarray, " p"]:
-    """Which unknowns some orthonormal directions, that nothing tells, hold so far that they are not told."""
+    """Return a mask of the unknowns that unidentifiable orthonormal directions make unidentifiable."""
     return np.linalg.norm(directions, axis=1) > _NEGLIGIBLE
 
 
 def named_directions(names: Sequence[str], directions: Float[np.ndarray, "p k"]) -> list[dict[str, float]]:
-    """Orthonormal directions that nothing tells, as combinations of the unknowns by name."""
+    """Return unidentifiable orthonormal directions as combinations of the unknowns by name."""
     untold = _sparse(directions)
     weight = np.abs(untold)
     # Many small weights hold an unknown as one large one does: each is named at least once.
@@ -276,19 +274,21 @@ def named_directions(names: Sequence[str], directions: Float[np.ndarray, "p k"])
 
 
 def _sparse(vectors: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
-    """A basis of the same space of which each vector is the only one to hold some unknown.
+    """Return a basis of the same space in which each vector alone contains some unknown.
 
     Eigenvectors of one eigenvalue are mixed at will: of an arm's two dozen each would name every link.
     """
     if vectors.shape[1] < 2:
         return vectors
-    own = scipy.linalg.qr(vectors.T, mode="r", pivoting=True)[1][: vectors.shape[1]]
-    basis = np.linalg.solve(vectors[np.sort(own)].T, vectors.T).T
+    factors = scipy.linalg.qr(vectors.T, mode="r", pivoting=True)
+    order = np.asarray(factors[-1])
+    chosen = np.sort(order[: vectors.shape[1]])
+    basis = np.linalg.solve(vectors[chosen].T, vectors.T).T
     return basis / np.linalg.norm(basis, axis=0)
 
 
 def _signed(v: np.ndarray) -> np.ndarray:
-    """The direction with its first named entry positive: eigenvectors come with either sign."""
+    """Return the direction with its first named entry positive: eigenvectors come with either sign."""
     first = v[np.argmax(np.abs(v) > _NEGLIGIBLE)]
     return v if first > 0 else -v
 
@@ -296,7 +296,7 @@ def _signed(v: np.ndarray) -> np.ndarray:
 def full_hessian(
     residual: Callable[[Float[Array, " p"]], Float[Array, "..."]], theta: Float[Array, " p"]
 ) -> Float[Array, "p p"]:
-    """Hessian of half the sum of squares, curvature of the residual included."""
+    """Return the hessian of half the sum of squares, curvature of the residual included."""
 
     def gradient(theta: Array) -> Array:
         e, push = jax.linearize(residual, theta)

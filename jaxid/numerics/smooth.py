@@ -16,18 +16,18 @@ _TINY = 1e-9
 
 
 def sign(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Smoothed sign, tanh(x / width)."""
+    """Return the smoothed sign, tanh(x / width)."""
     # The reciprocal of a constant width is taken out of a loop, a division is not.
     return jnp.tanh(x * (1.0 / width))
 
 
 def absolute(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Smoothed |x|, x tanh(x / width): never above |x|, below it by at most 0.28 width."""
+    """Return the smoothed |x|, x tanh(x / width): never above |x|, below it by at most 0.28 width."""
     return x * jnp.tanh(x / width)
 
 
 def at_rest(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Smoothed indicator of x = 0: one at zero, 0.02 two widths away.
+    """Return the smoothed indicator of x = 0: one at zero, 0.02 two widths away.
 
     Used for what acts at rest only (break-away friction); its product with the smoothed sign
     peaks at `REST_PEAK`, so callers that need a peak of one divide by it.
@@ -42,21 +42,21 @@ REST_PEAK = 0.37526
 def clip(
     x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Smoothed clip of x to plus or minus limit, corners rounded over `width`."""
+    """Return the smoothed clip of x to plus or minus limit, corners rounded over `width`."""
     return x - dead_zone(x, limit, width)
 
 
 def within(
     x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Slope of `clip`: one inside plus or minus limit, zero outside."""
+    """Return the slope of `clip`: one inside plus or minus limit, zero outside."""
     return jax.nn.sigmoid((limit - x) / width) - jax.nn.sigmoid((-limit - x) / width)
 
 
 def ramp(
     x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Smoothed clip of x to zero below and limit above, corners rounded over `width`, which may be zero."""
+    """Return the smoothed clip of x to 0 below and limit above, rounded over `width`, which may be zero."""
     # Far above a limit that is next to nothing the two corners would cancel to a difference of infinities.
     rounded = width > _TINY * jnp.abs(x)
     safe = jnp.where(rounded, width, 1.0)
@@ -65,7 +65,7 @@ def ramp(
 
 
 def sharp_clip(x: Float[Array, "..."], limit: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Clip of x to plus or minus limit, not smoothed.
+    """Return the clip of x to plus or minus limit, not smoothed.
 
     `jnp.clip` halves its derivative at ties, which costs two divisions in every loop.
     """
@@ -75,7 +75,7 @@ def sharp_clip(x: Float[Array, "..."], limit: Float[Array, "..."]) -> Float[Arra
 def dead_zone(
     x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Smoothed dead zone: zero inside plus or minus limit, x minus or plus limit outside."""
+    """Return the smoothed dead zone: zero inside plus or minus limit, x minus or plus limit outside."""
     above = jax.nn.softplus((x - limit) / width)
     below = jax.nn.softplus((-x - limit) / width)
     return width * (above - below)

@@ -22,7 +22,7 @@ def disturbance_at(
     times: Float[np.ndarray, " ticks"],
     log: Log | None = None,
 ) -> Float[np.ndarray, "ticks _"]:
-    """Sample what is added to the command in a loop.
+    """Sample the disturbance that is added to the command in a loop.
 
     A square wave is on for start < t <= start + on, and so on every on + off: the tick at the
     very instant of switching still sees the old value, however its time stamp is rounded.

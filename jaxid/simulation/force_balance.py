@@ -41,7 +41,7 @@ class ForceData(eqx.Module):
 
     @classmethod
     def of(cls, data: Prepared, rows: np.ndarray | None = None) -> ForceData:
-        """Arrays of a prepared log; weight one for `rows`, by default every moving sample."""
+        """Return the arrays of a prepared log; weight one for `rows`, by default every moving sample."""
         rows = data.moving if rows is None else rows
         return cls(
             data.q,
@@ -59,7 +59,7 @@ class ForceData(eqx.Module):
 
 
 def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
-    """Inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
+    """Return the inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     motion = whole_motion(plant, data, u)
@@ -67,7 +67,7 @@ def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
 
 
 def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration of all joints, also of those without an encoder, (time, n)."""
+    """Return position, velocity and acceleration of all joints, encoder or not, (time, n)."""
     times = data.start + data.period * jnp.arange(data.q.shape[0])
     return complete_motion(plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps)
 
@@ -76,7 +76,7 @@ def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array,
 def force_and_columns(
     plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array | None = None
 ) -> tuple[Float[Array, "kept n"], Float[Array, "kept n c"]]:
-    """Force residual of a plant and its Jacobian in the unknowns at some places.
+    """Return the force residual of a plant and its Jacobian in the unknowns at some places.
 
     Args:
         plant: The plant.
@@ -97,13 +97,13 @@ def force_and_columns(
 
 
 def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
-    """Declared force by joint through the same filter [N or N m]; zero where none is driven."""
+    """Return the declared force by joint through the same filter [N or N m]; zero where none is driven."""
     u = signals.delayed(data.force, jnp.zeros(()), data.period, hold=data.hold)
     return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
 
 
 def sharpened(plant: Plant, data: Prepared) -> Plant:
-    """The plant with a sign as sharp as its log allows.
+    """Return the plant with a sign as sharp as its log allows.
 
     The width is a third of the rest velocity: samples nearer to zero are left out, so that the
     smoothing biases nothing.
@@ -113,7 +113,7 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
 
 
 def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
-    """2-norm of the measured force at the samples that count."""
+    """Return the 2-norm of the measured force at the samples that count."""
     return jnp.linalg.norm(jnp.where(data.weight > 0, measured_force(plant, data), 0.0))
 
 

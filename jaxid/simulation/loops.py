@@ -75,7 +75,7 @@ class Drive(eqx.Module):
     def stepper(
         self, plant: Plant, x: State, ends: tuple[Array, ...]
     ) -> Callable[[State, tuple[Array, ...], Array], State]:
-        """What advances a state by one sample, given the force at its ends, and the time.
+        """Return a function that advances a state by one sample, given the force at its ends, and the time.
 
         To be called outside the loop over the samples: where the plant's forces are affine, its
         flow is one matrix, worked out here once.
@@ -94,7 +94,10 @@ class Drive(eqx.Module):
         def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
             if not self.set_valued:
                 return step(plant, x, hold_polynomial(ends), t, h)
-            bound = None if flow is None else lambda x, *reaction: flow(x, ends, *reaction)
+            if flow is None:
+                return set_valued_step(plant, x, hold_polynomial(ends), t, h)[0]
+            whole_step = flow
+            bound = lambda x, *reaction: whole_step(x, ends, *reaction)
             return set_valued_step(plant, x, hold_polynomial(ends), t, h, bound)[0]
 
         def several(x: State, ends: tuple[Array, ...], t: Array) -> State:
@@ -158,7 +161,7 @@ def open_loop(
 
 
 def interval_forces(plant: Plant, drive: Drive, command: Float[Array, "time m"]) -> tuple[Array, Array]:
-    """Declared force at the start and the end of every interval, delay applied.
+    """Return the declared force at the start and the end of every interval, delay applied.
 
     A delay that is no whole number of samples is averaged over the interval: taken literally, a
     held command has zero gradient in it.
@@ -221,7 +224,8 @@ def closed_loop(
     inertial, m = sensor.inertial, drive.gain.size
 
     def sensed(x: State, reading: Array, moved: tuple, noise: Array | None, renews: Array) -> tuple:
-        """Velocity and acceleration by inertial sensors, whether they are new, and what is to be kept."""
+        """Return velocity and acceleration by inertial sensors, whether they are new, and the memory."""
+        assert inertial is not None, "asked only with inertial sensors"
         before, v, a = moved
         mean = (x.qd - before) / drive.period
         raw = inertial.read(plant, x.q, x.qd, mean, noise)
@@ -243,7 +247,9 @@ def closed_loop(
         u, memory = controller.command(seen, memory, disturbance)
         force, past = _delayed_force(plant, drive, u, past)
         new = advance(x, (force,), t)
-        last = None if last is None else sensor.read_command(u, noise[n : n + m])
+        if last is not None:
+            assert noise is not None, "a command is measured only with noise"
+            last = sensor.read_command(u, noise[n : n + m])
         return (new, memory, past, last, held, moved), (x.q, x.qd, u, reading, controller.learned(memory))
 
     fresh = None if sensor.hold == 1 else jnp.arange(len(times)) % sensor.hold == 0
@@ -257,7 +263,7 @@ def closed_loop(
 
 
 def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[Array, Array]:
-    """Declared force over the coming interval, and the updated memory of past ones."""
+    """Return the declared force over the coming interval, and the updated memory of past ones."""
     force = drive.gain * u
     if drive.longest_delay == 0:
         return force, past
@@ -267,6 +273,27 @@ def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[A
     samples = jnp.arange(drive.longest_delay + 1)[:, None]
     weight = jnp.maximum(0.0, 1.0 - jnp.abs(samples - shift))
     return jnp.sum(weight * past, axis=0), past
+
+
+def initial_state(
+    plant: Plant,
+    position: Float[Array, " n"],
+    velocity: Float[Array, " n"] | None = None,
+    force: Float[Array, " m"] | None = None,
+) -> State:
+    """Return the state of a plant from its motion, the effects' internal states those of a constant force.
+
+    Args:
+        plant: The plant.
+        position: Coordinates, (n,) [m or rad].
+        velocity: Their rates, (n,); absent: at rest.
+        force: Declared force under which the drives have long been, (m,) [N or N m]; absent: zero.
+    """
+    position = jnp.asarray(position, dtype=jnp.float64)
+    velocity = jnp.zeros_like(position) if velocity is None else jnp.asarray(velocity, dtype=jnp.float64)
+    drives = len(plant.driven(position.size))
+    u = jnp.zeros(drives) if force is None else jnp.asarray(force, dtype=jnp.float64)
+    return State(position, velocity, plant.initial_states(u))
 
 
 def with_diffrax(
@@ -315,16 +342,17 @@ def with_diffrax(
         step_length,
         x0,
         args=(plant, force),
-        saveat=diffrax.SaveAt(ts=times),
+        saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
         stepsize_controller=controller,
         adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
         max_steps=max_steps,
     )
+    assert isinstance(solution.ys, State), "states are saved as they are"
     return solution.ys.q, solution.ys.qd
 
 
 def needed_substeps(plant: Plant, drive: Drive, q: Array, v: Array, u: Array) -> int:
-    """Integration steps a sample that the smoothed sign asks for along a motion.
+    """Return the integration steps a sample that the smoothed sign needs along a motion.
 
     Past that, the trajectory still looks plausible while its gradient is garbage: level times
     step over (mass times width) must not exceed about one.

@@ -88,7 +88,7 @@ class Replay(eqx.Module):
     follow: Float[Array, "n k"]
 
     def __call__(self, plant: Plant, nudge: Array | None = None) -> Trajectory:
-        """Trajectory at the samples of the log.
+        """Return the trajectory at the samples of the log.
 
         Args:
             plant: The plant.
@@ -99,6 +99,8 @@ class Replay(eqx.Module):
             q, v = q + nudge[: q.size], v + nudge[q.size :]
         if self.controller is not None:
             reference = self.reference() if isinstance(self.reference, UnknownReference) else self.reference
+            assert reference is not None, "make_replay gives a loop its reference"
+            assert self.disturbance is not None, "and its disturbance, which may be zero"
             run = closed_loop(
                 plant,
                 self.drive,
@@ -110,15 +112,16 @@ class Replay(eqx.Module):
                 self.sensor,
             )
         else:
+            assert self.command is not None, "make_replay gives an open loop its command"
             run = open_loop(plant, self.drive, self.command, q, v, None, self.restart)
         return jax.tree.map(lambda a: a[:: self.every], run)
 
     def started(self, start: Float[Array, " k"]) -> Replay:
-        """The same run, joints that have an encoder moved by so much and the others at rest with them."""
+        """Return the same run, joints with an encoder moved by so much and the others at rest with them."""
         return replace(self, position=self.position + self.follow @ start)
 
     def following(self, places: tuple, theta: Float[Array, " p"]) -> Replay:
-        """The same run with what is unknown of its reference at theta."""
+        """Return the same run with the unknowns of its reference at theta."""
         if not isinstance(self.reference, UnknownReference):
             return self
         return replace(self, reference=self.reference.with_unknowns(places, theta))
@@ -162,6 +165,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         )
     ticks = log.time[0] + period * np.arange((log.samples - 1) * every + 1)
     if log.reference is None:
+        assert machine.unknown_reference is not None, "refused above"
         reference, times = machine.unknown_reference.at(ticks - log.time[0]), ticks
     elif every == 1:
         reference, times = log.reference, log.time
@@ -202,12 +206,12 @@ def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: 
 
 
 def from_rest(replay: Replay) -> Replay:
-    """The same run, nothing moving at its start."""
+    """Return the same run, with zero velocity at its start."""
     return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
 
 
 def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
-    """Whether far more is left of the first samples of a run than of those behind them.
+    """Return whether the residual of a run's first samples is far larger than that of the others.
 
     Args:
         off: Measured less simulated; NaN where there is no reading.
@@ -217,12 +221,12 @@ def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
 
 
 def with_sensor(replay: Replay, sensor: Sensor) -> Replay:
-    """The same run, its controller reading by another sensor."""
+    """Return the same run, its controller reading by another sensor."""
     return eqx.tree_at(lambda r: r.sensor, replay, sensor, is_leaf=lambda x: isinstance(x, Sensor))
 
 
 def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100) -> Replay:
-    """An open-loop run whose initial position and velocity fit the first samples of its log.
+    """Return an open-loop run whose initial position and velocity fit the first samples of its log.
 
     A slope through noisy samples is a poor velocity, worse where an oscillation is sampled ten
     times a period; the plant itself knows how the first samples hang together.
@@ -236,6 +240,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     if replay.controller is not None or replay.restart is not None:
         return replay
     count = min(samples, log.samples)
+    assert replay.command is not None, "make_replay gives an open loop its command"
     short = eqx.tree_at(lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1])
     nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
     n = replay.position.size
@@ -289,18 +294,18 @@ def _open(
 
 
 def _refined(command: np.ndarray) -> np.ndarray:
-    """Band-limited interpolation, of an odd extension so that the ends do not ring."""
+    """Return the band-limited interpolation, of an odd extension so that the ends do not ring."""
     n = len(command)
     pad = min(n - 1, 200)
     whole = np.concatenate(
         [2 * command[0] - command[pad:0:-1], command, 2 * command[-1] - command[-2 : -pad - 2 : -1]]
     )
-    fine = scipy.signal.resample(whole, len(whole) * _REFINE, axis=0)
+    fine = np.asarray(scipy.signal.resample(whole, len(whole) * _REFINE, axis=0))
     return fine[pad * _REFINE : (pad + n - 1) * _REFINE + 1]
 
 
 def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
-    """Restart every `length` samples from the measured position and its local slope."""
+    """Return the restart every `length` samples from the measured position and its local slope."""
     n = (log.samples - 1) * every + 1
     flags = np.zeros(n, bool)
     q, v = np.zeros((n, log.filled.shape[1])), np.zeros((n, log.filled.shape[1]))
@@ -320,7 +325,7 @@ _STRAY = 2.0
 def local_line(
     log: Log, k: int, noise: Float[np.ndarray, " n"] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity at sample k, by joint, from parabolas through its neighbours.
+    """Return the position and velocity at sample k, by joint, from parabolas through its neighbours.
 
     As wide as noise asks and the motion allows: a machine that starts with a jerk is nowhere near a
     parabola for twenty samples. The widest one counts that agrees with all narrower ones.
@@ -331,15 +336,14 @@ def local_line(
         noise: Standard deviation of a reading, by joint; absent: read off the log.
     """
     noise = signals.high_band_std(log.filled) if noise is None else noise
-    position = velocity = low = high = None
-    for reach in _REACHES:
+    position, velocity, size = _parabola(log, k, _REACHES[0])
+    # Wide enough that rounding alone, in a log without noise, is no disagreement.
+    spread = _STRAY * size * noise + 1e-12 * np.abs(velocity)
+    low, high = velocity - spread, velocity + spread
+    going = np.ones(position.shape, bool)
+    for reach in _REACHES[1:]:
         q, v, size = _parabola(log, k, reach)
-        # Wide enough that rounding alone, in a log without noise, is no disagreement.
         spread = _STRAY * size * noise + 1e-12 * np.abs(v)
-        if velocity is None:
-            position, velocity, low, high = q, v, v - spread, v + spread
-            going = np.ones(q.shape, bool)
-            continue
         low, high = np.maximum(low, v - spread), np.minimum(high, v + spread)
         going = going & (low <= high)
         position, velocity = np.where(going, q, position), np.where(going, v, velocity)
@@ -347,7 +351,7 @@ def local_line(
 
 
 def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Value and slope at sample k, and the standard deviation of the slope for readings of one."""
+    """Return the value and slope at sample k, and the standard deviation of the slope for readings of one."""
     lo = int(np.clip(k - reach, 0, max(log.samples - 2 * reach - 1, 0)))
     x = log.filled[lo : lo + 2 * reach + 1]
     t = log.period * (np.arange(lo, lo + len(x)) - k)
@@ -357,12 +361,12 @@ def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, flo
 
 
 def start_velocity(log: Log) -> np.ndarray:
-    """Velocity at the first sample."""
+    """Return the velocity at the first sample."""
     return local_line(log, 0)[1]
 
 
 def exact_numerics(machine: Machine, log: Log, steps: int | None = None) -> Numerics:
-    """Integration for a run of which nothing is differentiated: dry friction sticks exactly.
+    """Return the integration for a run that is not differentiated: dry friction sticks exactly.
 
     Args:
         machine: The machine.

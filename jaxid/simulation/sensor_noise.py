@@ -11,7 +11,7 @@ from jaxid.numerics import filters as signals
 
 
 def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
-    """Standard deviation of a reading of each joint, as stated, else off the log's high band.
+    """Return the standard deviation of a reading of each joint, as stated, else off the log's high band.
 
     Zero where a joint has no encoder.
     """

@@ -10,6 +10,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from jaxid.arrays import Array
@@ -47,7 +48,7 @@ class AdaptiveStep(eqx.Module):
 
     @classmethod
     def sized(cls, name: str, *sizes: float) -> AdaptiveStep:
-        """The solver of that name for a motion of such position and velocity.
+        """Return the solver of that name for a motion of such position and velocity.
 
         Raises:
             InputError: If there is no such solver.
@@ -89,6 +90,7 @@ class AdaptiveStep(eqx.Module):
         return jax.tree.map(lambda y: jnp.where(good, y[0], jnp.nan), solution.ys)
 
 
-def _rate(since: Array, x: State, args: tuple) -> State:
+def _rate(since: ArrayLike, x: State, args: tuple) -> State:
     plant, ends, t, h = args
+    since = jnp.asarray(since)
     return derivative(plant, x, hold_polynomial(ends)(since / h), t + since)

@@ -37,7 +37,7 @@ class TooStiffError(InputError):
 
 
 def needed_steps(machine: Machine, log: Log) -> int:
-    """Integration steps a sample that the smooth part of the plant asks for along a log.
+    """Return the integration steps a sample that the smooth part of the plant needs along a log.
 
     Raises:
         TooStiffError: If that is more than any sound machine asks for.
@@ -63,7 +63,7 @@ def needed_steps(machine: Machine, log: Log) -> int:
 
 
 def _rounded(steps: int) -> int:
-    """Up to one of few numbers, a fifth more at most: for every other one all code is compiled anew."""
+    """Round up to one of few numbers, a fifth more at most: each other number compiles all code anew."""
     if steps <= _EACH:
         return steps
     octave = np.ceil(_AN_OCTAVE * np.log2(steps / _EACH)) / _AN_OCTAVE
@@ -72,7 +72,7 @@ def _rounded(steps: int) -> int:
 
 @eqx.filter_jit
 def _fastest(plant: Plant, q: Array, u: Array) -> Array:
-    """Fastest rate of the plant without dry friction, linearised at rest at some positions."""
+    """Return the fastest rate of the plant without dry friction, linearised at rest at some positions."""
 
     def rate(q: Array, u: Array) -> Array:
         zero = jnp.zeros_like(q)
@@ -90,7 +90,7 @@ def _fastest(plant: Plant, q: Array, u: Array) -> Array:
 
 
 def _slope(matrix: Array) -> Array:
-    """Largest entry of a matrix of slopes, what joint acts on what other and back taken together.
+    """Return the largest entry of a matrix of slopes, each pair of joints taken together.
 
     Joints may be in different units, and one light beside the other: k R / J alone is no rate of a motor
     behind a screw, only with k R / M is it one.
@@ -99,7 +99,7 @@ def _slope(matrix: Array) -> Array:
 
 
 def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
-    """Fastest rate of the effects that are oscillators: what steps cannot take exactly."""
+    """Return the fastest rate of the effects that are oscillators, which steps cannot take exactly."""
     worst = jnp.zeros(())
     for i, z in enumerate(x.own):
         if z is None or z.ndim == 0:
@@ -116,7 +116,7 @@ def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
 
 
 def with_numerical_damping(plant: Plant, q: Float[Array, " n"], period: float) -> Plant:
-    """The plant with damping beside springs that ring faster than samples can show.
+    """Return the plant with damping beside springs that ring faster than samples can show.
 
     Args:
         plant: The plant.
@@ -143,5 +143,5 @@ def with_numerical_damping(plant: Plant, q: Float[Array, " n"], period: float) -
 
 
 def steps_with_numerical_damping(steps: int, on: str) -> int:
-    """Of the steps that a ring would ask for, those that do once it was calmed; `on`: what is compared."""
+    """Return the steps that suffice once ringing is damped; `on` is the compared output."""
     return max(1, int(np.ceil((_COARSEST if on == "force" else _COARSER) * steps)))

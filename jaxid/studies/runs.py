@@ -59,7 +59,8 @@ class Runner:
             return Ways(session.recipe, None)
         first = inverse_dynamics(session.machine, session.fit.data)
         machine = first.machine if first.all_identified else session.machine
-        return Ways(session.recipe, choose_numerics(machine, log))
+        solver = at.model.output_error.get("solver")
+        return Ways(session.recipe, choose_numerics(machine, log, solver=solver))
 
     def chunk(self, number: int) -> Arrays:
         """All runs of a chunk, as arrays by estimator and run.

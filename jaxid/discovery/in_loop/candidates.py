@@ -70,7 +70,8 @@ class LoopFit:
     def of(cls, session: Session, machine: Machine, widths: dict[str, float], estimate: Estimate) -> LoopFit:
         """Refit the optimum of the loop without rounding, since the estimate is corrected for rounding."""
         stated, log = session.case.output_error, session.fit.log
-        numerics, on = choose_numerics(machine, log), stated.get("on", "position")
+        numerics = choose_numerics(machine, log, solver=stated.get("solver"))
+        on = stated.get("on", "position")
         problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
         point = problem.prior.inward(problem.padded(estimate.theta))
 

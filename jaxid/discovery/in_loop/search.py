@@ -20,6 +20,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.estimators import steps_of
+from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.within_prior.fit import within_prior_steps
 from jaxid.gap import gaps, noise_floor
 from jaxid.machine import Machine
@@ -162,16 +163,19 @@ def _fit(
     drawn: bool,
 ) -> LoopFit:
     """Fit within the prior from some values of the unknowns; for `drawn` see `within_prior_steps`."""
-    stated = session.case.output_error
+    stated, log = session.case.output_error, session.fit.log
+    numerics = choose_numerics(machine, log, solver=stated.get("solver"))
     result = run_alone(
         within_prior_steps(
             machine,
-            session.fit.log,
+            log,
             prior=stated["prior"],
             on=stated.get("on", "position"),
             widths=widths,
             begin=begin,
             drawn=drawn,
+            numerics=numerics,
+            minimiser=stated.get("minimiser"),
         )
     )
     return LoopFit.of(session, machine, widths, result)

@@ -23,7 +23,7 @@ _RANGE = 1e3
 
 
 def need_bodies(session: Session) -> Session:
-    """The same session, the unknown links of its arm kept to what bodies can be.
+    """Return the session with the unknown links of its arm restricted to parameters of real bodies.
 
     Of other machines inertias are positive anyway.
 
@@ -35,16 +35,16 @@ def need_bodies(session: Session) -> Session:
         return session
     unknown, bodies = machine.parameters.free, []
     for link in range(machine.plant.joints):
-        own = {f.path[0]: k for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
-        if own:
-            bodies.append(_body(link, own, unknown, f"{where}, link {link + 1}"))
+        indices = {f.path[0]: k for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
+        if indices:
+            bodies.append(_body(link, indices, unknown, f"{where}, link {link + 1}"))
     return session.with_machine(
         machine.with_plant(machine.plant, replace(machine.parameters, bodies=tuple(bodies)))
     )
 
 
-def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -> Body:
-    known = [name for name in TEN if name not in own]
+def _body(link: int, indices: dict[str, int], unknown: Sequence[Free], where: str) -> Body:
+    known = [name for name in TEN if name not in indices]
     if known:
         hint = "let all ten be unknown and start at those of a body; base parameters alone are of none"
         raise InputError(
@@ -53,7 +53,7 @@ def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -
             where=where,
             hint=hint,
         )
-    places = tuple(own[name] for name in TEN)
+    places = tuple(indices[name] for name in TEN)
     bounded = [unknown[k].name for k in places if np.isfinite([unknown[k].lower, unknown[k].upper]).any()]
     if bounded:
         what = f"{bounded[0]} has min or max, which physically_consistent does not keep"
@@ -74,7 +74,7 @@ def _body(link: int, own: dict[str, int], unknown: Sequence[Free], where: str) -
 
 
 def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
-    """A fit whose estimate says what its links are, where the log tells sums of their parameters too."""
+    """Run a fit and add the parameters of each link to its estimate, identifiable or not."""
     estimate = yield from steps
     if not estimate.machine.plant.linked:
         return estimate
@@ -87,7 +87,7 @@ def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
 
 
 def links_of(plant: Plant) -> list[dict[str, object]]:
-    """Each link's parameters, and the least eigenvalue of its pseudo-inertia over the largest."""
+    """Return the each link's parameters, and the least eigenvalue of its pseudo-inertia over the largest."""
     ten = bodies_of(plant)
     values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten))))
     return [
@@ -97,5 +97,5 @@ def links_of(plant: Plant) -> list[dict[str, object]]:
 
 
 def bodies_of(plant: Plant) -> Float[np.ndarray, "n 10"]:
-    """The ten parameters of every link."""
+    """Return the ten parameters of every link."""
     return np.stack([np.asarray(getattr(plant, name)) for name in TEN], axis=-1)

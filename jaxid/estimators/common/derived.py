@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.dynamics.frequencies import natural_frequencies
+from jaxid.effects.friction import CoulombFriction
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import effect_name
@@ -34,7 +35,7 @@ class Derived:
 
 
 def dry_friction(estimate: Estimate) -> list[Derived]:
-    """Of every Coulomb friction the level where its coefficient is a parameter, and the reverse.
+    """Return the level of each Coulomb friction given by its coefficient, and the reverse.
 
     The normal force is the plant's own, m g: a weight, by which a coefficient has its meaning.
     """
@@ -43,15 +44,16 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
     q = jnp.zeros(plant.joints)
     for k, effect in enumerate(plant.effects):
         name = effect_name(_before(plant, k), effect)
-        if effect.kind != "coulomb_friction" or not float(plant.port_normal(q)[effect.port]) > 0:
+        if not isinstance(effect, CoulombFriction) or not float(plant.port_normal(q)[effect.port]) > 0:
             continue
         by_level = effect.level is not None
 
         def other(theta: Array, k: int = k, by_level: bool = by_level) -> Array:
             moved = machine.parameters.insert(plant, theta)
-            own = moved.effects[k]
-            normal = moved.port_normal(q)[own.port]
-            return own.level / normal if by_level else own.friction_coefficient * normal
+            friction = moved.effects[k]
+            assert isinstance(friction, CoulombFriction), "its kind says so"
+            normal = moved.port_normal(q)[friction.port]
+            return friction.level / normal if by_level else friction.friction_coefficient * normal
 
         value, slope = jax.value_and_grad(other)(jnp.asarray(estimate.theta))
         used = np.flatnonzero(np.asarray(slope))
@@ -67,7 +69,7 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
 
 
 def natural_frequency(estimate: Estimate) -> list[Derived]:
-    """Of an axis with an elastic coupling, declared or found: the fastest swing, nothing held [Hz]."""
+    """Return the natural frequency of an axis with an elastic coupling, its joints free [Hz]."""
     plant, parameters = estimate.machine.plant, estimate.machine.parameters
     kinds = {e.kind for e in plant.effects}
     if plant.load is None and "joint_flexibility" not in kinds or "backlash" in kinds:
@@ -81,5 +83,5 @@ def natural_frequency(estimate: Estimate) -> list[Derived]:
 
 
 def _before(plant: Plant, k: int) -> Plant:
-    """The plant with its first k effects: by these the next is numbered."""
+    """Return the plant with its first k effects, which number the next one."""
     return eqx.tree_at(lambda p: p.effects, plant, plant.effects[:k])

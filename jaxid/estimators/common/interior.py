@@ -25,7 +25,7 @@ def inner_start(
     bodies: tuple[tuple[int, ...], ...],
     solve: Callable[[Array, Array], Array],
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-    """The least squares of columns @ theta + rest among bodies, from a body of any kind.
+    """Minimise the squares of columns @ theta + rest among bodies, from any body.
 
     Minus the logarithms of the determinants of the pseudo-inertias, over those at the start, times a weight
     that falls, keep what is sought inside. Newton's steps, damped by their own length, never leave it. The
@@ -61,8 +61,12 @@ def inner_start(
         for at, pull in zip(places, home, strict=True):
             inverse = solve(pseudo_inertia(theta[at]), jnp.eye(4))
             turned = jnp.einsum("ij,ajk->aik", inverse, unit)
-            gradient = gradient.at[at].add(weight * (pull - jnp.einsum("aii->a", turned)))
-            hessian = hessian.at[np.ix_(at, at)].add(weight * jnp.einsum("aij,bji->ab", turned, turned))
+            gradient = jnp.asarray(gradient).at[at].add(weight * (pull - jnp.einsum("aii->a", turned)))
+            hessian = (
+                jnp.asarray(hessian)
+                .at[np.ix_(at, at)]
+                .add(weight * jnp.einsum("aij,bji->ab", turned, turned))
+            )
         # What is without effect, and in no body, stays where it is.
         size = jnp.diag(hessian)
         without = size <= 0

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Bool, Float, PyTree, Scalar
 
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky
 from jaxid.arrays import Array
@@ -25,8 +29,8 @@ _TOLERANCE = 1e-12
 # Only a step that is damped by less than this says so: a short one promises little anywhere.
 _FLAT = 1e-8
 _WHOLE = 1e-2
-# Bodies take more evaluations, and have converged earlier: of what no force tells their coordinates go a long
-# way along curves.
+# Bodies take more evaluations, and have converged earlier: their unidentifiable coordinates move far along
+# curves.
 _BODY_STEPS = 500
 _BODY_TOLERANCE = 1e-9
 # And where it is above what it is known not to fall below by no more than this over the residual's entries: a
@@ -35,8 +39,8 @@ _SURE = 1e-4
 # And where no step within this damping lowers the cost, although one should by less than a tenth.
 _ROUGH = 1e-6
 _STUCK = 1e3
-# An unknown whose own size moves the residual by less than this part of the first one is without effect: what
-# its column holds is rounding, and dividing by it sends the unknown to 1e15.
+# An unknown whose size moves the residual by less than this part of the first one is without effect: its
+# column holds rounding, and dividing by it sends the unknown to 1e15.
 _NOTHING = 1e-12
 
 
@@ -45,7 +49,7 @@ class Transform(eqx.Module):
 
     What must be positive is fitted as its logarithm (in the force domain only what the balance is not in
     proportion to); the ten parameters of a body as its `log_cholesky`; the rest as it is. Scaling to order
-    one is the solver's own (it scales by the columns of the Jacobian).
+    one is the solver's (it scales by the columns of the Jacobian).
 
     Args:
         log: Which are fitted as their logarithms, (p,).
@@ -62,49 +66,49 @@ class Transform(eqx.Module):
 
     @classmethod
     def of(cls, parameters: Parameters) -> Transform:
-        """The transform of a set of unknowns."""
+        """Return the transform of a set of unknowns."""
         log = np.asarray([f.sign == "positive" for f in parameters.free], dtype=bool)
         bodies = parameters.bodies
-        bounds = (np.array([getattr(b, s) for b in bodies]).reshape(-1, 10) for s in ("lower", "upper"))
-        return cls(log, *bounds, tuple(b.places for b in bodies))
+        lower, upper = (np.array([getattr(b, s) for b in bodies]).reshape(-1, 10) for s in ("lower", "upper"))
+        return cls(log, lower, upper, tuple(b.places for b in bodies))
 
     def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Physical to solver."""
+        """Return physical values on the solver's scale."""
         return self._with_bodies(
             jnp.where(self.log, jnp.log(jnp.where(self.log, theta, 1.0)), theta), log_cholesky, theta
         )
 
     def outward(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Solver to physical."""
+        """Return physical values from those on the solver's scale."""
         return self._with_bodies(
             jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x), of_log_cholesky, x
         )
 
     def bounds(self, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> tuple[Array, Array]:
-        """Bounds on the physical values as those of the solver; bodies keep to their own."""
+        """Return bounds on the physical values on the solver's scale; bodies have separate ones."""
         plain = Transform(self.log)
         out = []
-        for bound, own in ((lower, self.lower), (upper, self.upper)):
+        for bound, coordinates in ((lower, self.lower), (upper, self.upper)):
             bound = plain.inward(bound)
-            for places, values in zip(self.bodies, own, strict=True):
-                bound = bound.at[np.array(places)].set(values)
+            for places, values in zip(self.bodies, coordinates, strict=True):
+                bound = jnp.asarray(bound).at[np.array(places)].set(values)
             out.append(bound)
         return out[0], out[1]
 
     def physical(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
-        """A Jacobian in the solver's values as one in the physical ones, at some of these."""
-        out = jacobian / self.slope(theta)
+        """Return a Jacobian by physical values from one by the solver's, at some physical values."""
+        out = jnp.asarray(jacobian / self.slope(theta))
         for places in map(np.array, self.bodies):
             out = out.at[:, places].set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
         return out
 
     def _with_bodies(self, out: Array, f: Callable[[Array], Array], values: Array) -> Array:
         for places in map(np.array, self.bodies):
-            out = out.at[places].set(f(values[places]))
+            out = jnp.asarray(out).at[places].set(f(values[places]))
         return out
 
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """D physical / d solver, for Jacobians; of what is part of no body."""
+        """Return d physical / d solver, for Jacobians, of unknowns that are part of no body."""
         return jnp.where(self.log, theta, 1.0)
 
 
@@ -118,6 +122,8 @@ class Minimum(eqx.Module):
         converged: Whether the cost could fall no further.
         residual: At theta, flat; empty where not kept.
         jacobian: Of the residual in the physical values; empty where not kept.
+        failure: Why a solver of optimistix did not converge, see `jaxid.estimators.common.minimise`; None of
+            jaxid's solver.
     """
 
     theta: Float[Array, " p"]
@@ -126,19 +132,23 @@ class Minimum(eqx.Module):
     converged: Array
     residual: Array
     jacobian: Array
+    failure: Array | None = None
 
 
 class Progress(eqx.Module):
-    """Where a descent stands, on the solver's scale: cut short anywhere, it goes on to the same bits.
+    """The state of a descent on the solver's scale: cut short anywhere, it goes on to the same bits.
 
     Args:
-        trial: Point to evaluate next, and by how much the cost should fall there (`predicted`).
-        x, cost, gradient, normal: Best point, and the quadratic picture of the cost there.
+        trial: Point to evaluate next.
+        predicted: Predicted fall of the cost there.
+        x, cost, gradient, normal: Best point, and the quadratic model of the cost there.
         kept: Residual and Jacobian there; empty where not kept.
-        damping, growth: Of the steps.
-        own: Sizes of the unknowns at the start. `nothing`: of the residual, what counts as nothing.
+        damping, growth: Damping of the next step, and its factor after a refused one.
+        scale: Sizes of the unknowns at the start.
+        nothing: 2-norm of a change of the residual that counts as none.
         steps: Evaluations so far.
         done: Whether the cost can fall no further, or is not finite.
+        aux: Auxiliary output of the residual at the best point; None if it has none.
     """
 
     trial: Array
@@ -150,14 +160,15 @@ class Progress(eqx.Module):
     kept: tuple[Array, Array]
     damping: Array
     growth: Array
-    own: Array
+    scale: Array
     nothing: Array
     steps: Array
     done: Array
+    aux: Any = None
 
     @classmethod
-    def at(cls, x: Array, own: Array, size: int, damping: float = DAMPING) -> Progress:
-        """At a start; `size`: of the residual that is kept, zero for none.
+    def at(cls, x: Array, scale: Array, size: int, damping: Array | float = DAMPING) -> Progress:
+        """Return the state at a start; `size` is that of the residual kept, zero for none.
 
         Of numpy's arrays where x is one: to make jax's outside of compiled code takes longer.
         """
@@ -172,14 +183,14 @@ class Progress(eqx.Module):
             (xp.zeros(size), xp.zeros((size, p))),
             xp.asarray(damping),
             xp.asarray(2.0),
-            own,
+            scale,
             xp.asarray(0.0),
             xp.asarray(0),
             xp.asarray(False),
         )
 
     def minimum(self, transform: Transform) -> Minimum:
-        """As a result."""
+        """Return the best point as a result."""
         theta = transform.outward(self.x)
         return Minimum(
             theta,
@@ -210,16 +221,15 @@ def levenberg_marquardt(
     residual's Jacobian in it (a second copy doubles the compile time): vmap it over starts or data.
 
     Args:
-        residual: Residual as a function of the physical unknowns; entries that are not to count
-            are zero.
-        theta: Start.
+        residual: Residual as a function of the physical unknowns; entries that do not count are zero.
+        theta: Physical values at the start.
         transform: Scale of the solver.
         lower, upper: Bounds on the physical values.
-        active: Which unknowns may move; absent: all.
+        active: Mask of the unknowns that may move; absent: all.
         max_steps: Most evaluations; absent: 60, or with bodies 500.
         keep: Return residual and Jacobian; without, batches need less memory.
-        damping: At the start, relative to the diagonal. What is linear asks for none.
-        tolerance: It has converged where the cost can fall by no more than this part of itself.
+        damping: Damping at the start, relative to the diagonal; a linear problem needs none.
+        tolerance: The fit has converged if the cost can fall by no more than this part of itself.
 
     Returns:
         The minimum; `converged` is false where the steps ran out or the residual is not finite.
@@ -250,11 +260,15 @@ def levenberg_marquardt(
     max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
     bounds = transform.bounds(jnp.asarray(lower), jnp.asarray(upper))
     x0 = jnp.clip(transform.inward(theta), *bounds)
-    own = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
-    size = jax.eval_shape(residual, theta).size if keep else 0
-    start = Progress.at(x0, own, size, damping)
+    scale = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
     on_scale = lambda x: residual(transform.outward(x))
-    return descend(on_scale, start, bounds, max_steps, active, tolerance, floor).minimum(transform)
+    solver = BoundedLevenbergMarquardt(rtol=tolerance, damping=damping, keep=keep)
+    options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor, "scale": scale}
+    solution = optx.least_squares(
+        lambda x, args: on_scale(x), solver, x0, options=options, max_steps=max_steps, throw=False
+    )
+    # The value is that of the state; implicit differentiation goes through the value alone.
+    return replace(solution.state, x=solution.value).minimum(transform)
 
 
 def descend(
@@ -269,33 +283,139 @@ def descend(
     """Go on with a descent; see `levenberg_marquardt`, but on the solver's scale.
 
     Args:
-        residual: Of the solver's unknowns.
-        progress: Where it stands.
-        bounds: On the solver's unknowns.
+        residual: Residual as a function of the solver's unknowns.
+        progress: State of the descent.
+        bounds: Lower and upper bounds on the solver's unknowns.
         max_steps: Evaluations at which to stop, those so far among them.
-        active, tolerance: As there.
-        floor: What the cost is known not to fall below: near enough to it, it has converged too.
+        active, tolerance: Options of `levenberg_marquardt`.
+        floor: Lower bound of the cost: near enough to it, the descent has converged too.
     """
-    moves = jnp.ones(progress.x.size, bool) if active is None else active
-
-    def flat(x: Array) -> tuple[Array, Array]:
-        e = residual(x).ravel()
-        return e, e
+    solver = BoundedLevenbergMarquardt(rtol=tolerance)
+    options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor}
+    fn = lambda x, args: (residual(x), None)
 
     def advance(p: Progress) -> Progress:
-        jacobian, e = jax.jacfwd(flat, has_aux=True)(p.trial)
-        return _advanced(p, e, jacobian, bounds, moves, tolerance, floor)
+        return solver.step(fn, p.x, None, options, p, frozenset())[1]
 
     return jax.lax.while_loop(lambda p: ~p.done & (p.steps < max_steps), advance, progress)
+
+
+class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt within bounds, as a solver of `optimistix.least_squares`.
+
+    Marquardt's scaling, Nielsen's damping; steps are projected on the bounds, and unknowns that press against
+    a bound rest. Each step evaluates the residual and its forward-mode Jacobian once.
+
+    Supports the following `options` of `optimistix.least_squares`, each optional:
+
+    - `lower`, `upper`: bounds, trees like the unknowns.
+    - `active`: which unknowns may move, a tree of booleans like the unknowns.
+    - `scale`: sizes of the unknowns, a tree like them; an unknown whose size moves the residual by less than
+      1e-12 of its first norm rests. Default: the absolute values at the start, one for zeros.
+    - `floor`: a value below which the cost is known not to fall.
+
+    Args:
+        rtol: The solve ends if half the sum of squares can fall by no more than this part of itself.
+        atol: The solve also ends if that can fall by no more than this.
+        damping: Damping of the first step, relative to the diagonal of the normal matrix.
+        keep: Whether the state holds residual and Jacobian at the best point; without, batches are smaller.
+        norm: Required by optimistix and not used: the cost alone decides.
+
+    Source:
+        Marquardt (1963); damping after Nielsen (1999), IMM-REP-1999-05.
+    """
+
+    rtol: float | Array = _TOLERANCE
+    atol: float | Array = 0.0
+    damping: float | Array = DAMPING
+    keep: bool = eqx.field(static=True, default=True)
+    norm: Callable[[PyTree], Scalar] = eqx.field(static=True, default=optx.max_norm)
+
+    def init(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        args: Any,
+        options: dict[str, Any],
+        f_struct: PyTree[jax.ShapeDtypeStruct],
+        aux_struct: PyTree[jax.ShapeDtypeStruct],
+        tags: frozenset[object],
+    ) -> Progress:
+        x = jnp.clip(ravel_pytree(y)[0], *_bounds_of(options, y))
+        scale = options.get("scale")
+        scale = jnp.where(x == 0, 1.0, jnp.abs(x)) if scale is None else ravel_pytree(scale)[0]
+        size = sum(f.size for f in jax.tree.leaves(f_struct)) if self.keep else 0
+        aux = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), aux_struct)
+        return replace(Progress.at(x, scale, size, self.damping), aux=aux)
+
+    def step(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        args: Any,
+        options: dict[str, Any],
+        state: Progress,
+        tags: frozenset[object],
+    ) -> tuple[PyTree, Progress, Any]:
+        unravel = ravel_pytree(y)[1]
+        active = options.get("active")
+        moves = jnp.ones(state.x.size, bool) if active is None else jnp.asarray(ravel_pytree(active)[0])
+
+        def flat(x: Array) -> tuple[Array, tuple[Array, Any]]:
+            out, aux = fn(unravel(jnp.asarray(x)), args)
+            e = ravel_pytree(out)[0]
+            return e, (e, aux)
+
+        jacobian, (e, aux) = jax.jacfwd(flat, has_aux=True)(state.trial)
+        tolerances = (self.rtol, self.atol, options.get("floor", -np.inf))
+        state = _advanced(state, e, aux, jacobian, _bounds_of(options, y), moves, *tolerances)
+        return unravel(jnp.asarray(state.x)), state, state.aux
+
+    def terminate(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        args: Any,
+        options: dict[str, Any],
+        state: Progress,
+        tags: frozenset[object],
+    ) -> tuple[Bool[jax.Array, ""], optx.RESULTS]:
+        lost = state.done & ~jnp.isfinite(state.cost)
+        result = optx.RESULTS.where(lost, optx.RESULTS.nonfinite, optx.RESULTS.successful)
+        return jnp.asarray(state.done), result
+
+    def postprocess(
+        self,
+        fn: Callable[[PyTree, Any], tuple[PyTree, Any]],
+        y: PyTree,
+        aux: Any,
+        args: Any,
+        options: dict[str, Any],
+        state: Progress,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[PyTree, Any, dict[str, Any]]:
+        return y, aux, {}
+
+
+def _bounds_of(options: dict[str, Any], y: PyTree) -> tuple[Array | float, Array | float]:
+    """Return the bounds of a solve, flat; infinite where none are given."""
+    lower, upper = options.get("lower"), options.get("upper")
+    return (
+        -np.inf if lower is None else ravel_pytree(lower)[0],
+        np.inf if upper is None else ravel_pytree(upper)[0],
+    )
 
 
 def _advanced(
     p: Progress,
     e: Array,
+    aux: Any,
     jacobian: Array,
-    bounds: tuple[Array, Array],
+    bounds: tuple[Array | float, Array | float],
     moves: Bool[Array, " p"],
-    tolerance: Array | float,
+    rtol: Array | float,
+    atol: Array | float,
     floor: Array | float,
 ) -> Progress:
     """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
@@ -306,14 +426,14 @@ def _advanced(
     ratio = (p.cost - cost) / jnp.maximum(p.predicted, 1e-300)
     shrink = jnp.where(first, 1.0, jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
     damping = jnp.clip(p.damping * jnp.where(better, shrink, p.growth), 1e-15, 1e20)
-    x, cost, gradient, normal, kept = jax.tree.map(
+    x, cost, gradient, normal, kept, aux = jax.tree.map(
         lambda new, old: jnp.where(better, new, old),
-        (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept),
-        (p.x, p.cost, p.gradient, p.normal, p.kept),
+        (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept, aux),
+        (p.x, p.cost, p.gradient, p.normal, p.kept, p.aux),
     )
     nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
     # Asked at every step: a velocity of which a level of zero leaves no trace has one as soon as that moves.
-    moves = moves & (p.own * jnp.sqrt(jnp.diag(normal)) > nothing)
+    moves = moves & (p.scale * jnp.sqrt(jnp.diag(normal)) > nothing)
     pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     aim = x + _step(gradient, normal, damping, moves & ~pressed)
     trial = jnp.clip(aim, lower, upper)
@@ -321,7 +441,7 @@ def _advanced(
     change = trial - x
     predicted = -change @ gradient - 0.5 * change @ normal @ change
     # A step cut short by a bound says little of what is left: its unknown rests from now on.
-    small = (predicted <= tolerance * cost) & jnp.all(trial == aim)
+    small = (predicted <= rtol * cost + atol) & jnp.all(trial == aim)
     # A step that a bound bent may promise less than nothing.
     flat = (p.damping < _WHOLE) & (p.predicted > 0) & (p.predicted <= _FLAT * p.cost)
     rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))
@@ -337,19 +457,20 @@ def _advanced(
         kept,
         damping,
         growth,
-        p.own,
+        p.scale,
         nothing,
         p.steps + 1,
         small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
+        aux,
     )
 
 
 def _step(gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"]) -> Array:
-    """Damped step of the free unknowns."""
+    """Return the damped step of the free unknowns."""
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
-    normal = jnp.where(jnp.outer(free, free), normal / jnp.outer(scale, scale), 0.0)
-    # A trace of damping keeps directions that the data cannot tell where they are.
+    normal = jnp.where(jnp.outer(jnp.asarray(free), jnp.asarray(free)), normal / jnp.outer(scale, scale), 0.0)
+    # A trace of damping keeps unidentifiable directions at rest.
     matrix = normal + jnp.diag(jnp.where(free, damping + 1e-13, 1.0))
     gradient = jnp.where(free, gradient / scale, 0.0)
     return -eliminated(matrix, gradient[:, None])[:, 0] / scale
@@ -365,7 +486,7 @@ def eliminated(matrix: Float[Array, "p p"], b: Float[Array, "p k"]) -> Float[Arr
     def eliminate(k: Array, rows: Array) -> Array:
         pivot = rows[k] / rows[k, k]
         rows = rows - rows[:, k, None] * pivot
-        return rows.at[k].set(pivot)
+        return jnp.asarray(rows).at[k].set(pivot)
 
     rows = jnp.concatenate([matrix, b], axis=1)
     return jax.lax.fori_loop(0, len(b), eliminate, rows)[:, len(b) :]

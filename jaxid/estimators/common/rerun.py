@@ -98,7 +98,7 @@ class Rerun:
 
 @eqx.filter_jit
 def _simulated(replay: Replay, places: tuple, plant: Plant, theta: Array) -> tuple[Array, Array]:
-    """Position, (time, n), and command, (time, m), at the samples of the log."""
+    """Return the position, (time, n), and command, (time, m), at the samples of the log."""
     run = replay(scatter(places, plant, theta))
     return run.position, run.command
 
@@ -109,7 +109,7 @@ def best_step(
     e: Float[np.ndarray, " rows"],
     theta: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """Gauss-Newton's step: within bounds, or, where links are kept to bodies, to the best of all bodies.
+    """Return Gauss-Newton's step within bounds, or to the best bodies if links are bodies.
 
     Between two bodies there are only bodies: any part of the step keeps to them too.
 
@@ -122,7 +122,7 @@ def best_step(
     if not parameters.bodies:
         return bounded_step(columns, e, theta, parameters.bounds)
     # As many rows as unknowns hold all that a sum of squares does.
-    triangle = np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r"))
     minimum = _best_bodies(triangle, Transform.of(parameters), parameters.guess, parameters.bounds)
     return np.asarray(minimum.theta) - theta
 
@@ -140,7 +140,7 @@ def bounded_step(
     theta: Float[np.ndarray, " p"],
     bounds: tuple[np.ndarray, np.ndarray],
 ) -> Float[np.ndarray, " p"]:
-    """Gauss-Newton's step within bounds: an unknown that would pass one goes there, and the rest adapts.
+    """Return Gauss-Newton's step within bounds: an unknown that would pass one stops there, the rest adapt.
 
     Directions that the columns do not tell stay where they are.
 
@@ -166,7 +166,7 @@ def bounded_step(
 
 
 def settled(change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], size: float) -> bool:
-    """Whether a step changes the residual by less than a hundredth of a standard deviation would.
+    """Return whether a step changes the residual by less than a hundredth of a standard deviation would.
 
     Args:
         change: Of the residual.
@@ -178,7 +178,7 @@ def settled(change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], s
 
 
 def span(columns: Float[np.ndarray, "rows p"]) -> Float[np.ndarray, "rows r"]:
-    """Orthonormal basis of what columns span."""
+    """Return an orthonormal basis of the span of some columns."""
     norm = np.linalg.norm(columns, axis=0)
     u, s, _ = np.linalg.svd(columns / np.where(norm > 0, norm, 1.0), full_matrices=False)
     return u[:, s > _ROUNDING * s[0]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -12,6 +13,8 @@ from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Progress, descend
+from jaxid.estimators.common.minimise import minimise_on_scale
+from jaxid.estimators.common.minimisers import Minimiser
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.within_prior.problem import Problem, WeightedResidual
 from jaxid.logs.log import Log
@@ -80,6 +83,14 @@ def _zero_starts(problem: Problem, draws: int) -> np.ndarray:
     return np.zeros((draws, problem.replay.follow.shape[1]))
 
 
+def _with_prior(
+    compared: WeightedResidual, sharpness: Array, prior_weight: Array, origin: Array, vectors: Array
+) -> Callable[[Array], Array]:
+    """Return the residual as a function of the coordinates, followed by the rows of the prior."""
+    along = compared.at_sharpness(sharpness).along(vectors, origin)
+    return jax.jit(lambda z: jnp.concatenate([along(z).ravel(), prior_weight * z]))
+
+
 def _advance(
     compared: WeightedResidual,
     sharpness: Array,
@@ -106,12 +117,30 @@ def _advance(
         progress: State of the descent.
     """
     bound = jnp.full(active.shape, BOUND)
-    along = compared.at_sharpness(sharpness).along(vectors, origin)
-    residual = jax.jit(lambda z: jnp.concatenate([along(z).ravel(), prior_weight * z]))
+    residual = _with_prior(compared, sharpness, prior_weight, origin, vectors)
     return descend(residual, progress, (-bound, bound), max_evaluations, active, tolerance)
 
 
 _advance_compiled = eqx.filter_jit(_advance)
+
+
+@eqx.filter_jit
+def _by_minimiser(
+    minimiser: Minimiser,
+    compared: WeightedResidual,
+    sharpness: Array,
+    prior_weight: Array,
+    origin: Array,
+    vectors: Array,
+    active: Array,
+    z: Array,
+) -> Minimum:
+    """Minimise the cost from one start by a solver of optimistix; see `_advance` for the arguments."""
+    bound = jnp.full(active.shape, BOUND)
+    residual = _with_prior(compared, sharpness, prior_weight, origin, vectors)
+    size = jnp.where(z == 0, 1.0, jnp.abs(z))
+    progress, failure = minimise_on_scale(minimiser, residual, z, size, (-bound, bound), active)
+    return replace(_minimum_of(progress), failure=failure)
 
 
 def descent(
@@ -138,6 +167,10 @@ def descent(
         active: Mask of the coordinates that are fitted, (k,).
         settled: Decrease of the cost at which to stop, as a fraction of the variance of one sample.
     """
+    if problem.minimiser is not None and np.any(active):
+        args = (problem.residual, sharpness, prior_weight, origin, vectors, active, z)
+        return (yield SolveRequest(_by_minimiser, (problem.minimiser, *args)))
+
     progress = _initial_progress(z, problem.measured.size)
     tolerance = np.asarray(0.1 * settled / len(problem.measured))
     args = (problem.residual, sharpness, prior_weight, origin, vectors, active, tolerance)

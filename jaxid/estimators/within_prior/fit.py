@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.within_prior.evaluations import BLOCK, DRAWS, linearise, precompile_residuals_at
@@ -78,6 +79,7 @@ def within_prior_steps(
     widths: Mapping[str, float] | None = None,
     begin: np.ndarray | None = None,
     drawn: bool = True,
+    minimiser: str | Minimiser | None = None,
 ) -> Steps[Estimate]:
     """Fit the identifiable combinations of the unknowns in the loop, and leave the others to the prior.
 
@@ -97,6 +99,8 @@ def within_prior_steps(
         begin: Start of the fit, as values of the unknowns; absent: the best of many points about the guesses.
         drawn: Sample the posterior, and simulate encoder quantisation. Without it standard deviations are
             those of Laplace's approximation for a loop without quantisation, in a fraction of the time.
+        minimiser: Name in `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix, for the
+            descents from one start; absent: jaxid's Levenberg-Marquardt.
 
     Returns:
         The estimate. Standard deviations include what remains of the prior along other directions, and its
@@ -111,6 +115,7 @@ def within_prior_steps(
     """
     numerics = numerics or choose_numerics(machine, log)
     problem = Problem.of(machine, log, prior, on, numerics, widths)
+    problem = replace(problem, minimiser=minimiser_of(minimiser))
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     first = None if begin is None else problem.prior.inward(problem.padded(begin))
     fit, precision, multistart = yield from _search(machine, problem, first, starts, given, drawn)
@@ -130,7 +135,7 @@ def within_prior_steps(
     if quantised:
         notes += _quantisation_notes(drawn, precision is not None, hessian or profile)
 
-    notes = (*notes_of(machine, numerics, log, on), *notes)
+    notes = (*notes_of(machine, numerics, log, on, minimiser), *notes)
     return _estimate(machine, fit, whole, notes, {"directions": stated} | multistart)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum
+from jaxid.estimators.common.minimisers import Minimiser
 from jaxid.estimators.output_error import measured_output, output_residual, turning_steps
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.logs.log import Log
@@ -85,6 +86,7 @@ class Problem:
         on: Output that is compared: "position", "force" or "both".
         sharpnesses: Sharpness of the smoothed sign at each step of the continuation.
         encoders: Indices of the joints that have an encoder.
+        minimiser: A solver of optimistix for the descents; None: jaxid's Levenberg-Marquardt.
     """
 
     replay: Replay
@@ -96,6 +98,7 @@ class Problem:
     on: str
     sharpnesses: tuple[np.ndarray, ...]
     encoders: tuple[int, ...]
+    minimiser: Minimiser | None = None
 
     @property
     def residual(self) -> WeightedResidual:
