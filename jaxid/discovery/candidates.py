@@ -328,9 +328,14 @@ def position(union: CandidateModel, candidate: Candidate) -> int:
     return int(path[1])
 
 
+def effect_of(union: CandidateModel, candidate: Candidate) -> Effect:
+    """Return a candidate as it stands in the union's plant, at its neutral values."""
+    return union.machine.plant.effects[position(union, candidate)]
+
+
 def effect_at(union: CandidateModel, candidate: Candidate, values: Float[np.ndarray, " k"]) -> Effect:
     """A candidate as an effect of its own, at some values of its unknowns."""
-    effect: Effect = union.machine.plant.effects[position(union, candidate)]
+    effect = effect_of(union, candidate)
     return type(effect)(**dict(zip(user_effect_names(effect), values, strict=True)), port=candidate.port)
 
 

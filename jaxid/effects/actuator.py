@@ -32,6 +32,8 @@ class ActuatorGain(Effect):
     adds_force = False
     in_drive = True
 
+    drive_gain = "gain"
+
     gain: Array = parameter("1", "positive", "applied over declared force")
 
     def act(self, x: Signals, state: None) -> Action:

@@ -25,6 +25,7 @@ class Backlash(Effect):
 
     of_spring = True
     with_springs = True
+    opens_spring = True
 
     gap: Array = parameter("position", "positive", "total clearance")
 
@@ -57,6 +58,7 @@ class JointFlexibility(Effect):
     """
 
     with_springs = False
+    adds_spring = True
 
     stiffness: Array = parameter("force/position", "positive", "of the spring")
     damping: Array = parameter("force*time/position", "positive", "beside the spring")

@@ -155,7 +155,7 @@ class RigidMicropositioningStage(Stage):
 
     def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
         # Of what one coordinate cannot tell apart: the table's, but for what sits in the drive or at rest.
-        at_motor = effect.in_drive or effect.kind == "static_friction"
+        at_motor = effect.in_drive or effect.break_away_level is not None
         return super().accepts(effect, port, drives) and port == (0 if at_motor else 1)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.discovery.at_rest.departures import Starts, starts_from_rest
-from jaxid.effects.friction import CoulombFriction, StaticFriction, StribeckFriction
+from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.estimate import Estimate
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -184,7 +184,7 @@ class _Trial:
 
 def _unknown(machine: Machine, log: Log) -> str:
     """What of the moment of a start is not known; empty where all is."""
-    if not any(e.kind == CoulombFriction.kind for e in machine.plant.effects):
+    if all(e.sliding_level is None for e in machine.plant.effects):
         return "there is no sliding friction that it could stand above"
     if machine.plant.coupled:
         return "the joints push one another, by more than what keeps one from starting"
@@ -202,11 +202,12 @@ def _blurred(estimate: Estimate, data: Prepared, joint: int) -> str:
     """Whether friction just above rest is not known, which delays starts too; empty where it is."""
     machine = estimate.machine
     for k, effect in enumerate(machine.plant.effects):
-        if effect.kind != StribeckFriction.kind or effect.port != joint:
+        velocity = effect.stribeck_velocity
+        if velocity is None or effect.port != joint:
             continue
         free = zip(machine.parameters.free, estimate.identifiable, strict=True)
         told = all(t for f, t in free if f.path[:2] == ("effects", k))
-        if not told or float(effect.velocity) < _RESOLVED * data.recipe.rest_velocity[joint]:
+        if not told or float(getattr(effect, velocity)) < _RESOLVED * data.recipe.rest_velocity[joint]:
             return f"{effect.kind} is not resolved by the samples that move"
     return ""
 

@@ -15,8 +15,6 @@ from jaxid.discovery.candidates import Candidate, CandidateModel
 from jaxid.discovery.score import Score
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where
-from jaxid.effects.coupling import Backlash, JointFlexibility
-from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.common.levenberg_marquardt import Minimum
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, output_residual
@@ -24,6 +22,7 @@ from jaxid.estimators.within_prior.posterior import most_probable
 from jaxid.estimators.within_prior.problem import Problem, read
 from jaxid.estimators.within_prior.rounding import drawn_roundings
 from jaxid.machine import Machine
+from jaxid.model.effect import Effect
 from jaxid.model.plant import Plant
 from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import NoiseModel
@@ -31,8 +30,6 @@ from jaxid.session import Session
 from jaxid.simulation.replay import Replay
 from jaxid.simulation.step_size import with_numerical_damping
 
-# A smooth loop of fixed steps cannot take these in.
-_LEFT_OUT = (StaticFriction, Backlash, JointFlexibility)
 # Draws of noise; the best that the luckiest of them gains is the threshold.
 _DRAWS = 1024
 # Where fits of a candidate begin: at so many of its looks, the most promising, as far along as that of these
@@ -146,7 +143,7 @@ class Loop:
         sigma, point, here = fit.noise, fit.point, fit.minimum
         # Sizes of motion from all samples: those of a short log may hardly leave its rest.
         data = replace(session.fit.data, moving=np.ones_like(session.fit.data.moving))
-        searched = [e for e in session.case.searched if e not in _LEFT_OUT]
+        searched = [e for e in session.case.searched if _follows(e)]
         union = build_candidate_model(fit.estimate.machine, data, searched)
         residual = np.concatenate([np.asarray(here.residual).ravel() / sigma, point])
         base = np.concatenate([np.asarray(here.jacobian) / sigma, np.eye(point.size)])
@@ -332,6 +329,11 @@ class Loop:
         text = f"the loop's residual is largest between {region[0]:.3g} and {region[1]:.3g} s"
         part = float(power[k] / np.sum(e**2))
         return Where(1, "time", region, (region,), text, part, 0.0, 0.0, True, none, none, none, none)
+
+
+def _follows(effect: type[Effect]) -> bool:
+    """Return whether a smooth loop of fixed steps can follow an effect."""
+    return effect.break_away_level is None and not effect.adds_spring and not effect.opens_spring
 
 
 @eqx.filter_jit

@@ -298,7 +298,7 @@ def two_intervals(changed: bool, name: str) -> Callable[..., Steps[Estimate]]:
 
 
 def _is_friction(machine: Machine, free: Free) -> bool:
-    return free.path[0] == "effects" and machine.plant.effects[free.path[1]].kind == "coulomb_friction"
+    return free.path[0] == "effects" and machine.plant.effects[free.path[1]].sliding_level is not None
 
 
 def _own(online: Online, joint: int, rows: np.ndarray, ages: np.ndarray) -> tuple[tuple[int, ...], Rows]:

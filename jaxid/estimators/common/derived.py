@@ -43,15 +43,19 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
     q = jnp.zeros(plant.joints)
     for k, effect in enumerate(plant.effects):
         name = effect_name(_before(plant, k), effect)
-        if effect.kind != "coulomb_friction" or not float(plant.port_normal(q)[effect.port]) > 0:
+        level = effect.sliding_level
+        # Only a law that may be stated either way has the other way to be derived.
+        if level is None or not hasattr(effect, "friction_coefficient"):
             continue
-        by_level = effect.level is not None
+        if not float(plant.port_normal(q)[effect.port]) > 0:
+            continue
+        by_level = getattr(effect, level) is not None
 
-        def other(theta: Array, k: int = k, by_level: bool = by_level) -> Array:
+        def other(theta: Array, k: int = k, by_level: bool = by_level, level: str = level) -> Array:
             moved = machine.parameters.insert(plant, theta)
             own = moved.effects[k]
             normal = moved.port_normal(q)[own.port]
-            return own.level / normal if by_level else own.friction_coefficient * normal
+            return getattr(own, level) / normal if by_level else own.friction_coefficient * normal
 
         value, slope = jax.value_and_grad(other)(jnp.asarray(estimate.theta))
         used = np.flatnonzero(np.asarray(slope))
@@ -59,7 +63,7 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
             continue
         part = np.asarray(slope)[used]
         covariance = estimate.precision.covariance[np.ix_(used, used)]
-        field, unit = ("friction_coefficient", "1") if by_level else ("level", machine.units.label("force"))
+        field, unit = ("friction_coefficient", "1") if by_level else (level, machine.units.label("force"))
         std = float(np.sqrt(part @ covariance @ part))
         out.append(Derived(f"{name}.{field}", float(value), std, unit))
     return out
@@ -68,8 +72,8 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
 def natural_frequency(estimate: Estimate) -> list[Derived]:
     """Of an axis with an elastic coupling, declared or found: the fastest swing, nothing held [Hz]."""
     plant, parameters = estimate.machine.plant, estimate.machine.parameters
-    kinds = {e.kind for e in plant.effects}
-    if plant.load is None and "joint_flexibility" not in kinds or "backlash" in kinds:
+    rigid = plant.load is None and not any(e.adds_spring for e in plant.effects)
+    if rigid or any(e.opens_spring for e in plant.effects):
         return []
     modes = natural_frequencies(plant, parameters.places, estimate.theta)
     std = modes.std(estimate.precision.covariance)
