@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 
 from jaxid.case.schema import Spot
+from jaxid.case.user_faults import check_declaration, one_line
 from jaxid.effects import EFFECTS
 from jaxid.errors import suggest
 from jaxid.model.effect import Effect
@@ -52,6 +53,7 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
         known = [n for n, c in vars(module).items() if _is_effect_of(c, module)]
         what = "is not a subclass of jaxid.model.effect.Effect" if cls is not None else "is not there"
         raise spot.refuse(kind, f": {name} {what}", suggest(name, known))
+    check_declaration(cls, kind, spot)
     if not hasattr(cls, "kind"):
         cls.kind = kind
     _check_kind(cls, module, kind, spot)
@@ -74,10 +76,10 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         sys.modules.pop(name, None)
         raise spot.refuse(
-            kind, f"cannot be imported ({type(error).__name__}: {error})", f"correct {path.name}"
+            kind, f"cannot be imported ({one_line(error, path)})", f"correct {path.name}"
         ) from error
     finally:
         # What it registers is its case's, not every case's.

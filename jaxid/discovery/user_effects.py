@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Array
+from jaxid.case.user_faults import check_action, one_line
 from jaxid.errors import InputError
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -53,14 +54,17 @@ def check_user_effect(
         raise InputError("has no parameters", where=where, hint=hint)
     try:
         starts, neutral = cls.starts(scales), cls.neutral(scales)
-        cls.limits(scales)
+        for lower, upper in cls.limits(scales).values():
+            float(lower), float(upper)
         effects = [cls(**values, port=port) for values in (neutral, *starts)]
     except Exception as error:
-        what = f"cannot be started ({type(error).__name__}: {error})"
+        what = f"cannot be started ({one_line(error)})"
         hint = f"let neutral(scales) and each of starts(scales) give a number for {', '.join(names)}"
         raise InputError(what, where=where, hint=hint) from error
     if not starts:
         raise InputError("starts(scales) is empty", where=where, hint="give at least one start")
+    for effect in effects[:2]:
+        check_action(effect, where)
     pieces = data.parts(3 * _ROWS, 3)
     part, plant = ForceData.of(pieces[len(pieces) // 2]), sharpened(machine.plant, data)
     models = [_with(plant, e, machine) for e in effects[:2]]

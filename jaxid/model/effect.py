@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 
@@ -112,8 +112,8 @@ class Effect(eqx.Module):
     kind: ClassVar[str]
     port: int = eqx.field(static=True, default=0, kw_only=True)
 
-    def act(self, x: Signals, state: Array | None) -> Action:
-        """What the effect does at one instant."""
+    def act(self, x: Signals, state: Any) -> Action:
+        """Return what the effect does at one instant; `state` is as `initial_state` gives it, or None."""
         raise NotImplementedError
 
     def initial_state(self, u: Array) -> Array | None:
