@@ -42,6 +42,7 @@ class CoulombFriction(Effect):
     def act(self, x: Signals, state: None) -> Action:
         if self.level is not None:
             return Action(dry=self.level)
+        assert self.friction_coefficient is not None, "__check_init__ asks for one of the two"
         return Action(dry=self.friction_coefficient * x.normal)
 
     @classmethod
