@@ -18,6 +18,7 @@ from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_in
 from jaxid.machine import Machine
 from jaxid.model.smoothing import typical_velocity
 from jaxid.references import make_reference
+from jaxid.simulation.finite_effects import need_finite_effects
 from jaxid.simulation.step_size import needed_steps
 
 
@@ -123,6 +124,7 @@ def open_session(
         names.add(name)
         opened.append(_run(name, measured, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
+    need_finite_effects(machine.plant, opened[0].data, fit.source)
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
 
 

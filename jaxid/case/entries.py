@@ -24,6 +24,7 @@ from jaxid.case.schema import (
 )
 from jaxid.case.tables import PLANT
 from jaxid.case.user_effect import user_effect
+from jaxid.case.user_faults import check_action, is_user_class
 from jaxid.case.user_file import names_a_file
 from jaxid.case.user_plant import check_user_plant, user_plant
 from jaxid.case.values import Value, read_value, read_values
@@ -233,7 +234,7 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
         cls = EFFECTS[read_kind(table, EFFECTS, spot)]
     spot = Spot(str(path), f"[[effects]] {index} ({cls.kind})")
     infos = parameters_of(cls)
-    _check_keys(table, list(infos), spot)
+    _check_keys(table, cls, spot)
     ports, what = read_ports(table, cls, plant, spot)
     if "shared" in table and flag(table["shared"], spot.at("shared")) and len(ports) > 1:
         hint = "leave it out: each joint then has a value of its own"
@@ -285,10 +286,14 @@ def check_kinds(classes: Iterable[type[Effect]], file: str) -> None:
             raise Spot(file).fault(f"two effects of your own are of kind '{cls.kind}'", hint)
 
 
-def _check_keys(table: dict[str, Any], names: list[str], spot: Spot) -> None:
+def _check_keys(table: dict[str, Any], cls: type[Effect], spot: Spot) -> None:
+    names, fields = list(parameters_of(cls)), {*cls.__dataclass_fields__} - {"port"}
     known = [*names, "kind", *PLACES, "shared"]
     for name in table:
         if name not in known:
+            if name in fields:
+                hint = f'write {name}: Array = parameter("force", "nonnegative", "what it is")'
+                raise spot.fault(f"'{name}' is a field of the class that is not a parameter", hint)
             raise spot.fault(f"unknown key '{name}'", nearest(name, known, table))
 
 
@@ -300,8 +305,13 @@ def _takes(cls: type[Effect]) -> str:
 def _check_together(cls: type[Effect], parameters: dict[str, tuple[Value, ...]], spot: Spot) -> None:
     """Let the class judge which optional parameters go together."""
     try:
-        cls(**{name: values[0].guess for name, values in parameters.items()})
-    except (ValueError, TypeError) as error:
-        if isinstance(error, InputError):
+        effect = cls(**{name: values[0].guess for name, values in parameters.items()})
+    except InputError:
+        raise
+    except Exception as error:
+        if not is_user_class(cls) and not isinstance(error, (ValueError, TypeError)):
             raise
-        raise spot.fault(str(error).rstrip("."), _takes(cls)) from error
+        text = " ".join(str(error).split()).rstrip(".")
+        raise spot.fault(text or type(error).__name__, _takes(cls)) from error
+    if is_user_class(cls):
+        check_action(effect, f"{spot.file}, {spot.table}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import MISSING, fields
+from typing import Any
 
 from jaxid.case.schema import (
     Key,
     Keys,
+    Spot,
     by_joint,
     choice,
     columns,
@@ -53,6 +55,8 @@ MINIMISERS = (
     "optimistix.NonlinearCG",
     "optimistix.NelderMead",
 )
+# Methods of `jaxid.estimators.register_method`, which a case may then name.
+USER_METHODS: list[str] = []
 # What a trajectory of `jaxid design` is improved for.
 CRITERIA = ("determinant", "condition")
 DERIVATIVES = ("central", "spectral", "parabolic")
@@ -89,6 +93,12 @@ _CONTROLLER_READS = {
     "regularization": number("positive"),
     "reach": whole(1),
 }
+
+
+def _estimator(value: Any, spot: Spot) -> str:
+    """Read one of [study] estimators; methods may be registered after this module is imported."""
+    return choice((*METHODS, *USER_METHODS, "discover", "in_loop"))(value, spot)
+
 
 DISTURBANCE = either_text(
     inline(
@@ -128,7 +138,7 @@ IDENTIFICATION: Keys = {
     "physically_consistent": Key(flag, "whether links must be what bodies can be"),
 }
 STUDY: Keys = {
-    "estimators": Key(several(choice((*METHODS, "discover", "in_loop")))),
+    "estimators": Key(several(_estimator)),
     "hidden": Key(several(text)),
     "noise": Key(several(number("nonnegative"))),
     "sample_rate": Key(several(number("positive"))),

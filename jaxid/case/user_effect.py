@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxid.case.schema import Spot
+from jaxid.case.user_faults import check_declaration
 from jaxid.case.user_file import check_kind, check_parameters, class_of_file
 from jaxid.effects import EFFECTS
 from jaxid.model.effect import Effect
@@ -25,7 +26,9 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
         InputError: If there is no such file or class, it does not import, it is no effect, or its
             kind is that of another.
     """
-    cls, module = class_of_file(kind, folder, Effect, "my_effects.py:MyEffect", spot)
+    cls, module = class_of_file(
+        kind, folder, Effect, "my_effects.py:MyEffect", spot, lambda c: check_declaration(c, kind, spot)
+    )
     check_kind(cls, Effect, module, EFFECTS, kind, spot)
     # Faults that would only come up in the middle of a fit.
     if cls.act is Effect.act:

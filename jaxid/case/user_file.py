@@ -8,11 +8,13 @@ from __future__ import annotations
 import importlib.util
 import sys
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
 from jaxid.case.schema import Spot
+from jaxid.case.user_faults import one_line
 from jaxid.effects import EFFECTS
 from jaxid.errors import suggest
 from jaxid.model.parameter import SIGNS, parameters_of
@@ -32,7 +34,12 @@ def names_a_file(kind: object) -> bool:
 
 
 def class_of_file(
-    kind: str, folder: Path, base: type[T], example: str, spot: Spot
+    kind: str,
+    folder: Path,
+    base: type[T],
+    example: str,
+    spot: Spot,
+    check: Callable[[type[T]], None] = lambda cls: None,
 ) -> tuple[type[T], ModuleType]:
     """Import a user's class.
 
@@ -42,6 +49,7 @@ def class_of_file(
         base: Class that it must be derived from.
         example: How `kind` should look, for hints.
         spot: Place of the kind in the case.
+        check: Checks the class before its kind is set; raises where it is faulty.
 
     Returns:
         The class, whose `kind` is the text if it states none, and its module.
@@ -63,6 +71,7 @@ def class_of_file(
         known = [n for n, c in vars(module).items() if is_defined_in(c, base, module)]
         missing = "is not there" if cls is None else f"is not a subclass of {base.__module__}.{base.__name__}"
         raise spot.refuse(kind, f": {name} {missing}", suggest(name, known))
+    check(cls)
     if not hasattr(cls, "kind"):
         setattr(cls, "kind", kind)  # noqa: B010  # the base of a user's class declares it, `type[T]` does not
     return cls, module
@@ -119,10 +128,10 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         sys.modules.pop(name, None)
         raise spot.refuse(
-            kind, f"cannot be imported ({type(error).__name__}: {error})", f"correct {path.name}"
+            kind, f"cannot be imported ({one_line(error, path)})", f"correct {path.name}"
         ) from error
     finally:
         # What it registers is its case's, not every case's.

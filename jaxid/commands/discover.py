@@ -20,7 +20,6 @@ from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import proposals
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where, locate
-from jaxid.effects.friction import StaticFriction
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_known_reference
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
@@ -30,6 +29,7 @@ from jaxid.estimators.output_error import choose_numerics, output_error
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect
 from jaxid.session import Session, open_session
 from jaxid.simulation.force_balance import ForceData
@@ -126,7 +126,7 @@ def explore(
     designs = session.machine.plant.designs_experiments if experiments is None else experiments
     separating = proposals(session, search, effects, progress) if designs else ()
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
-    missing = [] if unseen else [c for c in search.rest() if c.kind == StaticFriction.kind]
+    missing = [] if unseen else _break_aways(search)
     while missing:
         progress("looking at the starts from rest")
         leaving = break_away(after, session.runs, [c.port for c in missing])
@@ -173,12 +173,23 @@ def start_search(
     return baseline, Search(union, data, floor, colour, others, progress)
 
 
+def _break_aways(search: Search) -> list[cand.Candidate]:
+    """Return candidates that act at rest only and have one parameter, their level; one for each port."""
+    out: dict[int, cand.Candidate] = {}
+    for c in search.rest():
+        cls = type(cand.effect_of(search.union, c))
+        if [*parameters_of(cls)] == [cls.break_away_level]:
+            out.setdefault(c.port, c)
+    return list(out.values())
+
+
 def _with_break_away(
     estimate: Estimate, search: Search, c: cand.Candidate, b: BreakAway
 ) -> tuple[Estimate, NamedEffect, Step]:
     """An estimate with break-away friction beside it, as the starts from rest tell it."""
     machine = estimate.machine
-    effect = StaticFriction(level=b.level, port=c.port)
+    cls = type(cand.effect_of(search.union, c))
+    effect = cls(**{str(cls.break_away_level): b.level}, port=c.port)
     plant, free = free_effect(machine.plant, effect, machine.units)
     theta = np.append(estimate.theta, b.level)
     machine = machine.with_plant(plant, machine.parameters.extended(free)).with_estimate(theta)

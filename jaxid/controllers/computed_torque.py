@@ -36,8 +36,8 @@ def drive_gains(plant: Plant, drives: int) -> Float[Array, " m"]:
     out = [jnp.ones(())] * drives
     for e in plant.effects:
         j = plant.drive_of(e.port, drives)
-        if e.kind == "actuator_gain" and j is not None:
-            out[j] = out[j] * e.gain
+        if e.drive_gain is not None and j is not None:
+            out[j] = out[j] * getattr(e, e.drive_gain)
     return jnp.stack(out)
 
 

@@ -339,9 +339,14 @@ def position(superset: CandidateModel, candidate: Candidate) -> int:
     return int(path[1])
 
 
+def effect_of(superset: CandidateModel, candidate: Candidate) -> Effect:
+    """Return a candidate of the superset's plant, at its neutral values."""
+    return superset.machine.plant.effects[position(superset, candidate)]
+
+
 def effect_at(superset: CandidateModel, candidate: Candidate, values: Float[np.ndarray, " k"]) -> Effect:
     """Return a candidate as a separate effect with the given values of its unknowns."""
-    effect: Effect = superset.machine.plant.effects[position(superset, candidate)]
+    effect = effect_of(superset, candidate)
     return type(effect)(**dict(zip(user_effect_names(effect), values, strict=True)), port=candidate.port)
 
 

@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Array
+from jaxid.case.user_faults import check_action, one_line
 from jaxid.errors import InputError
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -80,14 +81,17 @@ def _built(cls: type[Effect], scales: Scales, port: int, where: str) -> list[Eff
 
     try:
         starts, neutral = cls.starts(scales), cls.neutral(scales)
-        cls.limits(scales)
+        for lower, upper in cls.limits(scales).values():
+            float(lower), float(upper)
         effects = [cls(**values, port=port) for values in (neutral, *starts)]
     except Exception as error:
-        what = f"cannot be built at its neutral values or its starts ({type(error).__name__}: {error})"
+        what = f"cannot be built at its neutral values or its starts ({one_line(error)})"
         hint = f"let neutral(scales) and each of starts(scales) give a number for {', '.join(names)}"
         raise InputError(what, where=where, hint=hint) from error
     if not starts:
         raise InputError("starts(scales) is empty", where=where, hint="give at least one start")
+    for effect in effects[:2]:
+        check_action(effect, where)
     return effects
 
 

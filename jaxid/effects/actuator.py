@@ -1,4 +1,4 @@
-"""What happens between the declared force and the force at the load."""
+"""Effects in the drive: between the declared force and the force at the load."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _CORNER = 1e-3
 class ActuatorGain(Effect):
     """The force is gain times the declared one.
 
-    Of a drive with a current loop the declared force is the measured torque, or, where the regulator is fast,
-    the wanted one. With k_T the motor's torque constant and k_T^ what the drive takes it for, k_S the factor
-    of its current sensor and H the static gain of its regulator,
+    In a drive with a current loop the declared force is the measured torque, or the wanted torque if the
+    regulator is fast. With k_T the motor's torque constant, k_T^ the value that the drive assumes for it, k_S
+    the factor of its current sensor and H the static gain of its regulator,
 
         actual / wanted   = k_T H / (k_T^ (1 + k_S H))
         measured / wanted = k_S H / (1 + k_S H)
@@ -26,11 +26,13 @@ class ActuatorGain(Effect):
 
     Source:
         Righettini et al. (2025), Robotics 14(4), 36, (6), (19)-(23). As printed the denominator of (19)
-        has k_T^ k_T where k_T^ belongs; (23) holds at any H, not in the limit only.
+        has k_T^ k_T in place of k_T^; (23) holds at any H, not in the limit only.
     """
 
     adds_force = False
     in_drive = True
+
+    drive_gain = "gain"
 
     gain: Array = parameter("1", "positive", "applied over declared force")
 
@@ -48,11 +50,11 @@ class ActuatorGain(Effect):
 
 @register("actuator_offset")
 class ActuatorOffset(Effect):
-    """The force is the declared one plus a constant, before what follows in the drive.
+    """The force is the declared one plus a constant, before later effects of the drive.
 
-    Behind it a saturation, or a limit by the supply's voltage, cuts off more on one side. Where neither acts
-    it is `constant_force` by another name. Where both are unknown before a saturation it wants bounds: far
-    beyond that the drive is a constant.
+    A saturation behind it, or a limit by the supply's voltage, cuts off more on one side. If neither acts,
+    it is `constant_force` by another name. An unknown offset before an unknown saturation needs bounds: far
+    beyond the limit the drive is a constant.
 
     Source:
         "PA-10 traineeship", section 5.2: an amplifier adds an offset to the command that it receives.
@@ -151,16 +153,16 @@ class Saturation(Effect):
 
 @register("voltage_limit")
 class VoltageLimit(Effect):
-    """The supply's voltage limits the force, the less is left the faster it moves.
+    """The supply's voltage limits the force, more so at higher speed.
 
-    A current that would take more than the supply has, |R i + k v| > U, is what it does have: with the stall
-    force k U / R and the no-load velocity U / k, and u the force of the wanted current,
+    A current that needs more voltage than the supply has, |R i + k v| > U, is limited to that voltage: with
+    the stall force k U / R and the no-load velocity U / k, and u the force of the wanted current,
 
         force = clip(u + stall v / velocity, -stall, stall) - stall v / velocity.
 
-    It falls in a line from `stall` at rest to nothing at `velocity`, beyond which the supply brakes; against
-    the motion it is as much larger. k is the motor's constant times its reduction, in N or N m per A and
-    V per m/s or rad/s alike; the inductance is left out.
+    The limit falls in a line from `stall` at rest to zero at `velocity`, beyond which the supply brakes;
+    against the motion it is larger by the same amount. k is the motor's constant times its reduction, in N
+    or N m per A, equally in V per m/s or rad/s; the inductance is neglected.
 
     Source:
         "PA-10 traineeship", (5.4)-(5.5), without the inductance, as there.
@@ -183,7 +185,7 @@ class VoltageLimit(Effect):
 
     @classmethod
     def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
-        # What falls no further over the log's speeds is a saturation.
+        # A limit that hardly falls over the log's speeds is a saturation.
         return {"stall": (0.0, 20 * scales.peak_force), "velocity": (0.0, 5 * scales.peak_velocity)}
 
     @classmethod

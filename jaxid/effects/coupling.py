@@ -1,4 +1,4 @@
-"""What an elastic coupling does beside its stiffness."""
+"""Effects of an elastic coupling beside its stiffness."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ _CORNER = 1e-2
 class Backlash(Effect):
     """No force passes a spring within its clearance: k times a dead zone of e, in place of k e.
 
-    Stated as the force that takes the spring's own back: k clip(e) + d e' inside. The gap lies about
-    the elongation at which the spring was relaxed.
+    Stated as the force that cancels the spring's force: k clip(e) + d e' inside the gap, which is centred at
+    the elongation of the relaxed spring.
     """
 
     of_spring = True
     with_springs = True
+    opens_spring = True
 
     gap: Array = parameter("position", "positive", "total clearance")
 
@@ -51,12 +52,13 @@ class Backlash(Effect):
 class JointFlexibility(Effect):
     """Part of the inertia, J, sits behind a spring: k e + d e' - (-J a) on the joint.
 
-    e is the elongation of the spring: J (a + e'') = -k e - d e'. What the plant's own inertia says of
-    the whole stays as it is; the effect takes its part of it away and gives the spring's pull instead.
-    The state is e times the spring's frequency, and e', of one size.
+    e is the elongation of the spring: J (a + e'') = -k e - d e'. The inertia of the plant stays that of the
+    whole; the effect subtracts its part J and adds the pull of the spring. The state is e times the spring's
+    frequency, and e': both have one size.
     """
 
     with_springs = False
+    adds_spring = True
 
     stiffness: Array = parameter("force/position", "positive", "of the spring")
     damping: Array = parameter("force*time/position", "positive", "beside the spring")
@@ -74,8 +76,8 @@ class JointFlexibility(Effect):
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        # Half of the inertia behind a spring that swings once in 3 to 100 samples. A fifth of critical
-        # damping: resonances are then wide enough for a grid of a third of an octave.
+        # Half of the inertia behind a spring with a period of 3 to 100 samples. At a fifth of critical
+        # damping resonances are wide enough for a grid of a third of an octave.
         inertia = 0.5 * scales.natural("inertia")
         found = []
         for samples in 3.0 * 2.0 ** (np.arange(16) / 3.0):

@@ -16,6 +16,7 @@ class ViscousFriction(Effect):
     """-c v."""
 
     any_direction = True
+    viscous_coefficient = "coefficient"
 
     coefficient: Array = parameter("force*time/position", "nonnegative", "c, drag per velocity")
 
@@ -26,6 +27,8 @@ class ViscousFriction(Effect):
 @register("coulomb_friction")
 class CoulombFriction(Effect):
     """-F sign v, set-valued at rest; F is `level`, or `friction_coefficient` times normal force."""
+
+    sliding_level = "level"
 
     level: Array | None = parameter("force", "nonnegative", "F, sliding friction", optional=True)
     friction_coefficient: Array | None = parameter(
@@ -39,6 +42,7 @@ class CoulombFriction(Effect):
     def act(self, x: Signals, state: None) -> Action:
         if self.level is not None:
             return Action(dry=self.level)
+        assert self.friction_coefficient is not None, "__check_init__ asks for one of the two"
         return Action(dry=self.friction_coefficient * x.normal)
 
     @classmethod
@@ -50,6 +54,8 @@ class CoulombFriction(Effect):
 class StaticFriction(Effect):
     """Break-away force above the sliding friction, at rest only."""
 
+    break_away_level = "level"
+
     level: Array = parameter("force", "nonnegative", "break-away force above Coulomb's")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -59,6 +65,8 @@ class StaticFriction(Effect):
 @register("stribeck_friction")
 class StribeckFriction(Effect):
     """-F_s exp(-(v/v_s)^2) sign v: the part above Coulomb friction at low velocity."""
+
+    stribeck_velocity = "velocity"
 
     level: Array = parameter("force", "nonnegative", "F_s, excess at low velocity")
     velocity: Array = parameter("position/time", "positive", "v_s, where the excess fades")

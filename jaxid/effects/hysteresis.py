@@ -15,8 +15,8 @@ from jaxid.numerics import smooth
 class Hysteresis(Effect):
     """Presliding friction: a spring of `stiffness` at reversal that slips at `level`.
 
-    Dahl's model: force -f, df/dt = k v - (k / F) |v| f. The state is the force over the level, so
-    that it stays of order one whatever the machine.
+    Dahl's model: force -f, df/dt = k v - (k / F) |v| f. The state is the force over the level, which is of
+    order one on any machine.
 
     Source:
         Dahl (1968), "A solid friction model", with exponent one.
@@ -44,9 +44,10 @@ class Hysteresis(Effect):
 class VelocityHysteresis(Effect):
     """-C exp(-(v/v_s)^2) sign v while speed grows, nothing while it falls: Stribeck's friction with memory.
 
-    C is `level` forwards and `level_negative` backwards; without the latter it is the same both ways. As
-    printed the law has no answer where a force exceeds friction without this term and not with it: then
-    the velocity stands, and the term is what is missing to balance. At rest it is part of what holds.
+    C is `level` forwards and `level_negative` backwards; without the latter it is the same in both
+    directions. The law as printed has no solution if a force exceeds friction without this term but not
+    with it: the velocity is then constant, and the term balances the rest of the force. At rest it adds to
+    the level that holds.
 
     Source:
         Bogdan and Abba, "Identification of mechanical parameters at low velocities for a micropositioning
@@ -69,6 +70,6 @@ class VelocityHysteresis(Effect):
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        # Either way its own: one level for both would hide that they differ.
+        # A level for each direction: one level for both would hide that they differ.
         levels = {"level": scales.force, "level_negative": scales.force}
         return [levels | {"velocity": scales.velocity * w} for w in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)]

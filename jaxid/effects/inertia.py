@@ -10,7 +10,7 @@ from jaxid.model.parameter import parameter
 
 @register("added_mass")
 class AddedMass(Effect):
-    """-m (a + g): extra inertia, and its weight where gravity acts along the joint."""
+    """-m (a + g): extra inertia, and its weight if gravity acts along the joint."""
 
     any_direction = True
 

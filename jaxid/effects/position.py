@@ -70,10 +70,9 @@ class Cogging(Effect):
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        # Two neighbouring periods must not lose more than half a turn over the stroke, or a true
-        # ripple falls between them: the grid is uniform in turns per stroke. Of three phases one
-        # has at least half of the amplitude with the right sign. Below two turns a ripple is no
-        # ripple, but any smooth force of position.
+        # Neighbouring periods differ by half a turn over the stroke, or a true ripple would fall between
+        # them: the grid is uniform in turns per stroke. Of three phases one has the right sign and at least
+        # half of the amplitude. Below two turns a ripple imitates any smooth force of position.
         return [
             {"amplitude": scales.force, "period": 2 * scales.position / turns, "phase": phase}
             for turns in np.arange(2.0, 60.0, 0.5)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.case.tables import USER_METHODS
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.unknowns import REFERENCE
@@ -214,6 +215,29 @@ METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "minimal_model": _minimal_model,
     "minimal_model_printed": _minimal_model_printed,
 }
+
+
+def register_method(name: str, steps: Callable[..., Steps[Estimate]]) -> None:
+    """Register an estimator, so that `identify`, `identify_many` and `study` know it by name.
+
+    Args:
+        name: Name of the method, in Python and in [study] estimators of a case.
+        steps: Function from a session to a generator of solves that returns an `Estimate`.
+
+    Raises:
+        InputError: If the name is not an identifier, or is that of another method.
+    """
+    known = METHODS.get(name)
+    taken = known is not None and (known.__module__, known.__qualname__) != (
+        steps.__module__,
+        steps.__qualname__,
+    )
+    if taken or name in ("discover", "in_loop") or not name.isidentifier():
+        what = "is taken" if name.isidentifier() else "is not a name"
+        raise InputError(f"method {name!r} {what}", hint="choose another name, of letters, digits and _")
+    METHODS[name] = steps
+    if name not in USER_METHODS:
+        USER_METHODS.append(name)
 
 
 def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:

@@ -187,7 +187,7 @@ def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> 
     levels = [
         (k, effects[_number(f)].port)
         for k, f in enumerate(machine.parameters.free)
-        if f.path[0] == "effects" and effects[_number(f)].kind == "coulomb_friction" and f.path[2] == "level"
+        if f.path[0] == "effects" and f.path[2] == effects[_number(f)].sliding_level
     ]
     seen = [k for k, port in levels if port < len(measured) and measured[port]]
     hidden = [k for k, port in levels if port < len(measured) and not measured[port]]

@@ -335,12 +335,12 @@ def choose_numerics(
         segments: Whether an open-loop run may be cut into segments.
         solver: One of `jaxid.simulation.solvers.SOLVERS`; None: fixed steps.
     """
-    kinds = {e.kind for e in machine.plant.effects}
+    breaks_away = any(e.break_away_level is not None for e in machine.plant.effects)
     exact = exact_numerics(machine, log, 1 if solver else None)
     numerics = replace(
         exact,
         substeps=1 if solver else max(exact.substeps, turning_steps(machine, log)),
-        set_valued="static_friction" not in kinds and solver is None,
+        set_valued=not breaks_away and solver is None,
         solver=solver,
     )
     if not numerics.set_valued and solver is None:

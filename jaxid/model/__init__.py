@@ -1,1 +1,11 @@
-"""One statement of the physics: parameters, effects, and the balance of a plant."""
+"""One statement of the physics: parameters, effects, and the balance of a plant.
+
+A user's own classes import from here: these names stay, wherever their modules are.
+"""
+
+from jaxid.model.effect import Action as Action
+from jaxid.model.effect import Effect as Effect
+from jaxid.model.effect import Scales as Scales
+from jaxid.model.effect import Signals as Signals
+from jaxid.model.parameter import parameter as parameter
+from jaxid.model.plant import Plant as Plant

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 
@@ -113,8 +113,8 @@ class Effect(eqx.Module):
     kind: ClassVar[str]
     port: int = eqx.field(static=True, default=0, kw_only=True)
 
-    def act(self, x: Signals, state: Array | None) -> Action:
-        """Compute the action of the effect at one instant."""
+    def act(self, x: Signals, state: Any) -> Action:
+        """Compute the action at one instant; `state` is as `initial_state` gives it, or None."""
         raise NotImplementedError
 
     def initial_state(self, u: Array) -> Array | None:
@@ -147,6 +147,28 @@ class Effect(eqx.Module):
     of_stages: ClassVar[bool] = False
     # Whether a search looks for it only where [discover] asks: elsewhere a simpler effect is taken for it.
     on_request: ClassVar[bool] = False
+
+    # Questions that shared code asks of an effect, whatever its kind. The first five name a parameter, or are
+    # None where the effect has no such parameter.
+    # Level of dry friction while sliding (Coulomb's, LuGre's).
+    sliding_level: ClassVar[str | None] = None
+    # Level above sliding friction that must be overcome to leave rest, and that acts at rest only.
+    break_away_level: ClassVar[str | None] = None
+    # Velocity over which dry friction falls to its sliding level (Stribeck's).
+    stribeck_velocity: ClassVar[str | None] = None
+    # Coefficient of friction in proportion to the velocity.
+    viscous_coefficient: ClassVar[str | None] = None
+    # Factor from the declared force of the drive to the applied one.
+    drive_gain: ClassVar[str | None] = None
+    # Whether it puts a part of the inertia behind a spring of its own, so that the machine resonates.
+    adds_spring: ClassVar[bool] = False
+    # Whether it lets a spring of the plant pass no force in a part of its range (a clearance).
+    opens_spring: ClassVar[bool] = False
+
+    @classmethod
+    def delays_command(cls) -> bool:
+        """Return whether the class delays the command: simulated loops then remember past commands."""
+        return cls.command_delay is not Effect.command_delay
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:

@@ -130,7 +130,7 @@ class RigidMicropositioningStage(Stage):
     def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
         # One coordinate does not separate motor and table: effects are named at the table, except those
         # of the drive and at rest.
-        at_motor = effect.in_drive or effect.kind == "static_friction"
+        at_motor = effect.in_drive or effect.break_away_level is not None
         return super().accepts(effect, port, drives) and port == (0 if at_motor else 1)
 
 

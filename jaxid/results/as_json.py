@@ -268,10 +268,10 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
     """Why effects were taken out again, and why the best of what the last round left were not added."""
     if not result.rounds:
         return []
-    present = {e.kind for e in result.session.machine.plant.effects}
+    effects = result.session.machine.plant.effects
     steps = [r.step for r in result.rounds]
     lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.why]
-    if "static_friction" not in present and result.unseen:
+    if all(e.break_away_level is None for e in effects) and result.unseen:
         lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
     session = result.session
     loop = session.machine.controller is not None and session.fit.log.reference is not None

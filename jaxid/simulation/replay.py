@@ -376,7 +376,7 @@ def exact_numerics(machine: Machine, log: Log, steps: int | None = None) -> Nume
     Raises:
         TooStiffError: If the machine asks for more steps than any sound one.
     """
-    delayed = any(e.kind == "input_delay" for e in machine.plant.effects)
+    delayed = any(e.delays_command() for e in machine.plant.effects)
     looped = machine.controller is not None
     steps = needed_steps(machine, log) if steps is None else steps
     return Numerics(substeps=steps, longest_delay=_LONGEST_DELAY if delayed and looped else 0)

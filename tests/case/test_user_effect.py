@@ -10,8 +10,7 @@ from jaxid.effects import EFFECTS
 from tests.support.case_faults import message, more, write
 
 OWN_EFFECT = """
-from jaxid.model.effect import Action, Effect
-from jaxid.model.parameter import parameter
+from jaxid.model import Action, Effect, parameter
 
 class Wind(Effect):
     {kind}
@@ -119,7 +118,7 @@ def test_own_effect_does_not_take_a_name_there_is(tmp_path):
     assert "takes the name of an effect there is: viscous_friction" in told
     write(
         tmp_path,
-        "from jaxid.effects import register\nfrom jaxid.model.effect import Effect\n"
+        "from jaxid.effects import register\nfrom jaxid.model import Effect\n"
         '@register("viscous_friction")\nclass ViscousFriction(Effect):\n    pass\n',
         "theirs.py",
     )

@@ -17,8 +17,7 @@ from truth.axis.hidden_effects import COULOMB, VISCOUS
 # A force in time at a known frequency: nothing that is registered does that.
 OWN = """
 import jax.numpy as jnp
-from jaxid.model.effect import Action, Effect
-from jaxid.model.parameter import parameter
+from jaxid.model import Action, Effect, parameter
 
 
 class Hum(Effect):

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.discovery.at_rest.departures import Starts, starts_from_rest
-from jaxid.effects.friction import CoulombFriction, StaticFriction, StribeckFriction
+from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.estimate import Estimate
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -196,7 +196,7 @@ class _Trial:
 
 def _reason_against(machine: Machine, log: Log) -> str:
     """Explain why the moment of a start cannot be simulated; empty if it can."""
-    if not any(e.kind == CoulombFriction.kind for e in machine.plant.effects):
+    if all(e.sliding_level is None for e in machine.plant.effects):
         return "there is no sliding friction that it could stand above"
     if not machine.plant.starts_alone:
         return "the forces between the joints exceed the force that keeps one at rest"
@@ -214,11 +214,15 @@ def _unresolved_friction(estimate: Estimate, data: Prepared, joint: int) -> str:
     """Explain why friction just above rest, which delays starts too, is not resolved; empty if it is."""
     machine = estimate.machine
     for k, effect in enumerate(machine.plant.effects):
-        if effect.kind != StribeckFriction.kind or effect.port != joint:
+        velocity = effect.stribeck_velocity
+        if velocity is None or effect.port != joint:
             continue
         free = zip(machine.parameters.free, estimate.identifiable, strict=True)
         identifiable = all(t for f, t in free if f.path[:2] == ("effects", k))
-        if not identifiable or float(effect.velocity) < _RESOLVED * data.recipe.rest_velocity[joint]:
+        if (
+            not identifiable
+            or float(getattr(effect, velocity)) < _RESOLVED * data.recipe.rest_velocity[joint]
+        ):
             return f"{effect.kind} is not resolved by the samples that move"
     return ""
 

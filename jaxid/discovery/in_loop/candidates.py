@@ -15,8 +15,6 @@ from jaxid.discovery.candidates import Candidate, CandidateModel
 from jaxid.discovery.score import Score
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where
-from jaxid.effects.coupling import Backlash, JointFlexibility
-from jaxid.effects.friction import StaticFriction
 from jaxid.estimators.common.levenberg_marquardt import Minimum
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, output_residual
@@ -25,6 +23,7 @@ from jaxid.estimators.within_prior.posterior import maximum_a_posteriori
 from jaxid.estimators.within_prior.problem import Problem
 from jaxid.estimators.within_prior.quantisation import quantisation_samples
 from jaxid.machine import Machine
+from jaxid.model.effect import Effect
 from jaxid.model.plant import Plant
 from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import NoiseModel
@@ -32,8 +31,6 @@ from jaxid.session import Session
 from jaxid.simulation.replay import Replay
 from jaxid.simulation.step_size import with_numerical_damping
 
-# Effects that a smooth loop of fixed steps cannot simulate.
-_LEFT_OUT = (StaticFriction, Backlash, JointFlexibility)
 # Number of draws of noise; the best gain of the luckiest draw is the threshold.
 _DRAWS = 1024
 # Fits of a candidate begin at so many of its trials, the most promising, and at that of these parts of the
@@ -153,7 +150,7 @@ class Loop:
         sigma, point, here = fit.noise, fit.point, fit.minimum
         # Scales of motion are taken from all samples: a short log may hardly leave its rest.
         data = replace(session.fit.data, moving=np.ones_like(session.fit.data.moving))
-        searched = [e for e in session.case.searched if e not in _LEFT_OUT]
+        searched = [e for e in session.case.searched if _follows(e)]
         superset = build_candidate_model(fit.estimate.machine, data, searched)
         residual = np.concatenate([np.asarray(here.residual).ravel() / sigma, point])
         base = np.concatenate([np.asarray(here.jacobian) / sigma, np.eye(point.size)])
@@ -382,6 +379,11 @@ class Loop:
             low=none,
             high=none,
         )
+
+
+def _follows(effect: type[Effect]) -> bool:
+    """Return whether a smooth loop of fixed steps can follow an effect."""
+    return effect.break_away_level is None and not effect.adds_spring and not effect.opens_spring
 
 
 @eqx.filter_jit

@@ -180,7 +180,7 @@ def _experiment(session: Session, search: Search, pair: Pair) -> tuple[Pair, Exp
     """Return the rivals with a sign smooth enough for a design, and how the experiment runs in it."""
     machine, log, data = session.machine, session.fit.log, session.fit.data
     tick = machine.hold_period or log.period
-    delayed = "input_delay" in pair.kinds or any(e.kind == "input_delay" for e in pair.plant.effects)
+    delayed = any(e.delays_command() for e in pair.plant.effects)
     hold = machine.hold if machine.controller is None else "zero_order"
     drive = Drive(
         jnp.asarray(machine.gain),

@@ -333,7 +333,7 @@ def two_intervals(changed: bool, name: str) -> Callable[..., Steps[Estimate]]:
 
 
 def _is_friction(machine: Machine, free: Free) -> bool:
-    return free.effect is not None and machine.plant.effects[free.effect].kind == "coulomb_friction"
+    return free.effect is not None and machine.plant.effects[free.effect].sliding_level is not None
 
 
 def _rows_of_joint(

@@ -11,10 +11,12 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.dynamics.frequencies import natural_frequencies
-from jaxid.effects.friction import CoulombFriction
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import effect_name
+
+# The other way to state a level of friction.
+_COEFFICIENT = "friction_coefficient"
 
 
 @dataclass(frozen=True)
@@ -44,16 +46,19 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
     q = jnp.zeros(plant.joints)
     for k, effect in enumerate(plant.effects):
         name = effect_name(_before(plant, k), effect)
-        if not isinstance(effect, CoulombFriction) or not float(plant.port_normal(q)[effect.port]) > 0:
+        level = effect.sliding_level
+        # Only a law that may be stated either way has the other way to be derived.
+        if level is None or not hasattr(effect, _COEFFICIENT):
             continue
-        by_level = effect.level is not None
+        if not float(plant.port_normal(q)[effect.port]) > 0:
+            continue
+        by_level = getattr(effect, level) is not None
 
-        def other(theta: Array, k: int = k, by_level: bool = by_level) -> Array:
+        def other(theta: Array, k: int = k, by_level: bool = by_level, level: str = level) -> Array:
             moved = machine.parameters.insert(plant, theta)
             friction = moved.effects[k]
-            assert isinstance(friction, CoulombFriction), "its kind says so"
             normal = moved.port_normal(q)[friction.port]
-            return friction.level / normal if by_level else friction.friction_coefficient * normal
+            return getattr(friction, level) / normal if by_level else getattr(friction, _COEFFICIENT) * normal
 
         value, slope = jax.value_and_grad(other)(jnp.asarray(estimate.theta))
         used = np.flatnonzero(np.asarray(slope))
@@ -62,7 +67,7 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
         part = np.asarray(slope)[used]
         covariance = estimate.precision.covariance[np.ix_(used, used)]
         force = machine.units.label("force", plant.motion(plant.effects[k].port))
-        field, unit = ("friction_coefficient", "1") if by_level else ("level", force)
+        field, unit = (_COEFFICIENT, "1") if by_level else (level, force)
         std = float(np.sqrt(part @ covariance @ part))
         out.append(Derived(f"{name}.{field}", float(value), std, unit))
     return out
@@ -71,8 +76,8 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
 def natural_frequency(estimate: Estimate) -> list[Derived]:
     """Return the natural frequency of an axis with an elastic coupling, its joints free [Hz]."""
     plant, parameters = estimate.machine.plant, estimate.machine.parameters
-    kinds = {e.kind for e in plant.effects}
-    if plant.load is None and "joint_flexibility" not in kinds or "backlash" in kinds:
+    rigid = plant.load is None and not any(e.adds_spring for e in plant.effects)
+    if rigid or any(e.opens_spring for e in plant.effects):
         return []
     modes = natural_frequencies(plant, parameters.places, estimate.theta)
     std = modes.std(estimate.precision.covariance)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.effects import EFFECTS
+from jaxid.effects.friction import ViscousFriction
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.minimal.basis import Basis, chi_of
 from jaxid.estimators.minimal.models import Structure
@@ -25,6 +25,8 @@ from jaxid.numerics.lanes import SolveRequest, Steps
 
 # A singular value of the scaled slopes below this, relative to the largest, is a rounding error.
 _RANK = 1e-6
+# Friction laws by which joints are compared: in proportion to the velocity, and dry.
+_VISCOUS, _SLIDING = "viscous", "sliding"
 
 
 @dataclass(frozen=True)
@@ -171,9 +173,12 @@ def _friction(plant: Plant, path: tuple, index: int | tuple[int, int] | None) ->
     """Return kind and joint of the friction whose strength an unknown is; None for other unknowns."""
     if path[0] == "effects":
         effect = plant.effects[path[1]]
-        regroups = effect.kind in ("viscous_friction", "coulomb_friction") and effect.port < plant.joints
-        return (effect.kind, effect.port) if regroups else None
+        if effect.port >= plant.joints:
+            return None
+        if effect.viscous_coefficient is not None:
+            return _VISCOUS, effect.port
+        return (_SLIDING, effect.port) if effect.sliding_level is not None else None
     for joint in range(plant.joints):
-        if plant.equivalent_parameter(EFFECTS["viscous_friction"], joint) == (path[0], index):
-            return "viscous_friction", joint
+        if plant.equivalent_parameter(ViscousFriction, joint) == (path[0], index):
+            return _VISCOUS, joint
     return None

@@ -54,7 +54,7 @@ def gains_of(machine: Machine) -> tuple[int | None, ...]:
     out: list[int | None] = [None] * machine.plant.joints
     for k, f in enumerate(machine.parameters.free):
         effect = None if f.effect is None else machine.plant.effects[f.effect]
-        if effect is not None and effect.kind == "actuator_gain":
+        if effect is not None and f.path[2] == effect.drive_gain:
             out[effect.port] = k
     return tuple(out)
 

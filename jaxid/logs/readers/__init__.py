@@ -1,5 +1,6 @@
 """Named columns of numbers from the file formats that logs come in."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,36 @@ from jaxid.logs.readers.csv_file import read_csv
 from jaxid.logs.readers.rows import Rows
 
 # Each reader: (path, names, rows) -> ({name: (samples, width)}, rows that were read).
-READERS = {".csv": read_csv, ".npz": read_npz, ".mat": read_mat, ".parquet": read_parquet}
+Reader = Callable[[Path, list[str], Rows | None], tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]]
+READERS: dict[str, Reader] = {
+    ".csv": read_csv,
+    ".npz": read_npz,
+    ".mat": read_mat,
+    ".parquet": read_parquet,
+}
+_OF_JAXID = frozenset(READERS)
+
+
+def register_reader(suffix: str, reader: Reader) -> None:
+    """Register a file format, so that every command reads logs whose name ends so.
+
+    Args:
+        suffix: End of the file's name, with its dot, as ".jsonl".
+        reader: Function of path, names of columns and rows, see `read_columns`.
+
+    Raises:
+        InputError: If the suffix has no dot, or is that of another format.
+    """
+    suffix = suffix.lower()
+    known = READERS.get(suffix)
+    if not suffix.startswith(".") or len(suffix) < 2:
+        raise InputError(f"suffix {suffix!r} is not the end of a file's name", hint='write it as ".jsonl"')
+    if known is not None and (known.__module__, known.__qualname__) != (
+        reader.__module__,
+        reader.__qualname__,
+    ):
+        raise InputError(f"suffix {suffix!r} is that of another format", hint="choose another suffix")
+    READERS[suffix] = reader
 
 
 def read_columns(
