@@ -71,7 +71,7 @@ def driven(
 
     def law(_: int, reading: np.ndarray) -> np.ndarray:
         u = live.command(reading)
-        told.append(live.told)
+        told.append(live.online_estimate)
         return u
 
     ran = simulate_under(
