@@ -63,15 +63,15 @@ class HiddenJoints(Plant):
         n = len(self.measured) + q.size
         declared, known = jnp.split(u, [u.size - 3 * len(self.measured)])
         pairs = zip(known.reshape(3, -1), (q, qd, qdd), strict=True)
-        q, qd, qdd = (spread(a, self.measured, n) + spread(b, self.hidden, n) for a, b in pairs)
         if reaction is not None:
             reaction = spread(reaction, self.hidden, self.plant.ports(jnp.zeros(n)).size)
+        q, qd, qdd = (spread(a, self.measured, n) + spread(b, self.hidden, n) for a, b in pairs)
         whole = self.plant.balance(q, qd, qdd, declared, t, states, reaction)
-        residual, dry, stick = (picked(a, self.hidden) for a in (whole.residual, whole.dry, whole.stick))
         rising = jnp.stack([picked(r, self.hidden) for r in whole.rising])
         slides, rises = (
             tuple(k for k, i in enumerate(self.hidden) if i in ports) for ports in (whole.slides, whole.rises)
         )
+        residual, dry, stick = (picked(a, self.hidden) for a in (whole.residual, whole.dry, whole.stick))
         return Balance(residual, dry, stick, rising, whole.rates, whole.drive, slides, rises)
 
 
