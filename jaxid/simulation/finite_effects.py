@@ -10,8 +10,9 @@ import numpy as np
 from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.logs.prepare import Prepared
+from jaxid.model.balance import port_motion
 from jaxid.model.effect import Effect, Signals
-from jaxid.model.plant import Plant, port_motion
+from jaxid.model.plant import Plant
 
 # Largest number of samples at which an effect is evaluated.
 _ROWS = 200
