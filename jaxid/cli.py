@@ -12,24 +12,7 @@ from typing import NoReturn
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
-
-METHODS = (
-    "output_error",
-    "inverse_dynamics",
-    "algebraic",
-    "instrumental_variable",
-    "didim",
-    "power",
-    "recursive",
-    "algebraic_single_time",
-    "algebraic_ratio",
-    "algebraic_sign_changed",
-    "algebraic_sign_unchanged",
-    "minimal_model",
-    "minimal_model_printed",
-)
-OUTPUTS = ("position", "force", "both")
-SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
+from jaxid.names import METHODS, OUTPUTS, SOLVERS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -6,6 +6,7 @@ A newcomer reads the package in this order. A room is a folder or a module direc
 ROOMS = {
     "arrays": "the array type of annotations",
     "errors": "one-line errors with a hint",
+    "names": "methods, outputs, solvers and other names that users write",
     "_platform": "float64 and XLA's loop option",
     "_cache": "compiled code on disk",
     "files": "writing outputs whole or not at all",

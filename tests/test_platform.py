@@ -152,7 +152,12 @@ def test_the_truth_does_not_import_what_it_judges():
         assert not roots & {"jax", "jaxid", "diffrax", "equinox"}, path
 
 
-def test_the_command_line_knows_every_method():
-    from jaxid import cli, estimators
+def test_every_method_has_its_estimator():
+    from jaxid import estimators, names
 
-    assert tuple(estimators.METHODS) == cli.METHODS
+    assert tuple(estimators.METHODS) == names.METHODS
+
+
+def test_names_are_read_without_jax_or_numpy():
+    path = PACKAGE / "names.py"
+    assert imports(path) == set()

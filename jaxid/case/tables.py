@@ -23,26 +23,20 @@ from jaxid.case.schema import (
     whole,
 )
 from jaxid.controllers import CONTROLLERS, Controller
-from jaxid.logs.log import HOLDS, OPTIONAL_COLUMNS
-
-METHODS = (
-    "inverse_dynamics",
-    "instrumental_variable",
-    "algebraic",
-    "algebraic_single_time",
-    "algebraic_ratio",
-    "algebraic_sign_changed",
-    "algebraic_sign_unchanged",
-    "minimal_model",
-    "minimal_model_printed",
-    "recursive",
-    "power",
-    "output_error",
-    "didim",
+from jaxid.names import (
+    CRITERIA,
+    DERIVATIVES,
+    DISCOVER,
+    HOLDS,
+    IN_LOOP,
+    METHODS,
+    MOTIONS,
+    OPTIONAL_COLUMNS,
+    ORIENTATIONS,
+    OUTPUTS,
+    STARTS,
 )
-# What a trajectory of `jaxid design` is improved for.
-CRITERIA = ("determinant", "condition")
-DERIVATIVES = ("central", "spectral", "parabolic")
+
 # Tables at the top of a case, in the order in which they are checked; [[ ]] where it may recur.
 TOP = {
     "plant": False,
@@ -89,15 +83,15 @@ DISTURBANCE = either_text(
 )
 
 PLANT: Keys = {
-    "motion": Key(choice(("linear", "rotary"))),
-    "orientation": Key(choice(("horizontal", "vertical"))),
+    "motion": Key(choice(MOTIONS)),
+    "orientation": Key(choice(ORIENTATIONS)),
     "gravity": Key(number("nonnegative")),
     "units": Key(inline({"position": Key(text), "force": Key(text)})),
 }
 ALGEBRAIC: Keys = {"window": Key(span(), "from and to [s]; absent: many windows over the log")}
 OUTPUT_ERROR: Keys = {
-    "on": Key(choice(("position", "force", "both"))),
-    "start": Key(choice(("inverse_dynamics", "recursive", "guess"))),
+    "on": Key(choice(OUTPUTS)),
+    "start": Key(choice(STARTS)),
     "prior": Key(number("positive"), "relative standard deviation of the guesses; fits what the log tells"),
     "starts": Key(whole(1), "how many, drawn within the prior"),
     "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),
@@ -113,7 +107,7 @@ IDENTIFICATION: Keys = {
     "physically_consistent": Key(flag, "whether links must be what bodies can be"),
 }
 STUDY: Keys = {
-    "estimators": Key(several(choice((*METHODS, "discover", "in_loop")))),
+    "estimators": Key(several(choice((*METHODS, DISCOVER, IN_LOOP)))),
     "hidden": Key(several(text)),
     "noise": Key(several(number("nonnegative"))),
     "sample_rate": Key(several(number("positive"))),

@@ -11,14 +11,13 @@ import numpy as np
 
 from jaxid.case.case import Case, load_case
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import METHODS, steps_of
+from jaxid.estimators import steps_of
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import OUTPUTS
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.log import Log
+from jaxid.names import METHODS, OUTPUTS, SOLVERS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.session import Session, open_session
-from jaxid.simulation.solvers import SOLVERS
 
 
 @dataclass(frozen=True)
@@ -77,12 +76,12 @@ def identify(
     Args:
         case: The case, or its file.
         log: The log, or its file.
-        method: One of `jaxid.estimators.METHODS`.
-        solver: For `output_error`, one of `jaxid.simulation.solvers.SOLVERS`: diffrax then integrates between
-            samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
+        method: One of `jaxid.names.METHODS`.
+        solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between samples,
+            dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
             of the fixed steps either way.
         on: For `output_error`, what of the simulated loop is to meet its log: one of
-            `jaxid.estimators.output_error.OUTPUTS`; None: as the case says, or position.
+            `jaxid.names.OUTPUTS`; None: as the case says, or position.
         validate: Logs to validate on, beside the case's own.
         progress: Called with a line at every stage.
 
@@ -126,7 +125,7 @@ def identify_many(
     Args:
         case: The case, or its file; or one for each log, which may differ in their guesses.
         logs: Logs, or their files.
-        method: One of `jaxid.estimators.METHODS`.
+        method: One of `jaxid.names.METHODS`.
         lanes: Logs in a compiled call.
 
     Returns:

@@ -17,7 +17,6 @@ from jaxid.arms.base_parameters import independent
 from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
-from jaxid.case.tables import CRITERIA
 from jaxid.dynamics.residuals import balance_along
 from jaxid.errors import InputError
 from jaxid.experiment_design.improve import improved
@@ -26,6 +25,7 @@ from jaxid.files import signal_csv, write_whole
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.names import CRITERIA
 
 HARMONICS = 5
 # Samples for each period of the fastest harmonic while a trajectory is sought, and room for peaks in between.

@@ -10,16 +10,8 @@ from jaxtyping import Float
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers import read_columns
 from jaxid.logs.timebase import sound_time
+from jaxid.names import HOLDS, OPTIONAL_COLUMNS
 
-HOLDS = ("zero_order", "linear", "band_limited")
-OPTIONAL_COLUMNS = (
-    "velocity",
-    "acceleration",
-    "reference",
-    "load_position",
-    "load_acceleration",
-    "temperature",
-)
 LOG_KEYS = ("time", "sample_rate", "position", "force", "hold", "rows", *OPTIONAL_COLUMNS)
 # Chosen: fewer samples than this leave nothing after filtering and trimming.
 MINIMUM_SAMPLES = 50

@@ -17,12 +17,11 @@ from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.estimators import need_consistent
 from jaxid.machine import Machine
+from jaxid.names import DISCOVER, IN_LOOP
 from jaxid.numerics.lanes import cores
 from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
 
-# What may stand among the estimators beside the methods: the search, and what a law found by itself.
-DISCOVER, IN_LOOP = "discover", "in_loop"
 _RUNS = 100
 # Part of the memory that the chunks in work may take together.
 _MEMORY = 0.25
