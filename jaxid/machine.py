@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from jaxid.model.units import Units
 from jaxid.model.unknowns import Parameters
 from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
+from jaxid.settings import Disturbance
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class Machine:
     gain: Float[np.ndarray, " m"]
     units: Units
     controller: Controller | None = None
-    disturbance: Mapping[str, float] | str | None = None
+    disturbance: Disturbance | str | None = None
     sensor: Sensor = Sensor()
     hold: str = "zero_order"
     unknown_reference: UnknownReference | None = None

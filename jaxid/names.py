@@ -6,6 +6,7 @@ It imports nothing, so that the command line can list them without loading JAX.
 # Estimators, in the order in which help texts list them; `jaxid.estimators.METHODS` has one entry for each.
 METHODS = (
     "output_error",
+    "within_prior",
     "inverse_dynamics",
     "algebraic",
     "instrumental_variable",
@@ -51,3 +52,6 @@ DERIVATIVES = ("central", "spectral", "parabolic")
 CRITERIA = ("determinant", "condition")
 MOTIONS = ("linear", "rotary")
 ORIENTATIONS = ("horizontal", "vertical")
+# Kinds of inertial sensors, and the axes that they may read.
+INERTIAL_KINDS = ("gyroscope", "accelerometer")
+AXES = ("x", "y", "z")

@@ -20,6 +20,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.references import make_reference
+from jaxid.schema import stated
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, needed_substeps, open_loop
@@ -100,23 +101,18 @@ class Scene:
         Raises:
             InputError: If the case does not say what to simulate.
         """
-        where, setting = str(case.path), case.simulation
-        if "load_acceleration" in case.log:
+        where, setting = case.where, case.simulation
+        if case.log is not None and case.log.load_acceleration is not None:
             raise InputError(
                 "a simulated log has no load_acceleration",
                 where=f"{where}, [log]",
                 hint="leave it out of the case that is simulated",
             )
-        for key in ("duration", "sample_rate"):
-            if key not in setting:
-                raise InputError(
-                    f"[simulation] has no {key}", where=where, hint=f"add {key} = ... to [simulation]"
-                )
-        rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+        rate, duration = sampling_of(case)
         machine = build_machine(case, at_truth=True, period=1 / rate)
         joints = case.plant.joints
-        position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
-        velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
+        position = np.broadcast_to(np.asarray(setting.initial_position), joints)
+        velocity = np.broadcast_to(np.asarray(setting.initial_velocity), joints)
         refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
         _refuse_massless(machine.plant, position, where)
         if machine.controller is None:
@@ -186,7 +182,7 @@ class Scene:
         else:
             sensor = (machine.sensor, noise[:, :joints])
             run = yield SolveRequest(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
-        _refuse_ended(machine.plant, run, self.drive.period, str(self.case.path))
+        _refuse_ended(machine.plant, run, self.drive.period, self.case.where)
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
@@ -213,6 +209,20 @@ def _open_run(
     return eqx.tree_at(lambda r: r.reading, run, sensor.read(run.position, noise))
 
 
+def sampling_of(case: Case) -> tuple[float, float]:
+    """Return the sampling rate [Hz] and the duration [s] of a simulation.
+
+    Raises:
+        InputError: If [simulation] lacks one of them.
+    """
+    rate, duration = case.simulation.sample_rate, case.simulation.duration
+    if rate is None or duration is None:
+        name = "duration" if duration is None else "sample_rate"
+        hint = f"add {name} = ... to [simulation]"
+        raise InputError(f"[simulation] has no {name}", where=case.where, hint=hint)
+    return rate, duration
+
+
 def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:
     """One signal for every drive, where there is one for all."""
     return np.broadcast_to(signal, (len(signal), machine.gain.size))
@@ -228,8 +238,8 @@ def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
         machine.gain,
         period,
         hold,
-        int(case.simulation.get("substeps", 4)),
-        "sharpness" not in case.simulation,
+        case.simulation.substeps,
+        case.simulation.sharpness is None,
         longest,
     )
 
@@ -288,8 +298,8 @@ def _refuse_coarse(
     if needed > drive.substeps:
         raise InputError(
             f"[simulation] substeps = {drive.substeps} is too coarse for sharpness = "
-            f"{case.simulation['sharpness']:g}",
-            where=str(case.path),
+            f"{case.simulation.sharpness:g}",
+            where=case.where,
             hint=f"set substeps = {needed}, a larger sharpness, or none (friction then sticks exactly)",
         )
 
@@ -316,7 +326,7 @@ def _log(
     if not np.all(np.isfinite(reading)):
         raise InputError(
             "the simulation diverged",
-            where=str(case.path),
+            where=case.where,
             hint="check gains and parameters, or raise substeps in [simulation]",
         )
     reading = np.array(reading)
@@ -328,7 +338,7 @@ def _log(
         force=command,
         reference=reference,
         hold=machine.hold,
-        source=f"simulation of {case.path.name}",
+        source=f"simulation of {case.name}",
     )
 
 
@@ -337,9 +347,11 @@ def _columns(case: Case, *, reference: bool) -> dict[str, str | list[str]]:
     names: dict[str, str | list[str]] = {"time": "t"}
     for key, name, count in (("position", "q", joints), ("force", "u", drives), ("reference", "ref", drives)):
         names[key] = name if count == 1 else [f"{name}{k + 1}" for k in range(count)]
-    if case.plant.cls.load is not None and (not case.log or "load_position" in case.log):
+    if case.plant.cls.load is not None and (case.log is None or case.log.load_position is not None):
         names["load_position"] = "q_load"
-    names.update({k: v for k, v in case.log.items() if k in names})
+    for key, given in ({} if case.log is None else stated(case.log)).items():
+        if key in names:
+            names[key] = given if isinstance(given, str) else list(given)
     if not reference:
         names.pop("reference")
     return names

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,28 @@ import numpy as np
 from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.pseudo_inertia import TEN
 from jaxid.case.places import check_places
-from jaxid.case.schema import Key, Keys, Spot, choice, number, read_table, several, text, whole
 from jaxid.case.urdf import Urdf, read_urdf
-from jaxid.case.values import Value, read_value, read_values
-from jaxid.model.parameter import parameters_of
+from jaxid.case.values import Value, read_values, value_reader, value_schema, values_schema
+from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg
 from jaxid.plants.geometry import JOINTS, Geometry
+from jaxid.schema import (
+    Key,
+    Keys,
+    Reader,
+    Spot,
+    anything,
+    choice,
+    either,
+    is_list,
+    list_of,
+    number,
+    read_table,
+    several,
+    text,
+    whole,
+)
 
 # Chosen: beyond any arm; what lies behind it is a slip.
 _MOST_LINKS = 50
@@ -27,9 +41,9 @@ _LISTS = {"first_moment": TEN[1:4], "inertia": TEN[4:]}
 _ANGLES = ("alpha", "theta")
 
 # Keys of [[plant.shafts]].
-_SHAFT: Keys = {
+SHAFT: Keys = {
     "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
-    "ratios": Key(several(number()), "by how much, a number a joint; 1 each where absent"),
+    "ratios": Key(several(number()), "turns of the shaft for one of each joint", note="1 each"),
 }
 # Below it the sine of an angle of a URDF file is nothing: 1.5708 stands there for a right angle.
 _ANGLE = 1e-4
@@ -37,12 +51,14 @@ _ANGLE = 1e-4
 UNKNOWN = ("none", "base", "all")
 # Keys of [plant] that only an arm has.
 LINKED: Keys = {
-    "links": Key(lambda value, spot: value, "a table [[plant.links]] for each link"),
+    "links": Key(anything, "a table [[plant.links]] for each link"),
     "urdf": Key(text, "file that describes the arm, relative to the case"),
     "tip": Key(text, "name of its last link in that file"),
-    "unknown": Key(choice(UNKNOWN), "which parameters of its links"),
-    "shafts": Key(lambda value, spot: value, "a table [[plant.shafts]] for each"),
-    "gravity_vector": Key(several(number(), shortest=3, longest=3), "in the frame of the base [m/s^2]"),
+    "unknown": Key(choice(UNKNOWN), "which parameters of its links are unknown", default="none"),
+    "shafts": Key(anything, "a table [[plant.shafts]] for each"),
+    "gravity_vector": Key(
+        several(number(), shortest=3, longest=3), "gravity in the frame of the base", unit="m/s^2"
+    ),
 }
 
 
@@ -63,7 +79,7 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
 
 
 def read_links(
-    links: list[dict[str, Any]], cls: type[Plant], file: str
+    links: list[dict[str, Any]], cls: type[Plant], root: Spot
 ) -> tuple[dict[str, tuple[Value, ...]], DenavitHartenberg]:
     """Inertial parameters of the links by name, one value a link, and their geometry.
 
@@ -72,8 +88,8 @@ def read_links(
     """
     rows, parameters = [], {}
     for k, link in enumerate(links, start=1):
-        spot = Spot(file, f"[[plant.links]] {k}")
-        given = read_table(_in_rad(link, spot), _keys(cls), spot)
+        spot = root.under(f"[[plant.links]] {k}")
+        given = read_table(_in_rad(link, spot), link_keys(cls), spot)
         rows.append([given["joint"], *(given.get(name, 0.0) for name in ("alpha", "a", "d", "theta"))])
         for name, values in given.items():
             if name in _LISTS:
@@ -96,7 +112,7 @@ def read_links_of_urdf(
     """
     if "links" in given:
         raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
-    arm = read_urdf(Path(spot.file).parent / given["urdf"], given.get("tip"))
+    arm = read_urdf(spot.folder / given["urdf"], given.get("tip"))
     if len(arm.names) > _MOST_LINKS:
         raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {_MOST_LINKS}")
     unknown = given.get("unknown", "none")
@@ -128,8 +144,8 @@ def read_shafts(shafts: Any, geometry: Geometry, spot: Spot) -> tuple[tuple[floa
         raise spot.at("shafts").fault("is not a list of tables", "write [[plant.shafts]], in double brackets")
     joints, out = len(geometry.joints), []
     for k, shaft in enumerate(shafts, start=1):
-        own = Spot(spot.file, f"[[plant.shafts]] {k}")
-        given = read_table(shaft, _SHAFT, own)
+        own = spot.under(f"[[plant.shafts]] {k}")
+        given = read_table(shaft, SHAFT, own)
         named = given["joints"]
         check_places(shaft["joints"], named, joints, "joint", own.at("joints"))
         if len({geometry.joints[j - 1] for j in named}) > 1:
@@ -150,16 +166,16 @@ def read_shafts(shafts: Any, geometry: Geometry, spot: Spot) -> tuple[tuple[floa
     return tuple(out)
 
 
-def _keys(cls: type[Plant]) -> Keys:
-    """Keys of one link."""
+def link_keys(cls: type[Plant]) -> Keys:
+    """Return the keys of one of [[plant.links]]."""
     infos = parameters_of(cls)
     value = "a number, or { guess = ... }"
     keys = {
         "joint": Key(choice(JOINTS), '"revolute" or "prismatic"', True),
-        "alpha": Key(number(), "twist from the axis before to this one [rad], or alpha_deg", True),
-        "a": Key(number(), "distance from the axis before to this one [m]", True),
-        "d": Key(number(), "offset along the axis [m]"),
-        "theta": Key(number(), "angle about the axis [rad], or theta_deg"),
+        "alpha": Key(number(), "twist from the previous axis to this one, or alpha_deg", True, "rad"),
+        "a": Key(number(), "distance from the previous axis to this one", True, "m"),
+        "d": Key(number(), "offset along the axis", unit="m"),
+        "theta": Key(number(), "angle about the axis, or theta_deg", unit="rad"),
     }
     for name in ("mass", "first_moment", "inertia", "rotor_inertia"):
         parts = _LISTS.get(name, (name,))
@@ -168,22 +184,23 @@ def _keys(cls: type[Plant]) -> Keys:
             axes = ", ".join(part.rpartition("_")[2] for part in parts)
             read, doc = _listed(info, parts), f"the list {axes}; each {value}"
         else:
-            read, doc = (lambda v, s, info=info: read_value(v, info, s)), f"{info.doc}; {value}"
+            read, doc = value_reader(info), f"{info.doc}; {value}"
         keys[name] = Key(read, doc, not info.optional)
     return keys
 
 
-def _listed(info: Any, parts: tuple[str, ...]) -> Any:
-    """A list with an entry for each axis, or pair of axes."""
+def _listed(info: ParameterInfo, parts: tuple[str, ...]) -> Reader:
+    """Return the reader of a list with an entry for each axis, or pair of axes."""
 
     def read(value: Any, spot: Spot) -> tuple[Value, ...]:
-        inner = isinstance(value, dict) and any(isinstance(v, list) for v in value.values())
-        if not isinstance(value, list) and not inner:
+        inner = isinstance(value, dict) and any(is_list(v) for v in value.values())
+        if not is_list(value) and not inner:
             axes = ", ".join(part.rpartition("_")[2] for part in parts)
             raise spot.refuse(value, "is not a list", f"give {len(parts)} entries: {axes}")
         return read_values(value, info, len(parts), spot, "component")
 
-    return read
+    table = values_schema(info)["anyOf"][1]
+    return Reader(read, either(list_of(value_schema(info), len(parts), len(parts)), table))
 
 
 def _in_rad(link: dict[str, Any], spot: Spot) -> dict[str, Any]:

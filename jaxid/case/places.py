@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from jaxid.case.schema import Spot, count, several, whole
 from jaxid.errors import suggest
 from jaxid.model.effect import Effect
 from jaxid.model.plant import PLACES
+from jaxid.schema import Spot, count, several, whole
 
 if TYPE_CHECKING:
     from jaxid.case.declared import PlantEntry

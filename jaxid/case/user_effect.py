@@ -11,12 +11,12 @@ import zlib
 from pathlib import Path
 from types import ModuleType
 
-from jaxid.case.schema import Spot
 from jaxid.effects import EFFECTS
 from jaxid.errors import suggest
 from jaxid.model.effect import Effect
 from jaxid.model.parameter import SIGNS, parameters_of
 from jaxid.model.units import Units
+from jaxid.schema import Spot
 
 # Module and time of change by file: a case that is loaded twice gets the same class twice, so
 # that nothing compiles anew, unless the file was edited in between.

@@ -6,8 +6,20 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from jaxid.case.schema import Key, Spot, count, number, read_table, shown
 from jaxid.model.parameter import ParameterInfo
+from jaxid.schema import (
+    Key,
+    Keys,
+    Reader,
+    Spot,
+    count,
+    either,
+    list_of,
+    number,
+    read_table,
+    schema_of,
+    shown,
+)
 
 
 @dataclass(frozen=True)
@@ -32,6 +44,40 @@ class Value:
         return self.true if at_truth and self.true is not None else self.guess
 
 
+def _keys(info: ParameterInfo) -> Keys:
+    signed = number(info.sign)
+    return {
+        "guess": Key(signed, "value that the fit starts from", True),
+        "min": Key(number(), "lower bound"),
+        "max": Key(number(), "upper bound"),
+        "true": Key(signed, "value that simulate and study use in place of the guess"),
+    }
+
+
+def value_reader(info: ParameterInfo) -> Reader:
+    """Return the reader of one value of a parameter."""
+    return Reader(lambda value, spot: read_value(value, info, spot), value_schema(info))
+
+
+def value_schema(info: ParameterInfo) -> dict[str, Any]:
+    """Return the JSON Schema of one value of a parameter: a number, or a table with its guess."""
+    if info.known:
+        return dict(number(info.sign).schema)
+    return either(number(info.sign).schema, schema_of(_keys(info)))
+
+
+def values_schema(info: ParameterInfo) -> dict[str, Any]:
+    """Return the JSON Schema of values for several places: one for all, a list, or a table of lists."""
+    table = schema_of(_keys(info))
+    table["properties"] = {name: either(entry, list_of(entry)) for name, entry in table["properties"].items()}
+    one = number(info.sign).schema
+    return (
+        either(one, list_of(value_schema(info)))
+        if info.known
+        else either(one, table, list_of(value_schema(info)))
+    )
+
+
 def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
     """Check a value against what its parameter may be.
 
@@ -54,13 +100,7 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
             hint = "give a number where it is known, { guess = ... } where it is not"
             raise spot.refuse(value, "is not a number", hint)
         return Value(signed(value, spot))
-    keys = {
-        "guess": Key(signed, "where the fit starts", required=True),
-        "min": Key(number(), "lower bound"),
-        "max": Key(number(), "upper bound"),
-        "true": Key(signed, "for simulate and study"),
-    }
-    given = read_table(value, keys, spot)
+    given = read_table(value, _keys(info), spot)
     lower, upper = given.get("min", -math.inf), given.get("max", math.inf)
     if lower > upper:
         raise spot.refuse(value, f"has min {lower:g} above max {upper:g}", "exchange min and max")

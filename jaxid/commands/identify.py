@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from jaxid.case.case import Case, load_case
+from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import steps_of
 from jaxid.estimators.estimate import Estimate
@@ -62,7 +62,7 @@ class Identification:
 
 
 def identify(
-    case: Case | str | Path,
+    case: CaseLike,
     log: Log | str | Path,
     *,
     method: str = "output_error",
@@ -74,7 +74,7 @@ def identify(
     """Identify the unknowns of a case from a log.
 
     Args:
-        case: The case, or its file.
+        case: The case, its file, or a dict with its tables.
         log: The log, or its file.
         method: One of `jaxid.names.METHODS`.
         solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between samples,
@@ -99,7 +99,7 @@ def identify(
     if not session.machine.parameters.free:
         raise InputError(
             "nothing is unknown",
-            where=str(session.case.path),
+            where=session.case.where,
             hint="give at least one parameter as { guess = ... }",
         )
     progress(f"fitting by {method}")
@@ -114,7 +114,7 @@ def identify(
 
 
 def identify_many(
-    case: Case | str | Path | Sequence[Case | str | Path],
+    case: CaseLike | Sequence[CaseLike],
     logs: Sequence[Log | str | Path],
     *,
     method: str = "output_error",
@@ -123,7 +123,8 @@ def identify_many(
     """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
 
     Args:
-        case: The case, or its file; or one for each log, which may differ in their guesses.
+        case: The case, its file, or a dict with its tables; or one for each log, with guesses that may
+            differ.
         logs: Logs, or their files.
         method: One of `jaxid.names.METHODS`.
         lanes: Logs in a compiled call.
@@ -136,11 +137,10 @@ def identify_many(
     """
     if method not in METHODS:
         raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
-    loaded = lambda c: c if isinstance(c, Case) else load_case(c)
-    if isinstance(case, Case | str | Path):
-        cases = [loaded(case)] * len(logs)
+    if isinstance(case, Case | Mapping | str | Path):
+        cases = [load_case(case)] * len(logs)
     elif len(case) == len(logs):
-        cases = [loaded(c) for c in case]
+        cases = [load_case(c) for c in case]
     else:
         raise InputError(f"{len(case)} cases for {len(logs)} logs", hint="give one case, or one for each log")
 
@@ -151,9 +151,10 @@ def identify_many(
 
 
 def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
-    if method != "output_error":
+    methods = ("output_error", "within_prior") if option == "on" else ("output_error",)
+    if method not in methods:
         raise InputError(
-            f"{option} {value!r} goes only with output_error",
+            f"{option} {value!r} goes only with {' and '.join(methods)}",
             hint=f"leave out {option}, or method {method!r}",
         )
     if value not in known:

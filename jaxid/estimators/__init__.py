@@ -37,23 +37,19 @@ def _output_error(
     on: str | None = None,
     numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
-    from jaxid.estimators.output_error import choose_numerics, need_loop, output_error_steps
+    from jaxid.estimators.output_error import choose_numerics, output_error_steps
 
-    log, on = session.fit.log, on or session.case.output_error.get("on", "position")
-    if "prior" in session.case.output_error:
-        from jaxid.estimators.within_prior.fit import directions_steps
-
+    case, log = session.case, session.fit.log
+    on = on or case.output_error.on
+    if case.fits_within_prior("output_error"):
         if solver is not None:
             raise InputError(
                 f"solver {solver!r} does not go with [output_error] prior",
-                where=str(session.case.path),
+                where=case.where,
                 hint="leave one of them out: a fit within a prior takes fixed steps",
             )
-        need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
-        stated = {k: v for k, v in session.case.output_error.items() if k not in ("on", "start")}
-        others = yield from _beside_the_guesses(session)
-        asked = directions_steps(session.machine, log, on=on, numerics=numerics, others=others, **stated)
-        return (yield from asked)
+        found = yield from _within_prior(session, on=on, numerics=numerics, asked="[output_error] prior")
+        return replace(found, method="output_error")
     start = yield from _start(session)
     if solver is not None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
@@ -66,18 +62,48 @@ def _output_error(
     return min((found, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
 
+def _within_prior(
+    session: Session,
+    *,
+    on: str | None = None,
+    numerics: Numerics | None = None,
+    asked: str = "the method within_prior",
+) -> Steps[Estimate]:
+    """Fit within the prior of the guesses; `asked` names the wish in messages."""
+    from jaxid.estimators.output_error import need_loop
+    from jaxid.estimators.within_prior.fit import directions_steps
+
+    settings = session.case.need_prior()
+    need_loop(session.machine, session.fit.log, asked, "or take another method")
+    others = yield from _beside_the_guesses(session)
+    return (
+        yield from directions_steps(
+            session.machine,
+            session.fit.log,
+            prior=settings.prior,
+            on=on or settings.on,
+            starts=settings.starts,
+            others=others,
+            hessian=settings.hessian,
+            profile=settings.profile,
+            numerics=numerics,
+            drawn=settings.drawn,
+        )
+    )
+
+
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
     """Another start of a fit within a prior: what a method finds of the unknowns, the rest at the guesses.
 
     Of sums that it cannot tell apart both parts move; what does not enter in proportion stays.
     """
-    method, unknown = session.case.output_error.get("start", "guess"), session.machine.parameters
+    method, unknown = session.case.need_prior().start, session.machine.parameters
     if method == "guess":
         return []
     from jaxid.estimators.recursive.rows import in_proportion_steps
 
     machine = yield from in_proportion_steps(session.machine, session.fit.data)
-    case = replace(session.case, recursive=session.case.recursive | {"start": "guess"})
+    case = replace(session.case, recursive=replace(session.case.recursive, start="guess"))
     first = yield from METHODS[method](replace(session, machine=machine, case=case))
     found = dict(zip(first.names, first.theta, strict=True))
     theta = np.array([found.get(f.name, f.guess) for f in unknown.free])
@@ -92,7 +118,7 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
     keep them may end where there is nothing to simulate.
     """
     parameters = session.machine.parameters
-    method = session.case.output_error.get("start", "inverse_dynamics")
+    method = session.case.output_error.start
     if method == "guess":
         return None
     first = yield from METHODS[method](session)
@@ -111,8 +137,8 @@ def _recursive(session: Session) -> Steps[Estimate]:
     case, run = session.case, session.fit
     run.log.need_every_encoder("recursive")
     saved = None
-    if "restart" in case.recursive:
-        saved = read_memory(case.folder / case.recursive["restart"], session.machine.parameters.names)
+    if case.recursive.restart is not None:
+        saved = read_memory(case.folder / case.recursive.restart, session.machine.parameters.names)
     return recursive_steps(session.machine, run.data, case.recursive, saved)
 
 
@@ -141,7 +167,7 @@ def _algebraic(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.algebraic.one_window import least_squares_steps
     from jaxid.estimators.algebraic.windows import algebraic_steps
 
-    run, window = session.fit, session.case.algebraic.get("window")
+    run, window = session.fit, session.case.algebraic.window
     run.log.need_every_encoder("algebraic")
     if window is None:
         return algebraic_steps(session.machine, run.log, run.data)
@@ -154,7 +180,7 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
     def steps(session: Session) -> Steps[Estimate]:
         from jaxid.estimators.algebraic.one_window import FORMS
 
-        run, window = session.fit, session.case.algebraic.get("window")
+        run, window = session.fit, session.case.algebraic.window
         run.log.need_every_encoder(name)
         return FORMS[name](session.machine, run.log, run.data, window)
 
@@ -177,7 +203,7 @@ _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 
 # Methods that simulate, and can be told how.
-SIMULATING = ("output_error", "instrumental_variable", "didim")
+SIMULATING = ("output_error", "within_prior", "instrumental_variable", "didim")
 
 # Methods that can keep links to what bodies can be: they minimise, step by step at least.
 CONSISTENT = (
@@ -191,6 +217,7 @@ CONSISTENT = (
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
+    "within_prior": _within_prior,
     "inverse_dynamics": _inverse_dynamics,
     "algebraic": _algebraic,
     "instrumental_variable": _instrumental_variable,
@@ -215,9 +242,9 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         InputError: If the reference has unknowns, and the method does not simulate the loop for them; or if
             links must be what bodies can be, and the method or they cannot.
     """
-    if method != "output_error":
+    if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
-    if not session.case.identification.get("physically_consistent"):
+    if not session.case.identification.physically_consistent:
         return METHODS[method](session, **options)
     from jaxid.estimators.common.consistency import need_bodies, with_links
 
@@ -231,13 +258,13 @@ def need_consistent(method: str, case: Case) -> None:
     Raises:
         InputError: If it is such a method.
     """
-    if not case.identification.get("physically_consistent"):
+    if not case.identification.physically_consistent:
         return
     hint = "" if method in CONSISTENT else f"use {', '.join(CONSISTENT)}, or leave it out"
-    if method == "output_error" and "prior" in case.output_error:
+    if method == "output_error" and case.fits_within_prior(method):
         method, hint = "output_error with a prior", "leave one of them out"
     if hint:
-        what, where = f"physically_consistent does not go with {method}", f"{case.path}, [identification]"
+        what, where = f"physically_consistent does not go with {method}", f"{case.where}, [identification]"
         raise InputError(what, where=where, hint=hint)
 
 
@@ -250,6 +277,6 @@ def need_known_reference(session: Session, why: str) -> None:
     if session.machine.unknown_reference is not None:
         raise InputError(
             f"the reference has unknowns, and {why}",
-            where=f"{session.case.path}, [reference]",
+            where=f"{session.case.where}, [reference]",
             hint="fit them by output_error, and give the numbers found",
         )

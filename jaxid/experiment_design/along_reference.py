@@ -25,9 +25,9 @@ from jaxid.files import signal_csv, write_whole
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
-from jaxid.names import CRITERIA
+from jaxid.scene import sampling_of
+from jaxid.settings import DesignTable
 
-HARMONICS = 5
 # Samples for each period of the fastest harmonic while a trajectory is sought, and room for peaks in between.
 _FINE, _ROOM = 20, 0.02
 # Trajectories that are drawn, those of them that are improved, and evaluations for each.
@@ -208,10 +208,10 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
         Swevers et al. (1997), IEEE Trans. Robotics and Automation 13(5), for the series and the determinant;
         Gautier & Khalil (1992), IJRR 11(4), for the condition number. The start at rest is ours.
     """
-    machine = build_machine(case, period=1 / float(case.simulation["sample_rate"]))
-    setting, where = case.design, str(case.path)
-    rate, duration = float(case.simulation["sample_rate"]), float(case.simulation["duration"])
-    base_hz, harmonics = setting.get("base_frequency_hz", 1 / duration), setting.get("harmonics", HARMONICS)
+    rate, duration = sampling_of(case)
+    machine = build_machine(case, period=1 / rate)
+    settings, where = case.design or DesignTable(), case.where
+    base_hz, harmonics = settings.base_frequency_hz or 1 / duration, settings.harmonics
     if base_hz * duration < 1 - 1e-9:
         hint = f"leave it out, or lengthen [simulation] duration to {1.001 / base_hz:.4g} s"
         what = "base_frequency_hz has no whole period in the experiment"
@@ -224,14 +224,15 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
         )
     n = case.plant.joints
     spread = lambda x, k=(): np.broadcast_to(np.asarray(x, float), (n, *k))
-    low, high = spread(case.limits["stroke"], (2,)).T
-    speed = spread(case.limits["speed"])
-    bounds = (low, high, speed, spread(setting.get("acceleration", np.inf)))
+    low, high = spread(case.limits.stroke, (2,)).T
+    speed = spread(case.limits.speed)
+    bounds = (low, high, speed, spread(np.inf if settings.acceleration is None else settings.acceleration))
     plant = replace(machine.plant, velocity_scale=jnp.asarray(speed.max()), sharpness=jnp.asarray(_SHARPNESS))
     machine = machine.with_plant(plant, machine.parameters)
     time = _instants(base_hz, harmonics)
     series = _Series.within(time, base_hz, harmonics, bounds)
-    force = np.abs(machine.gain) * np.broadcast_to(case.limits.get("force", np.inf), machine.gain.shape)
+    largest_command = np.inf if case.limits.force is None else case.limits.force
+    force = np.abs(machine.gain) * np.broadcast_to(largest_command, machine.gain.shape)
     noise = machine.sensor.force_noise
     known = noise is not None and bool(np.all(np.asarray(noise) > 0)) and plant.actuated is None
     p = len(machine.parameters.free)
@@ -246,7 +247,7 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
         time[1],
         machine.parameters.places,
         any(e.in_drive for e in plant.effects),
-        setting.get("criterion", CRITERIA[0]),
+        settings.criterion,
     )
     progress("drawing trajectories")
     draws = np.random.default_rng(0).normal(size=(_DRAWN, series.size))

@@ -29,7 +29,8 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import run_alone
-from jaxid.scene import refuse_impossible
+from jaxid.scene import refuse_impossible, sampling_of
+from jaxid.schema import stated
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import Replay
@@ -123,7 +124,7 @@ def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
     if not starts:
         raise InputError(
             "no experiment within the limits was found",
-            where=f"{case.path}, [limits]",
+            where=f"{case.where}, [limits]",
             hint="widen them, or check the loop's gains: the machine went beyond whatever it was asked",
         )
     known = [both(p) for p in starts]
@@ -153,8 +154,7 @@ class _DesignProblem:
 
     @classmethod
     def of(cls, case: Case) -> _DesignProblem:
-        setting = case.simulation
-        rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+        rate, duration = sampling_of(case)
         machine = build_machine(case, period=1 / rate)
         limits = _limits(case, machine)
         period = machine.hold_period or 1 / rate
@@ -168,8 +168,8 @@ class _DesignProblem:
         looped = machine.controller is not None
         drive = Drive(machine.gain, period, "zero_order", 1, True)
         none = np.zeros((ticks, m))
-        start, undisturbed = np.broadcast_to(setting.get("initial_position", 0.0), n), np.zeros((ticks, 1))
-        refuse_impossible(plant, start[None], f"{case.path}, [simulation] initial_position")
+        start, undisturbed = np.broadcast_to(case.simulation.initial_position, n), np.zeros((ticks, 1))
+        refuse_impossible(plant, start[None], f"{case.where}, [simulation] initial_position")
         inputs = (none, undisturbed, None) if looped else (None, None, none)
         # While an experiment is sought the command may go beyond: a cost without slope leads nowhere.
         free = machine.controller
@@ -180,8 +180,9 @@ class _DesignProblem:
         q = jnp.asarray(replay.position)[None]
         steps = min(needed_substeps(plant, drive, q, jnp.zeros_like(q), jnp.zeros((1, m))), _STEPS)
         replay = replace(replay, drive=replace(drive, substeps=steps))
-        on = case.output_error.get("on", "position")
-        prior = Prior.of(machine, case.output_error.get("prior", _PRIOR), np.zeros(0))
+        on = (case.within_prior or case.output_error).on
+        width = _PRIOR if case.within_prior is None else case.within_prior.prior
+        prior = Prior.of(machine, width, np.zeros(0))
         bench = cls(machine, replay, np.zeros(0), np.zeros(0), prior, on, limits, shapes, starts)
         own, whole = _noises(case, bench)
         return replace(bench, weight=np.tile(1.0 / whole, (len(range(0, ticks, every)), 1)), own=own / whole)
@@ -247,18 +248,20 @@ class _DesignProblem:
 
 def _limits(case: Case, machine: Machine) -> Limits:
     """The limits that a case states; the command's is within the controller's where it states none."""
-    stated, n, m = case.limits, case.plant.joints, machine.gain.size
-    low, high = np.broadcast_to(np.asarray(stated["stroke"], float), (n, 2)).T
+    table, n, m = case.limits, case.plant.joints, machine.gain.size
+    low, high = np.broadcast_to(np.asarray(table.stroke, float), (n, 2)).T
     own = None if machine.controller is None else machine.controller.limit
-    force = stated.get("force", np.inf if own is None else _UNSATURATED * np.asarray(own))
-    if machine.controller is None and "force" not in stated:
-        raise InputError("[limits] has no force", where=str(case.path), hint="add force = ... to [limits]")
+    force = table.force
+    if force is None:
+        force = np.inf if own is None else _UNSATURATED * np.asarray(own)
+    if machine.controller is None and table.force is None:
+        raise InputError("[limits] has no force", where=case.where, hint="add force = ... to [limits]")
     return Limits(
         np.array(low),
         np.array(high),
-        np.broadcast_to(stated["speed"], n).astype(float),
+        np.broadcast_to(np.asarray(table.speed, float), n).astype(float),
         np.broadcast_to(force, m).astype(float),
-        tuple(stated),
+        tuple(stated(table)),
     )
 
 
@@ -306,7 +309,7 @@ def _noises(case: Case, bench: _DesignProblem) -> tuple[Float[np.ndarray, " k"],
 def _no_noise(case: Case, what: str, key: str) -> InputError:
     return InputError(
         f"the noise of the {what} is not known",
-        where=f"{case.path}, [sensor]",
+        where=f"{case.where}, [sensor]",
         hint=f"add {key}: without it no experiment is better than another",
     )
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -17,6 +17,8 @@ from jaxid.experiment_design.shapes import largest
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.schema import stated
+from jaxid.settings import LimitsTable
 from jaxid.simulation.loops import Trajectory
 
 # Going beyond this part of a limit costs: as much as a factor e in evidence at the limit itself.
@@ -47,33 +49,33 @@ class Limits:
     stated: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, stated: Mapping[str, Any], machine: Machine, log: Log, data: Prepared) -> Limits:
+    def of(cls, table: LimitsTable, machine: Machine, log: Log, data: Prepared) -> Limits:
         """The limits that a case states, the rest as far as the log went.
 
         Where no force is stated it is the controller's own limit, if it has one: that is what the
         drive is known to stand.
 
         Args:
-            stated: The case's [limits].
+            table: Table [limits] of the case.
             machine: The machine.
             log, data: Its log, raw and prepared.
         """
         n, m = log.position.shape[1], log.force.shape[1]
-        stroke = stated.get("stroke")
+        stroke = table.stroke
         if stroke is None:
             low, high = data.q.min(axis=0), data.q.max(axis=0)
         else:
             low, high = np.broadcast_to(np.asarray(stroke, float), (n, 2)).T
-        speed = np.abs(data.qd).max(axis=0) if "speed" not in stated else stated["speed"]
+        speed = np.abs(data.qd).max(axis=0) if table.speed is None else table.speed
         own = None if machine.controller is None else machine.controller.limit
         used = np.abs(log.force).max(axis=0) if own is None else np.asarray(own)
-        force = stated.get("force", used)
+        force = used if table.force is None else table.force
         return cls(
             np.array(low, float),
             np.array(high, float),
             np.broadcast_to(speed, n).astype(float),
             np.broadcast_to(force, m).astype(float),
-            tuple(stated),
+            tuple(stated(table)),
         )
 
     def broken(self, peaks: Peaks) -> bool:

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.numerics import filters as signals
+from jaxid.settings import Preprocess
 
 # The surroundings of reversals that are left out are less of the motion than this.
 _MOSTLY = 0.5
@@ -214,7 +215,11 @@ class Prepared:
         return x[self.kept]
 
 
-def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
+# Everything is chosen from the log.
+_CHOSEN = Preprocess()
+
+
+def choose_recipe(log: Log, stated: Preprocess = _CHOSEN) -> Recipe:
     """Complete a stated recipe from the log, or choose all of it.
 
     The parallel filter ends where the position first stands less than four times above its noise floor
@@ -234,27 +239,26 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         InputError: If it states a cut-off that the log's sampling rate cannot have, or a median or a
             parabola that is longer than the log.
     """
-    stated = dict(stated or {})
     rate = log.rate_hz
-    if stated.get("cutoff_hz", 0.0) >= 0.5 * rate:
+    if stated.cutoff_hz is not None and stated.cutoff_hz >= 0.5 * rate:
         raise InputError(
-            f"[preprocess] cutoff_hz = {stated['cutoff_hz']:g} is not below half the sampling rate of "
+            f"[preprocess] cutoff_hz = {stated.cutoff_hz:g} is not below half the sampling rate of "
             f"{rate:.6g} Hz",
             where=log.source,
             hint="lower it, or leave it out: it is then chosen",
         )
-    parabolic, reach = stated.get("derivatives") == "parabolic", int(stated.get("reach", 2))
-    _require_length(log, stated.get("median"), reach if parabolic else None)
-    literal = "cutoff_hz" in stated or (parabolic and "decimation" in stated)
-    how = stated.get("derivatives", "central" if literal else "spectral")
+    parabolic, reach = stated.derivatives == "parabolic", stated.reach
+    _require_length(log, stated.median, reach if parabolic else None)
+    literal = stated.cutoff_hz is not None or (parabolic and stated.decimation is not None)
+    how = stated.derivatives or ("central" if literal else "spectral")
     edge = None if literal else _noise_cutoff(log)
     if parabolic:
         cutoff = signals.parabolic_cutoff(reach) * rate
         edge = None if literal else min(edge, _FLAT * cutoff)
     else:
-        cutoff = float(stated["cutoff_hz"]) if literal else min(2 * edge, 0.45 * rate)
+        cutoff = min(2 * edge, 0.45 * rate) if stated.cutoff_hz is None else stated.cutoff_hz
     band = cutoff if literal else edge
-    decimation = int(stated.get("decimation", _decimation(log, band)))
+    decimation = _decimation(log, band) if stated.decimation is None else stated.decimation
     q, qd, _ = differentiate(log.filled, log.period, cutoff, 4, how, reach=reach)
     noise = signals.high_band_std(log.filled)
     # White noise of density 2 sigma^2 / rate, times (2 pi f)^2, integrated up to the cut-off.
@@ -263,20 +267,21 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         # Slope of a line through 2 k + 1 samples.
         velocity_noise = noise * rate * np.sqrt(3 / (reach * (reach + 1) * (2 * reach + 1)))
     rest = np.maximum(5 * velocity_noise, 5e-3 * np.sqrt(np.mean(qd**2, axis=0)))
-    if "rest_velocity" in stated:
-        rest = np.full(q.shape[1], stated["rest_velocity"], float)
+    if stated.rest_velocity is not None:
+        rest = np.full(q.shape[1], stated.rest_velocity, float)
+    trim = trimmed(log, band, decimation, literal=literal) if stated.trim is None else stated.trim
     return Recipe(
         cutoff_hz=cutoff,
-        order=int(stated.get("order", 4)),
+        order=4 if stated.order is None else stated.order,
         decimation=decimation,
-        trim=int(stated.get("trim", trimmed(log, band, decimation, literal=literal))),
+        trim=trim,
         rest_velocity=tuple(float(r) for r in rest),
-        align_hold=bool(stated.get("align_hold", not literal)),
+        align_hold=not literal if stated.align_hold is None else stated.align_hold,
         derivatives=how,
         keeps_reversals=literal,
         edge=None if literal else 2 * edge / rate,
         reach=reach,
-        median=stated.get("median"),
+        median=stated.median,
     )
 
 

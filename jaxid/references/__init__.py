@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxid.errors import InputError, suggest
 from jaxid.references.bezier import BEZIER
 from jaxid.references.csv import CSV
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid
 from jaxid.references.fourier import FOURIER
 from jaxid.references.moves import POINT_TO_POINT, TRAPEZOID
 from jaxid.references.multisine import MULTISINE
@@ -23,7 +23,7 @@ from jaxid.references.synchronized import SYNCHRONIZED
 if TYPE_CHECKING:
     from jaxid.model.plant import Plant
 
-__all__ = ["REFERENCES", "Family", "Key", "make_reference"]
+__all__ = ["REFERENCES", "Family", "make_reference"]
 
 REFERENCES: dict[str, Family] = {
     family.kind: family

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid, about_zero, for_all_joints, is_about_zero, point_list
 from jaxid.references.s_curve import MotionBounds, SCurve, plan_s_curve
+from jaxid.schema import Key, choice, flag, number, whole
 
 
 def plan_line(
@@ -133,28 +134,39 @@ def _at_joints(point: np.ndarray, own: dict[str, Any], grid: Grid) -> np.ndarray
     return np.asarray(q, dtype=float)
 
 
+def _lowest_and_highest(unit: str) -> Key:
+    return Key(about_zero, "lowest and highest, or one number for both", True, unit, single=is_about_zero)
+
+
 SYNCHRONIZED = Family(
     kind="synchronized",
     doc="time-optimal motions of all joints together along straight lines, limited in jerk",
     keys={
-        "start": Key("where it stands at time zero", "position", default=0.0),
-        "points": Key("to visit in turn, one number a joint", "position", default=None, shape="points"),
+        "start": Key(number(), "position at time zero", unit="position", default=0.0),
+        "points": Key(
+            point_list(),
+            "points to visit in turn, one number a joint",
+            unit="position",
+            single=for_all_joints,
+        ),
         "polygon": Key(
-            "corners of a convex region; targets are drawn from it", "position", default=None, shape="points"
+            point_list(),
+            "corners of a convex region; targets are drawn from it",
+            unit="position",
+            single=for_all_joints,
         ),
         "coordinates": Key(
-            "what points and corners are of: the joints, or the tool",
-            shape="text",
+            choice(("joint", "task")),
+            "coordinates of points and corners: those of the joints, or of the tool",
             default="joint",
-            choices=("joint", "task"),
         ),
-        "velocity": Key("lowest and highest", "position/s", shape="range"),
-        "acceleration": Key("lowest and highest", "position/s^2", shape="range"),
-        "jerk": Key("lowest and highest", "position/s^3", shape="range"),
-        "onset": Key("rest before the first motion", "s", default=0.0, minimum=0.0),
-        "dwell": Key("rest at each target", "s", default=0.0, minimum=0.0),
-        "seed": Key("of the targets", shape="whole", default=0, minimum=0.0),
-        "repeat": Key("visit the points anew until the end", shape="flag", default=True),
+        "velocity": _lowest_and_highest("position/s"),
+        "acceleration": _lowest_and_highest("position/s^2"),
+        "jerk": _lowest_and_highest("position/s^3"),
+        "onset": Key(number("nonnegative"), "rest before the first motion", unit="s", default=0.0),
+        "dwell": Key(number("nonnegative"), "rest at each target", unit="s", default=0.0),
+        "seed": Key(whole(0), "seed of the targets", default=0),
+        "repeat": Key(flag, "visit the points anew until the end", default=True),
     },
     sample=_sample,
     together=True,

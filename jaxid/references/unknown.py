@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
@@ -37,7 +38,8 @@ class UnknownReference(eqx.Module):
         """Of a table of a case, and values for what it leaves unknown."""
         family = REFERENCES[table["kind"]]
         (values,) = family.read({**table, **unknown}, f"[{REFERENCE}]")
-        lists = {k: tuple(v.tolist()) for k, v in values.items() if family.keys[k].shape == "list"}
+        # Static fields must be hashable.
+        lists = {k: tuple(v.tolist()) for k, v in values.items() if isinstance(v, np.ndarray)}
         numbers = jnp.asarray(list(unknown.values()), dtype=jnp.float64)
         rest = tuple((k, v) for k, v in (values | lists).items() if k not in unknown)
         return cls(numbers, jnp.zeros(1), tuple(unknown), family.kind, rest)

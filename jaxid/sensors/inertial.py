@@ -20,8 +20,6 @@ from jaxid.dynamics.rhs import small_solve
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
 
-KINDS = ("gyroscope", "accelerometer")
-AXES = ("x", "y", "z")
 # What is held from before counts as so much of the readings' weight: only where these say nothing.
 _HELD = 1e-9
 # And of a joint's variance by that alone, more than this is left only where some motion is not told.
@@ -32,7 +30,7 @@ class Inertial(eqx.Module):
     """One sensor on a link.
 
     Args:
-        kind: One of `KINDS`.
+        kind: One of `jaxid.names.INERTIAL_KINDS`.
         link: 0-based.
         axes: Of its own that it reads, 0-based.
         position: Of an accelerometer in the link's frame, (3,) [m].

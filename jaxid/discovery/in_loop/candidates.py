@@ -68,9 +68,9 @@ class LoopFit:
     @classmethod
     def of(cls, session: Session, machine: Machine, widths: dict[str, float], estimate: Estimate) -> LoopFit:
         """With the point anew: what rounding does on average was taken off the estimate."""
-        stated, log = session.case.output_error, session.fit.log
-        numerics, on = choose_numerics(machine, log), stated.get("on", "position")
-        problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
+        settings, log = session.case.need_prior(), session.fit.log
+        numerics = choose_numerics(machine, log)
+        problem = Problem.of(machine, log, settings.prior, settings.on, numerics, widths)
         point = problem.prior.inward(problem.padded(estimate.theta))
         here = run_alone(read(problem, problem.ladder[-1], point))
         problem, here = problem.weighed(here)

@@ -36,7 +36,7 @@ UNSEEN = "a fit within a prior looks at the loop alone"
 
 
 def explore_within(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
-    """`discover` for a case with `[output_error] prior`.
+    """`discover` for a case with `[within_prior]`.
 
     Args:
         session: Case and log.
@@ -47,7 +47,7 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
         InputError: If the loop cannot be simulated, or a guess is zero.
     """
     progress("fitting what is there")
-    first = run_alone(steps_of("output_error", session))
+    first = run_alone(steps_of(session.case.prior_method, session))
     before = after = LoopFit.of(session, session.machine, {}, first)
     effects: list[NamedEffect] = []
     rounds = []
@@ -72,7 +72,7 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
             break
         added, after, found = good[0]
         # Those that were only compared had nothing drawn about them.
-        drawn = session.case.output_error.get("drawn", True)
+        drawn = session.case.need_prior().drawn
         after = _fit(session, after.machine, after.widths, after.estimate.theta, drawn=drawn)
         near = [s for s, *_ in good[1:] if s.evidence > added.evidence - _AS_GOOD]
         effects.append(replace(found, alternatives=tuple(near)))
@@ -118,19 +118,19 @@ def _fit(
     drawn: bool,
 ) -> LoopFit:
     """A fit within the prior from some values of the unknowns; `drawn`: as of `directions_steps`."""
-    stated = session.case.output_error
+    settings = session.case.need_prior()
     found = run_alone(
         directions_steps(
             machine,
             session.fit.log,
-            prior=stated["prior"],
-            on=stated.get("on", "position"),
+            prior=settings.prior,
+            on=settings.on,
             widths=widths,
             begin=begin,
             drawn=drawn,
         )
     )
-    return LoopFit.of(session, machine, widths, found)
+    return LoopFit.of(session, machine, widths, replace(found, method=session.case.prior_method))
 
 
 def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:

@@ -28,9 +28,8 @@ from jaxid.machine import Machine
 from jaxid.model.effect import carries_force
 from jaxid.model.parameter import parameters_of
 from jaxid.numerics.lanes import SolveRequest, Steps
+from jaxid.settings import Recursive
 
-# So many samples the start counts as.
-REGULARIZATION = 1e-3
 # Instants at which a log's history is written down, at most.
 _MOST = 200
 # Below this part of a row's force its right-hand side is nothing.
@@ -59,15 +58,14 @@ def gains_of(machine: Machine) -> tuple[int | None, ...]:
 
 
 def recursive_steps(
-    machine: Machine, data: Prepared, stated: Mapping[str, Any], saved: Mapping[str, Any] | None = None
+    machine: Machine, data: Prepared, settings: Recursive, saved: Mapping[str, Any] | None = None
 ) -> Steps[Estimate]:
     """Estimate the unknowns sample by sample.
 
     Args:
         machine: The machine. Its guesses matter for what is the plant's own, and where `start` says so.
         data: The log, prepared.
-        stated: Keys of the case's [recursive], each with a default: `half_life` [s of motion],
-            `regularization` (samples), `gate_velocity`, `gate_acceleration`, `rows`, `start`, `instrument`.
+        settings: Table [recursive] of the case.
         saved: Memory of an earlier run, as `jaxid.estimators.recursive.memory` reads it; it goes on
             from there.
 
@@ -79,12 +77,12 @@ def recursive_steps(
         InputError: If the unknowns do not enter the balance in proportion, a gain has nothing known to be
             told against, an instrument has no gain, or rows of unlike units are to be summed.
     """
-    gains, noisy = gains_of(machine), stated.get("instrument") == "model"
-    _check(machine, stated, gains, saved)
-    full = yield from rows_steps(machine, data, _gates(data, stated))
+    gains, noisy = gains_of(machine), settings.instrument == "model"
+    _check(machine, settings, gains, saved)
+    full = yield from rows_steps(machine, data, _gates(data, settings))
     _check_rows(machine, full, gains)
-    used = full.summed if stated.get("rows") == "summed" else full
-    recursion, memory = _recursion(machine, data, used, stated, gains)
+    used = full.summed if settings.rows == "summed" else full
+    recursion, memory = _recursion(machine, data, used, settings, gains)
     if saved is not None:
         recursion = replace(recursion, start=saved["start"], information=saved["information"])
         memory = RecursiveMemory(**{k: jnp.asarray(v) for k, v in saved["memory"].items()})
@@ -103,23 +101,24 @@ def recursive_steps(
         message="converged" if converged else "the estimate is not finite",
         residual=np.where(used.counts, used.rows @ theta - used.target, np.nan),
         samples=int(used.counts.sum()),
-        notes=_notes(machine, theta, stated, noisy),
-        details={"recursive": details_of(machine, recursion, memory, told, times, inflation, stated)},
+        notes=_notes(machine, theta, settings, noisy),
+        details={"recursive": details_of(machine, recursion, memory, told, times, inflation, settings)},
     )
 
 
 def _recursion(
-    machine: Machine, data: Prepared, used: Rows, stated: Mapping[str, Any], gains: tuple
+    machine: Machine, data: Prepared, used: Rows, settings: Recursive, gains: tuple
 ) -> tuple[Recursion, RecursiveMemory]:
     """The estimator as the case states it, and its memory before the first sample."""
-    period, half_life = data.period * data.recipe.decimation, stated.get("half_life", np.inf)
+    period = data.period * data.recipe.decimation
+    half_life = np.inf if settings.half_life is None else settings.half_life
     recursion = Recursion(
-        machine.parameters.guess if stated.get("start") == "guess" else start_of(machine),
-        stated.get("regularization", REGULARIZATION) * _sizes(machine, used),
+        machine.parameters.guess if settings.start == "guess" else start_of(machine),
+        settings.regularization * _sizes(machine, used),
         np.asarray(2.0 ** (-period / half_life)),
-        stated.get("rows") == "summed",
+        settings.rows == "summed",
         gains,
-        stated.get("instrument") == "model",
+        settings.instrument == "model",
     )
     return recursion, recursion.memory()
 
@@ -130,21 +129,19 @@ def _sizes(machine: Machine, used: Rows) -> Float[np.ndarray, " p"]:
     return np.asarray(column_squares(used.rows, used.counts, used.force, natural)[0])
 
 
-def _gates(data: Prepared, stated: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
+def _gates(data: Prepared, settings: Recursive) -> tuple[np.ndarray, np.ndarray] | None:
     """Stated gates by joint; an acceleration alone stands beside the recipe's rest velocity."""
-    if "gate_velocity" not in stated and "gate_acceleration" not in stated:
+    if settings.gate_velocity is None and settings.gate_acceleration is None:
         return None
     joints = data.q.shape[1]
-    velocity = stated.get("gate_velocity", data.recipe.rest_velocity)
-    acceleration = stated.get("gate_acceleration", np.inf)
+    velocity = data.recipe.rest_velocity if settings.gate_velocity is None else settings.gate_velocity
+    acceleration = np.inf if settings.gate_acceleration is None else settings.gate_acceleration
     return tuple(np.broadcast_to(np.asarray(x, float), (joints,)) for x in (velocity, acceleration))
 
 
-def _check(
-    machine: Machine, stated: Mapping[str, Any], gains: tuple, saved: Mapping[str, Any] | None
-) -> None:
+def _check(machine: Machine, settings: Recursive, gains: tuple, saved: Mapping[str, Any] | None) -> None:
     """Refuse what cannot be, whatever the log."""
-    rows, instrument = stated.get("rows", "full"), stated.get("instrument", "none")
+    rows, instrument = settings.rows, settings.instrument
     if instrument == "model" and not any(g is not None for g in gains):
         raise InputError(
             'instrument = "model" is for gains of drives, and none is unknown',
@@ -184,14 +181,12 @@ def _check_rows(machine: Machine, rows: Rows, gains: tuple) -> None:
             )
 
 
-def _notes(
-    machine: Machine, theta: np.ndarray, stated: Mapping[str, Any], instrument: bool
-) -> tuple[str, ...]:
+def _notes(machine: Machine, theta: np.ndarray, settings: Recursive, instrument: bool) -> tuple[str, ...]:
     lower, upper = machine.parameters.bounds
     out = [n for n, o in zip(machine.parameters.names, (theta < lower) | (theta > upper), strict=True) if o]
     notes = [f"beyond the bounds that sign or case set: {', '.join(out)}; no bound is kept"] if out else []
     if instrument:
         notes.append("instruments: the drive's force as the model of least squares asks for it")
-    half = stated.get("half_life")
+    half = settings.half_life
     what = "nothing is forgotten" if half is None else f"half of a sample's weight is left after {half:g} s"
     return (f"{what} of motion", *notes) if half else (what, *notes)

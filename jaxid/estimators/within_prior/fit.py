@@ -147,7 +147,7 @@ def _estimate(
         message = "the simulation is not finite where the fit ended"
     of_cost = {"criterion_percent": problem.criterion(minimum), "effective_parameters": found.effective}
     return Estimate(
-        method="output_error",
+        method="within_prior",
         machine=machine.with_estimate(theta),
         theta=theta,
         precision=precision,
