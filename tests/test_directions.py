@@ -351,7 +351,7 @@ def test_the_method_and_the_older_key_give_the_same_numbers(folder, tmp_path):
         assert (older.method, estimate.method) == ("output_error", "within_prior")
     (tmp_path / "case.toml").write_text(text.replace(STATED, "[output_error]\n").replace("drawn = false", ""))
     with pytest.raises(
-        jaxid.InputError, match=r"the table \[within_prior\] is missing; add \[within_prior\]"
+        jaxid.InputError, match=r"table \[within_prior\] is missing; add \[within_prior\]"
     ):
         jaxid.identify(tmp_path / "case.toml", logged(0), method="within_prior")
     (tmp_path / "case.toml").write_text(text + "[within_prior]\nprior = 0.3\n")
