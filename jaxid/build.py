@@ -177,8 +177,7 @@ def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
     }
     values: dict[str, Any] = {}
     for name, given in entry.parameters.items():
-        listed = isinstance(given, tuple)
-        values[name] = _guesses(given, at_truth) if listed else given.start(at_truth)
+        values[name] = _guesses(given, at_truth) if isinstance(given, tuple) else given.start(at_truth)
     plant = entry.cls(**values, **options, **entry.options)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
@@ -187,9 +186,12 @@ def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
             for k, v in enumerate(given):
                 # Of one entry a joint it is the joint's motion, where these differ.
                 motion = info.motion or (plant.motion(k) if info.more == 0 else None)
-                row = [(k, v)] if isinstance(v, Value) else [((k, i), x) for i, x in enumerate(v)]
-                for at, x in row:
-                    number = k + 1 if isinstance(v, Value) else f"{k + 1}, {at[1] + 1}"
+                entries: list[tuple[str, int | tuple[int, int], Value]]
+                if isinstance(v, Value):
+                    entries = [(f"{k + 1}", k, v)]
+                else:
+                    entries = [(f"{k + 1}, {i + 1}", (k, i), x) for i, x in enumerate(v)]
+                for number, at, x in entries:
                     free += _free(x, f"{name}[{number}]", (name,), info, motion, case, at_truth, index=at)
         elif given is not None:
             free += _free(given, name, (name,), info, info.motion, case, at_truth)
@@ -243,7 +245,9 @@ def _unknown_reference(
     if not case.unknown_reference:
         return None, []
     values = {name: v.start(at_truth) for name, v in case.unknown_reference.items()}
-    unknown_reference, free = UnknownReference.of(case.reference, values), []
+    assert case.reference is not None, "unknowns of a reference are read from its table"
+    unknown_reference = UnknownReference.of(case.reference, values)
+    free: list[Free] = []
     motion, keys = plant.motion(plant.driven(plant.joints)[0]), REFERENCES[unknown_reference.kind].keys
     for name, value in case.unknown_reference.items():
         path, info = (REFERENCE, name), info_of(keys[name])
@@ -264,7 +268,7 @@ def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controlle
     }
     values |= case.controller.law
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
-    arrays = {k: v if k in static else as_array(v) for k, v in values.items()}
+    arrays: dict[str, Any] = {k: v if k in static else as_array(v) for k, v in values.items()}
     period = case.controller.period or _log_period(case, period)
     if cls.every_drive and case.plant.drives < case.plant.joints:
         raise InputError(
@@ -293,18 +297,15 @@ def _estimator(case: Case, machine: Machine, period: float, settings: Recursive)
         hint = "take kind = 'computed_torque', or give a guess in place of a value"
         what = "kind = 'adaptive' needs at least one unknown parameter"
         raise InputError(what, where=where, hint=hint)
-    gates = (settings.gate_velocity, settings.gate_acceleration)
-    velocity, acceleration = (
-        other if gate is None else gate for gate, other in zip(gates, (_GATE, np.inf), strict=True)
-    )
+    velocity, acceleration = settings.gate_velocity, settings.gate_acceleration
     try:
         return RealTime.of(
             machine,
             period,
             noise=1.0,
             spread=np.ones(count),
-            gate_velocity=velocity,
-            gate_acceleration=acceleration,
+            gate_velocity=_GATE if velocity is None else np.asarray(velocity),
+            gate_acceleration=np.inf if acceleration is None else np.asarray(acceleration),
             half_life=np.inf if settings.half_life is None else settings.half_life,
             summed=settings.rows == "summed",
             instrument=settings.instrument == "model",
@@ -316,10 +317,12 @@ def _estimator(case: Case, machine: Machine, period: float, settings: Recursive)
 
 def _log_period(case: Case, period: float | None) -> float:
     """Return the sampling period [s] of the log, or of [log] or [simulation]."""
+    if period is not None:
+        return period
     logged = None if case.log is None else case.log.sample_rate
     rate = logged or case.simulation.sample_rate
-    if period is None and rate is None:
+    if rate is None:
         hint = "add period = <its sampling time in s>"
         where = f"{case.where}, [controller]"
         raise InputError("the controller's period is not known", where=where, hint=hint)
-    return period if period is not None else 1.0 / rate
+    return 1.0 / rate

@@ -46,21 +46,21 @@ class Machine:
 
     @property
     def hold_period(self) -> float | None:
-        """For how long the controller holds a command [s]; None where there is none."""
+        """Time for which the controller holds a command [s]; None without a controller."""
         return None if self.controller is None else self.controller.period
 
     def with_plant(self, plant: Plant, parameters: Parameters) -> Machine:
-        """The same machine around another plant and its unknowns."""
+        """Return the machine with another plant and its unknowns."""
         return replace(self, plant=plant, parameters=parameters)
 
-    def with_estimate(self, theta: Sequence[float]) -> Machine:
-        """The same machine with its unknowns set, which are also the new guesses."""
-        theta = np.asarray(theta, dtype=np.float64)
-        parameters = self.parameters.with_guess(theta)
-        plant = self.parameters.insert(self.plant, theta)
+    def with_estimate(self, theta: Sequence[float] | np.ndarray) -> Machine:
+        """Return the machine with these values of its unknowns, which are also the new guesses."""
+        values = np.asarray(theta, dtype=np.float64)
+        parameters = self.parameters.with_guess(values.tolist())
+        plant = self.parameters.insert(self.plant, values)
         unknown_reference = (
             None
             if self.unknown_reference is None
-            else self.unknown_reference.with_unknowns(self.parameters.places, theta)
+            else self.unknown_reference.with_unknowns(self.parameters.places, values)
         )
         return replace(self, plant=plant, parameters=parameters, unknown_reference=unknown_reference)

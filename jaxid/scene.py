@@ -131,7 +131,7 @@ class Scene:
             raise InputError("there is nothing to follow", where=where, hint="add a [reference]")
         period = machine.controller.period
         reference = make_reference(
-            case.true_reference,
+            case.true_reference or {},
             1 / period,
             duration,
             case.folder,
@@ -170,13 +170,11 @@ class Scene:
         times = self.drive.period * np.arange(len(self.signal))
         start, sensor = (self.position, self.velocity), (machine.sensor, noise)
         looped = machine.controller is not None
+        signal = self.signal
         if looped:
             extra = disturbance_at(machine.disturbance, times)
-            signal = (
-                self.signal
-                if machine.unknown_reference is None
-                else np.asarray(machine.unknown_reference.at(times)())
-            )
+            if machine.unknown_reference is not None:
+                signal = np.asarray(machine.unknown_reference.at(times)())
             args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
             run = yield SolveRequest(_closed_run, args)
         else:

@@ -213,7 +213,7 @@ def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]
     """Check a log, and return the findings; short: a fit within a prior needs two positions only."""
     limit = None if case.controller is None else case.controller.limit
     units, plant = machine.units, machine.plant
-    driven = plant.at_drives(np.arange(plant.joints))
+    driven = np.asarray(plant.at_drives(np.arange(plant.joints)))
     stated = machine.sensor.position_resolution is not None
     findings = check_log(
         log,

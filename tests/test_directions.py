@@ -350,9 +350,7 @@ def test_the_method_and_the_older_key_give_the_same_numbers(folder, tmp_path):
         np.testing.assert_array_equal(estimate.std, older.std)
         assert (older.method, estimate.method) == ("output_error", "within_prior")
     (tmp_path / "case.toml").write_text(text.replace(STATED, "[output_error]\n").replace("drawn = false", ""))
-    with pytest.raises(
-        jaxid.InputError, match=r"table \[within_prior\] is missing; add \[within_prior\]"
-    ):
+    with pytest.raises(jaxid.InputError, match=r"table \[within_prior\] is missing; add \[within_prior\]"):
         jaxid.identify(tmp_path / "case.toml", logged(0), method="within_prior")
     (tmp_path / "case.toml").write_text(text + "[within_prior]\nprior = 0.3\n")
     with pytest.raises(jaxid.InputError, match=r"\[output_error\]: prior is given beside \[within_prior\]"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,7 +29,7 @@ class PlantEntry:
     """
 
     cls: type[Plant]
-    parameters: dict[str, Value | tuple[Value, ...]]
+    parameters: Mapping[str, Value | tuple[Value | tuple[Value, ...], ...]]
     units: Units
     vertical: bool
     gravity: float | None

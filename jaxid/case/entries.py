@@ -210,6 +210,7 @@ def _plant_list(
 
     Where every machine of a kind has as many joints (fixed) a fault tells what the entries are.
     """
+    assert info.more is not None, "only lists come here"
     entries = joints + info.more
     whole_list = value if is_list(value) else None
     if info.width is None and isinstance(value, dict) and is_list(value.get("guess")):
@@ -230,6 +231,7 @@ def _plant_list(
 
 def _row(value: Any, info: ParameterInfo, spot: Spot) -> tuple[Value, ...]:
     """An entry of a list that is a list itself."""
+    assert info.width is not None, "only lists of lists come here"
     if not is_list(value):
         raise spot.refuse(value, "is not a list", f"give {info.width} numbers: {info.doc}")
     return read_values(value, info, info.width, spot, "component")
@@ -339,8 +341,9 @@ def _takes(cls: type[Effect]) -> str:
 
 def _check_together(cls: type[Effect], parameters: dict[str, tuple[Value, ...]], spot: Spot) -> None:
     """Let the class judge which optional parameters go together."""
+    guesses: dict[str, Any] = {name: values[0].guess for name, values in parameters.items()}
     try:
-        cls(**{name: values[0].guess for name, values in parameters.items()})
+        cls(**guesses)
     except (ValueError, TypeError) as error:
         if isinstance(error, InputError):
             raise

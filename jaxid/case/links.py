@@ -16,6 +16,7 @@ from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg
 from jaxid.plants.geometry import JOINTS, Geometry
+from jaxid.plants.serial_arm import SerialArm
 from jaxid.schema import (
     Key,
     Keys,
@@ -120,6 +121,7 @@ def read_links_of_urdf(
     free = {name: np.full(len(arm.names), unknown == "all") for name in TEN}
     if unknown == "base":
         weight = {name: given[name] for name in ("gravity_vector",) if name in given}
+        assert issubclass(cls, SerialArm), "no other plant has links"
         plant = cls(**values, geometry=arm.geometry, **weight)
         if not np.any(np.asarray(plant.gravity_vector)):
             hint = 'state a gravity_vector other than zero, or unknown = "all"'

@@ -68,9 +68,10 @@ def read_ports(
         return tuple(before + k for k in _places(table, name, there[name], spot)), name
     if "joint" in table:
         chosen = _places(_numbered(table, plant.names, spot), "joint", parts, spot)
-        undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]
+        actuated = range(plant.joints) if plant.actuated is None else plant.actuated
+        undriven = plant.actuated is not None and not set(chosen) <= set(actuated)
         if cls.in_drive and undriven:
-            driven = ", ".join(str(k + 1) for k in plant.actuated)
+            driven = ", ".join(str(k + 1) for k in actuated)
             what = f"has no drive for {cls.kind} to sit in"
             raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
         return chosen, "joint"

@@ -185,13 +185,15 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
     if _TYPES[kind] and not length > 0:
         raise InputError("<axis> has no length", where=where, hint='write a direction such as xyz="0 0 1"')
     copied = joint.find("mimic")
+    parent, child = ends
     return _Joint(
-        name,
-        _TYPES[kind],
-        *ends,
-        _place(joint.find("origin"), where),
-        axis / (length or 1.0),
-        None if copied is None else copied.get("joint", ""),
+        name=name,
+        motion=_TYPES[kind],
+        parent=parent,
+        child=child,
+        place=_place(joint.find("origin"), where),
+        axis=axis / (length or 1.0),
+        mimics=None if copied is None else copied.get("joint", ""),
     )
 
 

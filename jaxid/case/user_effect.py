@@ -69,6 +69,8 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
         return _LOADED[path][1]
     name = f"jaxid_user_{path.stem}_{zlib.crc32(str(path).encode()):08x}"
     spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None, "a file that ends in .py always has a loader"
+    assert spec.loader is not None, "a file that ends in .py always has a loader"
     module = importlib.util.module_from_spec(spec)
     before = dict(EFFECTS)
     sys.modules[name] = module

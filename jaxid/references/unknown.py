@@ -56,4 +56,6 @@ class UnknownReference(eqx.Module):
     def __call__(self) -> Float[Array, "ticks 1"]:
         """The position of the one drive at its instants [m or rad]."""
         values = dict(self.known) | dict(zip(self.names, self.numbers, strict=True))
-        return REFERENCES[self.kind].follow(values, self.time)[:, None]
+        follow = REFERENCES[self.kind].follow
+        assert follow is not None, "only families that can be followed have unknowns"
+        return follow(values, self.time)[:, None]
