@@ -201,8 +201,11 @@ REFUSED = [
     ('kind = "gyro"\nlink = 1\nnoise = 1.0', "kind = \"gyro\" is unknown; did you mean 'gyroscope'"),
     ('kind = "gyroscope"\nlink = 3\nnoise = 1.0', "link = 3 does not exist; the plant has 2 links"),
     ('kind = "gyroscope"\nlink = 1', "'noise' is missing"),
-    ('kind = "gyroscope"\nlink = 1\nnoise = 1.0', "the gyroscopes do not tell the motion of every joint"),
-    ('kind = "gyroscope"\nlink = 2\nnoise = 1.0\naxes = ["z"]', "do not tell the motion of every joint"),
+    (
+        'kind = "gyroscope"\nlink = 1\nnoise = 1.0',
+        "the gyroscopes do not determine the motion of every joint",
+    ),
+    ('kind = "gyroscope"\nlink = 2\nnoise = 1.0\naxes = ["z"]', "do not determine the motion of every joint"),
     ('kind = "gyroscope"\nlink = 1\nnoise = 1.0\naxes = ["z", "z"]', "names an axis twice"),
     ('kind = "gyroscope"\nlink = 1\nnoise = 1.0\naxes = ["z"]\nscale = [1.0, 1.0]', "scale .* has 2 entries"),
     ('kind = "gyroscope"\nlink = 1\nnoise = 1.0\nposition = [0.0, 0.0, 0.1]', "is a key of accelerometers"),

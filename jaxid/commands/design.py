@@ -19,7 +19,7 @@ def design(case: CaseLike, *, progress: Callable[[str], None] = lambda text: Non
     `jaxid.experiment_design.along_reference.excite`. Else:
 
     The logarithm of the information's determinant is raised through the simulation by gradients (D-optimal;
-    Bayesian: each guess is a prior of the relative width `[output_error] prior`, 0.5 where absent), over sums
+    Bayesian: each guess is a prior of the relative width `[within_prior] prior`, 0.5 where absent), over sums
     of sines and a tour from end to end, within [limits].
 
     Args:

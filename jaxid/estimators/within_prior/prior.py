@@ -60,7 +60,7 @@ class Prior(eqx.Module):
             if f.guess == 0.0 and f.name not in own:
                 raise InputError(
                     f"{f.name} has a guess of zero, which a relative prior says nothing of",
-                    where="[output_error] prior",
+                    where="prior",
                     hint="give it a guess of its natural size",
                 )
         guess, (lower, upper) = machine.parameters.guess, machine.parameters.bounds
