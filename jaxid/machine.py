@@ -1,4 +1,4 @@
-"""Everything that a fit or a simulation needs of a case, as arrays and modules."""
+"""Machine: a plant with its drive, controller and sensors, as arrays and modules."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from jaxid.settings import Disturbance
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """A plant with what drives, closes and measures it.
+    """A plant with its drive, controller and sensors.
 
     Args:
         plant: The plant at its guesses (or true values).
-        parameters: Its unknowns.
+        parameters: Unknown parameters of plant and reference.
         gain: Declared force at the joint per unit of the logged command, gears of the plant included, (m,).
-        units: Labels.
+        units: Labels of the units.
         controller: The sampled law; None: unknown, only open loop can be simulated.
-        disturbance: Added to the command in the loop: a square wave's level, on, off [s] and
-            start [s], or the name of a column of the log; None: none.
-        sensor: What is known of the measurement.
-        hold: How the command runs between samples.
-        unknown_reference: Reference with unknowns, where the log has no reference; None: it is known.
+        disturbance: Signal added to the command in the loop: a square wave, or the name of a column
+            of the log; None: nothing is added.
+        sensor: Known errors of the measurement.
+        hold: Course of the command between samples.
+        unknown_reference: Reference with unknowns, for logs without a reference; None: it is known.
     """
 
     plant: Plant

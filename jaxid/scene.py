@@ -1,4 +1,4 @@
-"""The log that a case would give: reference or input in, sensors' readings out."""
+"""Simulated logs of a case: from reference or input to the readings of the sensors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SimulatedLog:
     columns: dict[str, str | list[str]]
 
     def csv(self) -> str:
-        """The log as a table with a header, every digit kept."""
+        """Return the log as a table with a header, every digit kept."""
         log = self.log
         load = "load_position" in self.columns
         known = log.position[:, list(log.measured)]
@@ -71,14 +71,14 @@ class SimulatedLog:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a case says of a simulation, ready to run with any values of its parameters.
+    """A case set up for simulation, with any values of its parameters.
 
     Args:
         case: The case.
-        machine: At its true values where it has any.
-        drive: How the command acts.
+        machine: Machine at its true values, if it has any.
+        drive: Path of the command to the plant.
         signal: Reference (in a loop) or input at every tick, by drive.
-        position, velocity: At the start.
+        position, velocity: State of the joints at the start.
         every: The log holds one tick in so many.
     """
 
@@ -92,14 +92,14 @@ class Scene:
 
     @classmethod
     def of(cls, case: Case, *, longer_delays: float = 1.0) -> Scene:
-        """The scene of a case.
+        """Set up the simulation of a case.
 
         Args:
             case: The case.
-            longer_delays: How many times the case's delays may be, where parameters are drawn.
+            longer_delays: Factor by which drawn delays may exceed those of the case.
 
         Raises:
-            InputError: If the case does not say what to simulate.
+            InputError: If the case lacks reference, input, duration or sample_rate.
         """
         where, setting = case.where, case.simulation
         if case.log is not None and case.log.load_acceleration is not None:
@@ -154,11 +154,11 @@ class Scene:
         return cls(case, machine, drive, reference, position, velocity, every)
 
     def simulated_log(self, machine: Machine, rng: np.random.Generator) -> Steps[SimulatedLog]:
-        """The log of a machine like the scene's, one run at a time.
+        """Simulate the log of a machine like the scene's, one run at a time.
 
         Args:
-            machine: Its plant and its sensor count.
-            rng: Draws the sensors' noise.
+            machine: Machine whose plant and sensor replace those of the scene.
+            rng: Generator of the sensors' noise.
         """
         joints = self.case.plant.joints
         # A law that measures the command sees the noise that the log has.
@@ -222,7 +222,7 @@ def sampling_of(case: Case) -> tuple[float, float]:
 
 
 def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:
-    """One signal for every drive, where there is one for all."""
+    """Return one signal for every drive, if there is one for all."""
     return np.broadcast_to(signal, (len(signal), machine.gain.size))
 
 
@@ -303,7 +303,7 @@ def _refuse_coarse(
 
 
 def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
-    """The velocity that the smoothed sign's sharpness multiplies: the reference's largest."""
+    """Return the machine with the largest speed of the reference as the scale of the smoothed sign."""
     speed = float(np.abs(np.diff(reference, axis=0)).max() / period)
     if speed == 0.0:
         return machine

@@ -1,4 +1,4 @@
-"""A case and its logs, opened, checked and prepared: where every command starts."""
+"""A case and its logs, opened, checked and prepared: the start of every command."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from jaxid.simulation.step_size import needed_steps
 
 @dataclass(frozen=True)
 class OpenedLog:
-    """One log with what was different when it was taken.
+    """One log, prepared, with the disturbance of its controller.
 
     Args:
-        name: In results.
-        log: The log, its force behind the recipe's running median where it has one.
-        data: The same, prepared.
-        disturbance: The controller's.
+        name: Name of the log in results.
+        log: The log; its force has passed the recipe's running median, if there is one.
+        data: The prepared log.
+        disturbance: Signal that was added to the controller's command.
     """
 
     name: str
@@ -38,7 +38,7 @@ class OpenedLog:
     disturbance: Disturbance | str | None
 
     def machine(self, machine: Machine) -> Machine:
-        """A machine as it stood when this log was taken."""
+        """Return a machine with the disturbance of this log."""
         return replace(machine, disturbance=self.disturbance)
 
 
@@ -50,8 +50,8 @@ class Session:
         case: The case.
         machine: Its machine.
         fit: The log to fit.
-        validations: Others, by name; prepared by the same recipe.
-        recipe: How the logs are filtered.
+        validations: Further logs with their names, prepared by the same recipe.
+        recipe: Filtering of all logs.
         findings: Warnings on the logs.
     """
 
@@ -68,7 +68,7 @@ class Session:
         return (self.fit, *self.validations)
 
     def with_machine(self, machine: Machine) -> Session:
-        """The same session around another machine."""
+        """Return the session with another machine."""
         return replace(self, machine=machine)
 
 
@@ -133,13 +133,13 @@ def open_session(
 
 
 def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None = None) -> Session:
-    """A session around a simulated log, which no file was read for and nothing can be wrong with.
+    """Open a session on a simulated log; no file checks are needed.
 
     Args:
         case: The case.
-        machine: At the start of a fit.
-        log: The log.
-        recipe: How to filter it; absent: chosen from it.
+        machine: Machine at the start of a fit.
+        log: The simulated log.
+        recipe: Filtering of the log; None: chosen from the log.
 
     Raises:
         InputError: If the log is too short, or moves too little.
@@ -250,10 +250,10 @@ def _run(
 
 
 def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepared:
-    left = log.samples // recipe.decimation - 2 * recipe.trim
-    if left * log.position.shape[1] < needed:
+    remaining = log.samples // recipe.decimation - 2 * recipe.trim
+    if remaining * log.position.shape[1] < needed:
         raise InputError(
-            f"too short: {log.samples} samples leave {max(left, 0)} after decimation by "
+            f"too short: {log.samples} samples leave {max(remaining, 0)} after decimation by "
             f"{recipe.decimation} and trimming {recipe.trim} at each end, as [preprocess] states or "
             "the log's noise asks",
             where=log.source,
@@ -273,7 +273,7 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepare
 
 
 def _scaled(machine: Machine, data: Prepared) -> Machine:
-    """The machine with the velocity scale of its log, which the smoothed sign multiplies."""
+    """Return the machine with the RMS speed of its log as the scale of the smoothed sign."""
     speed = float(np.sqrt(np.mean(data.qd**2)))
     plant = replace(machine.plant, velocity_scale=np.asarray(speed))
     return machine.with_plant(plant, machine.parameters)

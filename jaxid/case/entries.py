@@ -41,7 +41,7 @@ _MOST_JOINTS = 50
 
 
 def read_kind(table: dict[str, Any], known: Any, spot: Spot) -> str:
-    """The kind that a table names.
+    """Read the kind that a table names.
 
     Raises:
         InputError: If it is missing or unknown.
@@ -124,12 +124,12 @@ def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot:
 
 
 def _shape(info: ParameterInfo) -> str:
-    """What a parameter looks like in a case."""
+    """Return the form of a parameter in a case, for hints."""
     return "{ guess = ... }" if info.more is None else "[{ guess = ... }, ...]"
 
 
 def _count_joints(table: Any, cls: type[Plant], spot: Spot) -> int:
-    """How many joints a plant has: as many as its lists tell, or as its class says."""
+    """Count the joints of a plant: the entries of its lists, or the number of its class."""
     if isinstance(cls.joints, int):
         return cls.joints
     name = next(n for n, info in parameters_of(cls).items() if info.more == 0)
@@ -206,9 +206,9 @@ def _plant_parameters(
 def _plant_list(
     value: Any, info: ParameterInfo, joints: int, spot: Spot, fixed: bool
 ) -> tuple[Value | tuple[Value, ...], ...]:
-    """A list of the plant's: as long as it has joints, or longer by what the class says.
+    """Read a list of the plant, with one entry for each joint, or more as the class says.
 
-    Where every machine of a kind has as many joints (fixed) a fault tells what the entries are.
+    If every machine of a kind has the same number of joints (fixed), a fault names the entries.
     """
     assert info.more is not None, "only lists come here"
     entries = joints + info.more
@@ -230,7 +230,7 @@ def _plant_list(
 
 
 def _row(value: Any, info: ParameterInfo, spot: Spot) -> tuple[Value, ...]:
-    """An entry of a list that is a list itself."""
+    """Read an entry of a list that is a list itself."""
     assert info.width is not None, "only lists of lists come here"
     if not is_list(value):
         raise spot.refuse(value, "is not a list", f"give {info.width} numbers: {info.doc}")

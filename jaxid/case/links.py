@@ -34,7 +34,7 @@ from jaxid.schema import (
     whole,
 )
 
-# Chosen: beyond any arm; what lies behind it is a slip.
+# Chosen: more links than any arm has.
 _MOST_LINKS = 50
 # Entries of a list of the case, by the plant's parameters that they are.
 _LISTS = {"first_moment": TEN[1:4], "inertia": TEN[4:]}
@@ -46,9 +46,9 @@ SHAFT: Keys = {
     "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
     "ratios": Key(several(number()), "turns of the shaft for one of each joint", note="1 each"),
 }
-# Below it the sine of an angle of a URDF file is nothing: 1.5708 stands there for a right angle.
+# Below it the sine of an angle of a URDF file counts as zero: 1.5708 stands there for a right angle.
 _ANGLE = 1e-4
-# What of the links that a URDF file describes is to be identified.
+# Choices of the parameters of a URDF file that are unknown.
 UNKNOWN = ("none", "base", "all")
 # Keys of [plant] that only an arm has.
 LINKED: Keys = {
@@ -67,7 +67,7 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
     """Refuse a [plant] without links.
 
     Raises:
-        InputError: If there is none, or no table is where one should be.
+        InputError: If there are no links, or one of them is not a table.
     """
     links = table.get("links")
     if links is None:
@@ -82,10 +82,10 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
 def read_links(
     links: list[dict[str, Any]], cls: type[Plant], root: Spot
 ) -> tuple[dict[str, tuple[Value, ...]], DenavitHartenberg]:
-    """Inertial parameters of the links by name, one value a link, and their geometry.
+    """Read the inertial parameters of the links by name, one value a link, and their geometry.
 
     Raises:
-        InputError: If a link states what it cannot have, or not what it must.
+        InputError: If a link has a key or value that it cannot have, or lacks one.
     """
     rows, parameters = [], {}
     for k, link in enumerate(links, start=1):
@@ -106,10 +106,13 @@ def read_links(
 def read_links_of_urdf(
     given: dict[str, Any], cls: type[Plant], spot: Spot
 ) -> tuple[dict[str, tuple[Value, ...]], Urdf]:
-    """The same of the URDF file that [plant] names: parameters of the links, and what the file says.
+    """Read the parameters of the links from the URDF file that [plant] names.
+
+    Returns:
+        The parameters by name, one value a link, and the contents of the file.
 
     Raises:
-        InputError: If [plant] describes the links as well, or the file no arm.
+        InputError: If [plant] describes the links as well, or the file does not describe an arm.
     """
     if "links" in given:
         raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
@@ -137,10 +140,10 @@ def read_links_of_urdf(
 
 
 def read_shafts(shafts: Any, geometry: Geometry, spot: Spot) -> tuple[tuple[float, ...], ...]:
-    """[[plant.shafts]]: by how much each turns with every joint.
+    """Read [[plant.shafts]]: the ratio of each shaft to every joint.
 
     Raises:
-        InputError: If one names joints that are not there, or of which some turn and some slide.
+        InputError: If a shaft names joints that do not exist, or both revolute and prismatic ones.
     """
     if not isinstance(shafts, list) or not all(isinstance(shaft, dict) for shaft in shafts):
         raise spot.at("shafts").fault("is not a list of tables", "write [[plant.shafts]], in double brackets")
@@ -206,7 +209,7 @@ def _listed(info: ParameterInfo, parts: tuple[str, ...]) -> Reader:
 
 
 def _in_rad(link: dict[str, Any], spot: Spot) -> dict[str, Any]:
-    """The table with its angles in rad."""
+    """Return the table with its angles in rad."""
     out = dict(link)
     for name in _ANGLES:
         degrees = f"{name}_deg"

@@ -1,4 +1,4 @@
-"""Where the effects of a case act: on joints, springs, shafts, passive angles, tools; all count from 1."""
+"""Places on which the effects of a case act: joints, springs, shafts, passive angles, tools; from 1."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
     from jaxid.case.declared import PlantEntry
 
 
-# What a place is called, where that is not its key.
+# Nouns of places that differ from their keys.
 _NOUNS = {"passive": "passive angle"}
 
 
 def read_ports(
     table: dict[str, Any], cls: type[Effect], plant: PlantEntry, spot: Spot
 ) -> tuple[tuple[int, ...], str]:
-    """Ports on which an effect acts, 0-based, and what they are: all that suit where none is named.
+    """Read the ports on which an effect acts, 0-based, and their noun; all that suit, if none is named.
 
     Raises:
-        InputError: If a place that is named is none of the plant's, or none for such an effect.
+        InputError: If a place does not exist on the plant, or does not go with the effect.
     """
     places = [name for name in PLACES if name in table]
     if len(places) > 1:
@@ -83,10 +83,10 @@ def read_ports(
 
 
 def _numbered(table: dict[str, Any], names: tuple[str, ...], spot: Spot) -> dict[str, Any]:
-    """The table with joints by number, of which a URDF file has told the names.
+    """Return the table with numbers in place of the names that a URDF file gives to the joints.
 
     Raises:
-        InputError: If it names one that is not there.
+        InputError: If it names an unknown joint.
     """
     given = table["joint"]
     listed = given if isinstance(given, list) else [given]
@@ -98,7 +98,7 @@ def _numbered(table: dict[str, Any], names: tuple[str, ...], spot: Spot) -> dict
 
 
 def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[int, ...]:
-    """The joints or springs that a table names, 0-based."""
+    """Read the joints or springs that a table names; return them 0-based."""
     given, place = table[what], spot.at(what)
     several_places = isinstance(given, list)
     named = several(whole(1))(given, place) if several_places else (whole(1)(given, place),)
@@ -107,10 +107,10 @@ def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[i
 
 
 def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot: Spot) -> None:
-    """Refuse places beyond those that there are, or named twice.
+    """Refuse places that do not exist, or are named twice.
 
     Raises:
-        InputError: If there are any.
+        InputError: If a place does not exist or is named twice.
     """
     noun = _NOUNS.get(what, what)
     if max(named) > there:

@@ -111,7 +111,10 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
 
 
 def _tree(path: Path) -> Element:
-    """The file's root element. Documents that declare entities are refused, for these can fill all memory."""
+    """Parse the file and return its root element.
+
+    Documents that declare entities are refused: these can fill all memory.
+    """
     where = str(path)
 
     def refuse(*args: object) -> None:
@@ -146,7 +149,7 @@ def _tree(path: Path) -> Element:
 
 
 def _named(robot: Element, tag: str, file: str) -> Iterator[tuple[str, Element]]:
-    """The links or joints with their names.
+    """Return the links or joints with their names.
 
     Raises:
         InputError: If one has no name, or two have one.
@@ -198,7 +201,7 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
 
 
 def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
-    """The link that no joint moves, from which all others can be reached.
+    """Return the link that no joint moves, from which all others can be reached.
 
     Raises:
         InputError: If there is none, or more than one, or a loop.
@@ -331,7 +334,7 @@ def _inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndar
 
 
 def _towards(axis: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """The axes of a link turned such that z is the joint's; as they are where it is."""
+    """Turn the axes of a link such that z is the joint's; keep them if it is already."""
     # Half a turn about x first where z would turn by more than a right angle: no division by what vanishes.
     half = np.diag([1.0, -1.0, -1.0]) if axis[2] < 0 else np.eye(3)
     x, y, z = half @ axis

@@ -1,4 +1,4 @@
-"""What a family of references declares, and how a table of the case is read against it."""
+"""Families of references: their keys, and the reading of a table of the case."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Grid:
         return self.samples / self.rate_hz
 
     def fault(self, what: str, hint: str) -> InputError:
-        """An error that names the table."""
+        """Return an error that names the table."""
         return InputError(what, where=self.where, hint=hint)
 
 

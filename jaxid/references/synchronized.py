@@ -25,7 +25,7 @@ def plan_line(
     acceleration: Float[np.ndarray, "n 2"],
     jerk: Float[np.ndarray, "n 2"],
 ) -> SCurve:
-    """The path parameter, from 0 to 1, of the fastest motion along a straight line.
+    """Plan the path parameter, from 0 to 1, of the fastest motion along a straight line.
 
     Args:
         way: Of each joint, with its sign [position].
@@ -97,7 +97,7 @@ def _drawn(polygon: np.ndarray, seed: int, grid: Grid) -> Iterator[np.ndarray]:
 
 
 def _simplices(polygon: np.ndarray, grid: Grid) -> Float[np.ndarray, "k n1 n"]:
-    """A polygon as triangles, by their corners."""
+    """Split a polygon into triangles, and return their corners."""
     import scipy.spatial  # a third of a second, which no other kind of reference needs
 
     n = polygon.shape[1]
@@ -121,7 +121,7 @@ def _simplices(polygon: np.ndarray, grid: Grid) -> Float[np.ndarray, "k n1 n"]:
 
 
 def _at_joints(point: np.ndarray, own: dict[str, Any], grid: Grid) -> np.ndarray:
-    """A point in joint space."""
+    """Return a point in joint space."""
     if own["coordinates"] == "joint":
         return point
     q = None if grid.plant is None else grid.plant.joint_positions(point)

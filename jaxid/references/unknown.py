@@ -35,7 +35,7 @@ class UnknownReference(eqx.Module):
 
     @classmethod
     def of(cls, table: Mapping[str, Any], unknown: Mapping[str, float]) -> UnknownReference:
-        """Of a table of a case, and values for what it leaves unknown."""
+        """Build the reference of a table of a case, with values of its unknowns."""
         family = REFERENCES[table["kind"]]
         (values,) = family.read({**table, **unknown}, f"[{REFERENCE}]")
         # Static fields must be hashable.
@@ -45,16 +45,16 @@ class UnknownReference(eqx.Module):
         return cls(numbers, jnp.zeros(1), tuple(unknown), family.kind, rest)
 
     def at(self, time: Float[Array, " ticks"]) -> UnknownReference:
-        """The same reference at other instants."""
+        """Return the reference at other instants."""
         return replace(self, time=jnp.asarray(time))
 
     def with_unknowns(self, places: tuple, theta: Float[Array, " p"]) -> UnknownReference:
-        """The same reference with theta[k] where places[k] is one of its unknowns."""
+        """Return the reference with theta[k] for each places[k] that is one of its unknowns."""
         own = [k for k, (path, _) in enumerate(places) if path[0] == REFERENCE]
         return replace(self, numbers=jnp.stack([jnp.asarray(theta[k]) for k in own])) if own else self
 
     def __call__(self) -> Float[Array, "ticks 1"]:
-        """The position of the one drive at its instants [m or rad]."""
+        """Return the position of the one drive at its instants [m or rad]."""
         values = dict(self.known) | dict(zip(self.names, self.numbers, strict=True))
         follow = REFERENCES[self.kind].follow
         assert follow is not None, "only families that can be followed have unknowns"
