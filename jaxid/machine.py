@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.controllers import Controller
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
@@ -53,7 +54,7 @@ class Machine:
         """Return the machine with another plant and its unknowns."""
         return replace(self, plant=plant, parameters=parameters)
 
-    def with_estimate(self, theta: Sequence[float] | np.ndarray) -> Machine:
+    def with_estimate(self, theta: Sequence[float] | Array) -> Machine:
         """Return the machine with these values of its unknowns, which are also the new guesses."""
         values = np.asarray(theta, dtype=np.float64)
         parameters = self.parameters.with_guess(values.tolist())

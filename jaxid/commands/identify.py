@@ -92,7 +92,7 @@ def identify(
         raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     options = {}
     if solver is not None:
-        options["solver"] = _checked("solver", solver, SOLVERS, method)
+        options["solver"] = _checked("solver", solver, tuple(SOLVERS), method)
     if on is not None:
         options["on"] = _checked("on", on, OUTPUTS, method)
     session = open_session(case, log, validate, method=method)

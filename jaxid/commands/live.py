@@ -80,7 +80,7 @@ class Live:
         self._online, self._rows = None, None
         if identify:
             if "model" not in self._controller.of_machine or self.adapts:
-                kind = case.controller.kind
+                kind = "" if case.controller is None else case.controller.kind
                 what = "identifies by itself" if self.adapts else "has no model to put what is found into"
                 raise InputError(
                     f"a controller of kind {kind!r} {what}",
