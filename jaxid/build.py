@@ -184,7 +184,7 @@ def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
         given = entry.parameters.get(name)
         if isinstance(given, tuple):
             for k, v in enumerate(given):
-                # Of one entry a joint it is the joint's motion, where these differ.
+                # A list with one entry a joint has the motion of each joint.
                 motion = info.motion or (plant.motion(k) if info.more == 0 else None)
                 entries: list[tuple[str, int | tuple[int, int], Value]]
                 if isinstance(v, Value):

@@ -31,7 +31,7 @@ class SimulatedLog:
     """A simulated log.
 
     Args:
-        log: As a sensor would have recorded it.
+        log: The log that the sensors would have recorded.
         trajectory: The motion behind it, without noise, one row a tick.
         columns: Names of the columns, as the case's [log] has them; else q, u, ref, or q1, q2 and so on.
     """
@@ -261,24 +261,24 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
 
 def refuse_impossible(plant: Plant, positions: np.ndarray, where: str, period: float | None = None) -> None:
     """Refuse positions that the machine cannot take; `period` is the time from one to the next."""
-    found = plant.impossible(positions)
-    if found is not None:
-        row, what = found
+    fault = plant.impossible(positions)
+    if fault is not None:
+        row, what = fault
         when = "" if period is None else f" at t = {row * period:.4g} s"
         raise InputError(what + when, where=where, hint="keep away from it, or check the lengths")
 
 
 def _refuse_ended(plant: Plant, run: Trajectory, period: float, where: str) -> None:
-    """Refuse a motion that ended where the machine cannot go on."""
+    """Refuse a motion that ended in a position which the machine cannot leave."""
     known = np.isfinite(run.position).all(axis=1)
     if known.all():
         return
     last = max(int(np.argmin(known)) - 1, 0)
     q, v = np.asarray(run.position)[last], np.asarray(run.velocity)[last]
-    found = plant.impossible(q + period * np.arange(3)[:, None] * v)
-    if found is not None:
+    fault = plant.impossible(q + period * np.arange(3)[:, None] * v)
+    if fault is not None:
         raise InputError(
-            f"the motion ends at t = {last * period:.4g} s: {found[1]}",
+            f"the motion ends at t = {last * period:.4g} s: {fault[1]}",
             where=where,
             hint="keep reference or input away from it, or check gains and lengths",
         )

@@ -1,4 +1,4 @@
-"""Case files: the machine that a log came from, what is known of it and what is unknown."""
+"""Cases: a machine with its known and unknown parameters, the columns of its logs, and settings."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from jaxid.schema import (
     whole,
 )
 
-# Of a plant whose lists say how many joints it has.
+# Most joints of a plant whose lists give their number.
 _MOST_JOINTS = 50
 
 
@@ -55,7 +55,7 @@ def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
     """Read [plant].
 
     Raises:
-        InputError: If it states what the plant cannot have, or not what it must.
+        InputError: If it has a key or value that the plant cannot have, or lacks one.
     """
     spot = root.under("[plant]")
     cls = PLANTS[read_kind(table, PLANTS, spot)]
@@ -324,7 +324,7 @@ def check_kinds(classes: Iterable[type[Effect]], root: Spot) -> None:
     for cls in classes:
         if known.setdefault(cls.kind, cls) is not cls:
             hint = "give one of them another kind"
-            raise root.fault(f"two effects of your own are of kind '{cls.kind}'", hint)
+            raise root.fault(f"two user-defined effects are of kind '{cls.kind}'", hint)
 
 
 def _check_keys(table: dict[str, Any], names: list[str], spot: Spot) -> None:

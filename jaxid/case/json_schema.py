@@ -88,7 +88,7 @@ def case_schema() -> dict[str, Any]:
     return {
         "$schema": DRAFT,
         "title": "jaxid case",
-        "description": "machine that a log came from: what is known of it, and what is unknown",
+        "description": "a machine, the columns of its logs, and the settings of every method",
         "type": "object",
         "properties": {name: tables[name] for name in TOP},
         "required": ["plant"],

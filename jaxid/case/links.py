@@ -149,19 +149,19 @@ def read_shafts(shafts: Any, geometry: Geometry, spot: Spot) -> tuple[tuple[floa
         raise spot.at("shafts").fault("is not a list of tables", "write [[plant.shafts]], in double brackets")
     joints, out = len(geometry.joints), []
     for k, shaft in enumerate(shafts, start=1):
-        own = spot.under(f"[[plant.shafts]] {k}")
-        given = read_table(shaft, SHAFT, own)
+        at = spot.under(f"[[plant.shafts]] {k}")
+        given = read_table(shaft, SHAFT, at)
         named = given["joints"]
-        check_places(shaft["joints"], named, joints, "joint", own.at("joints"))
+        check_places(shaft["joints"], named, joints, "joint", at.at("joints"))
         if len({geometry.joints[j - 1] for j in named}) > 1:
-            raise own.at("joints").refuse(
+            raise at.at("joints").refuse(
                 shaft["joints"],
                 "names joints that turn and joints that slide",
                 "a shaft goes with joints of one kind",
             )
         ratios = given.get("ratios", (1.0,) * len(named))
         if len(ratios) != len(named) or 0.0 in ratios:
-            raise own.at("ratios").refuse(
+            raise at.at("ratios").refuse(
                 shaft["ratios"],
                 f"does not go with {len(named)} joints",
                 "give a ratio other than zero for each",

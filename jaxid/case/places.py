@@ -34,7 +34,7 @@ def read_ports(
             ("no springs", "chain or flexible_axis")
             if cls.with_springs
             else (
-                "springs of its own",
+                "springs",
                 "axis, or state the spring there",
             )
         )
@@ -62,8 +62,8 @@ def read_ports(
             what, hint = f"has no command for {cls.kind} to act on", "name the joint of the drive"
             raise spot.at(name).refuse(table[name], what, hint)
         if name == "tool" and not cls.any_direction:
-            alike = "what is the same in all directions (added_mass, viscous_friction)"
-            hint = f"name a joint; on a tool acts {alike}"
+            uniform = "effects that are the same in all directions (added_mass, viscous_friction)"
+            hint = f"name a joint; on a tool act {uniform}"
             raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", hint)
         return tuple(before + k for k in _places(table, name, there[name], spot)), name
     if "joint" in table:

@@ -1,4 +1,4 @@
-"""A user's own effect: a class in a Python file beside the case.
+"""User-defined effects: a class in a Python file beside the case.
 
 It belongs to the cases that name it: the registry of all cases is left as it was.
 """
@@ -28,11 +28,11 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
 
     Args:
         kind: "my_effects.py:MyEffect".
-        folder: Where relative files start from.
-        spot: Where the kind stands.
+        folder: Folder from which relative file names start.
+        spot: Position of the kind in the case.
 
     Returns:
-        The class; its `kind` is the text where it gives none.
+        The class; its `kind` is the text, if the class gives none.
 
     Raises:
         InputError: If there is no such file or class, it does not import, it is no effect, or its
@@ -82,7 +82,7 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
             kind, f"cannot be imported ({type(error).__name__}: {error})", f"correct {path.name}"
         ) from error
     finally:
-        # What it registers is its case's, not every case's.
+        # Effects that it registers belong to its case, not to every case.
         EFFECTS.clear()
         EFFECTS.update(before)
     _LOADED[path] = (changed, module)

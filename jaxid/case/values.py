@@ -27,10 +27,10 @@ class Value:
     """One number of a machine.
 
     Args:
-        guess: The known value, or where a fit starts.
+        guess: Known value, or start of a fit.
         free: Whether it is to be identified.
-        lower, upper: Bounds, where it is.
-        true: What a simulation uses in its place; None: `guess`.
+        lower, upper: Bounds of an unknown value.
+        true: Value for simulations; None: `guess`.
     """
 
     guess: float
@@ -40,7 +40,7 @@ class Value:
     true: float | None = None
 
     def start(self, at_truth: bool) -> float:
-        """Return the guess, or the true value where there is one and it is asked for."""
+        """Return the guess; or the true value, if it is asked for and there is one."""
         return self.true if at_truth and self.true is not None else self.guess
 
 
@@ -79,15 +79,15 @@ def values_schema(info: ParameterInfo) -> dict[str, Any]:
 
 
 def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
-    """Check a value against what its parameter may be.
+    """Read one value of a parameter.
 
     Args:
         value: `3.0`, or a table of guess, min, max, true.
         info: The parameter.
-        spot: Where it stands.
+        spot: Position of the value, for messages.
 
     Raises:
-        InputError: If it is no finite number, of the wrong sign, or outside its own bounds.
+        InputError: If it is not a finite number, has the wrong sign, or lies outside of its bounds.
     """
     signed = number(info.sign)
     if isinstance(value, list):
@@ -97,7 +97,7 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
         raise spot.refuse(value, "must be a known number", hint)
     if not isinstance(value, dict):
         if isinstance(value, bool) or not isinstance(value, int | float):
-            hint = "give a number where it is known, { guess = ... } where it is not"
+            hint = "give a number if it is known, { guess = ... } if it is not"
             raise spot.refuse(value, "is not a number", hint)
         return Value(signed(value, spot))
     given = read_table(value, _keys(info), spot)
@@ -116,14 +116,14 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
 def read_values(
     value: Any, info: ParameterInfo, places: int, spot: Spot, what: str = "joint"
 ) -> tuple[Value, ...]:
-    """Check a value for several places: one for each of them, or a list.
+    """Read the values of several places: one for all of them, or a list.
 
     Args:
         value: A value, a list of values, or a table of lists.
         info: The parameter.
-        places: How many there are.
-        spot: Where it stands.
-        what: What a place is, for messages.
+        places: Number of places.
+        spot: Position of the value, for messages.
+        what: Noun of a place, for messages.
 
     Returns:
         One value a place.

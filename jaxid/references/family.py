@@ -88,7 +88,7 @@ def for_all_joints(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Grid:
-    """The instants at which a reference is wanted, and what else a family may need.
+    """The instants of a reference, and the context that a family may need.
 
     Attributes:
         rate_hz: Samples per second.
@@ -96,7 +96,7 @@ class Grid:
         base_dir: Folder that relative file names start from.
         joint: 0-based joint, so that random ones differ.
         where: File and table, for messages.
-        plant: What is to follow, for a family that asks for its kinematics; None where it is not known.
+        plant: Plant that follows, for a family that needs its kinematics; None: not known.
     """
 
     rate_hz: float | int
@@ -129,10 +129,10 @@ class Family:
         kind: Its name in a case.
         doc: One line for the user.
         keys: Every parameter allowed, by name.
-        sample: From the values of one joint to its positions at the grid's instants; or, where
-            `together`, from those of all joints to theirs, (samples, joints).
+        sample: Function from the values of one joint to its positions at the grid's instants; with
+            `together`, from the values of all joints to their positions, (samples, joints).
         unknown: Parameters that may be unknown, and are then fitted by `output_error`.
-        follow: As `sample`, from values and instants [s] as JAX's arrays; where any may be unknown.
+        follow: Like `sample`, with values and instants [s] as JAX arrays; for families with unknowns.
         together: Whether the joints are sampled together.
     """
 

@@ -77,8 +77,8 @@ def string_moves(
     """Visit targets one after the other.
 
     Args:
-        start: Where the axis stands at time zero [position].
-        targets: Where it goes, in turn [position].
+        start: Position at time zero [position].
+        targets: Positions to visit in turn [position].
         limits: Speed, acceleration and perhaps jerk, for `plan_move`.
         values: Holds `onset` [s] of the first move, `dwell` [s] at each target and `repeat`: whether the
             targets are visited anew until the grid ends, or the last one is held.

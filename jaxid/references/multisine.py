@@ -32,7 +32,7 @@ def _phases(count: int, values: dict[str, Any], joint: int) -> Float[np.ndarray,
     if values["phases"] == "schroeder":
         k = np.arange(1, count + 1)
         return -np.pi * k * (k - 1) / count
-    # The joint is part of the seed: joints that move alike could not be told apart.
+    # The joint is part of the seed: joints with equal motions could not be separated.
     return np.random.default_rng([values["seed"], joint]).uniform(0.0, 2.0 * np.pi, count)
 
 

@@ -1,4 +1,4 @@
-"""A reference of which some numbers are unknown: what a loop followed when nobody logged it."""
+"""References with unknown numbers, for loops whose reference was not logged."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class UnknownReference(eqx.Module):
     Args:
         numbers: Values of the unknowns.
         time: Instants from the start of the log [s].
-        names: Of the unknowns.
-        kind: Of the family.
+        names: Names of the unknowns.
+        kind: Kind of the family.
         known: Its other values.
     """
 
@@ -50,8 +50,8 @@ class UnknownReference(eqx.Module):
 
     def with_unknowns(self, places: tuple, theta: Float[Array, " p"]) -> UnknownReference:
         """Return the reference with theta[k] for each places[k] that is one of its unknowns."""
-        own = [k for k, (path, _) in enumerate(places) if path[0] == REFERENCE]
-        return replace(self, numbers=jnp.stack([jnp.asarray(theta[k]) for k in own])) if own else self
+        ours = [k for k, (path, _) in enumerate(places) if path[0] == REFERENCE]
+        return replace(self, numbers=jnp.stack([jnp.asarray(theta[k]) for k in ours])) if ours else self
 
     def __call__(self) -> Float[Array, "ticks 1"]:
         """Return the position of the one drive at its instants [m or rad]."""
