@@ -53,7 +53,7 @@ class _Joint:
 def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
     """Read an arm from a URDF file.
 
-    Links behind fixed joints are one body. Joints outside of the chain from the first link to the tip are held
+    Links behind fixed joints are one body. Joints outside the chain from the first link to the tip are held
     at zero, and the links that they carry are part of the body that they stand on. Shapes, limits,
     transmissions and <dynamics> (declare friction as effects) are passed over.
 
