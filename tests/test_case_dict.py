@@ -98,3 +98,18 @@ def test_a_fingerprint_is_of_the_contents():
     # A key that is stated at its default does not make another case.
     other["simulation"] = {**SCENE["simulation"], "substeps": 4}
     assert fingerprint(load_case(one)) == fingerprint(load_case(other))
+
+
+def test_a_session_builds_one_machine(monkeypatch):
+    from jaxid import session
+
+    built = []
+    build = session.build_machine
+    monkeypatch.setattr(session, "build_machine", lambda *a, **k: built.append(1) or build(*a, **k))
+    case = demo()
+    case["log"].pop("reference")
+    case["reference"] = {"kind": "csv", "file": str(DEMO / "log.csv"), "column": "ref", "time": "t"}
+    case["validation"] = [{"name": "second", "log": str(DEMO / "validation.csv")}]
+    opened = jaxid.open_session(case, DEMO / "log.csv")
+    assert len(built) == 1
+    assert all(run.log.reference is not None for run in opened.runs)
