@@ -209,7 +209,7 @@ def test_too_short(csv_file):
     [
         ({"time": None}, "neither time nor sample_rate"),
         ({"position": None}, "'position' is missing; add position"),
-        ({"forse": "u"}, "unknown key 'forse'; did you mean 'force'"),
+        ({"forse": "u"}, "unknown key 'forse'; there is: time, sample_rate, position, force"),
         ({"hold": "zero-order"}, "hold = \"zero-order\" is unknown; did you mean 'zero_order'"),
         ({"sample_rate": -1.0}, "sample_rate = -1.0 is not positive; it must be > 0"),
         ({"rows": [-5, 100]}, r"rows = \[-5, 100\] is not a range of rows"),

@@ -102,7 +102,7 @@ def test_guesses_and_known_values_stand_in_the_plant(tmp_path):
 
 def test_true_values_take_the_place_of_guesses_only_where_asked(tmp_path):
     guess = machine(tmp_path)
-    true = machine(tmp_path, true=True)
+    true = machine(tmp_path, at_truth=True)
     assert float(true.plant.inertia) == 95.0
     assert float(true.plant.effects[1].amplitude) == 2.0
     # without a truth the guess is the truth

@@ -310,7 +310,7 @@ def test_file_faults(folder):
     refuse({**table, "file": "rf.csv"}, r"no such file; .*ref\.csv", base_dir=folder)
     refuse({**table, "column": "A"}, "no column 'A'; did you mean 'a'", base_dir=folder)
     refuse({**table, "time": "b"}, "time does not run forward in row 1", base_dir=folder)
-    refuse({**table, "column": 3}, "column = 3 is no text", base_dir=folder)
+    refuse({**table, "column": 3}, "column = 3 is not a text", base_dir=folder)
     np.savez(folder / "ref.npz", m=np.ones((9, 2)), bad=np.array([1.0, np.nan, 2.0]))
     matrix = {"kind": "csv", "file": "ref.npz", "column": "m"}
     refuse(matrix, r"is a matrix; name one of its columns: 'm\[1\]'", base_dir=folder)

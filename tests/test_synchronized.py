@@ -178,7 +178,7 @@ def test_targets_are_uniform_in_the_polygon_and_repeat_by_seed():
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"polygon": None}, "polygon = None is no list of points"),
+        ({"polygon": None}, "polygon = None is not a list of points"),
         ({"polygon": [[0.0, 0.0], [1.0, 0.0]]}, "polygon has 2 corners; give at least 3, for 2 joints"),
         ({"polygon": [[0, 0], [1, 1], [2, 2]]}, "polygon has no area"),
         ({"polygon": [*SQUARE, [0.5, 0.2]]}, "corner 5 of polygon lies within the others"),

@@ -10,7 +10,8 @@ from jaxid.case.case import load_case
 from jaxid.effects import EFFECTS
 
 OWN_EFFECT = """
-from jaxid.model.plant import Action, Effect, parameter
+from jaxid.model.effect import Action, Effect
+from jaxid.model.parameter import parameter
 
 class Wind(Effect):
     {kind}
@@ -118,7 +119,7 @@ def test_own_effect_does_not_take_a_name_there_is(tmp_path):
     assert "takes the name of an effect there is: viscous_friction" in told
     write(
         tmp_path,
-        "from jaxid.effects import register\nfrom jaxid.model.plant import Effect\n"
+        "from jaxid.effects import register\nfrom jaxid.model.effect import Effect\n"
         '@register("viscous_friction")\nclass ViscousFriction(Effect):\n    pass\n',
         "theirs.py",
     )
