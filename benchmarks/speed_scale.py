@@ -58,7 +58,7 @@ def _study(name: str, runs: int, scheduler: str | None = None) -> dict:
     path, counts = CASES[name]
     case = jaxid.load_case(path)
     if counts is not None:
-        case = replace(case, sensor={**case.sensor, "position_resolution": counts})
+        case = replace(case, sensor=replace(case.sensor, position_resolution=counts))
     chunk = Plan.of(case, runs=runs).chunk
     # Two chunks a core: whichever worker takes them, all compile.
     first = _timed(lambda: jaxid.study(case, runs=2 * chunk * cores(), scheduler=scheduler), 1)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,38 +23,40 @@ from jaxid.model.parameter import ParameterInfo, as_array, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import REFERENCE, Free, Parameters, effect_name, label
+from jaxid.names import AXES
 from jaxid.references import REFERENCES
 from jaxid.references.unknown import UnknownReference
+from jaxid.schema import stated
 from jaxid.sensors.encoder import Sensor
 from jaxid.sensors.inertial import Inertial, InertialSensors
+from jaxid.settings import Recursive
 
-# Velocity above which a joint's row counts for a law that identifies, where the case states none.
+# Velocity [m/s or rad/s] above which a joint's row counts for an adaptive controller by default.
 _GATE = 1e-2
 
 
 def build_machine(case: Case, *, at_truth: bool = False, period: float | None = None) -> Machine:
-    """Make a machine of a case.
+    """Build the machine of a case.
 
     Args:
         case: The case.
-        at_truth: Take the `true` values where there are any, in place of the guesses.
-        period: Sampling time [s] of the log, which a controller without its own runs at; absent:
-            what [log] or [simulation] give as sample_rate.
+        at_truth: Whether to take the `true` values, if there are any, in place of the guesses.
+        period: Sampling time [s] of the log, for a controller without a period; None: from the
+            sample_rate of [log] or [simulation].
 
     Returns:
         The machine.
 
     Raises:
-        InputError: If the controller's period is not to be found, or the case asks for what
-            this version does not have.
+        InputError: If the controller's period is not known, or entries of the case contradict each other.
     """
-    if case.transmission is not None:
-        hint = "leave it out, and state what the joints do and their drives"
+    if case.actuator.transmission is not None:
+        hint = "leave it out, and give positions and forces of the joints"
         what = "transmission goes with a measured log that is checked, fitted or searched"
-        raise InputError(what, where=f"{case.path}, [actuator]", hint=hint)
+        raise InputError(what, where=f"{case.where}, [actuator]", hint=hint)
     plant, free = _plant(case, at_truth)
-    unknown_reference, more = _course(case, at_truth, plant)
-    gain = np.asarray(case.gain, dtype=np.float64) * np.asarray(plant.gearing)
+    unknown_reference, more = _unknown_reference(case, at_truth, plant)
+    gain = np.asarray(case.actuator.gain, dtype=np.float64) * np.asarray(plant.gearing)
     gain = np.broadcast_to(gain, (case.plant.drives,)).copy()
     controller = _controller(case, period, gain)
     sensor = _sensor(case, controller, plant)
@@ -67,9 +68,9 @@ def build_machine(case: Case, *, at_truth: bool = False, period: float | None = 
         gain=gain,
         units=case.plant.units,
         controller=controller,
-        disturbance=(case.controller or {}).get("disturbance"),
+        disturbance=None if case.controller is None else case.controller.disturbance,
         sensor=sensor,
-        hold=case.log.get("hold", "zero_order"),
+        hold=case.hold,
         unknown_reference=unknown_reference,
     )
 
@@ -88,31 +89,32 @@ def make_plant(case: Case | str | Path, *, at_truth: bool = False) -> Plant:
 
 
 def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:
-    """What measures; readings slower than the loop are held for some of its ticks."""
-    given = {name: as_array(value) for name, value in case.sensor.items() if name != "rate"}
+    """Return the sensors; readings slower than the loop are held for some of its ticks."""
+    given = {name: as_array(value) for name, value in stated(case.sensor).items() if name != "rate"}
     given["inertial"] = _inertial(case, controller, plant) if case.inertial_sensors else None
-    if "rate" not in case.sensor:
+    if case.sensor.rate is None:
         return Sensor(**given)
-    hold = _held(case.sensor["rate"], controller, f"{case.path}, [sensor]")
-    # A difference over part of a hold is nothing, and then several times too much.
+    hold = _ticks_held(case.sensor.rate, controller, f"{case.where}, [sensor]")
+
+    # A difference over a part of a hold is zero, and then several times too large.
     for name in ("velocity_average", "reach"):
         ticks = getattr(controller, name, 0)
         if ticks % hold:
             raise InputError(
                 f"{name} = {ticks} ticks, and readings are new every {hold}",
-                where=f"{case.path}, [controller]",
+                where=f"{case.where}, [controller]",
                 hint=f"take {name} = {hold}, or a multiple of it",
             )
     return Sensor(**given, hold=hold)
 
 
 @eqx.filter_jit
-def _told(sensors: InertialSensors, plant: Plant, q: Array, readings: Array, zero: Array) -> Array:
+def _identifiable(sensors: InertialSensors, plant: Plant, q: Array, readings: Array, zero: Array) -> Array:
     return sensors.fused(plant, q, readings, zero, zero)[2]
 
 
-def _held(rate: float, controller: Controller | None, where: str) -> int:
-    """Ticks of the loop for which readings at this rate are held."""
+def _ticks_held(rate: float, controller: Controller | None, where: str) -> int:
+    """Return the ticks of the loop for which readings at a rate [Hz] are held."""
     if controller is None:
         hint = "leave it out; sample_rate says how often a log without a loop is read"
         raise InputError("rate goes with a loop", where=where, hint=hint)
@@ -124,37 +126,39 @@ def _held(rate: float, controller: Controller | None, where: str) -> int:
 
 
 def _inertial(case: Case, controller: Controller | None, plant: Plant) -> InertialSensors:
-    """Gyroscopes and accelerometers; together they must tell every joint, wherever the plant stands."""
+    """Return gyroscopes and accelerometers; together they must determine every joint in any position."""
     sensors, known, holds = [], [], []
-    for k, stated in enumerate(case.inertial_sensors, start=1):
-        own = {n: v for n, v in stated.items() if n not in ("rate", "calibrated", "link")}
-        own["link"] = stated["link"] - 1
-        nominal = {n: v for n, v in own.items() if n not in ("rotation", "scale", "bias")}
-        sensors.append(Inertial(**own))
-        known.append(Inertial(**(own if stated.get("calibrated", True) else nominal)))
-        where = f"{case.path}, [[inertial_sensors]] {k}"
-        holds.append(_held(stated["rate"], controller, where) if "rate" in stated else 1)
+    for k, entry in enumerate(case.inertial_sensors, start=1):
+        exact = {n: v for n, v in stated(entry).items() if n not in ("rate", "calibrated")}
+        exact |= {"link": entry.link - 1, "axes": tuple(AXES.index(axis) for axis in entry.axes)}
+        nominal = {n: v for n, v in exact.items() if n not in ("rotation", "scale", "bias")}
+        sensors.append(Inertial(**exact))
+        known.append(Inertial(**(exact if entry.calibrated else nominal)))
+        where = f"{case.where}, [[inertial_sensors]] {k}"
+        holds.append(1 if entry.rate is None else _ticks_held(entry.rate, controller, where))
     out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
+
+    # Three random positions show whether the readings determine the motion.
     zero = np.zeros(plant.joints)
     rng = np.random.default_rng(0)
     try:
         positions = [plant.any_motion(rng)[0] for _ in range(3)]
     except InputError as error:
-        raise InputError(f"{case.path}, [plant.parameters]: {error}") from error
+        raise InputError(f"{case.where}, [plant.parameters]: {error}") from error
     for q in positions:
         readings = out.read(plant, q, zero, zero)
-        if not bool(_told(out, plant, q, readings, zero)):
+        if not bool(_identifiable(out, plant, q, readings, zero)):
             what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"
             raise InputError(
-                f"{what} do not tell the motion of every joint",
-                where=f"{case.path}, [[inertial_sensors]]",
+                f"{what} do not determine the motion of every joint",
+                where=f"{case.where}, [[inertial_sensors]]",
                 hint="add one of each kind on the last link, or with more axes, and a range beyond gravity",
             )
     return out
 
 
 def _plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
-    """The plant with its effects, and the unknowns."""
+    """Return the plant with its effects, and the unknowns."""
     plant, free = _bare_plant(case, at_truth)
     for entry in case.effects:
         for at in range(len(entry.ports)):
@@ -165,21 +169,22 @@ def _plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
 
 
 def _check_weights(plant: Plant, case: Case) -> None:
-    """A coefficient of friction needs a weight that it is of."""
+    """Refuse a coefficient of friction on a joint without weight."""
     for effect in plant.effects:
         if getattr(effect, "friction_coefficient", None) is None:
             continue
         if not float(np.asarray(plant.port_normal(np.zeros(plant.joints)))[effect.port]) > 0:
-            what = f"{label(plant, effect.kind, effect.port)} has a friction_coefficient where nothing weighs"
+            name = label(plant, effect.kind, effect.port)
+            what = f"{name} has a friction_coefficient, but its joint carries no weight"
             hint = "let [plant] gravity be positive, or give the friction by its level"
-            raise InputError(what, where=str(case.path), hint=hint)
+            raise InputError(what, where=case.where, hint=hint)
 
 
 def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
-    """The plant without effects, and its own unknowns."""
+    """Return the plant without effects, and its unknowns."""
     entry = case.plant
     known: dict[str, Any] = {"gravity": entry.gravity, "vertical": entry.vertical}
-    sharpness = case.simulation.get("sharpness")
+    sharpness = case.simulation.sharpness
     known |= {"smoothing": None if sharpness is None else Smoothing(sharpness), "actuated": entry.actuated}
     options = {
         name: value
@@ -188,34 +193,36 @@ def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
     }
     values: dict[str, Any] = {}
     for name, given in entry.parameters.items():
-        listed = isinstance(given, tuple)
-        values[name] = _starts(given, at_truth) if listed else given.start(at_truth)
+        values[name] = _guesses(given, at_truth) if isinstance(given, tuple) else given.start(at_truth)
     plant = entry.cls(**values, **options, **entry.options)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
         given = entry.parameters.get(name)
         if isinstance(given, tuple):
             for k, v in enumerate(given):
-                # Of one entry a joint it is the joint's motion, where these differ.
+                # A list with one entry a joint has the motion of each joint.
                 motion = info.motion or (plant.motion(k) if info.more == 0 else None)
-                row = [(k, v)] if isinstance(v, Value) else [((k, i), x) for i, x in enumerate(v)]
-                for at, x in row:
-                    number = k + 1 if isinstance(v, Value) else f"{k + 1}, {at[1] + 1}"
+                entries: list[tuple[str, int | tuple[int, int], Value]]
+                if isinstance(v, Value):
+                    entries = [(f"{k + 1}", k, v)]
+                else:
+                    entries = [(f"{k + 1}, {i + 1}", (k, i), x) for i, x in enumerate(v)]
+                for number, at, x in entries:
                     free += _free(x, f"{name}[{number}]", (name,), info, motion, case, at_truth, index=at)
         elif given is not None:
             free += _free(given, name, (name,), info, info.motion, case, at_truth)
     return plant, free
 
 
-def _starts(given: tuple, at_truth: bool) -> list:
-    """Values of a list, or of a list of lists."""
-    return [v.start(at_truth) if isinstance(v, Value) else _starts(v, at_truth) for v in given]
+def _guesses(given: tuple, at_truth: bool) -> list:
+    """Return the guesses (or true values) of a list, or of a list of lists."""
+    return [v.start(at_truth) if isinstance(v, Value) else _guesses(v, at_truth) for v in given]
 
 
 def _with_effect(
     plant: Plant, entry: EffectEntry, at: int, case: Case, at_truth: bool
 ) -> tuple[Plant, list[Free]]:
-    """The plant with an effect on one of its ports, and the effect's unknowns."""
+    """Return the plant with an effect on one of its ports, and the unknowns of the effect."""
     values = {name: of_ports[at] for name, of_ports in entry.parameters.items()}
     effect = entry.cls(port=entry.ports[at], **{name: v.start(at_truth) for name, v in values.items()})
     key = effect_name(plant, effect)
@@ -239,7 +246,7 @@ def _free(
     *,
     index: int | tuple[int, int] | None = None,
 ) -> list[Free]:
-    """The unknown that a value is; empty where it is known."""
+    """Return a value as a list of one unknown; empty if it is known."""
     if not value.free:
         return []
     unit = case.plant.units.label(info.dimension, motion)
@@ -247,12 +254,16 @@ def _free(
     return [Free(name, path, unit, info.sign, guess, *bounds, index=index, true=value.true)]
 
 
-def _course(case: Case, at_truth: bool, plant: Plant) -> tuple[UnknownReference | None, list[Free]]:
-    """The reference that has unknowns, and these."""
+def _unknown_reference(
+    case: Case, at_truth: bool, plant: Plant
+) -> tuple[UnknownReference | None, list[Free]]:
+    """Return the reference and its unknowns; None and an empty list if all of it is known."""
     if not case.unknown_reference:
         return None, []
     values = {name: v.start(at_truth) for name, v in case.unknown_reference.items()}
-    unknown_reference, free = UnknownReference.of(case.reference, values), []
+    assert case.reference is not None, "unknowns of a reference are read from its table"
+    unknown_reference = UnknownReference.of(case.reference, values)
+    free: list[Free] = []
     motion, keys = plant.motion(plant.driven(plant.joints)[0]), REFERENCES[unknown_reference.kind].keys
     for name, value in case.unknown_reference.items():
         path, info = (REFERENCE, name), info_of(keys[name])
@@ -261,64 +272,68 @@ def _course(case: Case, at_truth: bool, plant: Plant) -> tuple[UnknownReference 
 
 
 def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controller | None:
+    """Return the controller of a case; None if it has none."""
     if case.controller is None:
         return None
-    cls = CONTROLLERS[case.controller["kind"]]
-    # Defaults that are plain numbers would be no array leaves, and compile anew where given.
+    cls = CONTROLLERS[case.controller.kind]
+    # Defaults that are plain numbers are no array leaves: a case that states them would compile anew.
     values = {
         field.name: field.default
         for field in fields(cls)
         if field.default is not MISSING and isinstance(field.default, float)
     }
-    given = {k: v for k, v in case.controller.items() if k not in ("kind", "disturbance", "period")}
-    values |= given
+    values |= case.controller.law
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
-    arrays = {k: v if k in static else as_array(v) for k, v in values.items()}
-    period = case.controller.get("period") or _log_period(case, period)
-    plant, where = case.plant, f"{case.path}, [controller]"
-    check_drives(case.controller["kind"], plant.cls, plant.drives, plant.joints, where)
+    arrays: dict[str, Any] = {k: v if k in static else as_array(v) for k, v in values.items()}
+    period = case.controller.period or _log_period(case, period)
+    plant, where = case.plant, f"{case.where}, [controller]"
+    check_drives(case.controller.kind, plant.cls, plant.drives, plant.joints, where)
     if "model" in cls.of_machine:
-        # The law knows what the case guesses, whatever the machine truly is.
+        # The law knows the guesses of the case, not the true values.
         model, free = _plant(case, False)
         arrays |= {"model": model, "gain": as_array(gain.tolist())}
         if "estimator" in cls.of_machine:
             known = Machine(model, Parameters(tuple(free)), gain, plant.units)
-            stated = {k: arrays.pop(k) for k in ON_LINE if k in arrays}
-            arrays["estimator"] = _estimator(case, known, period, stated)
+            settings = Recursive(**{k: arrays.pop(k) for k in ON_LINE if k in arrays})
+            arrays["estimator"] = _estimator(case, known, period, settings)
     return cls(period=period, **arrays)
 
 
-def _estimator(case: Case, machine: Machine, period: float, stated: Mapping[str, Any]) -> Any:
-    """Of a law that identifies: what finds the unknowns; how certain its start is, the law says."""
+def _estimator(case: Case, machine: Machine, period: float, settings: Recursive) -> Any:
+    """Build the on-line estimator of an adaptive controller; the law itself sets the weight of its start."""
     from jaxid.estimators.recursive.real_time import RealTime
 
-    where, count = f"{case.path}, [controller]", len(machine.parameters.free)
+    where, count = f"{case.where}, [controller]", len(machine.parameters.free)
     if not count:
         hint = "take kind = 'computed_torque', or give a guess in place of a value"
-        raise InputError("kind = 'adaptive' has nothing to find: all is known", where=where, hint=hint)
-    velocity = stated.get("gate_velocity", _GATE)
-    at_guess = stated.get("start") == "guess"
+        what = "kind = 'adaptive' needs at least one unknown parameter"
+        raise InputError(what, where=where, hint=hint)
+    velocity, acceleration = settings.gate_velocity, settings.gate_acceleration
     try:
         return RealTime.of(
             machine,
             period,
             noise=1.0,
             spread=np.ones(count),
-            gate_velocity=velocity,
-            gate_acceleration=stated.get("gate_acceleration", np.inf),
-            half_life=stated.get("half_life", np.inf),
-            summed=stated.get("rows") == "summed",
-            instrument=stated.get("instrument") == "model",
-            start=machine.parameters.guess if at_guess else None,
+            gate_velocity=_GATE if velocity is None else np.asarray(velocity),
+            gate_acceleration=np.inf if acceleration is None else np.asarray(acceleration),
+            half_life=np.inf if settings.half_life is None else settings.half_life,
+            summed=settings.rows == "summed",
+            instrument=settings.instrument == "model",
+            start=machine.parameters.guess if settings.start == "guess" else None,
         )
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 
 
 def _log_period(case: Case, period: float | None) -> float:
-    rate = case.log.get("sample_rate") or case.simulation.get("sample_rate")
-    if period is None and rate is None:
+    """Return the sampling period [s] of the log, or of [log] or [simulation]."""
+    if period is not None:
+        return period
+    logged = None if case.log is None else case.log.sample_rate
+    rate = logged or case.simulation.sample_rate
+    if rate is None:
         hint = "add period = <its sampling time in s>"
-        where = f"{case.path}, [controller]"
+        where = f"{case.where}, [controller]"
         raise InputError("the controller's period is not known", where=where, hint=hint)
-    return period if period is not None else 1.0 / rate
+    return 1.0 / rate

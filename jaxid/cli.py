@@ -12,36 +12,7 @@ from typing import NoReturn
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
-
-METHODS = (
-    "output_error",
-    "inverse_dynamics",
-    "algebraic",
-    "instrumental_variable",
-    "didim",
-    "power",
-    "recursive",
-    "algebraic_single_time",
-    "algebraic_ratio",
-    "algebraic_sign_changed",
-    "algebraic_sign_unchanged",
-    "minimal_model",
-    "minimal_model_printed",
-)
-OUTPUTS = ("position", "force", "both")
-SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
-MINIMISERS = (
-    "levenberg_marquardt",
-    "optimistix.LevenbergMarquardt",
-    "optimistix.IndirectLevenbergMarquardt",
-    "optimistix.GaussNewton",
-    "optimistix.Dogleg",
-    "optimistix.BFGS",
-    "optimistix.DFP",
-    "optimistix.LBFGS",
-    "optimistix.NonlinearCG",
-    "optimistix.NelderMead",
-)
+from jaxid.names import METHODS, MINIMISERS, OUTPUTS, SOLVERS
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -95,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
         ("effects", "the effects there are, with parameters and units", _run_effects),
     ):
         commands.add_parser(name, help=what, description=what).set_defaults(run=run)
+    _schema(commands)
     _simulate(commands)
     _design(commands)
     _check(commands)
@@ -102,6 +74,13 @@ def _parser() -> argparse.ArgumentParser:
     _discover(commands)
     _study(commands)
     return parser
+
+
+def _schema(commands: argparse._SubParsersAction) -> None:
+    what = "the JSON Schema of a file, for editors that complete and check by it"
+    parser = commands.add_parser("schema", help=what, description=what)
+    parser.set_defaults(run=_run_schema)
+    parser.add_argument("file", metavar="FILE", choices=("case",), help="case: the case file")
 
 
 def _add(
@@ -263,6 +242,15 @@ def _run_effects(args: argparse.Namespace) -> int:
     from jaxid.results.catalogue import effects_table
 
     print(effects_table())
+    return 0
+
+
+def _run_schema(args: argparse.Namespace) -> int:
+    import json
+
+    from jaxid.case.json_schema import case_schema
+
+    print(json.dumps(case_schema(), indent=2, ensure_ascii=False))
     return 0
 
 

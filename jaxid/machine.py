@@ -1,36 +1,38 @@
-"""Everything that a fit or a simulation needs of a case, as arrays and modules."""
+"""Machine: a plant with its drive, controller and sensors, as arrays and modules."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.controllers import Controller
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.model.unknowns import Parameters
 from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
+from jaxid.settings import Disturbance
 
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """A plant with what drives, closes and measures it.
+    """A plant with its drive, controller and sensors.
 
     Args:
         plant: The plant at its guesses (or true values).
-        parameters: Its unknowns.
+        parameters: Unknown parameters of plant and reference.
         gain: Declared force at the joint per unit of the logged command, gears of the plant included, (m,).
-        units: Labels.
+        units: Labels of the units.
         controller: The sampled law; None: unknown, only open loop can be simulated.
-        disturbance: Added to the command in the loop: a square wave's level, on, off [s] and
-            start [s], or the name of a column of the log; None: none.
-        sensor: What is known of the measurement.
-        hold: How the command runs between samples.
-        unknown_reference: Reference with unknowns, where the log has no reference; None: it is known.
+        disturbance: Signal added to the command in the loop: a square wave, or the name of a column
+            of the log; None: nothing is added.
+        sensor: Known errors of the measurement.
+        hold: Course of the command between samples.
+        unknown_reference: Reference with unknowns, for logs without a reference; None: it is known.
     """
 
     plant: Plant
@@ -38,14 +40,14 @@ class Machine:
     gain: Float[np.ndarray, " m"]
     units: Units
     controller: Controller | None = None
-    disturbance: Mapping[str, float] | str | None = None
+    disturbance: Disturbance | str | None = None
     sensor: Sensor = Sensor()
     hold: str = "zero_order"
     unknown_reference: UnknownReference | None = None
 
     @property
     def hold_period(self) -> float | None:
-        """For how long the controller holds a command [s]; None where there is none."""
+        """Time for which the controller holds a command [s]; None without a controller."""
         return None if self.controller is None else self.controller.period
 
     def unit(self, quantity: str, joint: int = 0) -> str:
@@ -69,17 +71,17 @@ class Machine:
         return every[0] if len(set(every)) == 1 else every
 
     def with_plant(self, plant: Plant, parameters: Parameters) -> Machine:
-        """The same machine around another plant and its unknowns."""
+        """Return the machine with another plant and its unknowns."""
         return replace(self, plant=plant, parameters=parameters)
 
-    def with_estimate(self, theta: Sequence[float] | np.ndarray) -> Machine:
-        """The same machine with its unknowns set, which are also the new guesses."""
-        theta = np.asarray(theta, dtype=np.float64)
-        parameters = self.parameters.with_guess(theta)
-        plant = self.parameters.insert(self.plant, theta)
+    def with_estimate(self, theta: Sequence[float] | Array) -> Machine:
+        """Return the machine with these values of its unknowns, which are also the new guesses."""
+        values = np.asarray(theta, dtype=np.float64)
+        parameters = self.parameters.with_guess(values.tolist())
+        plant = self.parameters.insert(self.plant, values)
         unknown_reference = (
             None
             if self.unknown_reference is None
-            else self.unknown_reference.with_unknowns(self.parameters.places, theta)
+            else self.unknown_reference.with_unknowns(self.parameters.places, values)
         )
         return replace(self, plant=plant, parameters=parameters, unknown_reference=unknown_reference)

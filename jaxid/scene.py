@@ -1,4 +1,4 @@
-"""The log that a case would give: reference or input in, sensors' readings out."""
+"""Simulated logs of a case: from reference or input to the readings of the sensors."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.references import make_reference
+from jaxid.schema import stated
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, needed_substeps, open_loop
@@ -30,7 +31,7 @@ class SimulatedLog:
     """A simulated log.
 
     Args:
-        log: As a sensor would have recorded it.
+        log: The log that the sensors would have recorded.
         trajectory: The motion behind it, without noise, one row a tick.
         columns: Names of the columns, as the case's [log] has them; else q, u, ref, or q1, q2 and so on.
     """
@@ -40,7 +41,7 @@ class SimulatedLog:
     columns: dict[str, str | list[str]]
 
     def csv(self) -> str:
-        """The log as a table with a header, every digit kept."""
+        """Return the log as a table with a header, every digit kept."""
         log = self.log
         load = "load_position" in self.columns
         known = log.position[:, list(log.measured)]
@@ -70,14 +71,14 @@ class SimulatedLog:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a case says of a simulation, ready to run with any values of its parameters.
+    """A case set up for simulation, with any values of its parameters.
 
     Args:
         case: The case.
-        machine: At its true values where it has any.
-        drive: How the command acts.
+        machine: Machine at its true values, if it has any.
+        drive: Path of the command to the plant.
         signal: Reference (in a loop) or input at every tick, by drive.
-        position, velocity: At the start.
+        position, velocity: State of the joints at the start.
         every: The log holds one tick in so many.
     """
 
@@ -91,32 +92,27 @@ class Scene:
 
     @classmethod
     def of(cls, case: Case, *, longer_delays: float = 1.0) -> Scene:
-        """The scene of a case.
+        """Set up the simulation of a case.
 
         Args:
             case: The case.
-            longer_delays: How many times the case's delays may be, where parameters are drawn.
+            longer_delays: Factor by which drawn delays may exceed those of the case.
 
         Raises:
-            InputError: If the case does not say what to simulate.
+            InputError: If the case lacks reference, input, duration or sample_rate.
         """
-        where, setting = str(case.path), case.simulation
-        if "load_acceleration" in case.log:
+        where, setting = case.where, case.simulation
+        if case.log is not None and case.log.load_acceleration is not None:
             raise InputError(
                 "a simulated log has no load_acceleration",
                 where=f"{where}, [log]",
                 hint="leave it out of the case that is simulated",
             )
-        for key in ("duration", "sample_rate"):
-            if key not in setting:
-                raise InputError(
-                    f"[simulation] has no {key}", where=where, hint=f"add {key} = ... to [simulation]"
-                )
-        rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+        rate, duration = sampling_of(case)
         machine = build_machine(case, at_truth=True, period=1 / rate)
         joints = case.plant.joints
-        position = np.broadcast_to(np.asarray(setting.get("initial_position", 0.0)), joints)
-        velocity = np.broadcast_to(np.asarray(setting.get("initial_velocity", 0.0)), joints)
+        position = np.broadcast_to(np.asarray(setting.initial_position), joints)
+        velocity = np.broadcast_to(np.asarray(setting.initial_velocity), joints)
         refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
         _refuse_massless(machine.plant, position, where)
         if machine.controller is None:
@@ -135,7 +131,7 @@ class Scene:
             raise InputError("there is nothing to follow", where=where, hint="add a [reference]")
         period = machine.controller.period
         reference = make_reference(
-            case.true_reference,
+            case.true_reference or {},
             1 / period,
             duration,
             case.folder,
@@ -158,11 +154,11 @@ class Scene:
         return cls(case, machine, drive, reference, position, velocity, every)
 
     def simulated_log(self, machine: Machine, rng: np.random.Generator) -> Steps[SimulatedLog]:
-        """The log of a machine like the scene's, one run at a time.
+        """Simulate the log of a machine like the scene's, one run at a time.
 
         Args:
-            machine: Its plant and its sensor count.
-            rng: Draws the sensors' noise.
+            machine: Machine whose plant and sensor replace those of the scene.
+            rng: Generator of the sensors' noise.
         """
         joints = self.case.plant.joints
         # A law that measures the command sees the noise that the log has.
@@ -174,19 +170,17 @@ class Scene:
         times = self.drive.period * np.arange(len(self.signal))
         start, sensor = (self.position, self.velocity), (machine.sensor, noise)
         looped = machine.controller is not None
+        signal = self.signal
         if looped:
             extra = disturbance_at(machine.disturbance, times)
-            signal = (
-                self.signal
-                if machine.unknown_reference is None
-                else np.asarray(machine.unknown_reference.at(times)())
-            )
+            if machine.unknown_reference is not None:
+                signal = np.asarray(machine.unknown_reference.at(times)())
             args = (machine.plant, self.drive, machine.controller, signal, extra, *start, *sensor)
             run = yield SolveRequest(_closed_run, args)
         else:
             sensor = (machine.sensor, noise[:, :joints])
             run = yield SolveRequest(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
-        _refuse_ended(machine.plant, run, self.drive.period, str(self.case.path))
+        _refuse_ended(machine.plant, run, self.drive.period, self.case.where)
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None
         reading, command = (np.asarray(x)[pick] for x in (run.reading, run.command))
@@ -213,8 +207,22 @@ def _open_run(
     return eqx.tree_at(lambda r: r.reading, run, sensor.read(run.position, noise))
 
 
+def sampling_of(case: Case) -> tuple[float, float]:
+    """Return the sampling rate [Hz] and the duration [s] of a simulation.
+
+    Raises:
+        InputError: If [simulation] lacks one of them.
+    """
+    rate, duration = case.simulation.sample_rate, case.simulation.duration
+    if rate is None or duration is None:
+        name = "duration" if duration is None else "sample_rate"
+        hint = f"add {name} = ... to [simulation]"
+        raise InputError(f"[simulation] has no {name}", where=case.where, hint=hint)
+    return rate, duration
+
+
 def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:
-    """One signal for every drive, where there is one for all."""
+    """Return one signal for every drive, if there is one for all."""
     return np.broadcast_to(signal, (len(signal), machine.gain.size))
 
 
@@ -228,8 +236,8 @@ def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
         machine.gain,
         period,
         hold,
-        int(case.simulation.get("substeps", 4)),
-        "sharpness" not in case.simulation,
+        case.simulation.substeps,
+        case.simulation.sharpness is None,
         longest,
     )
 
@@ -253,24 +261,24 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
 
 def refuse_impossible(plant: Plant, positions: np.ndarray, where: str, period: float | None = None) -> None:
     """Refuse positions that the machine cannot take; `period` is the time from one to the next."""
-    found = plant.impossible(positions)
-    if found is not None:
-        row, what = found
+    fault = plant.impossible(positions)
+    if fault is not None:
+        row, what = fault
         when = "" if period is None else f" at t = {row * period:.4g} s"
         raise InputError(what + when, where=where, hint="keep away from it, or check the lengths")
 
 
 def _refuse_ended(plant: Plant, run: Trajectory, period: float, where: str) -> None:
-    """Refuse a motion that ended where the machine cannot go on."""
+    """Refuse a motion that ended in a position which the machine cannot leave."""
     known = np.isfinite(run.position).all(axis=1)
     if known.all():
         return
     last = max(int(np.argmin(known)) - 1, 0)
     q, v = np.asarray(run.position)[last], np.asarray(run.velocity)[last]
-    found = plant.impossible(q + period * np.arange(3)[:, None] * v)
-    if found is not None:
+    fault = plant.impossible(q + period * np.arange(3)[:, None] * v)
+    if fault is not None:
         raise InputError(
-            f"the motion ends at t = {last * period:.4g} s: {found[1]}",
+            f"the motion ends at t = {last * period:.4g} s: {fault[1]}",
             where=where,
             hint="keep reference or input away from it, or check gains and lengths",
         )
@@ -288,14 +296,14 @@ def _refuse_coarse(
     if needed > drive.substeps:
         raise InputError(
             f"[simulation] substeps = {drive.substeps} is too coarse for sharpness = "
-            f"{case.simulation['sharpness']:g}",
-            where=str(case.path),
+            f"{case.simulation.sharpness:g}",
+            where=case.where,
             hint=f"set substeps = {needed}, a larger sharpness, or none (friction then sticks exactly)",
         )
 
 
 def _scaled(machine: Machine, reference: np.ndarray, period: float) -> Machine:
-    """The velocity that the smoothed sign's sharpness multiplies: the reference's largest."""
+    """Return the machine with the largest speed of the reference as the scale of the smoothed sign."""
     speed = float(np.abs(np.diff(reference, axis=0)).max() / period)
     if speed == 0.0:
         return machine
@@ -316,7 +324,7 @@ def _log(
     if not np.all(np.isfinite(reading)):
         raise InputError(
             "the simulation diverged",
-            where=str(case.path),
+            where=case.where,
             hint="check gains and parameters, or raise substeps in [simulation]",
         )
     reading = np.array(reading)
@@ -328,7 +336,7 @@ def _log(
         force=command,
         reference=reference,
         hold=machine.hold,
-        source=f"simulation of {case.path.name}",
+        source=f"simulation of {case.name}",
     )
 
 
@@ -337,9 +345,11 @@ def _columns(case: Case, *, reference: bool) -> dict[str, str | list[str]]:
     names: dict[str, str | list[str]] = {"time": "t"}
     for key, name, count in (("position", "q", joints), ("force", "u", drives), ("reference", "ref", drives)):
         names[key] = name if count == 1 else [f"{name}{k + 1}" for k in range(count)]
-    if case.plant.cls.load is not None and (not case.log or "load_position" in case.log):
+    if case.plant.cls.load is not None and (case.log is None or case.log.load_position is not None):
         names["load_position"] = "q_load"
-    names.update({k: v for k, v in case.log.items() if k in names})
+    for key, given in ({} if case.log is None else stated(case.log)).items():
+        if key in names:
+            names[key] = given if isinstance(given, str) else list(given)
     if not reference:
         names.pop("reference")
     return names

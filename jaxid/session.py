@@ -1,8 +1,7 @@
-"""A case and its logs, opened, checked and prepared: where every command starts."""
+"""A case and its logs, opened, checked and prepared: the start of every command."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.build import build_machine
-from jaxid.case.case import Case, load_case
+from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.errors import InputError
 from jaxid.logs.log import Log, read_log, with_load
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
@@ -18,28 +17,29 @@ from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_in
 from jaxid.machine import Machine
 from jaxid.model.smoothing import typical_velocity
 from jaxid.references import make_reference
+from jaxid.settings import Actuator, Disturbance, LogTable
 from jaxid.simulation.finite_effects import need_finite_effects
 from jaxid.simulation.step_size import needed_steps
 
 
 @dataclass(frozen=True)
 class OpenedLog:
-    """One log with what was different when it was taken.
+    """One log, prepared, with the disturbance of its controller.
 
     Args:
-        name: In results.
-        log: The log, its force behind the recipe's running median where it has one.
-        data: The same, prepared.
-        disturbance: The controller's.
+        name: Name of the log in results.
+        log: The log; its force has passed the recipe's running median, if there is one.
+        data: The prepared log.
+        disturbance: Signal that was added to the controller's command.
     """
 
     name: str
     log: Log
     data: Prepared
-    disturbance: dict | str | None
+    disturbance: Disturbance | str | None
 
     def machine(self, machine: Machine) -> Machine:
-        """A machine as it stood when this log was taken."""
+        """Return a machine with the disturbance of this log."""
         return replace(machine, disturbance=self.disturbance)
 
 
@@ -51,8 +51,8 @@ class Session:
         case: The case.
         machine: Its machine.
         fit: The log to fit.
-        validations: Others, by name; prepared by the same recipe.
-        recipe: How the logs are filtered.
+        validations: Further logs with their names, prepared by the same recipe.
+        recipe: Filtering of all logs.
         findings: Warnings on the logs.
     """
 
@@ -69,55 +69,61 @@ class Session:
         return (self.fit, *self.validations)
 
     def with_machine(self, machine: Machine) -> Session:
-        """The same session around another machine."""
+        """Return the session with another machine."""
         return replace(self, machine=machine)
 
 
 def open_session(
-    case: Case | str | Path,
+    case: CaseLike,
     log: Log | str | Path,
     validate: Sequence[Log | str | Path] = (),
     *,
     align_hold: bool | None = None,
-    method: str = "output_error",
+    method: str | None = None,
 ) -> Session:
     """Open a case and its logs, check them and prepare them.
 
     Args:
-        case: The case, or its file.
+        case: The case, its file, or a dict with its tables.
         log: The log to fit, or its file.
-        validate: More logs to validate on, beside the case's own.
-        align_hold: See `jaxid.logs.prepare.Recipe`; absent: what the case's recipe implies.
-        method: That is to fit the log: only `output_error` can do with a short one, within a prior, and
-            "discover" by it.
+        validate: More logs to validate on, beside those of the case.
+        align_hold: See `jaxid.logs.prepare.Recipe`; None: as the case's recipe implies.
+        method: Method that will fit the log, or "discover": a fit within a prior can do with a short log.
+            None: within the prior, if the case has one.
 
     Raises:
         InputError: If anything in case or logs is unsound.
     """
-    case = case if isinstance(case, Case) else load_case(case)
-    read = functools.partial(_read, case)
-    case = at_joints(case)
-    fit = read(log)
+    as_logged = load_case(case)
+    case = at_joints(as_logged)
+    fit = _read(as_logged, log)
+    # The machine of the first log serves them all: only the controller's period depends on the log.
     machine = build_machine(case, period=fit.period)
-    held = method in ("output_error", "discover") and "prior" in case.output_error
-    findings = _check(case, fit, machine, held)
+
+    def read(log: Log | str | Path, columns: LogTable | None = None, *, whole: bool = False) -> Log:
+        return _followed(case, _read(as_logged, log, columns=columns, whole=whole), machine.plant)
+
+    fit = _followed(case, fit, machine.plant)
+    short = case.fits_within_prior(method)
+    findings = _check(case, fit, machine, short)
     recipe = choose_recipe(fit, case.preprocess)
     if align_hold is not None:
         recipe = replace(recipe, align_hold=align_hold)
     disturbance = machine.disturbance
-    needed = 0 if held else enough(machine)
+    needed = 0 if short else enough(machine)
+
     opened = [_run("fit", fit, machine, recipe, needed, disturbance)]
     names = {"fit"}
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
-        measured = read(source, columns=entry.columns)
-        findings += _check(case, measured, machine, held)
+        measured = read(source, entry.columns)
+        findings += _check(case, measured, machine, short)
         opened.append(_run(entry.name, measured, machine, recipe, needed, entry.disturbance))
         names.add(entry.name)
     for extra in validate:
         measured = read(extra, whole=True)
-        findings += _check(case, measured, machine, held)
+        findings += _check(case, measured, machine, short)
         name = Path(measured.source).stem
         while name in names:
             name += "'"
@@ -129,33 +135,39 @@ def open_session(
 
 
 def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None = None) -> Session:
-    """A session around a simulated log, which no file was read for and nothing can be wrong with.
+    """Open a session on a simulated log; no file checks are needed.
 
     Args:
         case: The case.
-        machine: At the start of a fit.
-        log: The log.
-        recipe: How to filter it; absent: chosen from it.
+        machine: Machine at the start of a fit.
+        log: The simulated log.
+        recipe: Filtering of the log; None: chosen from the log.
 
     Raises:
         InputError: If the log is too short, or moves too little.
     """
     recipe = recipe or choose_recipe(log, case.preprocess)
-    needed = 0 if "prior" in case.output_error else enough(machine)
+    needed = 0 if case.fits_within_prior(None) else enough(machine)
     run = _run("fit", log, machine, recipe, needed, machine.disturbance)
     return Session(case, _scaled(machine, run.data), run, (), recipe, ())
 
 
-def _read(case: Case, log: Log | str | Path, *, columns: dict | None = None, whole: bool = False) -> Log:
-    """A log, or that of a file by the case's columns or others; `whole`: all its rows."""
+def _read(case: Case, log: Log | str | Path, *, columns: LogTable | None = None, whole: bool = False) -> Log:
+    """Return a log, or read it from a file; its forces and positions are those of the joints.
+
+    Args:
+        case: The case, as it was logged.
+        log: The log, or its file.
+        columns: Columns of the file; None: those of [log].
+        whole: Whether to read all rows of the file.
+    """
     joints, drives, load = case.plant.joints, case.plant.drives, case.plant.cls.load
     if not isinstance(log, Log):
         columns = case.columns if columns is None else columns
-        kept = {k: v for k, v in columns.items() if not (whole and k == "rows")}
-        own = joints if load is None else None
-        log = read_log(log, kept, joints=own, drives=drives)
-        return _followed(case, with_load(_without_gears(case, log), load, joints))
-    log = _followed(case, with_load(log, load, joints))
+        columns = replace(columns, rows=None) if whole else columns
+        log = read_log(log, columns, joints=joints if load is None else None, drives=drives)
+        return with_load(_without_gears(case, log), load, joints)
+    log = with_load(log, load, joints)
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):
         values = getattr(log, name)
         if values is not None and values.shape[1] != width:
@@ -169,43 +181,42 @@ def _read(case: Case, log: Log | str | Path, *, columns: dict | None = None, who
 
 
 def at_joints(case: Case) -> Case:
-    """The case of what is logged at the joints, where its own logs are of motors that move several."""
-    return case if case.transmission is None else replace(case, transmission=None, gain=1.0)
+    """Return the case for logs of the joints, if its logs are of motors that move several."""
+    return case if case.actuator.transmission is None else replace(case, actuator=Actuator())
 
 
 def _without_gears(case: Case, log: Log) -> Log:
-    """A log of the motors as one of the joints: positions R^-1 p, forces R' times gain times command."""
-    if case.transmission is None:
+    """Return a log of motors as one of the joints: positions R^-1 p, forces R' times gain times command."""
+    if case.actuator.transmission is None:
         return log
-    rows = np.asarray(case.transmission)
+    rows = np.asarray(case.actuator.transmission)
     moved = {
         name: np.linalg.solve(rows, getattr(log, name).T).T
         for name in ("position", "velocity", "acceleration", "reference")
         if getattr(log, name) is not None
     }
-    return replace(log, force=log.force * np.asarray(case.gain) @ rows, **moved)
+    return replace(log, force=log.force * np.asarray(case.actuator.gain) @ rows, **moved)
 
 
-def _followed(case: Case, log: Log) -> Log:
-    """The log with the reference that the case knows, where the log has none."""
+def _followed(case: Case, log: Log, plant: Plant) -> Log:
+    """Return the log with the reference of the case, if the log has none."""
     if log.reference is not None or case.controller is None or case.reference is None:
         return log
     if case.unknown_reference:
         return log
-    rate, plant = 1 / log.period, build_machine(at_joints(case), period=log.period).plant
-    where = f"{case.path}, [reference]"
+    rate, where = 1 / log.period, f"{case.where}, [reference]"
     reference = make_reference(
         case.reference, rate, log.samples / rate, case.folder, where=where, plant=plant
     )
     return replace(log, reference=np.broadcast_to(reference, (log.samples, case.plant.drives)))
 
 
-def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
-    """Findings on a log; held: by a prior, for which two positions are a movement."""
-    limit = (case.controller or {}).get("limit")
+def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]:
+    """Check a log, and return the findings; short: a fit within a prior needs two positions only."""
+    limit = None if case.controller is None else case.controller.limit
     units, plant = machine.units, machine.plant
     motions = [plant.motion(j) or units.motion for j in range(plant.joints)]
-    driven = plant.at_drives(np.arange(plant.joints))
+    driven = np.asarray(plant.at_drives(np.arange(plant.joints)))
     stated = machine.sensor.position_resolution is not None
     findings = check_log(
         log,
@@ -213,7 +224,7 @@ def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
         motion=motions,
         units={"position": units.position} if units.position else None,
         driven=driven,
-        fewest_levels=2 if held else FEWEST_LEVELS,
+        fewest_levels=2 if short else FEWEST_LEVELS,
         resolution_stated=stated,
     )
     impossible = plant.impossible(log.position) if all(log.measured) else None
@@ -230,22 +241,22 @@ def _check(case: Case, log: Log, machine: Machine, held: bool) -> list[Finding]:
 
 
 def enough(machine: Machine) -> int:
-    """Samples of motion that a log must have, where no prior holds what it does not tell."""
+    """Return the samples of motion that a log must have for a fit without a prior."""
     return 5 * max(len(machine.parameters.free), 4)
 
 
 def _run(
-    name: str, log: Log, machine: Machine, recipe: Recipe, needed: int, disturbance: dict | str | None
+    name: str, log: Log, machine: Machine, recipe: Recipe, needed: int, disturbance: Disturbance | str | None
 ) -> OpenedLog:
     log = recipe.cleaned(log)
     return OpenedLog(name, log, _prepare(log, machine, recipe, needed), disturbance)
 
 
 def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepared:
-    left = log.samples // recipe.decimation - 2 * recipe.trim
-    if left * log.position.shape[1] < needed:
+    remaining = log.samples // recipe.decimation - 2 * recipe.trim
+    if remaining * log.position.shape[1] < needed:
         raise InputError(
-            f"too short: {log.samples} samples leave {max(left, 0)} after decimation by "
+            f"too short: {log.samples} samples leave {max(remaining, 0)} after decimation by "
             f"{recipe.decimation} and trimming {recipe.trim} at each end, as [preprocess] states or "
             "the log's noise asks",
             where=log.source,
@@ -265,7 +276,7 @@ def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepare
 
 
 def _scaled(machine: Machine, data: Prepared) -> Machine:
-    """The machine with the velocity scale of its log, which the smoothed sign multiplies."""
+    """Return the machine with the velocity scale of its log, which the smoothed sign multiplies."""
     speed = typical_velocity(machine.plant, data.qd, lambda v: float(np.sqrt(np.mean(v**2))))
     plant = machine.plant.smoothed(velocity_scale=speed)
     return machine.with_plant(plant, machine.parameters)

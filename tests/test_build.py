@@ -16,6 +16,7 @@ from jaxid.logs.log import Log
 from jaxid.model.parameter import parameter
 from jaxid.model.plant import Plant
 from jaxid.plants import PLANTS
+from jaxid.settings import Disturbance
 from jaxid.simulation.disturbance import disturbance_at
 
 CASE = """
@@ -60,7 +61,7 @@ position_resolution = 1.0e-6
 [simulation]
 sharpness = 1e-4
 """
-PULSES = {"level": 5.07, "on": 0.5, "off": 0.5, "start": 0.343}
+PULSES = Disturbance(level=5.07, on=0.5, off=0.5, start=0.343)
 
 
 def machine(folder: Path, text: str = CASE, **options):
@@ -249,14 +250,14 @@ def test_jitter_of_time_stamps_moves_no_edge(jitter):
 
 def test_edges_do_not_drift_over_a_long_log():
     # 0.1 + 0.2 is not 0.3: the rounding of 1e4 cycles must not reach a tick
-    wave = {"level": 1.0, "on": 0.1, "off": 0.2}
+    wave = Disturbance(level=1.0, on=0.1, off=0.2)
     ticks = np.arange(300_000)
     on = disturbance_at(wave, ticks * 0.01)[:, 0]
     np.testing.assert_array_equal(on, ((ticks - 1) % 30 < 10) & (ticks > 0))
 
 
 def test_disturbance_without_pause_is_a_step():
-    d = disturbance_at({"level": 2.0, "on": 1.0, "off": 0.0, "start": 1.0}, np.arange(5.0))
+    d = disturbance_at(Disturbance(level=2.0, on=1.0, off=0.0, start=1.0), np.arange(5.0))
     np.testing.assert_array_equal(d[:, 0], [0.0, 0.0, 2.0, 2.0, 2.0])
 
 

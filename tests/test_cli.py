@@ -9,9 +9,8 @@ import sys
 import numpy as np
 import pytest
 
-from jaxid import cli
+from jaxid import cli, names
 from jaxid.effects import EFFECTS
-from jaxid.estimators import METHODS
 from jaxid.plants import PLANTS
 from tests.support.cli_setup import TRUTH, held, place, recorded, refused, run, text
 
@@ -66,8 +65,13 @@ def test_plants_and_effects_with_parameters_and_units(capsys):
     assert ["period", ">", "0", "m", "rad"] in [row[:5] for row in lines]
 
 
-def test_methods_are_those_there_are():
-    assert set(cli.METHODS) == set(METHODS)
+def test_help_lists_every_method_output_and_solver(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["identify", "--help"])
+    text = "".join(capsys.readouterr().out.split())
+    assert ",".join(names.METHODS) in text
+    assert ",".join(names.OUTPUTS) in text
+    assert ",".join(names.SOLVERS) in text
 
 
 # What is written over

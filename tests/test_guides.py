@@ -11,10 +11,10 @@ import pytest
 
 import jaxid
 from jaxid import cli
-from jaxid.case.tables import USER_METHODS
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS, register_method
 from jaxid.logs.readers import READERS, read_columns, register_reader
+from jaxid.names import USER_METHODS
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "docs" / "examples"
 

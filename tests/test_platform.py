@@ -135,7 +135,12 @@ def test_the_package_does_not_import_its_tests_or_experiments():
         assert not {m.split(".")[0] for m in imports(path)} & strangers, path
 
 
-def test_the_command_line_knows_every_method():
-    from jaxid import cli, estimators
+def test_every_method_has_its_estimator():
+    from jaxid import estimators, names
 
-    assert tuple(estimators.METHODS) == cli.METHODS
+    assert tuple(estimators.METHODS) == names.METHODS
+
+
+def test_names_are_read_without_jax_or_numpy():
+    path = PACKAGE / "names.py"
+    assert imports(path) == set()

@@ -1,11 +1,11 @@
-"""Case files: what machine a log came from, what is known of it and what is not."""
+"""Cases: a machine with its known and unknown parameters, the columns of its logs, and settings."""
 
 from __future__ import annotations
 
 import difflib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +14,43 @@ import numpy as np
 from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.entries import check_kinds, read_effects, read_kind, read_plant, read_search
 from jaxid.case.reference import read_signal, read_unknown_reference
-from jaxid.case.schema import Key, Keys, Spot, read_table
 from jaxid.case.sensors import read_inertial_sensors
 from jaxid.case.tables import (
-    ALGEBRAIC,
-    IDENTIFICATION,
-    OUTPUT_ERROR,
-    STUDY,
     TOP,
-    actuator_keys,
+    ControllerTable,
     controller_keys,
-    design_keys,
-    limits_keys,
-    log_keys,
-    preprocess_keys,
-    recursive_keys,
-    sensor_keys,
-    simulation_keys,
+    controller_table,
     validation_keys,
 )
 from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError, suggest
-from jaxid.logs.log import LOG_KEYS
+from jaxid.logs.log import log_table
 from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
+from jaxid.names import DISCOVER, HOLDS
+from jaxid.schema import Counts, Spot, keys_of, plain, read_settings, read_table
+from jaxid.settings import (
+    Actuator,
+    Algebraic,
+    DesignTable,
+    Disturbance,
+    Identification,
+    InertialSensor,
+    LimitsTable,
+    LogTable,
+    OutputError,
+    Preprocess,
+    Recursive,
+    SensorTable,
+    SimulationTable,
+    StudyTable,
+    WithinPrior,
+)
+
+# Name of a case that is a dict, in messages and results.
+UNNAMED = "case"
 
 
 @dataclass(frozen=True)
@@ -47,89 +58,108 @@ class Validation:
     """One of [[validation]].
 
     Args:
-        name: What it is called in results.
-        log: Its file; None: the log of the fit.
+        name: Name in results.
+        log: Its file; None: the fitted log.
         columns: Its [log] table, complete: for `jaxid.logs.log.read_log`.
-        disturbance: The controller's on this log: a square wave's keys, or a column's name.
+        disturbance: The controller's on this log: a square wave, or the name of a column.
     """
 
     name: str
     log: Path | None
-    columns: dict[str, Any]
-    disturbance: dict[str, float] | str | None = None
+    columns: LogTable
+    disturbance: Disturbance | str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Case:
-    """A case file, checked. Tables that it does not have are empty, or None.
+    """A checked case. Tables that it does not have are at their defaults, or None.
 
     Args:
-        path: The file.
-        plant: What [plant] says.
-        effects: What [[effects]] say, in the order of the drive.
-        gain: Declared force per unit of the logged command: one, or one a drive.
-        transmission: R, rows of numbers; joint = R^-1 motor.
-        log: [log], as `jaxid.logs.log.read_log` takes it; empty where it is absent.
-        preprocess: [preprocess], for `jaxid.logs.prepare.choose_recipe`.
-        identification: [identification], for `jaxid.estimators`.
-        algebraic: [algebraic], for the estimators of that name.
-        output_error: [output_error], likewise.
-        recursive: [recursive], likewise.
-        controller: [controller].
-        sensor: [sensor].
-        inertial_sensors: [[inertial_sensors]], see `jaxid.case.sensors`.
-        limits: [limits], for `jaxid.experiment_design.limits`.
-        validations: What [[validation]] say.
-        candidates: Effects that a search may name because [discover] asks: user's own, some of jaxid's.
-        kinds: Of those that are registered, what it may name, from there; empty: all.
-        design: [design], for `jaxid.experiment_design.along_reference`.
-        reference: [reference], for `jaxid.references.make_reference`, at its guesses.
-        unknown_reference: What of it is unknown.
-        input: [input], likewise.
-        simulation: [simulation].
-        study: [study].
+        path: The case file; None for a case that was given as a dict.
+        base: Folder from which relative file names start, if there is no file.
+        tables: The tables as they were given, before they were checked.
+        plant: Entry of [plant].
+        effects: Entries of [[effects]], in the order of the drive.
+        actuator: Table [actuator].
+        log: Table [log], for `jaxid.logs.log.read_log`.
+        preprocess: Table [preprocess], for `jaxid.logs.prepare.choose_recipe`.
+        identification: Table [identification], for `jaxid.estimators`.
+        algebraic: Table [algebraic], for the estimators of that name.
+        output_error: Table [output_error], for the estimator of that name.
+        within_prior: Table [within_prior], or the same by the older keys of [output_error].
+        recursive: Table [recursive], for the estimator of that name.
+        controller: Table [controller].
+        sensor: Table [sensor].
+        inertial_sensors: Entries of [[inertial_sensors]].
+        limits: Table [limits], for `jaxid.experiment_design.limits`.
+        validations: Entries of [[validation]].
+        candidates: Effects of [discover] that a search may name beside the registered ones.
+        kinds: Kinds of [discover] that a search is limited to; empty: all.
+        design: Table [design], for `jaxid.experiment_design.along_reference`.
+        reference: Table [reference], for `jaxid.references.make_reference`, at its guesses.
+        unknown_reference: Unknowns of [reference], by name.
+        input: Table [input], for `jaxid.references.make_reference`.
+        simulation: Table [simulation].
+        study: Table [study].
     """
 
-    path: Path
+    path: Path | None
     plant: PlantEntry
+    base: Path = field(default=Path(), repr=False)
+    tables: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
     effects: tuple[EffectEntry, ...] = ()
-    gain: float | tuple[float, ...] = 1.0
-    transmission: tuple[tuple[float, ...], ...] | None = None
-    log: dict[str, Any] = field(default_factory=dict)
-    preprocess: dict[str, Any] = field(default_factory=dict)
-    identification: dict[str, Any] = field(default_factory=dict)
-    algebraic: dict[str, Any] = field(default_factory=dict)
-    output_error: dict[str, Any] = field(default_factory=dict)
-    recursive: dict[str, Any] = field(default_factory=dict)
-    controller: dict[str, Any] | None = None
-    sensor: dict[str, Any] = field(default_factory=dict)
-    inertial_sensors: tuple[dict[str, Any], ...] = ()
-    limits: dict[str, Any] = field(default_factory=dict)
+    actuator: Actuator = Actuator()
+    log: LogTable | None = None
+    preprocess: Preprocess = Preprocess()
+    identification: Identification = Identification()
+    algebraic: Algebraic = Algebraic()
+    output_error: OutputError = OutputError()
+    within_prior: WithinPrior | None = None
+    recursive: Recursive = Recursive()
+    controller: ControllerTable | None = None
+    sensor: SensorTable = SensorTable()
+    inertial_sensors: tuple[InertialSensor, ...] = ()
+    limits: LimitsTable = LimitsTable()
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
     kinds: tuple[str, ...] = ()
-    design: dict[str, Any] = field(default_factory=dict)
+    design: DesignTable | None = None
     reference: dict[str, Any] | None = None
     unknown_reference: dict[str, Value] = field(default_factory=dict)
     input: dict[str, Any] | None = None
-    simulation: dict[str, Any] = field(default_factory=dict)
-    study: dict[str, Any] = field(default_factory=dict)
+    simulation: SimulationTable = SimulationTable()
+    study: StudyTable = StudyTable()
+
+    @property
+    def where(self) -> str:
+        """Name of the case in messages: its path, or "case"."""
+        return UNNAMED if self.path is None else str(self.path)
+
+    @property
+    def name(self) -> str:
+        """Name of the case in results: that of its file, or "case"."""
+        return UNNAMED if self.path is None else self.path.name
+
+    @property
+    def title(self) -> str:
+        """Title of the case in reports: its file's name without suffix, or "case"."""
+        return UNNAMED if self.path is None else self.path.stem
 
     @property
     def folder(self) -> Path:
-        """Where relative file names of the case start from."""
-        return self.path.parent
+        """Folder from which relative file names of the case start."""
+        return self.base if self.path is None else self.path.parent
 
     @property
     def true_reference(self) -> dict[str, Any] | None:
-        """[reference] for a simulation: at true values where its unknowns have any."""
+        """[reference] for a simulation: with the true values of its unknowns, if it has any."""
         if self.reference is None:
             return None
         return self.reference | {k: v.start(True) for k, v in self.unknown_reference.items()}
 
     @property
     def own_effects(self) -> tuple[type[Effect], ...]:
-        """User's effects that the case knows: those it declares, and the candidates."""
+        """User-defined effects that the case names: those that it declares, and the candidates."""
         classes = (*(entry.cls for entry in self.effects), *self.candidates)
         return tuple(dict.fromkeys(c for c in classes if EFFECTS.get(c.kind) is not c))
 
@@ -145,112 +175,166 @@ class Case:
     @property
     def load_column(self) -> bool:
         """Whether the log has the position of a load behind an elastic coupling."""
-        named = self.log.get("position", ())
+        if self.log is None:
+            return True
+        named = self.log.position
         whole = not isinstance(named, str) and len(named) == self.plant.joints
-        return not self.log or whole or "load_position" in self.log
+        return whole or self.log.load_position is not None
 
     @property
-    def columns(self) -> dict[str, Any]:
+    def hold(self) -> str:
+        """Course of the command between samples."""
+        return HOLDS[0] if self.log is None else self.log.hold
+
+    @property
+    def columns(self) -> LogTable:
         """The [log] table of a case that must have one.
 
         Raises:
             InputError: If it has none.
         """
-        if not self.log:
+        if self.log is None:
             hint = "name the columns: time, position, force"
-            raise InputError("the table [log] is missing", where=str(self.path), hint=hint)
+            raise InputError("the table [log] is missing", where=self.where, hint=hint)
         return self.log
 
+    def fits_within_prior(self, method: str | None) -> bool:
+        """Return whether a method takes the guesses as a prior.
 
-def load_case(path: str | Path) -> Case:
-    """Read a case file; whatever it does not know is an error.
+        The method `within_prior` does; `discover` (or no method, None) if the case has a prior;
+        `output_error` if the prior is one of its own keys.
+        """
+        if method == "output_error":
+            return self.output_error.prior is not None
+        return method == "within_prior" or (method in (None, DISCOVER) and self.within_prior is not None)
+
+    @property
+    def prior_method(self) -> str:
+        """Name of the method that fits within the prior: of output_error if the prior is one of its keys."""
+        return "within_prior" if self.output_error.prior is None else "output_error"
+
+    def need_prior(self) -> WithinPrior:
+        """Return the settings of a fit within the prior.
+
+        Raises:
+            InputError: If the case has none.
+        """
+        if self.within_prior is None:
+            hint = "add [within_prior] with prior, the relative standard deviation of the guesses"
+            raise InputError("the table [within_prior] is missing", where=self.where, hint=hint)
+        return self.within_prior
+
+
+# A case, its file, or a dict with its tables.
+CaseLike = Case | Mapping[str, Any] | str | Path
+
+
+def load_case(source: CaseLike) -> Case:
+    """Load a case from a file or a dict; unknown keys are errors.
 
     Args:
-        path: A TOML file.
+        source: A TOML file; or a dict with the same tables and keys, in which relative file names start from
+            the current folder. A case is returned as it is.
 
     Returns:
         The case.
 
     Raises:
-        InputError: If the file cannot be read, or holds an unknown, missing or impossible entry;
-            the text names file, table, key and the hint.
+        InputError: If the file cannot be read, or a table or key is unknown, missing or impossible; the text
+            names file (or "case"), table, key and the fix.
     """
-    path = Path(path)
-    tables, file = _tables(path), str(path)
-    plant = read_plant(tables["plant"], file)
-    joints, drives = plant.joints, plant.drives
+    if isinstance(source, Case):
+        return source
+    if isinstance(source, Mapping):
+        return read_case(plain(source), None, Path())
+    path = Path(source)
+    return read_case(_toml(path), path, path.parent)
 
-    def read(name: str, keys: Keys) -> dict[str, Any]:
-        return read_table(tables.get(name, {}), keys, Spot(file, f"[{name}]"))
 
-    followed, unknown = read_unknown_reference(tables, drives, file)
-    actuator = _checked_transmission(
-        read("actuator", actuator_keys(drives)), plant, file, "controller" in tables
-    )
-    search = read_search(tables.get("discover", {}), path)
+def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Case:
+    """Check the tables of a case.
+
+    Args:
+        tables: Tables as TOML gives them.
+        path: File that they came from; None: no file.
+        folder: Folder from which relative file names start.
+
+    Raises:
+        InputError: If a table or key is unknown, missing or impossible.
+    """
+    top = Spot(UNNAMED if path is None else str(path), folder=folder)
+    _check_top(tables, top)
+    plant = read_plant(tables["plant"], top)
+    drives = plant.drives
+    root = replace(top, counts=Counts(plant.joints, drives, plant.names))
+
+    def read(cls: type, name: str) -> Any:
+        return read_settings(cls, tables.get(name, {}), root.under(f"[{name}]"))
+
+    at_guess, unknown = read_unknown_reference(tables, drives, root)
+    candidates, kinds = read_search(tables.get("discover", {}), root)
+    output_error = read(OutputError, "output_error")
     case = Case(
         path=path,
+        base=folder,
+        tables=tables,
         plant=plant,
-        effects=read_effects(tables.get("effects", []), plant, path),
-        gain=actuator.get("gain", 1.0),
-        transmission=actuator.get("transmission"),
-        log=_log(tables, plant, file),
-        preprocess=_checked_preprocess(read("preprocess", preprocess_keys(joints)), file),
-        identification=read("identification", IDENTIFICATION),
-        algebraic=read("algebraic", ALGEBRAIC),
-        output_error=_checked_output_error(read("output_error", OUTPUT_ERROR), file),
-        recursive=_apart(
-            read("recursive", recursive_keys(joints)),
-            "restart",
-            ("start", "regularization"),
-            Spot(file, "[recursive]"),
-        ),
-        controller=_controller(tables, drives, file),
-        sensor=read("sensor", sensor_keys(joints, drives)),
-        inertial_sensors=read_inertial_sensors(tables, plant.cls.links(joints), file),
-        limits=read("limits", limits_keys(joints, drives)),
-        validations=_validations(tables, plant, path),
-        candidates=search.get("candidates", ()),
-        kinds=search.get("kinds", ()),
-        design=read("design", design_keys(joints)),
-        reference=read_signal("reference", tables | followed, drives, file),
+        effects=read_effects(tables.get("effects", []), plant, root),
+        actuator=read(Actuator, "actuator"),
+        log=_log(tables, root),
+        preprocess=read(Preprocess, "preprocess"),
+        identification=read(Identification, "identification"),
+        algebraic=read(Algebraic, "algebraic"),
+        output_error=output_error,
+        within_prior=_within_prior(tables, output_error, root),
+        recursive=read(Recursive, "recursive"),
+        controller=_controller(tables, root),
+        sensor=read(SensorTable, "sensor"),
+        inertial_sensors=read_inertial_sensors(tables, plant.cls.links(plant.joints), root),
+        limits=read(LimitsTable, "limits"),
+        validations=_validations(tables, root),
+        candidates=candidates,
+        kinds=kinds,
+        design=read(DesignTable, "design") if tables.get("design") else None,
+        reference=read_signal("reference", {**tables, **at_guess}, drives, root),
         unknown_reference=unknown,
-        input=read_signal("input", tables, drives, file),
-        simulation=read("simulation", simulation_keys(joints)),
-        study=read("study", STUDY),
+        input=read_signal("input", tables, drives, root),
+        simulation=read(SimulationTable, "simulation"),
+        study=read(StudyTable, "study"),
     )
-    check_kinds(case.own_effects, file)
-    _check_loop(case)
+
+    # Keys that are sound by themselves may contradict each other.
+    _check_transmission(case, root)
+    _check_preprocess(tables.get("preprocess", {}), root)
+    _check_recursive(tables.get("recursive", {}), root)
+    check_kinds(case.own_effects, root)
+    _check_loop(case, root)
     return case
 
 
-def _tables(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file, whose names and kinds (one, or many) are right."""
-    file = str(path)
-    tables = _toml(path)
+def _check_top(tables: Mapping[str, Any], top: Spot) -> None:
+    """Refuse tables with unknown names or of the wrong kind (one, or many)."""
     for name, value in tables.items():
         if name not in TOP:
             what = (
                 f"unknown table [{name}]"
                 if isinstance(value, dict | list)
-                else (f"key '{name}' stands outside of any table")
+                else f"key '{name}' stands outside of any table"
             )
-            raise Spot(file).fault(what, _top_mend(name, value))
+            raise top.fault(what, _hint_at_top(name, value))
         many = isinstance(value, list) and all(isinstance(v, dict) for v in value)
         if TOP[name] and not many:
-            raise Spot(file).fault(f"[{name}] may recur", f"write [[{name}]], in double brackets")
+            raise top.fault(f"[{name}] may recur", f"write [[{name}]], in double brackets")
         if not TOP[name] and not isinstance(value, dict):
-            raise Spot(file).fault(f"'{name}' is not one table", f"write [{name}] once")
+            raise top.fault(f"'{name}' is not one table", f"write [{name}] once")
     if "plant" not in tables:
-        raise Spot(file).fault("the table [plant] is missing", 'add [plant] with kind = "axis"')
-    return tables
+        raise top.fault("the table [plant] is missing", 'add [plant] with kind = "axis"')
 
 
-def _top_mend(name: str, value: Any) -> str:
-    if difflib.get_close_matches(name, TOP, n=1):
-        return suggest(name, TOP, limit=len(TOP))
+def _hint_at_top(name: str, value: Any) -> str:
     hint = suggest(name, TOP, limit=len(TOP))
-    return hint if isinstance(value, dict | list) else f"move it below its [table]; {hint}"
+    near = difflib.get_close_matches(name, TOP, n=1)
+    return hint if near or isinstance(value, dict | list) else f"move it below its [table]; {hint}"
 
 
 def _toml(path: Path) -> dict[str, Any]:
@@ -271,13 +355,11 @@ def _toml(path: Path) -> dict[str, Any]:
         raise InputError(what, where=str(path), hint="name a TOML file that may be read") from error
 
 
-def _checked_transmission(
-    actuator: dict[str, Any], plant: PlantEntry, file: str, looped: bool
-) -> dict[str, Any]:
-    rows, spot = actuator.get("transmission"), Spot(file, "[actuator]", "transmission")
+def _check_transmission(case: Case, root: Spot) -> None:
+    rows, spot = case.actuator.transmission, root.under("[actuator]").at("transmission")
     if rows is None:
-        return actuator
-    joints = plant.joints
+        return
+    plant, joints = case.plant, case.plant.joints
     if joints == 1:
         hint = "leave it out; a ratio of gears goes into gain"
         raise spot.fault("is for plants with several joints", hint)
@@ -287,96 +369,101 @@ def _checked_transmission(
     if {len(rows), *map(len, rows)} != {joints} or np.linalg.matrix_rank(rows) < joints:
         hint = f"give {joints} rows of {joints} numbers, none a sum of others"
         raise spot.fault("is not an invertible square matrix", hint)
-    if looped:
-        hint = "leave [controller] out: what was logged is then identified without the loop"
+    if case.controller is not None:
+        hint = "leave [controller] out: the log is then identified without the loop"
         raise spot.fault("does not go with a loop, whose gains are at the motors", hint)
     gears = [n for n, i in parameters_of(plant.cls).items() if i.known and n in plant.parameters]
     if gears:
-        hint = "keep transmission where the log is of the motors' angles, else the other"
+        hint = "keep transmission if the log is of the motors' angles, else the other"
         raise spot.fault(f"and {gears[0]} of [plant.parameters] are both given", hint)
-    return actuator
 
 
-def _checked_output_error(given: dict[str, Any], file: str) -> dict[str, Any]:
-    """Refuse what only a fit within a prior does where there is none."""
-    lost = [key for key in given if key not in ("on", "prior", "start", "solver", "minimiser")]
-    if lost and "prior" not in given:
-        hint = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
-        raise Spot(file, "[output_error]", lost[0]).fault("goes with prior only", hint)
-    return given
+def _within_prior(tables: Mapping[str, Any], settings: OutputError, root: Spot) -> WithinPrior | None:
+    """Return [within_prior]; or the same by the older keys of [output_error]."""
+    given, spot = tables.get("output_error", {}), root.under("[output_error]")
+    if "within_prior" in tables:
+        if settings.prior is not None:
+            raise spot.at("prior").fault("is given beside [within_prior]", "keep [within_prior] alone")
+        stated = read_settings(WithinPrior, tables["within_prior"], root.under("[within_prior]"))
+    else:
+        stated = None
+    if settings.prior is None:
+        lost = [key for key in given if key not in ("on", "start", "solver", "minimiser")]
+        if lost:
+            hint = f"add prior, the relative standard deviation of the guesses, or leave {lost[0]} out"
+            raise spot.at(lost[0]).fault("goes with prior only", hint)
+        return stated
+    return WithinPrior(**{key: getattr(settings, key) for key in given})
 
 
-def _checked_preprocess(stated: dict[str, Any], file: str) -> dict[str, Any]:
-    """Keys of a low-pass and of a parabola do not stand together."""
-    parabolic, spot = stated.get("derivatives") == "parabolic", Spot(file, "[preprocess]")
-    if "reach" in stated and not parabolic:
+def _check_preprocess(given: Mapping[str, Any], root: Spot) -> None:
+    """Refuse keys of a low-pass beside those of a parabola."""
+    parabolic, spot = given.get("derivatives") == "parabolic", root.under("[preprocess]")
+    if "reach" in given and not parabolic:
         hint = 'add derivatives = "parabolic", or leave it out'
         raise spot.at("reach").fault("is that of a parabola", hint)
     for key in ("cutoff_hz", "order"):
-        if key in stated and parabolic:
+        if key in given and parabolic:
             what = 'is of a low-pass, which derivatives = "parabolic" does without'
             raise spot.at(key).fault(what, "leave out one of them")
-    return stated
 
 
-def _apart(stated: dict[str, Any], key: str, others: tuple[str, ...], spot: Spot) -> dict[str, Any]:
-    """A table in which one key stands without some others: what they say, it says otherwise."""
-    for other in others:
-        if key in stated and other in stated:
-            raise spot.at(other).fault(f"does not go with {key}", "leave out one of them")
-    return stated
+def _check_recursive(given: Mapping[str, Any], root: Spot) -> None:
+    """Refuse a start beside a run to go on from."""
+    for key in ("start", "regularization"):
+        if "restart" in given and key in given:
+            spot = root.under("[recursive]").at(key)
+            raise spot.fault("does not go with restart", "leave out one of them")
 
 
-def _log(tables: Mapping[str, Any], plant: PlantEntry, file: str) -> dict[str, Any]:
+def _log(tables: Mapping[str, Any], root: Spot) -> LogTable | None:
     if "log" not in tables:
-        return {}
-    spot = Spot(file, "[log]")
-    keys = log_keys(plant.joints, plant.drives, plant.names)
-    keys |= {name: Key(keys[name].read, keys[name].doc, True) for name in ("position", "force")}
-    return _check_time(read_table(tables["log"], keys, spot), spot)
+        return None
+    return _time_base(log_table(tables["log"], root.under("[log]")), root.under("[log]"))
 
 
-def _check_time(table: dict[str, Any], spot: Spot) -> dict[str, Any]:
-    if ("time" in table) == ("sample_rate" in table):
-        if "time" in table:
-            raise spot.fault("both time and sample_rate are given", "keep one of them")
-        hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
-        raise spot.fault("neither time nor sample_rate is given", hint)
+def _time_base(table: LogTable, spot: Spot) -> LogTable:
+    """Return the table of a log; refuse two time bases."""
+    if table.time is not None and table.sample_rate is not None:
+        raise spot.fault("both time and sample_rate are given", "keep one of them")
     return table
 
 
-def _controller(tables: Mapping[str, Any], drives: int, file: str) -> dict[str, Any] | None:
+def _controller(tables: Mapping[str, Any], root: Spot) -> ControllerTable | None:
     if "controller" not in tables:
         return None
-    table, spot = tables["controller"], Spot(file, "[controller]")
+    table, spot = tables["controller"], root.under("[controller]")
     kind = read_kind(table, CONTROLLERS, spot)
-    keys = {"kind": Key(lambda value, spot: value), **controller_keys(kind, drives)}
-    return read_table(table, keys, spot)
+    return controller_table(read_table(table, controller_keys(kind), spot))
 
 
-def _validations(tables: Mapping[str, Any], plant: PlantEntry, path: Path) -> tuple[Validation, ...]:
+def _validations(tables: Mapping[str, Any], root: Spot) -> tuple[Validation, ...]:
     base = tables.get("log", {})
-    own = (tables.get("controller") or {}).get("disturbance")
-    found: list[Validation] = []
+    of_fit = (tables.get("controller") or {}).get("disturbance")
+    out: list[Validation] = []
     for k, table in enumerate(tables.get("validation", []), start=1):
-        spot = Spot(str(path), f"[[validation]] {k}")
-        given = read_table(table, validation_keys(plant.joints, plant.drives, plant.names), spot)
-        if given["name"] in [v.name for v in found]:
-            raise spot.at("name").refuse(given["name"], "is taken", "give each its own name")
-        columns = {key: value for key, value in given.items() if key in LOG_KEYS}
+        spot = root.under(f"[[validation]] {k}")
+        given = read_table(table, validation_keys(), spot)
+        if given["name"] in [v.name for v in out]:
+            raise spot.at("name").refuse(given["name"], "is taken", "give each a different name")
+        columns = {name: table[name] for name in keys_of(LogTable) if name in table}
         if "log" not in given and "rows" not in columns:
             hint = "add log = <its file>, or rows that the fit does not use"
-            raise spot.fault("it would be the log of the fit itself", hint)
-        log = path.parent / given["log"] if "log" in given else None
-        merged = _merged(base, columns, same_file=log is None)
-        _check_time(merged, spot)
-        disturbance = given.get("disturbance", own)
-        found.append(Validation(given["name"], log, merged, disturbance))
-    return tuple(found)
+            raise spot.fault("this validation log is identical to the fitted log", hint)
+        log = root.folder / given["log"] if "log" in given else None
+        merged = log_table(_merged(base, columns, same_file=log is None), spot)
+        disturbance = given["disturbance"] if "disturbance" in given else _disturbance(of_fit)
+        out.append(Validation(given["name"], log, _time_base(merged, spot), disturbance))
+    return tuple(out)
 
 
-def _merged(base: dict[str, Any], columns: dict[str, Any], *, same_file: bool) -> dict[str, Any]:
-    """[log] with what differs; rows of one file say nothing about another."""
+def _disturbance(given: Any) -> Disturbance | str | None:
+    """Return the disturbance of [controller], which was checked there."""
+    return Disturbance(**{k: float(v) for k, v in given.items()}) if isinstance(given, dict) else given
+
+
+def _merged(base: Mapping[str, Any], columns: Mapping[str, Any], *, same_file: bool) -> dict[str, Any]:
+    """Return [log] with the keys that differ; rows of one file mean nothing in another."""
     dropped = set() if same_file else {"rows"}
     # One time base takes the place of the other.
     dropped |= {"time"} if "sample_rate" in columns else set()
@@ -384,17 +471,16 @@ def _merged(base: dict[str, Any], columns: dict[str, Any], *, same_file: bool) -
     return {**{key: value for key, value in base.items() if key not in dropped}, **columns}
 
 
-def _check_loop(case: Case) -> None:
-    """Refuse entries that only a loop could use, where there is none."""
-    file = str(case.path)
+def _check_loop(case: Case, root: Spot) -> None:
+    """Refuse entries that only a loop could use, if there is none."""
     if case.controller is None:
         if case.reference is not None:
             hint = "add [controller], or call it [input] for open loop"
-            raise Spot(file, "[reference]").fault("there is no loop to follow it", hint)
+            raise root.under("[reference]").fault("there is no loop to follow it", hint)
         for k, validation in enumerate(case.validations, start=1):
             if validation.disturbance is not None:
-                spot = Spot(file, f"[[validation]] {k}", "disturbance")
+                spot = root.under(f"[[validation]] {k}").at("disturbance")
                 raise spot.fault("belongs to a controller", "add [controller], or leave it out")
     if case.reference is not None and case.input is not None:
         hint = "keep [reference] for closed loop, or [input] for open loop"
-        raise Spot(file).fault("both [reference] and [input] are given", hint)
+        raise root.fault("both [reference] and [input] are given", hint)

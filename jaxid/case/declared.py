@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,15 +21,15 @@ class PlantEntry:
         parameters: One value, or a list, by name.
         units: Labels.
         vertical: Whether weight acts along the axis.
-        gravity: Its acceleration [m/s^2]; None: the class's own.
-        joints: How many there are.
+        gravity: Acceleration of gravity [m/s^2]; None: the default of the class.
+        joints: Number of joints.
         actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
-        options: What else its class takes, by field: the geometry and the shafts of an arm.
-        names: Of its joints, where these have any: in a URDF file.
+        options: Further fields of its class: the geometry and the shafts of an arm.
+        names: Names of the joints, if a URDF file gives them.
     """
 
     cls: type[Plant]
-    parameters: dict[str, Value | tuple[Value, ...]]
+    parameters: Mapping[str, Value | tuple[Value | tuple[Value, ...], ...]]
     units: Units
     vertical: bool
     gravity: float | None
@@ -39,7 +40,7 @@ class PlantEntry:
 
     @property
     def drives(self) -> int:
-        """How many drives there are."""
+        """Number of drives."""
         return self.joints if self.actuated is None else len(self.actuated)
 
 
@@ -50,7 +51,7 @@ class EffectEntry:
     Args:
         cls: Its class.
         parameters: By name, one value for each of `ports`.
-        ports: Where it acts: joints from 0 on, and behind them springs, shafts, passive angles or tools.
+        ports: Ports that it acts on: joints from 0 on, then springs, shafts, passive angles or tools.
     """
 
     cls: type[Effect]

@@ -3,31 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.links import LINKED, check_links, read_links, read_links_of_urdf, read_shafts
 from jaxid.case.places import check_places, read_ports
-from jaxid.case.schema import (
-    Key,
-    Reader,
-    Spot,
-    choice,
-    count,
-    flag,
-    nearest,
-    read_table,
-    several,
-    text,
-    whole,
-)
 from jaxid.case.tables import PLANT
 from jaxid.case.user_effect import user_effect
 from jaxid.case.user_faults import check_action, is_user_class
 from jaxid.case.user_file import names_a_file
 from jaxid.case.user_plant import check_user_plant, user_plant
-from jaxid.case.values import Value, read_value, read_values
+from jaxid.case.values import Value, read_value, read_values, values_schema
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.model.effect import Effect
@@ -35,14 +21,31 @@ from jaxid.model.interface import PLACES
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
+from jaxid.names import MOTIONS
 from jaxid.plants import PLANTS
+from jaxid.schema import (
+    Key,
+    Reader,
+    Spot,
+    anything,
+    choice,
+    count,
+    flag,
+    is_list,
+    list_of,
+    nearest,
+    read_table,
+    several,
+    text,
+    whole,
+)
 
-# Of a plant whose lists say how many joints it has.
+# Most joints of a plant whose lists give their number.
 _MOST_JOINTS = 50
 
 
 def read_kind(table: dict[str, Any], known: Any, spot: Spot) -> str:
-    """The kind that a table names.
+    """Read the kind that a table names.
 
     Raises:
         InputError: If it is missing or unknown.
@@ -52,30 +55,30 @@ def read_kind(table: dict[str, Any], known: Any, spot: Spot) -> str:
     return choice(known)(table["kind"], spot.at("kind"))
 
 
-def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
+def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
     """Read [plant].
 
     Raises:
-        InputError: If it states what the plant cannot have, or not what it must.
+        InputError: If it has a key or value that the plant cannot have, or lacks one.
     """
-    spot = Spot(file, "[plant]")
+    spot = root.under("[plant]")
     kind = str(table.get("kind", ""))
     users = names_a_file(kind)
     if users:
-        cls = user_plant(kind, Path(file).parent, spot.at("kind"))
+        cls = user_plant(kind, root.folder, spot.at("kind"))
     else:
         cls = PLANTS[read_kind(table, PLANTS, spot)]
-    keys = {"kind": Key(lambda value, spot: value), **PLANT}
+    keys = {"kind": Key(anything), **PLANT}
     if cls.linked:
         return _linked(table, cls, keys, spot)
     if cls.couplings:
-        keys["coupling"] = Key(choice(tuple(cls.couplings)))
+        keys["coupling"] = coupling_key(cls)
         if "coupling" in table:
             cls = cls.couplings[keys["coupling"].read(table["coupling"], spot.at("coupling"))]
     joints = _count_joints(table.get("parameters"), cls, spot)
     if "actuated" in cls.__dataclass_fields__:
-        keys["actuated"] = Key(_actuated(joints))
-    keys["parameters"] = Key(lambda v, s: _plant_parameters(v, cls, joints, file))
+        keys["actuated"] = actuated_key(joints)
+    keys["parameters"] = Key(Reader(lambda v, s: _plant_parameters(v, cls, joints, root)))
     given = read_table(table, keys, spot)
     if "parameters" not in given:
         needed = ", ".join(f"{name} = {_shape(info)}" for name, info in parameters_of(cls).items())
@@ -87,13 +90,13 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
         raise spot.at("orientation").refuse("vertical", "does not go with a rotary plant", hint)
     units = Units(motion, **given.get("units", {}))
     entry = PlantEntry(
-        cls,
-        given["parameters"],
-        units,
-        vertical,
-        given.get("gravity"),
-        joints,
-        given.get("actuated", cls.actuated),
+        cls=cls,
+        parameters=given["parameters"],
+        units=units,
+        vertical=vertical,
+        gravity=given.get("gravity"),
+        joints=joints,
+        actuated=given.get("actuated", cls.actuated),
     )
     if users:
         check_user_plant(entry, kind, spot.at("kind"))
@@ -103,8 +106,8 @@ def read_plant(table: dict[str, Any], file: str) -> PlantEntry:
 def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot) -> PlantEntry:
     """[plant] of an arm, which [[plant.links]] or a URDF file describe."""
     # Weight is a vector there, and acts whichever way the arm stands.
-    own = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
-    given = read_table(table, {**own, **LINKED}, spot)
+    taken = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
+    given = read_table(table, {**taken, **LINKED}, spot)
     names: tuple[str, ...] = ()
     if "urdf" in given:
         parameters, arm = read_links_of_urdf(given, cls, spot)
@@ -114,41 +117,42 @@ def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot:
         if of_file:
             raise spot.at(of_file[0]).fault("goes with urdf only", 'add urdf = "<its file>", or leave it out')
         check_links(table, spot)
-        parameters, geometry = read_links(table["links"], cls, spot.file)
+        parameters, geometry = read_links(table["links"], cls, spot)
     options = {name: given[name] for name in ("gravity_vector",) if name in given}
     if "shafts" in table:
         options["shafts"] = read_shafts(table["shafts"], geometry, spot)
     units = Units(given.get("motion", cls.usual_motion), **given.get("units", {}))
     return PlantEntry(
-        cls,
-        parameters,
-        units,
-        False,
-        None,
-        len(geometry.joints),
-        cls.actuated,
-        {"geometry": geometry, **options},
-        names,
+        cls=cls,
+        parameters=parameters,
+        units=units,
+        vertical=False,
+        gravity=None,
+        joints=len(geometry.joints),
+        actuated=cls.actuated,
+        options={"geometry": geometry, **options},
+        names=names,
     )
 
 
 def _shape(info: ParameterInfo) -> str:
-    """What a parameter looks like in a case."""
+    """Return the form of a parameter in a case, for hints."""
     return "{ guess = ... }" if info.more is None else "[{ guess = ... }, ...]"
 
 
 def _count_joints(table: Any, cls: type[Plant], spot: Spot) -> int:
-    """How many joints a plant has: as many as its lists tell, or as its class says."""
+    """Count the joints of a plant: the entries of its lists, or the number of its class."""
     if isinstance(cls.joints, int):
         return cls.joints
     name = next(n for n, info in parameters_of(cls).items() if info.more == 0)
     given = table.get(name) if isinstance(table, dict) else None
     if isinstance(given, dict):
         given = given.get("guess", given)
-    if given is None:  # told as missing when the table is read
+    # An absent list is refused as missing when the table is read.
+    if given is None:
         return 1
-    spot = Spot(spot.file, "[plant.parameters]", name)
-    if not isinstance(given, list):
+    spot = spot.under("[plant.parameters]").at(name)
+    if not is_list(given):
         raise spot.refuse(given, "is not a list", f"give a list, even of one: {name} = [...]")
     if not 1 <= len(given) <= _MOST_JOINTS:
         hint = f"a {cls.kind} has 1 to {_MOST_JOINTS}"
@@ -156,45 +160,72 @@ def _count_joints(table: Any, cls: type[Plant], spot: Spot) -> int:
     return len(given)
 
 
-def _actuated(joints: int) -> Reader:
+def coupling_key(cls: type[Plant]) -> Key:
+    """Return the key that chooses between the variants of a plant."""
+    return Key(choice(tuple(cls.couplings)), "whether the coupling gives", default=next(iter(cls.couplings)))
+
+
+def actuated_key(joints: int) -> Key:
+    """Return the key that lists the driven joints."""
+
     def read(value: Any, spot: Spot) -> tuple[int, ...]:
         driven = several(whole(1))(value, spot)
         check_places(value, driven, joints, "joint", spot)
         return tuple(j - 1 for j in driven)
 
-    return read
+    return Key(Reader(read, several(whole(1)).schema), "driven joints, from 1", note="all")
 
 
-def _plant_parameters(
-    table: Any, cls: type[Plant], joints: int, file: str
-) -> dict[str, Value | tuple[Value, ...]]:
-    def reader(info: ParameterInfo) -> Any:
-        def read(value: Any, spot: Spot) -> Value | tuple[Value, ...]:
+def parameter_keys(cls: type[Plant], joints: int) -> dict[str, Key]:
+    """Return the keys of [plant.parameters]."""
+    fixed = isinstance(cls.joints, int)
+
+    def key(info: ParameterInfo) -> Key:
+        def read(value: Any, spot: Spot) -> Value | tuple[Value | tuple[Value, ...], ...]:
             if info.more is not None:
-                return _plant_list(value, info, joints, spot, isinstance(cls.joints, int))
-            if isinstance(value, list) and joints > 1:
+                return _plant_list(value, info, joints, spot, fixed)
+            if is_list(value) and joints > 1:
                 return read_values(value, info, joints, spot)
             return read_value(value, info, spot)
 
-        return read
+        doc = f"{info.doc}; a number" + ("" if info.known else ", or { guess = ... }")
+        return Key(Reader(read, _parameter_schema(info)), doc, not info.optional, unit_of(info))
 
-    keys = {
-        name: Key(reader(info), f"{info.doc}; a number, or {{ guess = ... }}", not info.optional)
-        for name, info in parameters_of(cls).items()
-    }
-    return read_table(table, keys, Spot(file, "[plant.parameters]"))
+    return {name: key(info) for name, info in parameters_of(cls).items()}
+
+
+def unit_of(info: ParameterInfo) -> str:
+    """Return the unit of a parameter: of a linear machine, and of a rotary one if it differs."""
+    units = [Units(motion).label(info.dimension, info.motion) for motion in MOTIONS]
+    return " or ".join(dict.fromkeys(unit for unit in units if unit))
+
+
+def _parameter_schema(info: ParameterInfo) -> dict[str, Any]:
+    if info.more is None:
+        return values_schema(info)
+    if info.width is not None:
+        return list_of(values_schema(info))
+    lists = values_schema(info)["anyOf"][1:]
+    return {"anyOf": lists}
+
+
+def _plant_parameters(
+    table: Any, cls: type[Plant], joints: int, root: Spot
+) -> dict[str, Value | tuple[Value, ...]]:
+    return read_table(table, parameter_keys(cls, joints), root.under("[plant.parameters]"))
 
 
 def _plant_list(
     value: Any, info: ParameterInfo, joints: int, spot: Spot, fixed: bool
 ) -> tuple[Value | tuple[Value, ...], ...]:
-    """A list of the plant's: as long as it has joints, or longer by what the class says.
+    """Read a list of the plant, with one entry for each joint, or more as the class says.
 
-    Where every machine of a kind has as many joints (fixed) a fault tells what the entries are.
+    If every machine of a kind has the same number of joints (fixed), a fault names the entries.
     """
+    assert info.more is not None, "only lists come here"
     entries = joints + info.more
-    whole_list = value if isinstance(value, list) else None
-    if info.width is None and isinstance(value, dict) and isinstance(value.get("guess"), list):
+    whole_list = value if is_list(value) else None
+    if info.width is None and isinstance(value, dict) and is_list(value.get("guess")):
         whole_list = value["guess"]
     beside = "" if info.more == 0 else f": {info.more} more than joints"
     beside = f": {info.doc}" if fixed else beside
@@ -211,28 +242,29 @@ def _plant_list(
 
 
 def _row(value: Any, info: ParameterInfo, spot: Spot) -> tuple[Value, ...]:
-    """An entry of a list that is a list itself."""
-    if not isinstance(value, list):
+    """Read an entry of a list that is a list itself."""
+    assert info.width is not None, "only lists of lists come here"
+    if not is_list(value):
         raise spot.refuse(value, "is not a list", f"give {info.width} numbers: {info.doc}")
     return read_values(value, info, info.width, spot, "component")
 
 
-def read_effects(tables: list, plant: PlantEntry, path: Path) -> tuple[EffectEntry, ...]:
+def read_effects(tables: list, plant: PlantEntry, root: Spot) -> tuple[EffectEntry, ...]:
     """Read [[effects]], in the order of the drive.
 
     Raises:
-        InputError: If one is unknown, or states what it cannot have, or not what it must.
+        InputError: If an effect is unknown, or has a key or value that it cannot have, or lacks one.
     """
-    return tuple(_effect(table, k, plant, path) for k, table in enumerate(tables, start=1))
+    return tuple(_effect(table, k, plant, root) for k, table in enumerate(tables, start=1))
 
 
-def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) -> EffectEntry:
-    spot = Spot(str(path), f"[[effects]] {index}")
+def _effect(table: dict[str, Any], index: int, plant: PlantEntry, root: Spot) -> EffectEntry:
+    spot = root.under(f"[[effects]] {index}")
     if names_a_file(table.get("kind", "")):
-        cls = user_effect(str(table["kind"]), path.parent, spot.at("kind"))
+        cls = user_effect(str(table["kind"]), root.folder, spot.at("kind"))
     else:
         cls = EFFECTS[read_kind(table, EFFECTS, spot)]
-    spot = Spot(str(path), f"[[effects]] {index} ({cls.kind})")
+    spot = root.under(f"[[effects]] {index} ({cls.kind})")
     infos = parameters_of(cls)
     _check_keys(table, cls, spot)
     ports, what = read_ports(table, cls, plant, spot)
@@ -251,39 +283,55 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, path: Path) ->
     return EffectEntry(cls, parameters, ports)
 
 
-def read_search(table: Any, path: Path) -> dict[str, tuple]:
-    """Read [discover]: `kinds` and `candidates` of effects that a search may name, where it has them.
+def read_search(table: Any, root: Spot) -> tuple[tuple[type[Effect], ...], tuple[str, ...]]:
+    """Read [discover].
+
+    Returns:
+        Effects that a search may name on request or from a user's file, and the kinds that it is limited to.
 
     Raises:
-        InputError: If a kind is unknown, or a candidate no class of a file, or in every search as it is.
+        InputError: If a kind is unknown, or a candidate is no class of a file, or takes part in every search.
     """
+    given = read_table(table, search_keys(root), root.under("[discover]"))
+    return given.get("candidates", ()), given.get("kinds", ())
 
-    def own(value: Any, spot: Spot) -> type[Effect]:
+
+def search_keys(root: Spot) -> dict[str, Key]:
+    """Return the keys of [discover]."""
+
+    def candidate(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
         if kind in EFFECTS and EFFECTS[kind].on_request:
             return EFFECTS[kind]
         if kind in EFFECTS:
             raise spot.refuse(kind, "takes part in every search", "leave it out")
-        return user_effect(kind, path.parent, spot)
+        return user_effect(kind, root.folder, spot)
 
-    keys = {
-        "candidates": Key(several(own), 'a list such as ["my_effects.py:MyEffect"]'),
-        "kinds": Key(several(choice(tuple(EFFECTS))), "what `jaxid effects` lists; default: all of it"),
+    return {
+        "candidates": Key(
+            several(Reader(candidate, text.schema)),
+            'further effects that discover may name, a list such as ["my_effects.py:MyEffect"]',
+            default=(),
+        ),
+        "kinds": Key(
+            several(choice(tuple(EFFECTS))),
+            "the only effects that discover may name, out of `jaxid effects`",
+            note="all of them",
+        ),
     }
-    return read_table(table, keys, Spot(str(path), "[discover]"))
 
 
-def check_kinds(classes: Iterable[type[Effect]], file: str) -> None:
-    """Refuse two own effects of one kind: results go by kind.
+def check_kinds(classes: Iterable[type[Effect]], root: Spot) -> None:
+    """Refuse two user-defined effects of one kind: results go by kind.
 
     Raises:
-        InputError: If there are.
+        InputError: If there are two.
     """
     known: dict[str, type[Effect]] = {}
     for cls in classes:
         if known.setdefault(cls.kind, cls) is not cls:
             hint = "give one of them another kind"
-            raise Spot(file).fault(f"two effects of your own are of kind '{cls.kind}'", hint)
+            raise root.fault(f"two user-defined effects are of kind '{cls.kind}'", hint)
 
 
 def _check_keys(table: dict[str, Any], cls: type[Effect], spot: Spot) -> None:
@@ -304,8 +352,9 @@ def _takes(cls: type[Effect]) -> str:
 
 def _check_together(cls: type[Effect], parameters: dict[str, tuple[Value, ...]], spot: Spot) -> None:
     """Let the class judge which optional parameters go together."""
+    guesses: dict[str, Any] = {name: values[0].guess for name, values in parameters.items()}
     try:
-        effect = cls(**{name: values[0].guess for name, values in parameters.items()})
+        effect = cls(**guesses)
     except InputError:
         raise
     except Exception as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,31 @@ import numpy as np
 from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.pseudo_inertia import TEN
 from jaxid.case.places import check_places
-from jaxid.case.schema import Key, Keys, Spot, choice, number, read_table, several, text, whole
 from jaxid.case.urdf import Urdf, read_urdf
-from jaxid.case.values import Value, read_value, read_values
-from jaxid.model.parameter import parameters_of
+from jaxid.case.values import Value, read_values, value_reader, value_schema, values_schema
+from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.plants.denavit_hartenberg import DenavitHartenberg
 from jaxid.plants.geometry import JOINTS, Geometry
+from jaxid.plants.serial_arm import SerialArm
+from jaxid.schema import (
+    Key,
+    Keys,
+    Reader,
+    Spot,
+    anything,
+    choice,
+    either,
+    is_list,
+    list_of,
+    number,
+    read_table,
+    several,
+    text,
+    whole,
+)
 
-# Chosen: beyond any arm; what lies behind it is a slip.
+# Chosen: more links than any arm has.
 _MOST_LINKS = 50
 # Entries of a list of the case, by the plant's parameters that they are.
 _LISTS = {"first_moment": TEN[1:4], "inertia": TEN[4:]}
@@ -27,22 +42,24 @@ _LISTS = {"first_moment": TEN[1:4], "inertia": TEN[4:]}
 _ANGLES = ("alpha", "theta")
 
 # Keys of [[plant.shafts]].
-_SHAFT: Keys = {
+SHAFT: Keys = {
     "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
-    "ratios": Key(several(number()), "by how much, a number a joint; 1 each where absent"),
+    "ratios": Key(several(number()), "turns of the shaft for one of each joint", note="1 each"),
 }
-# Below it the sine of an angle of a URDF file is nothing: 1.5708 stands there for a right angle.
+# Below it the sine of an angle of a URDF file counts as zero: 1.5708 stands there for a right angle.
 _ANGLE = 1e-4
-# What of the links that a URDF file describes is to be identified.
+# Choices of the parameters of a URDF file that are unknown.
 UNKNOWN = ("none", "base", "all")
 # Keys of [plant] that only an arm has.
 LINKED: Keys = {
-    "links": Key(lambda value, spot: value, "a table [[plant.links]] for each link"),
+    "links": Key(anything, "a table [[plant.links]] for each link"),
     "urdf": Key(text, "file that describes the arm, relative to the case"),
     "tip": Key(text, "name of its last link in that file"),
-    "unknown": Key(choice(UNKNOWN), "which parameters of its links"),
-    "shafts": Key(lambda value, spot: value, "a table [[plant.shafts]] for each"),
-    "gravity_vector": Key(several(number(), shortest=3, longest=3), "in the frame of the base [m/s^2]"),
+    "unknown": Key(choice(UNKNOWN), "which parameters of its links are unknown", default="none"),
+    "shafts": Key(anything, "a table [[plant.shafts]] for each"),
+    "gravity_vector": Key(
+        several(number(), shortest=3, longest=3), "gravity in the frame of the base", unit="m/s^2"
+    ),
 }
 
 
@@ -50,7 +67,7 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
     """Refuse a [plant] without links.
 
     Raises:
-        InputError: If there is none, or no table is where one should be.
+        InputError: If there are no links, or one of them is not a table.
     """
     links = table.get("links")
     if links is None:
@@ -63,17 +80,17 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
 
 
 def read_links(
-    links: list[dict[str, Any]], cls: type[Plant], file: str
+    links: list[dict[str, Any]], cls: type[Plant], root: Spot
 ) -> tuple[dict[str, tuple[Value, ...]], DenavitHartenberg]:
-    """Inertial parameters of the links by name, one value a link, and their geometry.
+    """Read the inertial parameters of the links by name, one value a link, and their geometry.
 
     Raises:
-        InputError: If a link states what it cannot have, or not what it must.
+        InputError: If a link has a key or value that it cannot have, or lacks one.
     """
     rows, parameters = [], {}
     for k, link in enumerate(links, start=1):
-        spot = Spot(file, f"[[plant.links]] {k}")
-        given = read_table(_in_rad(link, spot), _keys(cls), spot)
+        spot = root.under(f"[[plant.links]] {k}")
+        given = read_table(_in_rad(link, spot), link_keys(cls), spot)
         rows.append([given["joint"], *(given.get(name, 0.0) for name in ("alpha", "a", "d", "theta"))])
         for name, values in given.items():
             if name in _LISTS:
@@ -89,14 +106,17 @@ def read_links(
 def read_links_of_urdf(
     given: dict[str, Any], cls: type[Plant], spot: Spot
 ) -> tuple[dict[str, tuple[Value, ...]], Urdf]:
-    """The same of the URDF file that [plant] names: parameters of the links, and what the file says.
+    """Read the parameters of the links from the URDF file that [plant] names.
+
+    Returns:
+        The parameters by name, one value a link, and the contents of the file.
 
     Raises:
-        InputError: If [plant] describes the links as well, or the file no arm.
+        InputError: If [plant] describes the links as well, or the file does not describe an arm.
     """
     if "links" in given:
         raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
-    arm = read_urdf(Path(spot.file).parent / given["urdf"], given.get("tip"))
+    arm = read_urdf(spot.folder / given["urdf"], given.get("tip"))
     if len(arm.names) > _MOST_LINKS:
         raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {_MOST_LINKS}")
     unknown = given.get("unknown", "none")
@@ -104,6 +124,7 @@ def read_links_of_urdf(
     free = {name: np.full(len(arm.names), unknown == "all") for name in TEN}
     if unknown == "base":
         weight = {name: given[name] for name in ("gravity_vector",) if name in given}
+        assert issubclass(cls, SerialArm), "no other plant has links"
         plant = cls(**values, geometry=arm.geometry, **weight)
         if not np.any(np.asarray(plant.gravity_vector)):
             hint = 'state a gravity_vector other than zero, or unknown = "all"'
@@ -119,28 +140,28 @@ def read_links_of_urdf(
 
 
 def read_shafts(shafts: Any, geometry: Geometry, spot: Spot) -> tuple[tuple[float, ...], ...]:
-    """[[plant.shafts]]: by how much each turns with every joint.
+    """Read [[plant.shafts]]: the ratio of each shaft to every joint.
 
     Raises:
-        InputError: If one names joints that are not there, or of which some turn and some slide.
+        InputError: If a shaft names joints that do not exist, or both revolute and prismatic ones.
     """
     if not isinstance(shafts, list) or not all(isinstance(shaft, dict) for shaft in shafts):
         raise spot.at("shafts").fault("is not a list of tables", "write [[plant.shafts]], in double brackets")
     joints, out = len(geometry.joints), []
     for k, shaft in enumerate(shafts, start=1):
-        own = Spot(spot.file, f"[[plant.shafts]] {k}")
-        given = read_table(shaft, _SHAFT, own)
+        at = spot.under(f"[[plant.shafts]] {k}")
+        given = read_table(shaft, SHAFT, at)
         named = given["joints"]
-        check_places(shaft["joints"], named, joints, "joint", own.at("joints"))
+        check_places(shaft["joints"], named, joints, "joint", at.at("joints"))
         if len({geometry.joints[j - 1] for j in named}) > 1:
-            raise own.at("joints").refuse(
+            raise at.at("joints").refuse(
                 shaft["joints"],
                 "names joints that turn and joints that slide",
                 "a shaft goes with joints of one kind",
             )
         ratios = given.get("ratios", (1.0,) * len(named))
         if len(ratios) != len(named) or 0.0 in ratios:
-            raise own.at("ratios").refuse(
+            raise at.at("ratios").refuse(
                 shaft["ratios"],
                 f"does not go with {len(named)} joints",
                 "give a ratio other than zero for each",
@@ -150,16 +171,16 @@ def read_shafts(shafts: Any, geometry: Geometry, spot: Spot) -> tuple[tuple[floa
     return tuple(out)
 
 
-def _keys(cls: type[Plant]) -> Keys:
-    """Keys of one link."""
+def link_keys(cls: type[Plant]) -> Keys:
+    """Return the keys of one of [[plant.links]]."""
     infos = parameters_of(cls)
     value = "a number, or { guess = ... }"
     keys = {
         "joint": Key(choice(JOINTS), '"revolute" or "prismatic"', True),
-        "alpha": Key(number(), "twist from the axis before to this one [rad], or alpha_deg", True),
-        "a": Key(number(), "distance from the axis before to this one [m]", True),
-        "d": Key(number(), "offset along the axis [m]"),
-        "theta": Key(number(), "angle about the axis [rad], or theta_deg"),
+        "alpha": Key(number(), "twist from the previous axis to this one, or alpha_deg", True, "rad"),
+        "a": Key(number(), "distance from the previous axis to this one", True, "m"),
+        "d": Key(number(), "offset along the axis", unit="m"),
+        "theta": Key(number(), "angle about the axis, or theta_deg", unit="rad"),
     }
     for name in ("mass", "first_moment", "inertia", "rotor_inertia"):
         parts = _LISTS.get(name, (name,))
@@ -168,26 +189,27 @@ def _keys(cls: type[Plant]) -> Keys:
             axes = ", ".join(part.rpartition("_")[2] for part in parts)
             read, doc = _listed(info, parts), f"the list {axes}; each {value}"
         else:
-            read, doc = (lambda v, s, info=info: read_value(v, info, s)), f"{info.doc}; {value}"
+            read, doc = value_reader(info), f"{info.doc}; {value}"
         keys[name] = Key(read, doc, not info.optional)
     return keys
 
 
-def _listed(info: Any, parts: tuple[str, ...]) -> Any:
-    """A list with an entry for each axis, or pair of axes."""
+def _listed(info: ParameterInfo, parts: tuple[str, ...]) -> Reader:
+    """Return the reader of a list with an entry for each axis, or pair of axes."""
 
     def read(value: Any, spot: Spot) -> tuple[Value, ...]:
-        inner = isinstance(value, dict) and any(isinstance(v, list) for v in value.values())
-        if not isinstance(value, list) and not inner:
+        inner = isinstance(value, dict) and any(is_list(v) for v in value.values())
+        if not is_list(value) and not inner:
             axes = ", ".join(part.rpartition("_")[2] for part in parts)
             raise spot.refuse(value, "is not a list", f"give {len(parts)} entries: {axes}")
         return read_values(value, info, len(parts), spot, "component")
 
-    return read
+    table = values_schema(info)["anyOf"][1]
+    return Reader(read, either(list_of(value_schema(info), len(parts), len(parts)), table))
 
 
 def _in_rad(link: dict[str, Any], spot: Spot) -> dict[str, Any]:
-    """The table with its angles in rad."""
+    """Return the table with its angles in rad."""
     out = dict(link)
     for name in _ANGLES:
         degrees = f"{name}_deg"

@@ -1,29 +1,29 @@
-"""Where the effects of a case act: on joints, springs, shafts, passive angles, tools; all count from 1."""
+"""Places on which the effects of a case act: joints, springs, shafts, passive angles, tools; from 1."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from jaxid.case.schema import Spot, count, several, whole
 from jaxid.errors import suggest
 from jaxid.model.effect import Effect
 from jaxid.model.interface import PLACES
+from jaxid.schema import Spot, count, several, whole
 
 if TYPE_CHECKING:
     from jaxid.case.declared import PlantEntry
 
 
-# What a place is called, where that is not its key.
+# Nouns of places that differ from their keys.
 _NOUNS = {"passive": "passive angle"}
 
 
 def read_ports(
     table: dict[str, Any], cls: type[Effect], plant: PlantEntry, spot: Spot
 ) -> tuple[tuple[int, ...], str]:
-    """Ports on which an effect acts, 0-based, and what they are: all that suit where none is named.
+    """Read the ports on which an effect acts, 0-based, and their noun; all that suit, if none is named.
 
     Raises:
-        InputError: If a place that is named is none of the plant's, or none for such an effect.
+        InputError: If a place does not exist on the plant, or does not go with the effect.
     """
     places = [name for name in PLACES if name in table]
     if len(places) > 1:
@@ -34,7 +34,7 @@ def read_ports(
             ("no springs", "chain or flexible_axis")
             if cls.with_springs
             else (
-                "springs of its own",
+                "springs",
                 "axis, or state the spring there",
             )
         )
@@ -62,15 +62,16 @@ def read_ports(
             what, hint = f"has no command for {cls.kind} to act on", "name the joint of the drive"
             raise spot.at(name).refuse(table[name], what, hint)
         if name == "tool" and not cls.any_direction:
-            alike = "what is the same in all directions (added_mass, viscous_friction)"
-            hint = f"name a joint; on a tool acts {alike}"
+            uniform = "effects that are the same in all directions (added_mass, viscous_friction)"
+            hint = f"name a joint; on a tool act {uniform}"
             raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", hint)
         return tuple(before + k for k in _places(table, name, there[name], spot)), name
     if "joint" in table:
         chosen = _places(_numbered(table, plant.names, spot), "joint", parts, spot)
-        undriven = [k + 1 for k in chosen if plant.actuated is not None and k not in plant.actuated]
+        actuated = range(plant.joints) if plant.actuated is None else plant.actuated
+        undriven = plant.actuated is not None and not set(chosen) <= set(actuated)
         if cls.in_drive and undriven:
-            driven = ", ".join(str(k + 1) for k in plant.actuated)
+            driven = ", ".join(str(k + 1) for k in actuated)
             what = f"has no drive for {cls.kind} to sit in"
             raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
         return chosen, "joint"
@@ -82,10 +83,10 @@ def read_ports(
 
 
 def _numbered(table: dict[str, Any], names: tuple[str, ...], spot: Spot) -> dict[str, Any]:
-    """The table with joints by number, of which a URDF file has told the names.
+    """Return the table with numbers in place of the names that a URDF file gives to the joints.
 
     Raises:
-        InputError: If it names one that is not there.
+        InputError: If it names an unknown joint.
     """
     given = table["joint"]
     listed = given if isinstance(given, list) else [given]
@@ -97,7 +98,7 @@ def _numbered(table: dict[str, Any], names: tuple[str, ...], spot: Spot) -> dict
 
 
 def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[int, ...]:
-    """The joints or springs that a table names, 0-based."""
+    """Read the joints or springs that a table names; return them 0-based."""
     given, place = table[what], spot.at(what)
     several_places = isinstance(given, list)
     named = several(whole(1))(given, place) if several_places else (whole(1)(given, place),)
@@ -106,10 +107,10 @@ def _places(table: dict[str, Any], what: str, there: int, spot: Spot) -> tuple[i
 
 
 def check_places(given: Any, named: tuple[int, ...], there: int, what: str, spot: Spot) -> None:
-    """Refuse places beyond those that there are, or named twice.
+    """Refuse places that do not exist, or are named twice.
 
     Raises:
-        InputError: If there are any.
+        InputError: If a place does not exist or is named twice.
     """
     noun = _NOUNS.get(what, what)
     if max(named) > there:

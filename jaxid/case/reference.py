@@ -6,34 +6,43 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxid.case.entries import read_kind
-from jaxid.case.schema import Spot
 from jaxid.case.values import Value, read_value
-from jaxid.errors import InputError
 from jaxid.model.parameter import ParameterInfo
 from jaxid.references import REFERENCES
-from jaxid.references import Key as ReferenceKey
+from jaxid.schema import Key, Spot
 
 
-def read_signal(name: str, tables: Mapping[str, Any], drives: int, file: str) -> dict[str, Any] | None:
-    """[reference] or [input], checked by the family that it names; None where it says nothing."""
+def read_signal(name: str, tables: Mapping[str, Any], drives: int, root: Spot) -> dict[str, Any] | None:
+    """Read [reference] or [input], checked by the family that it names.
+
+    Returns:
+        The table; None if it is absent or empty.
+
+    Raises:
+        InputError: If a key is unknown, missing or impossible, or has values for another number of joints.
+    """
     if not tables.get(name):
         return None
-    table, spot = tables[name], Spot(file, f"[{name}]")
+    table, spot = tables[name], root.under(f"[{name}]")
     kind = read_kind(table, REFERENCES, spot)
-    try:
-        read = REFERENCES[kind].read(table, f"[{name}]")
-    except InputError as error:
-        raise InputError(f"{file}, {error}") from error
+    read = REFERENCES[kind].read(table, f"{root.file}, [{name}]")
     if len(read) not in (1, drives):
         raise spot.fault(f"has values for {len(read)} joints", f"the plant drives {drives}")
     return dict(table)
 
 
 def read_unknown_reference(
-    tables: Mapping[str, Any], drives: int, file: str
+    tables: Mapping[str, Any], drives: int, root: Spot
 ) -> tuple[dict[str, Any], dict[str, Value]]:
-    """[reference] at its guesses (nothing where it has none), and its unknowns."""
-    table, spot = tables.get("reference", {}), Spot(file, "[reference]")
+    """Read the unknowns of [reference].
+
+    Returns:
+        [reference] at its guesses (an empty dict if nothing is unknown), and the unknowns by name.
+
+    Raises:
+        InputError: If something is unknown that cannot be, or the reference is not one that can be fitted.
+    """
+    table, spot = tables.get("reference", {}), root.under("[reference]")
     given = {k: v for k, v in table.items() if isinstance(v, dict)}
     if not given:
         return {}, {}
@@ -54,10 +63,11 @@ def read_unknown_reference(
     return {"reference": {**table, **{k: v.guess for k, v in unknown.items()}}}, unknown
 
 
-def info_of(key: ReferenceKey) -> ParameterInfo:
-    """A number of a reference as a parameter."""
+def info_of(key: Key) -> ParameterInfo:
+    """Return a number of a reference as a parameter."""
     over, _, under = key.unit.partition("/")
     words = {"": "", "s": "time", "s^2": "time2", "s^3": "time3"}
     dimension = f"{over}/{words[under]}" if under else words.get(over, over)
-    sign = "positive" if key.positive else "nonnegative" if key.minimum == 0.0 else "free"
+    schema = key.read.schema
+    sign = "positive" if "exclusiveMinimum" in schema else "nonnegative" if "minimum" in schema else "free"
     return ParameterInfo(dimension, sign, key.doc)

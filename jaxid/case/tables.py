@@ -1,66 +1,33 @@
-"""What the tables of a case may hold, declared: one line a key."""
+"""Tables of a case whose keys depend on a kind: [plant] and [controller]; and the list of all tables."""
 
 from __future__ import annotations
 
-from dataclasses import MISSING, fields
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
-from jaxid.case.schema import (
+from jaxid.controllers import CONTROLLERS, Controller
+from jaxid.names import MOTIONS, ORIENTATIONS
+from jaxid.schema import (
     Key,
     Keys,
-    Spot,
-    by_joint,
+    Reader,
+    anything,
+    by_drive,
     choice,
-    columns,
     either_text,
     flag,
     inline,
+    keys_of,
     number,
-    odd,
-    rows,
     several,
-    span,
-    stretch,
+    table_of,
     text,
     whole,
 )
-from jaxid.controllers import CONTROLLERS, Controller
-from jaxid.logs.log import HOLDS, OPTIONAL_COLUMNS
+from jaxid.settings import Disturbance, LogTable, Recursive
 
-METHODS = (
-    "inverse_dynamics",
-    "instrumental_variable",
-    "algebraic",
-    "algebraic_single_time",
-    "algebraic_ratio",
-    "algebraic_sign_changed",
-    "algebraic_sign_unchanged",
-    "minimal_model",
-    "minimal_model_printed",
-    "recursive",
-    "power",
-    "output_error",
-    "didim",
-)
-SOLVERS = ("tsit5", "dopri5", "dopri8", "bosh3", "kvaerno3", "kvaerno5")
-MINIMISERS = (
-    "levenberg_marquardt",
-    "optimistix.LevenbergMarquardt",
-    "optimistix.IndirectLevenbergMarquardt",
-    "optimistix.GaussNewton",
-    "optimistix.Dogleg",
-    "optimistix.BFGS",
-    "optimistix.DFP",
-    "optimistix.LBFGS",
-    "optimistix.NonlinearCG",
-    "optimistix.NelderMead",
-)
-# Methods of `jaxid.estimators.register_method`, which a case may then name.
-USER_METHODS: list[str] = []
-# What a trajectory of `jaxid design` is improved for.
-CRITERIA = ("determinant", "condition")
-DERIVATIVES = ("central", "spectral", "parabolic")
-# Tables at the top of a case, in the order in which they are checked; [[ ]] where it may recur.
+# Tables at the top of a case, in the order of the checks; True for those in [[ ]], which may recur.
 TOP = {
     "plant": False,
     "effects": True,
@@ -70,6 +37,7 @@ TOP = {
     "identification": False,
     "algebraic": False,
     "output_error": False,
+    "within_prior": False,
     "recursive": False,
     "controller": False,
     "sensor": False,
@@ -83,192 +51,115 @@ TOP = {
     "simulation": False,
     "study": False,
 }
-# Fields of controllers that are bounded; all others may have any sign.
-_CONTROLLER_SIGNS = {"derivative_filter": "nonnegative", "epsilon": "positive", "tolerance": "positive"}
-# Keys that a law which identifies shares with [recursive].
-ON_LINE = ("half_life", "gate_velocity", "gate_acceleration", "rows", "start", "instrument")
-# And fields that are no value by drive.
-_CONTROLLER_READS = {
-    "poles": several(number("negative"), shortest=2, longest=3),
-    "regularization": number("positive"),
-    "reach": whole(1),
-}
-
-
-def _estimator(value: Any, spot: Spot) -> str:
-    """Read one of [study] estimators; methods may be registered after this module is imported."""
-    return choice((*METHODS, *USER_METHODS, "discover", "in_loop"))(value, spot)
-
-
-DISTURBANCE = either_text(
-    inline(
-        {
-            "level": Key(number(), "height of the square wave, in units of the command", True),
-            "on": Key(number("positive"), "how long it is on [s]", True),
-            "off": Key(number("nonnegative"), "how long it is off in between [s]", True),
-            "start": Key(number(), "when it first goes on [s]; default 0"),
-        }
-    )
+DISTURBANCE = either_text(table_of(Disturbance))
+_DISTURBANCE = Key(
+    DISTURBANCE, "added to the command: a square wave, or the name of a column", note="nothing"
 )
 
 PLANT: Keys = {
-    "motion": Key(choice(("linear", "rotary"))),
-    "orientation": Key(choice(("horizontal", "vertical"))),
-    "gravity": Key(number("nonnegative")),
-    "units": Key(inline({"position": Key(text), "force": Key(text)})),
-}
-ALGEBRAIC: Keys = {"window": Key(span(), "from and to [s]; absent: many windows over the log")}
-OUTPUT_ERROR: Keys = {
-    "on": Key(choice(("position", "force", "both"))),
-    "start": Key(choice(("inverse_dynamics", "recursive", "guess"))),
-    "solver": Key(choice(SOLVERS)),
-    "minimiser": Key(choice(MINIMISERS)),
-    "prior": Key(number("positive"), "relative standard deviation of the guesses; fits what the log tells"),
-    "starts": Key(whole(1), "how many, drawn within the prior"),
-    "hessian": Key(flag, "curvature of the cost in place of Gauss-Newton's"),
-    "profile": Key(flag, "profile likelihoods of what is fitted"),
-    "drawn": Key(flag, "draw what else is as probable, and what rounding does; default true"),
-}
-DESIGN: Keys = {
-    "criterion": Key(choice(CRITERIA)),
-    "harmonics": Key(whole(2), "of the Fourier series, by joint"),
-    "base_frequency_hz": Key(number("positive"), "of the first one; default one over the duration"),
-}
-IDENTIFICATION: Keys = {
-    "physically_consistent": Key(flag, "whether links must be what bodies can be"),
-}
-STUDY: Keys = {
-    "estimators": Key(several(_estimator)),
-    "hidden": Key(several(text)),
-    "noise": Key(several(number("nonnegative"))),
-    "sample_rate": Key(several(number("positive"))),
-    "position_resolution": Key(several(number("positive"))),
-    "draw": Key(number("nonnegative")),
-    "start_spread": Key(number("nonnegative")),
-    "runs": Key(whole(1)),
-    "chunk": Key(whole(1)),
+    "motion": Key(choice(MOTIONS), "linear or rotary: sets the units", note="linear, or as the kind has it"),
+    "orientation": Key(
+        choice(ORIENTATIONS), "vertical if weight acts along the axis", default=ORIENTATIONS[0]
+    ),
+    "gravity": Key(number("nonnegative"), "acceleration of gravity", unit="m/s^2", note="9.81"),
+    "units": Key(
+        inline(
+            {
+                "position": Key(text, "label of the unit of positions"),
+                "force": Key(text, "label of the unit of forces"),
+            }
+        ),
+        "labels, if the quantities are not mechanical",
+    ),
 }
 
-
-def log_keys(joints: int, drives: int, names: tuple[str, ...] = ()) -> Keys:
-    """Keys of [log]; columns may go by the names of the joints, where these have any."""
-    of_joints = Key(columns(joints, names=names), "name of its column")
-    of_drives = Key(columns(drives, "drive", names), "name of its column")
-    return {
-        "time": Key(text, "name of its column"),
-        "sample_rate": Key(number("positive"), "samples per second"),
-        "position": of_joints,
-        "force": of_drives,
-        "hold": Key(choice(HOLDS)),
-        "rows": Key(rows),
-        **{k: of_drives if k == "reference" else of_joints for k in OPTIONAL_COLUMNS},
-    }
-
-
-def validation_keys(joints: int, drives: int, names: tuple[str, ...] = ()) -> Keys:
-    """Keys of [[validation]]."""
-    own = {
-        "name": Key(text, "what it is called in results", required=True),
-        "log": Key(text, "its file, relative to the case"),
-        "disturbance": Key(DISTURBANCE),
-    }
-    return {**own, **log_keys(joints, drives, names)}
-
-
-def actuator_keys(drives: int) -> Keys:
-    """Keys of [actuator]."""
-    row = several(number(), shortest=drives)
-    return {
-        "gain": Key(by_joint(number("nonzero"), drives, "drive")),
-        "transmission": Key(several(row, shortest=drives)),
-    }
+# Keys that an adaptive controller shares with [recursive].
+ON_LINE = ("half_life", "gate_velocity", "gate_acceleration", "rows", "start", "instrument")
+# Keys of the control laws, by the field of the controller; a key belongs to the kinds that have the field.
+_LAW: dict[str, tuple[Reader, str]] = {
+    "kp": (by_drive(number()), "gain of the position error"),
+    "kv": (by_drive(number()), "gain of the velocity loop"),
+    "ki": (by_drive(number()), "gain of the integral of the position error"),
+    "kd": (by_drive(number()), "gain of the velocity error"),
+    "coulomb": (by_drive(number()), "Coulomb friction fed forward, in units of the command"),
+    "viscous": (by_drive(number()), "viscous friction fed forward, units of the command per velocity"),
+    "inertia": (by_drive(number()), "inertia fed forward, units of the command per acceleration"),
+    "derivative_filter": (by_drive(number("nonnegative")), "time constant of the derivative's low-pass [s]"),
+    "anti_windup": (flag, "hold the integral while the command is at its limit"),
+    "poles": (several(number("negative"), shortest=2, longest=3), "poles of the closed loop [1/s]"),
+    "epsilon": (
+        by_drive(number("positive")),
+        "velocity within which the sign of dry friction is linear [m/s or rad/s]",
+    ),
+    "dynamics": (flag, "whether forces without friction are fed forward"),
+    "gains": (flag, "whether the command is divided by the gains of the drives"),
+    "friction": (flag, "whether friction is fed forward"),
+    "regularization": (number("positive"), "number of samples that the start counts as"),
+    "tolerance": (
+        by_drive(number("positive")),
+        "relative error of the force below which the estimate is fed forward",
+    ),
+    "reach": (whole(1), "ticks between the positions that are differenced; absent: velocity_average"),
+}
 
 
-def preprocess_keys(joints: int) -> Keys:
-    """Keys of [preprocess]."""
-    return {
-        "cutoff_hz": Key(number("positive")),
-        "order": Key(whole(1)),
-        "decimation": Key(whole(1)),
-        "trim": Key(whole(0)),
-        "rest_velocity": Key(by_joint(number("nonnegative"), joints)),
-        "align_hold": Key(flag),
-        "median": Key(odd(3), "samples of the running median of the force"),
-        "derivatives": Key(choice(DERIVATIVES)),
-        "reach": Key(whole(1), "samples on each side of a parabola"),
-    }
+@dataclass(frozen=True, kw_only=True)
+class ControllerTable:
+    """[controller]: a control law with its settings.
+
+    Args:
+        kind: One of `jaxid.controllers.CONTROLLERS`.
+        period: Sampling time [s]; None: that of the log.
+        disturbance: Signal that is added to the command: a square wave, or the name of a column.
+        law: Further settings, by the fields of the controller's class.
+    """
+
+    kind: str
+    period: float | None = None
+    disturbance: Disturbance | str | None = None
+    law: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def limit(self) -> float | tuple[float, ...] | None:
+        """Bound of the command; None: no bound."""
+        return self.law.get("limit")
 
 
-def recursive_keys(joints: int) -> Keys:
-    """Keys of [recursive]."""
-    return {
-        "half_life": Key(number("positive"), "s of motion after which a sample counts half"),
-        "regularization": Key(number("positive"), "how many samples the start counts as"),
-        "gate_velocity": Key(by_joint(number("nonnegative"), joints)),
-        "gate_acceleration": Key(by_joint(number("nonnegative"), joints)),
-        "rows": Key(choice(("full", "summed"))),
-        "start": Key(choice(("neutral", "guess"))),
-        "instrument": Key(choice(("none", "model"))),
-        "restart": Key(text, "result.json of an earlier run, relative to the case"),
-    }
+def controller_table(given: Mapping[str, Any]) -> ControllerTable:
+    """Return [controller] from its checked keys."""
+    apart = ("kind", "period", "disturbance")
+    law = {name: value for name, value in given.items() if name not in apart}
+    return ControllerTable(**{name: given[name] for name in apart if name in given}, law=law)
 
 
-def controller_keys(kind: str, drives: int) -> Keys:
-    """Keys of [controller]: those of every controller, and the fields of the class of this kind."""
+def controller_keys(kind: str) -> Keys:
+    """Return the keys of [controller]: those of every controller, and the fields of this kind's class."""
     keys = {
-        "period": Key(number("positive"), "sampling time [s]"),
-        "velocity_average": Key(whole(1), "samples"),
-        "limit": Key(by_joint(number("positive"), drives, "drive"), "of the command"),
-        "disturbance": Key(DISTURBANCE),
+        "period": Key(number("positive"), "sampling time", unit="s", note="the log's"),
+        "velocity_average": Key(whole(1), "samples whose mean is differenced for the velocity", default=1),
+        "limit": Key(by_drive(number("positive")), "bound of the command", note="no bound"),
+        "disturbance": _DISTURBANCE,
     }
     cls = CONTROLLERS[kind]
-    unstated = {field.name for field in fields(Controller)} | set(cls.of_machine)
-    own = {}
-    for field in fields(cls):
-        if field.name not in unstated:
-            required = field.default is MISSING and field.default_factory is MISSING
-            sign = _CONTROLLER_SIGNS.get(field.name, "free")
-            yes_or_no = field.type in (bool, "bool")
-            read = flag if yes_or_no else by_joint(number(sign), drives, "drive")
-            read = _CONTROLLER_READS.get(field.name, read)
-            own[field.name] = Key(read, f"it belongs to kind = '{kind}'", required)
+    unstated = {f.name for f in fields(Controller)} | set(cls.of_machine)
+    law = {}
+    for f in fields(cls):
+        if f.name not in unstated:
+            required = f.default is MISSING and f.default_factory is MISSING
+            plain = flag if f.type in (bool, "bool") else by_drive(number())
+            read, doc = _LAW.get(f.name, (plain, "setting of the law"))
+            law[f.name] = Key(read, f"{doc}; it belongs to kind = '{kind}'", required)
     if "estimator" in cls.of_machine:
-        own |= {k: v for k, v in recursive_keys(drives).items() if k in ON_LINE}
-    return {**own, **keys}
+        law |= {name: entry for name, entry in keys_of(Recursive).items() if name in ON_LINE}
+    return {"kind": Key(anything), **law, **keys}
 
 
-def sensor_keys(joints: int, drives: int) -> Keys:
-    """Keys of [sensor]."""
+def validation_keys() -> Keys:
+    """Return the keys of [[validation]]: its own, and any of [log] that differs."""
+    of_log = {name: Key(k.read, k.doc, False, k.unit) for name, k in keys_of(LogTable).items()}
     return {
-        "position_resolution": Key(by_joint(number("positive"), joints)),
-        "position_noise": Key(by_joint(number("nonnegative"), joints)),
-        "force_noise": Key(by_joint(number("nonnegative"), drives, "drive")),
-        "rate": Key(number("positive"), "readings per second, held in between; absent: one a tick"),
-    }
-
-
-def limits_keys(joints: int, drives: int) -> Keys:
-    """Keys of [limits]."""
-    return {
-        "stroke": Key(stretch(joints), "lowest and highest position"),
-        "speed": Key(by_joint(number("positive"), joints), "largest speed"),
-        "force": Key(by_joint(number("positive"), drives, "drive"), "largest command, in its units"),
-    }
-
-
-def design_keys(joints: int) -> Keys:
-    """Keys of [design]."""
-    most = Key(by_joint(number("positive"), joints), "largest acceleration")
-    return {**DESIGN, "acceleration": most}
-
-
-def simulation_keys(joints: int) -> Keys:
-    """Keys of [simulation]."""
-    return {
-        "duration": Key(number("positive"), "s"),
-        "sample_rate": Key(number("positive"), "samples per second"),
-        "substeps": Key(whole(1)),
-        "sharpness": Key(number("positive")),
-        "initial_position": Key(by_joint(number(), joints)),
-        "initial_velocity": Key(by_joint(number(), joints)),
+        "name": Key(text, "name in results", True),
+        "log": Key(text, "file of the log, relative to the case", note="the fitted log"),
+        "disturbance": _DISTURBANCE,
+        **of_log,
     }

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxid.errors import InputError, suggest
 from jaxid.plants.geometry import JointFrames
 
-# What a joint of each type does; None: it holds.
+# Motion of a joint of each type; None: it is fixed.
 _TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
@@ -25,7 +25,7 @@ class Urdf:
     """An open chain of joints.
 
     Args:
-        names: Of the joints that move, from the base to the tip.
+        names: Names of the joints that move, from the base to the tip.
         geometry: Their frames: the file's, turned such that z is the joint's axis. That of the base is
             the frame of the file's first link.
         bodies: Mass, first moments x y z, and inertia tensor xx xy xz yy yz zz about the frame's origin, of
@@ -39,7 +39,7 @@ class Urdf:
 
 @dataclass(frozen=True)
 class _Joint:
-    """A joint of the file: what it does (None: it holds), and where in the link before it."""
+    """A joint of the file: its motion (None: it is fixed), and its place in the parent link."""
 
     name: str
     motion: str | None
@@ -53,9 +53,9 @@ class _Joint:
 def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
     """Read an arm from a URDF file.
 
-    What fixed joints join is one body. Joints that do not lie between the first link and the tip are held at
-    zero, and what they carry is part of the body that they stand on. Shapes, limits, transmissions and
-    <dynamics> (friction is what effects are for) are passed over.
+    Links behind fixed joints are one body. Joints outside the chain from the first link to the tip are held
+    at zero, and the links that they carry are part of the body that they stand on. Shapes, limits,
+    transmissions and <dynamics> (declare friction as effects) are passed over.
 
     Args:
         path: The file.
@@ -111,7 +111,10 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
 
 
 def _tree(path: Path) -> Element:
-    """The file's root element. Documents that declare entities are refused, for these can fill all memory."""
+    """Parse the file and return its root element.
+
+    Documents that declare entities are refused: these can fill all memory.
+    """
     where = str(path)
 
     def refuse(*args: object) -> None:
@@ -146,7 +149,7 @@ def _tree(path: Path) -> Element:
 
 
 def _named(robot: Element, tag: str, file: str) -> Iterator[tuple[str, Element]]:
-    """The links or joints with their names.
+    """Return the links or joints with their names.
 
     Raises:
         InputError: If one has no name, or two have one.
@@ -165,7 +168,7 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
     """One joint.
 
     Raises:
-        InputError: If it is of a type that is no joint of an arm, or joins what is not there.
+        InputError: If its type is not one of an arm, or it joins links that do not exist.
     """
     where = f"{file}, joint '{name}'"
     kind = joint.get("type", "")
@@ -185,18 +188,20 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
     if _TYPES[kind] and not length > 0:
         raise InputError("<axis> has no length", where=where, hint='write a direction such as xyz="0 0 1"')
     copied = joint.find("mimic")
+    parent, child = ends
     return _Joint(
-        name,
-        _TYPES[kind],
-        *ends,
-        _place(joint.find("origin"), where),
-        axis / (length or 1.0),
-        None if copied is None else copied.get("joint", ""),
+        name=name,
+        motion=_TYPES[kind],
+        parent=parent,
+        child=child,
+        place=_place(joint.find("origin"), where),
+        axis=axis / (length or 1.0),
+        mimics=None if copied is None else copied.get("joint", ""),
     )
 
 
 def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
-    """The link that no joint moves, from which all others can be reached.
+    """Return the link that no joint moves, from which all others can be reached.
 
     Raises:
         InputError: If there is none, or more than one, or a loop.
@@ -216,7 +221,7 @@ def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
         raise InputError(
             f"no joint joins '{roots[0]}' and '{roots[1]}'",
             where=file,
-            hint="join them, or take out what is not part of the arm",
+            hint="join them, or take out links that are not part of the arm",
         )
     reached, ahead = set(), list(roots)
     while ahead:
@@ -253,7 +258,7 @@ def _chain(
         for one, other in zip(way, longest, strict=False):
             if one is not other:
                 what = f"joints '{other.name}' and '{one.name}' branch: an arm is one chain"
-                hint = 'say which by tip = "<name of its last link>"; what branches off is then held at zero'
+                hint = 'say which by tip = "<name of its last link>"; branches are then held at zero'
                 raise InputError(what, where=file, hint=hint)
     if not longest:
         raise InputError(
@@ -289,7 +294,7 @@ def _numbers(element: Element, name: str, count: int, where: str) -> np.ndarray:
 
 
 def _place(origin: Element | None, where: str) -> Float[np.ndarray, "4 4"]:
-    """Homogeneous transform of an <origin>; where there is none, or a part is missing, nothing."""
+    """Return the homogeneous transform of an <origin>; missing parts are zero."""
     out = np.eye(4)
     if origin is None:
         return out
@@ -329,8 +334,8 @@ def _inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndar
 
 
 def _towards(axis: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """The axes of a link turned such that z is the joint's; as they are where it is."""
-    # Half a turn about x first where z would turn by more than a right angle: no division by what vanishes.
+    """Turn the axes of a link such that z is the joint's; keep them if it is already."""
+    # Half a turn about x first, if z would turn by more than a right angle: the divisor stays above zero.
     half = np.diag([1.0, -1.0, -1.0]) if axis[2] < 0 else np.eye(3)
     x, y, z = half @ axis
     # About the cross product of both, by Rodrigues' formula.

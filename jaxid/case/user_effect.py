@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxid.case.schema import Spot
 from jaxid.case.user_faults import check_declaration
 from jaxid.case.user_file import check_kind, check_parameters, class_of_file
 from jaxid.effects import EFFECTS
 from jaxid.model.effect import Effect
+from jaxid.schema import Spot
 
 
 def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
@@ -16,11 +16,11 @@ def user_effect(kind: str, folder: Path, spot: Spot) -> type[Effect]:
 
     Args:
         kind: "my_effects.py:MyEffect".
-        folder: Folder from which relative paths start.
-        spot: Place of the kind in the case.
+        folder: Folder from which relative file names start.
+        spot: Position of the kind in the case.
 
     Returns:
-        The class; its `kind` is the text if it states none.
+        The class; its `kind` is the text, if the class gives none.
 
     Raises:
         InputError: If there is no such file or class, it does not import, it is no effect, or its

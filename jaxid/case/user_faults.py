@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.case.schema import Spot
 from jaxid.errors import InputError
 from jaxid.model.effect import Action, Effect, Signals
 from jaxid.model.interface import PLACES
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.numerics.affine import depends
+from jaxid.schema import Spot
 
 # Names that a case gives a meaning of its own in [[effects]].
 _RESERVED = ("kind", "port", "shared", *PLACES)

@@ -13,13 +13,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
-from jaxid.case.schema import Spot
 from jaxid.case.user_faults import one_line
 from jaxid.effects import EFFECTS
 from jaxid.errors import suggest
 from jaxid.model.parameter import SIGNS, parameters_of
 from jaxid.model.units import Units
 from jaxid.plants import PLANTS
+from jaxid.schema import Spot
 
 T = TypeVar("T")
 

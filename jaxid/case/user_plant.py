@@ -12,13 +12,13 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.case.declared import PlantEntry
-from jaxid.case.schema import Spot
 from jaxid.case.user_file import check_kind, check_parameters, class_of_file
 from jaxid.case.values import Value
 from jaxid.errors import InputError
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 from jaxid.plants import PLANTS
+from jaxid.schema import Spot
 
 _MOTIONS = ("linear", "rotary")
 # Relative; chosen: a mass matrix is asked for at sizes of order one, and rounding leaves 1e-15.

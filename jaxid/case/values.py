@@ -6,8 +6,20 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from jaxid.case.schema import Key, Spot, count, number, read_table, shown
 from jaxid.model.parameter import ParameterInfo
+from jaxid.schema import (
+    Key,
+    Keys,
+    Reader,
+    Spot,
+    count,
+    either,
+    list_of,
+    number,
+    read_table,
+    schema_of,
+    shown,
+)
 
 
 @dataclass(frozen=True)
@@ -15,10 +27,10 @@ class Value:
     """One number of a machine.
 
     Args:
-        guess: The known value, or where a fit starts.
+        guess: Known value, or start of a fit.
         free: Whether it is to be identified.
-        lower, upper: Bounds, where it is.
-        true: What a simulation uses in its place; None: `guess`.
+        lower, upper: Bounds of an unknown value.
+        true: Value for simulations; None: `guess`.
     """
 
     guess: float
@@ -28,20 +40,54 @@ class Value:
     true: float | None = None
 
     def start(self, at_truth: bool) -> float:
-        """Return the guess, or the true value where there is one and it is asked for."""
+        """Return the guess; or the true value, if it is asked for and there is one."""
         return self.true if at_truth and self.true is not None else self.guess
 
 
+def _keys(info: ParameterInfo) -> Keys:
+    signed = number(info.sign)
+    return {
+        "guess": Key(signed, "value that the fit starts from", True),
+        "min": Key(number(), "lower bound"),
+        "max": Key(number(), "upper bound"),
+        "true": Key(signed, "value that simulate and study use in place of the guess"),
+    }
+
+
+def value_reader(info: ParameterInfo) -> Reader:
+    """Return the reader of one value of a parameter."""
+    return Reader(lambda value, spot: read_value(value, info, spot), value_schema(info))
+
+
+def value_schema(info: ParameterInfo) -> dict[str, Any]:
+    """Return the JSON Schema of one value of a parameter: a number, or a table with its guess."""
+    if info.known:
+        return dict(number(info.sign).schema)
+    return either(number(info.sign).schema, schema_of(_keys(info)))
+
+
+def values_schema(info: ParameterInfo) -> dict[str, Any]:
+    """Return the JSON Schema of values for several places: one for all, a list, or a table of lists."""
+    table = schema_of(_keys(info))
+    table["properties"] = {name: either(entry, list_of(entry)) for name, entry in table["properties"].items()}
+    one = number(info.sign).schema
+    return (
+        either(one, list_of(value_schema(info)))
+        if info.known
+        else either(one, table, list_of(value_schema(info)))
+    )
+
+
 def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
-    """Check a value against what its parameter may be.
+    """Read one value of a parameter.
 
     Args:
         value: `3.0`, or a table of guess, min, max, true.
         info: The parameter.
-        spot: Where it stands.
+        spot: Position of the value, for messages.
 
     Raises:
-        InputError: If it is no finite number, of the wrong sign, or outside its own bounds.
+        InputError: If it is not a finite number, has the wrong sign, or lies outside of its bounds.
     """
     signed = number(info.sign)
     if isinstance(value, list):
@@ -51,16 +97,10 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
         raise spot.refuse(value, "must be a known number", hint)
     if not isinstance(value, dict):
         if isinstance(value, bool) or not isinstance(value, int | float):
-            hint = "give a number where it is known, { guess = ... } where it is not"
+            hint = "give a number if it is known, { guess = ... } if it is not"
             raise spot.refuse(value, "is not a number", hint)
         return Value(signed(value, spot))
-    keys = {
-        "guess": Key(signed, "where the fit starts", required=True),
-        "min": Key(number(), "lower bound"),
-        "max": Key(number(), "upper bound"),
-        "true": Key(signed, "for simulate and study"),
-    }
-    given = read_table(value, keys, spot)
+    given = read_table(value, _keys(info), spot)
     lower, upper = given.get("min", -math.inf), given.get("max", math.inf)
     if lower > upper:
         raise spot.refuse(value, f"has min {lower:g} above max {upper:g}", "exchange min and max")
@@ -76,14 +116,14 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
 def read_values(
     value: Any, info: ParameterInfo, places: int, spot: Spot, what: str = "joint"
 ) -> tuple[Value, ...]:
-    """Check a value for several places: one for each of them, or a list.
+    """Read the values of several places: one for all of them, or a list.
 
     Args:
         value: A value, a list of values, or a table of lists.
         info: The parameter.
-        places: How many there are.
-        spot: Where it stands.
-        what: What a place is, for messages.
+        places: Number of places.
+        spot: Position of the value, for messages.
+        what: Noun of a place, for messages.
 
     Returns:
         One value a place.

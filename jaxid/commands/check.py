@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.case.case import Case
+from jaxid.case.case import CaseLike
 from jaxid.estimators.inverse_dynamics import force_precision
 from jaxid.files import ready_folder, write_json
 from jaxid.gap import noise_floor
@@ -96,13 +96,11 @@ class Check:
         return folder
 
 
-def check(
-    case: Case | str | Path, log: Log | str | Path, *, validate: Sequence[Log | str | Path] = ()
-) -> Check:
+def check(case: CaseLike, log: Log | str | Path, *, validate: Sequence[Log | str | Path] = ()) -> Check:
     """Check a log against a case before any fit.
 
     Args:
-        case: The case, or its file.
+        case: The case, its file, or a dict with its tables.
         log: The log, or its file.
         validate: More logs to check, beside the case's own.
 

@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 from jaxid.build import build_machine
-from jaxid.case.case import Case, load_case
+from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.errors import InputError
 from jaxid.experiment_design.along_reference import Excitation, excite
 from jaxid.experiment_design.in_loop import Design, design_in_loop
+from jaxid.scene import sampling_of
 
 
-def design(
-    case: Case | str | Path, *, progress: Callable[[str], None] = lambda text: None
-) -> Design | Excitation:
+def design(case: CaseLike, *, progress: Callable[[str], None] = lambda text: None) -> Design | Excitation:
     """Find the reference (in a loop) or the input that tells a case's unknowns best, at its guesses.
 
     Of an arm, and of any case with a key in [design], the reference is taken to be followed: see
     `jaxid.experiment_design.along_reference.excite`. Else:
 
     The logarithm of the information's determinant is raised through the simulation by gradients (D-optimal;
-    Bayesian: each guess is a prior of the relative width `[output_error] prior`, 0.5 where absent), over sums
+    Bayesian: each guess is a prior of the relative width `[within_prior] prior`, 0.5 where absent), over sums
     of sines and a tour from end to end, within [limits].
 
     Args:
-        case: The case, or its file; it needs [simulation] duration and sample_rate, [limits] stroke and
-            speed (in open loop force), and in [sensor] the noise of what `[output_error] on` compares.
+        case: The case, its file, or a dict with its tables; it needs [simulation] duration and sample_rate,
+            [limits] stroke and speed (in open loop force), and in [sensor] the noise of what
+            `[output_error] on` compares.
         progress: Called with a line at every stage.
 
     Raises:
@@ -35,23 +34,23 @@ def design(
     Source:
         Chaloner and Verdinelli (1995), "Bayesian experimental design: a review".
     """
-    case = case if isinstance(case, Case) else load_case(case)
+    case = load_case(case)
     _check(case)
-    if case.plant.cls.linked or case.design:
+    if case.plant.cls.linked or case.design is not None:
         return excite(case, progress)
     return design_in_loop(case, progress)
 
 
 def _check(case: Case) -> None:
     """Refuse a case without what any design needs."""
-    where = str(case.path)
+    where = case.where
     for table, key in (
         ("simulation", "duration"),
         ("simulation", "sample_rate"),
         ("limits", "stroke"),
         ("limits", "speed"),
     ):
-        if key not in getattr(case, table):
+        if getattr(getattr(case, table), key) is None:
             raise InputError(f"[{table}] has no {key}", where=where, hint=f"add {key} = ... to [{table}]")
-    if not build_machine(case, period=1 / float(case.simulation["sample_rate"])).parameters.free:
+    if not build_machine(case, period=1 / sampling_of(case)[0]).parameters.free:
         raise InputError("nothing is unknown", where=where, hint="give a parameter as { guess = ... }")

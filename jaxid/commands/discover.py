@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxid.case.case import Case
+from jaxid.case.case import CaseLike
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.in_loop.confirm import WHY, hindering
@@ -46,7 +46,7 @@ _BARRED = 3
 
 
 def discover(
-    case: Case | str | Path,
+    case: CaseLike,
     log: Log | str | Path,
     *,
     validate: Sequence[Log | str | Path] = (),
@@ -60,7 +60,7 @@ def discover(
     """Find the effects that a case's model is missing, on a log.
 
     Args:
-        case: The case, or its file.
+        case: The case, its file, or a dict with its tables.
         log: The log, or its file.
         validate: Logs that must confirm each effect, beside the case's own.
         max_effects: Most effects to add.
@@ -101,7 +101,7 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "what it is would be taken for an effect")
-    if "prior" in session.case.output_error:
+    if session.case.fits_within_prior("discover"):
         return explore_within(session, max_effects=max_effects, progress=progress)
     data = session.fit.data
     progress("fitting what is there")

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from jaxid.case.case import Case, load_case
+from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import METHODS, steps_of
+from jaxid.estimators import steps_of
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import OUTPUTS
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.log import Log
+from jaxid.names import METHODS, OUTPUTS, SOLVERS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.session import Session, open_session
-from jaxid.simulation.solvers import SOLVERS
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Identification:
 
 
 def identify(
-    case: Case | str | Path,
+    case: CaseLike,
     log: Log | str | Path,
     *,
     method: str = "output_error",
@@ -77,16 +76,16 @@ def identify(
     """Identify the unknowns of a case from a log.
 
     Args:
-        case: The case, or its file.
+        case: The case, its file, or a dict with its tables.
         log: The log, or its file.
-        method: One of `jaxid.estimators.METHODS`.
-        solver: For `output_error`, one of `jaxid.simulation.solvers.SOLVERS`: diffrax then integrates between
-            samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
+        method: One of `jaxid.names.METHODS`.
+        solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between samples,
+            dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
             of the fixed steps either way.
         minimiser: For `output_error`, one of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of
             optimistix; None: as the case says, or jaxid's Levenberg-Marquardt.
         on: For `output_error`, what of the simulated loop is to meet its log: one of
-            `jaxid.estimators.output_error.OUTPUTS`; None: as the case says, or position.
+            `jaxid.names.OUTPUTS`; None: as the case says, or position.
         validate: Logs to validate on, beside the case's own.
         progress: Called with a line at every stage.
 
@@ -97,7 +96,7 @@ def identify(
         raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     options = {}
     if solver is not None:
-        options["solver"] = _checked("solver", solver, SOLVERS, method)
+        options["solver"] = _checked("solver", solver, tuple(SOLVERS), method)
     if minimiser is not None:
         _need_output_error("minimiser", minimiser_name(minimiser), method)
         minimiser_of(minimiser)
@@ -108,7 +107,7 @@ def identify(
     if not session.machine.parameters.free:
         raise InputError(
             "nothing is unknown",
-            where=str(session.case.path),
+            where=session.case.where,
             hint="give at least one parameter as { guess = ... }",
         )
     progress(f"fitting by {method}")
@@ -123,7 +122,7 @@ def identify(
 
 
 def identify_many(
-    case: Case | str | Path | Sequence[Case | str | Path],
+    case: CaseLike | Sequence[CaseLike],
     logs: Sequence[Log | str | Path],
     *,
     method: str = "output_error",
@@ -132,9 +131,10 @@ def identify_many(
     """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
 
     Args:
-        case: The case, or its file; or one for each log, which may differ in their guesses.
+        case: The case, its file, or a dict with its tables; or one for each log, with guesses that may
+            differ.
         logs: Logs, or their files.
-        method: One of `jaxid.estimators.METHODS`.
+        method: One of `jaxid.names.METHODS`.
         lanes: Logs in a compiled call.
 
     Returns:
@@ -145,11 +145,10 @@ def identify_many(
     """
     if method not in METHODS:
         raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
-    loaded = lambda c: c if isinstance(c, Case) else load_case(c)
-    if isinstance(case, Case | str | Path):
-        cases = [loaded(case)] * len(logs)
+    if isinstance(case, Case | Mapping | str | Path):
+        cases = [load_case(case)] * len(logs)
     elif len(case) == len(logs):
-        cases = [loaded(c) for c in case]
+        cases = [load_case(c) for c in case]
     else:
         raise InputError(f"{len(case)} cases for {len(logs)} logs", hint="give one case, or one for each log")
 
@@ -159,7 +158,7 @@ def identify_many(
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
 
-def _checked(option: str, value: str, known: Iterable[str], method: str) -> str:
+def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
     _need_output_error(option, value, method)
     if value not in known:
         raise InputError(f"{option} {value!r} is not known", hint=suggest(value, known))
@@ -167,9 +166,9 @@ def _checked(option: str, value: str, known: Iterable[str], method: str) -> str:
 
 
 def _need_output_error(option: str, value: str, method: str) -> None:
-    if method != "output_error":
+    if method not in ("output_error", "within_prior"):
         raise InputError(
-            f"{option} {value!r} goes only with output_error",
+            f"{option} {value!r} goes only with {' and '.join(methods)}",
             hint=f"leave out {option}, or method {method!r}",
         )
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +18,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.build import build_machine
-from jaxid.case.case import Case, load_case
+from jaxid.case.case import CaseLike, load_case
 from jaxid.controllers import Controller, Tick, base, laws_with_model
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import Online, OnlineEstimate, OnlineMemory
@@ -40,7 +39,8 @@ class Live:
     """The loop of a case without its plant: readings in, commands out.
 
     Args:
-        case: The case, or its file; it needs [controller], [reference] and [simulation].
+        case: The case, its file, or a dict with its tables; it needs [controller], [reference] and
+            [simulation].
         identify: Identify the unknowns on-line and, once all may be trusted, put what was found into
             the model of a controller that has one.
         tolerance: Of that trust (see `jaxid.estimators.algebraic.online.OnlineEstimate`).
@@ -55,11 +55,11 @@ class Live:
             on-line.
     """
 
-    def __init__(self, case: Case | str | Path, *, identify: bool = False, tolerance: float = 0.05):
-        case = case if isinstance(case, Case) else load_case(case)
+    def __init__(self, case: CaseLike, *, identify: bool = False, tolerance: float = 0.05):
+        case = load_case(case)
         scene = Scene.of(case)
         if scene.machine.controller is None:
-            raise InputError("there is no loop", where=str(case.path), hint="add a [controller]")
+            raise InputError("there is no loop", where=case.where, hint="add a [controller]")
         self.machine = build_machine(case, period=scene.drive.period)
         self.reference: Float[np.ndarray, "ticks m"] = scene.signal
         self.period: float = scene.drive.period
@@ -80,12 +80,12 @@ class Live:
         self._online, self._rows = None, None
         if identify:
             if "model" not in self._controller.of_machine or self.adapts:
-                kind = (case.controller or {})["kind"]
+                kind = "" if case.controller is None else case.controller.kind
                 what = "identifies by itself" if self.adapts else "has no model to put what is found into"
                 laws = laws_with_model(self.machine.plant, case.plant.drives, case.plant.joints)
                 raise InputError(
                     f"a controller of kind {kind!r} {what}",
-                    where=str(case.path),
+                    where=case.where,
                     hint=f"take kind = '{laws[0]}'" if laws and not self.adapts else "leave identify out",
                 )
             self._online = _online(self.machine, self.reference, self._driven, self.period, tolerance)
@@ -179,18 +179,18 @@ class Live:
             self.switched = self._tick
 
 
-def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> OnlineEstimate:
+def follow(case: CaseLike, log: Log, *, tolerance: float = 0.05) -> OnlineEstimate:
     """What the on-line estimator tells at every sample of a log but the first, (time, p) each.
 
     Args:
-        case: The case, or its file.
+        case: The case, its file, or a dict with its tables.
         log: The log; its command is held between samples.
         tolerance: Of trust (see `jaxid.estimators.algebraic.online.OnlineEstimate`).
 
     Raises:
         InputError: If the case asks for what cannot be identified on-line.
     """
-    case = case if isinstance(case, Case) else load_case(case)
+    case = load_case(case)
     log.need_every_encoder("on-line identification")
     machine = build_machine(case, period=log.period)
     fast = np.abs(np.diff(log.position, axis=0)).max(axis=0) / log.period

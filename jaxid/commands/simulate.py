@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from jaxid.case.case import Case, load_case
+from jaxid.case.case import CaseLike, load_case
 from jaxid.numerics.lanes import run_alone
 from jaxid.scene import Scene, SimulatedLog
 
 
-def simulate(case: Case | str | Path, *, seed: int = 0) -> SimulatedLog:
+def simulate(case: CaseLike, *, seed: int = 0) -> SimulatedLog:
     """Simulate the log that a case would give, at its true values where it has any.
 
     Args:
-        case: The case, or its file; it needs [simulation] with duration and sample_rate, and
-            [reference] (with a [controller]) or [input].
+        case: The case, its file, or a dict with its tables; it needs [simulation] with duration and
+            sample_rate, and [reference] (with a [controller]) or [input].
         seed: Of the sensors' noise.
 
     Raises:
         InputError: If the case does not say what to simulate.
     """
-    scene = Scene.of(case if isinstance(case, Case) else load_case(case))
+    scene = Scene.of(load_case(case))
     return run_alone(scene.simulated_log(scene.machine, np.random.default_rng(seed)))

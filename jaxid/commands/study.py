@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from jaxid.case.case import Case, load_case
+from jaxid.case.case import CaseLike, load_case
 from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
 from jaxid.files import check_folder, mark_folder, write_json, write_whole
@@ -36,7 +36,7 @@ Told = Callable[[int, int], None]
 
 
 def study(
-    case: Case | str | Path,
+    case: CaseLike,
     *,
     runs: int | None = None,
     seed: int = 0,
@@ -49,8 +49,8 @@ def study(
     """Simulate and identify a case over and over.
 
     Args:
-        case: The case, or its file; [simulation] and [study] say what to do, `true` where a true value
-            differs from the guess.
+        case: The case, its file, or a dict with its tables; [simulation] and [study] describe the study,
+            `true` gives a true value that differs from the guess.
         runs: At each level; in place of the case's.
         seed: Of everything drawn.
         folder: Where each chunk is kept as soon as it ends, and the results at the end; absent: in
@@ -64,7 +64,7 @@ def study(
     Raises:
         InputError: If the case does not say what to simulate, or the folder holds another study.
     """
-    case = case if isinstance(case, Case) else load_case(case)
+    case = load_case(case)
     where = None if folder is None else Path(folder)
     if resume and where is None:
         raise InputError("there is nothing to resume from", hint="give the folder of the study: -o DIR")

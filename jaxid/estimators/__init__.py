@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.case.tables import USER_METHODS
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.unknowns import REFERENCE
+from jaxid.names import USER_METHODS
 from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:
@@ -40,32 +40,23 @@ def _output_error(
     on: str | None = None,
     numerics: Numerics | None = None,
 ) -> Steps[Estimate]:
-    from jaxid.estimators.output_error import choose_numerics, need_loop, output_error_steps
-
-    log, stated = session.fit.log, session.case.output_error
-    on = str(on or stated.get("on", "position"))
-    solver = solver or stated.get("solver")
-    minimiser = minimiser or stated.get("minimiser")
-    if "prior" in stated:
-        from jaxid.estimators.within_prior.fit import within_prior_steps
-
-        need_loop(session.machine, log, "[output_error] prior", "or leave prior out")
-        if solver is not None and numerics is None:
-            numerics = choose_numerics(session.machine, log, solver=solver)
-        others = yield from _beside_the_guesses(session)
-        options = {k: v for k, v in stated.items() if k not in ("on", "start", "solver", "minimiser")}
-        return (
-            yield from within_prior_steps(
-                session.machine,
-                log,
-                on=on,
-                numerics=numerics,
-                others=others,
-                minimiser=minimiser,
-                **options,
-            )
+    case, log = session.case, session.fit.log
+    stated = case.output_error
+    on = on or stated.on
+    if case.fits_within_prior("output_error"):
+        result = yield from _within_prior(
+            session,
+            solver=solver,
+            minimiser=minimiser,
+            on=on,
+            numerics=numerics,
+            asked="[output_error] prior",
         )
+        return replace(result, method="output_error")
 
+    from jaxid.estimators.output_error import choose_numerics, output_error_steps
+
+    solver, minimiser = solver or stated.solver, minimiser or stated.minimiser
     start = yield from _start(session)
     if solver is not None and numerics is None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
@@ -80,18 +71,54 @@ def _output_error(
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
 
+def _within_prior(
+    session: Session,
+    *,
+    solver: str | None = None,
+    minimiser: str | Minimiser | None = None,
+    on: str | None = None,
+    numerics: Numerics | None = None,
+    asked: str = "the method within_prior",
+) -> Steps[Estimate]:
+    """Fit within the prior of the guesses; `asked` names the request in messages."""
+    from jaxid.estimators.output_error import choose_numerics, need_loop
+    from jaxid.estimators.within_prior.fit import within_prior_steps
+
+    settings, log = session.case.need_prior(), session.fit.log
+    solver = solver or settings.solver
+    need_loop(session.machine, log, asked, "or take another method")
+    if solver is not None and numerics is None:
+        numerics = choose_numerics(session.machine, log, solver=solver)
+    others = yield from _beside_the_guesses(session)
+    return (
+        yield from within_prior_steps(
+            session.machine,
+            log,
+            prior=settings.prior,
+            on=on or settings.on,
+            starts=settings.starts,
+            others=others,
+            hessian=settings.hessian,
+            profile=settings.profile,
+            numerics=numerics,
+            drawn=settings.drawn,
+            minimiser=minimiser or settings.minimiser,
+        )
+    )
+
+
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
     """Return another start of a fit within a prior: the estimates of a method, the rest at the guesses.
 
     Of sums that it cannot tell apart both parts move; what does not enter in proportion stays.
     """
-    method, unknown = session.case.output_error.get("start", "guess"), session.machine.parameters
+    method, unknown = session.case.need_prior().start, session.machine.parameters
     if method == "guess":
         return []
     from jaxid.estimators.recursive.rows import keep_linear_steps
 
     machine = yield from keep_linear_steps(session.machine, session.fit.data)
-    case = replace(session.case, recursive=session.case.recursive | {"start": "guess"})
+    case = replace(session.case, recursive=replace(session.case.recursive, start="guess"))
     first = yield from METHODS[method](replace(session, machine=machine, case=case))
     found = dict(zip(first.names, first.theta, strict=True))
     theta = np.array([found.get(f.name, f.guess) for f in unknown.free])
@@ -106,7 +133,7 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
     keep them may end where there is nothing to simulate.
     """
     parameters = session.machine.parameters
-    method = session.case.output_error.get("start", "inverse_dynamics")
+    method = session.case.output_error.start
     if method == "guess":
         return None
     first = yield from METHODS[method](session)
@@ -125,8 +152,8 @@ def _recursive(session: Session) -> Steps[Estimate]:
     case, run = session.case, session.fit
     run.log.need_every_encoder("recursive")
     saved = None
-    if "restart" in case.recursive:
-        saved = read_memory(case.folder / case.recursive["restart"], session.machine.parameters.names)
+    if case.recursive.restart is not None:
+        saved = read_memory(case.folder / case.recursive.restart, session.machine.parameters.names)
     return recursive_steps(session.machine, run.data, case.recursive, saved)
 
 
@@ -155,7 +182,7 @@ def _algebraic(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.algebraic.one_window import least_squares_steps
     from jaxid.estimators.algebraic.windows import algebraic_steps
 
-    run, window = session.fit, session.case.algebraic.get("window")
+    run, window = session.fit, session.case.algebraic.window
     run.log.need_every_encoder("algebraic")
     if window is None:
         return algebraic_steps(session.machine, run.log, run.data)
@@ -168,7 +195,7 @@ def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
     def steps(session: Session) -> Steps[Estimate]:
         from jaxid.estimators.algebraic.one_window import FORMS
 
-        run, window = session.fit, session.case.algebraic.get("window")
+        run, window = session.fit, session.case.algebraic.window
         run.log.need_every_encoder(name)
         return FORMS[name](session.machine, run.log, run.data, window)
 
@@ -191,7 +218,7 @@ _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 
 # Methods that simulate, and can be told how.
-SIMULATING = ("output_error", "instrumental_variable", "didim")
+SIMULATING = ("output_error", "within_prior", "instrumental_variable", "didim")
 
 # Methods that can keep links to what bodies can be: they minimise, step by step at least.
 CONSISTENT = (
@@ -205,6 +232,7 @@ CONSISTENT = (
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
+    "within_prior": _within_prior,
     "inverse_dynamics": _inverse_dynamics,
     "algebraic": _algebraic,
     "instrumental_variable": _instrumental_variable,
@@ -252,9 +280,9 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         InputError: If the reference has unknowns, and the method does not simulate the loop for them; or if
             links must be what bodies can be, and the method or they cannot.
     """
-    if method != "output_error":
+    if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
-    if not session.case.identification.get("physically_consistent"):
+    if not session.case.identification.physically_consistent:
         return METHODS[method](session, **options)
     from jaxid.estimators.common.consistency import need_bodies, with_links
 
@@ -268,13 +296,13 @@ def need_consistent(method: str, case: Case) -> None:
     Raises:
         InputError: If it is such a method.
     """
-    if not case.identification.get("physically_consistent"):
+    if not case.identification.physically_consistent:
         return
     hint = "" if method in CONSISTENT else f"use {', '.join(CONSISTENT)}, or leave it out"
-    if method == "output_error" and "prior" in case.output_error:
+    if method == "output_error" and case.fits_within_prior(method):
         method, hint = "output_error with a prior", "leave one of them out"
     if hint:
-        what, where = f"physically_consistent does not go with {method}", f"{case.path}, [identification]"
+        what, where = f"physically_consistent does not go with {method}", f"{case.where}, [identification]"
         raise InputError(what, where=where, hint=hint)
 
 
@@ -287,6 +315,6 @@ def need_known_reference(session: Session, why: str) -> None:
     if session.machine.unknown_reference is not None:
         raise InputError(
             f"the reference has unknowns, and {why}",
-            where=f"{session.case.path}, [reference]",
+            where=f"{session.case.where}, [reference]",
             hint="fit them by output_error, and give the numbers found",
         )

@@ -41,8 +41,6 @@ from jaxid.simulation.replay import (
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.solvers import RELATIVE
 
-# What a fit may compare.
-OUTPUTS = ("position", "force", "both")
 # An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
 # deviation is cut into segments.
 _LOST = 0.5
@@ -180,7 +178,7 @@ def output_error(
         start: In place of the guesses, for example from `inverse_dynamics`.
         numerics: How to integrate; chosen from plant and log where absent.
         hessian: Take the covariance from the full Hessian in place of Gauss-Newton's.
-        on: One of `OUTPUTS`. Both: each column over the standard deviation that a fit of the position
+        on: One of `jaxid.names.OUTPUTS`. Both: each column over the standard deviation that a fit of position
             leaves in it. The force is that of a closed loop; an open loop is given its own.
         minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix; absent:
             `jaxid.estimators.common.levenberg_marquardt`.
@@ -333,7 +331,7 @@ def choose_numerics(
         machine: The machine.
         log: The log.
         segments: Whether an open-loop run may be cut into segments.
-        solver: One of `jaxid.simulation.solvers.SOLVERS`; None: fixed steps.
+        solver: One of `jaxid.names.SOLVERS`; None: fixed steps.
     """
     breaks_away = any(e.break_away_level is not None for e in machine.plant.effects)
     exact = exact_numerics(machine, log, 1 if solver else None)

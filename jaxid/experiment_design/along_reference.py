@@ -17,7 +17,6 @@ from jaxid.arms.base_parameters import independent
 from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
-from jaxid.case.tables import CRITERIA
 from jaxid.dynamics.residuals import balance_along
 from jaxid.errors import InputError
 from jaxid.experiment_design.improve import improved
@@ -26,9 +25,9 @@ from jaxid.files import signal_csv, write_whole
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.scene import sampling_of
+from jaxid.settings import DesignTable
 
-# Number of harmonics by default.
-HARMONICS = 5
 # Samples in each period of the fastest harmonic while a trajectory is sought, and room for peaks in between.
 _FINE, _ROOM = 20, 0.02
 # Number of trajectories that are drawn, number of them that are improved, and evaluations for each.
@@ -228,8 +227,8 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
         Swevers et al. (1997), IEEE Trans. Robotics and Automation 13(5), for the series and the determinant;
         Gautier & Khalil (1992), IJRR 11(4), for the condition number. The start at rest is ours.
     """
-    where = str(case.path)
-    rate, duration = float(case.simulation["sample_rate"]), float(case.simulation["duration"])
+    where = case.where
+    rate, duration = sampling_of(case)
     machine = build_machine(case, period=1 / rate)
     base_hz, harmonics = _frequencies(case, rate, duration)
     bounds = _bounds(case)
@@ -262,8 +261,8 @@ def excite(case: Case, progress: Callable[[str], None] = lambda text: None) -> E
 
 def _frequencies(case: Case, rate: float, duration: float) -> tuple[float, int]:
     """Return the base frequency [Hz] and the number of harmonics of a case, and check that they fit."""
-    setting, where = case.design, f"{case.path}, [design]"
-    base_hz, harmonics = setting.get("base_frequency_hz", 1 / duration), setting.get("harmonics", HARMONICS)
+    settings, where = case.design or DesignTable(), f"{case.where}, [design]"
+    base_hz, harmonics = settings.base_frequency_hz or 1 / duration, settings.harmonics
     if base_hz * duration < 1 - 1e-9:
         hint = f"leave it out, or lengthen [simulation] duration to {1.001 / base_hz:.4g} s"
         what = "base_frequency_hz has no whole period in the experiment"
@@ -277,9 +276,10 @@ def _frequencies(case: Case, rate: float, duration: float) -> tuple[float, int]:
 def _bounds(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return low and high end of the stroke, speed and acceleration of a case, (n,) each."""
     n = case.plant.joints
-    low, high = np.broadcast_to(np.asarray(case.limits["stroke"], float), (n, 2)).T
-    speed = np.broadcast_to(np.asarray(case.limits["speed"], float), n)
-    acceleration = np.broadcast_to(np.asarray(case.design.get("acceleration", np.inf), float), n)
+    low, high = np.broadcast_to(np.asarray(case.limits.stroke, float), (n, 2)).T
+    speed = np.broadcast_to(np.asarray(case.limits.speed, float), n)
+    stated = (case.design or DesignTable()).acceleration
+    acceleration = np.broadcast_to(np.asarray(np.inf if stated is None else stated, float), n)
     return low, high, speed, acceleration
 
 
@@ -289,7 +289,8 @@ def _problem(
     """Set up the design of a case, and return if the noise of the forces is known."""
     plant, gain = machine.plant, np.abs(machine.gain)
     time = _instants(base_hz, harmonics)
-    force = gain * np.broadcast_to(case.limits.get("force", np.inf), machine.gain.shape)
+    largest_command = np.inf if case.limits.force is None else case.limits.force
+    force = gain * np.broadcast_to(largest_command, machine.gain.shape)
     p = len(machine.parameters.free)
     weight, known = np.ones(case.plant.joints), False
     noise = machine.sensor.force_noise
@@ -306,7 +307,7 @@ def _problem(
         period=time[1],
         places=machine.parameters.places,
         driven=any(e.in_drive for e in plant.effects),
-        criterion=case.design.get("criterion", CRITERIA[0]),
+        criterion=(case.design or DesignTable()).criterion,
     )
     return problem, known
 

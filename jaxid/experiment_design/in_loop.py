@@ -29,7 +29,8 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import run_alone
-from jaxid.scene import refuse_impossible
+from jaxid.scene import refuse_impossible, sampling_of
+from jaxid.schema import stated
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import Replay
@@ -127,7 +128,7 @@ def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
     if not starts:
         raise InputError(
             "no experiment within the limits was found",
-            where=f"{case.path}, [limits]",
+            where=f"{case.where}, [limits]",
             hint="widen them, or check the loop's gains: every trial exceeded them, whatever its amplitude",
         )
 
@@ -171,9 +172,7 @@ class _DesignProblem:
 
     @classmethod
     def of(cls, case: Case) -> _DesignProblem:
-        """Set up the design of a case."""
-        setting = case.simulation
-        rate, duration = float(setting["sample_rate"]), float(setting["duration"])
+        rate, duration = sampling_of(case)
         machine = build_machine(case, period=1 / rate)
         limits = _limits(case, machine)
         period = machine.hold_period or 1 / rate
@@ -184,15 +183,16 @@ class _DesignProblem:
         machine = machine.with_plant(plant, machine.parameters)
         shapes, starts = _family(machine, limits, ticks, period)
 
-        start = np.broadcast_to(setting.get("initial_position", 0.0), case.plant.joints)
-        refuse_impossible(plant, start[None], f"{case.path}, [simulation] initial_position")
+        start = np.broadcast_to(case.simulation.initial_position, case.plant.joints)
+        refuse_impossible(plant, start[None], f"{case.where}, [simulation] initial_position")
+        width = _PRIOR if case.within_prior is None else case.within_prior.prior
         problem = cls(
             machine=machine,
             replay=_empty_replay(machine, start, ticks, period, every),
             weight=np.zeros(0),
             direct_share=np.zeros(0),
-            prior=Prior.of(machine, case.output_error.get("prior", _PRIOR), np.zeros(0)),
-            on=case.output_error.get("on", "position"),
+            prior=Prior.of(machine, width, np.zeros(0)),
+            on=(case.within_prior or case.output_error).on,
             limits=limits,
             shapes=shapes,
             starts=starts,
@@ -307,18 +307,20 @@ def _empty_replay(machine: Machine, start: np.ndarray, ticks: int, period: float
 
 def _limits(case: Case, machine: Machine) -> Limits:
     """Take the limits that a case states; a force that is not stated follows from the controller's limit."""
-    stated, n, m = case.limits, case.plant.joints, machine.gain.size
-    if machine.controller is None and "force" not in stated:
-        raise InputError("[limits] has no force", where=str(case.path), hint="add force = ... to [limits]")
-    low, high = np.broadcast_to(np.asarray(stated["stroke"], float), (n, 2)).T
+    table, n, m = case.limits, case.plant.joints, machine.gain.size
+    if machine.controller is None and table.force is None:
+        raise InputError("[limits] has no force", where=case.where, hint="add force = ... to [limits]")
+    low, high = np.broadcast_to(np.asarray(table.stroke, float), (n, 2)).T
     saturation = None if machine.controller is None else machine.controller.limit
-    force = stated.get("force", np.inf if saturation is None else _UNSATURATED * np.asarray(saturation))
+    force = table.force
+    if force is None:
+        force = np.inf if saturation is None else _UNSATURATED * np.asarray(saturation)
     return Limits(
         low=np.array(low),
         high=np.array(high),
-        speed=np.broadcast_to(stated["speed"], n).astype(float),
+        speed=np.broadcast_to(np.asarray(table.speed, float), n).astype(float),
         force=np.broadcast_to(force, m).astype(float),
-        stated=tuple(stated),
+        stated=tuple(stated(table)),
     )
 
 
@@ -372,7 +374,7 @@ def _no_noise(case: Case, what: str, key: str) -> InputError:
     """Build the error of a case whose noise is not stated."""
     return InputError(
         f"the noise of the {what} is not known",
-        where=f"{case.path}, [sensor]",
+        where=f"{case.where}, [sensor]",
         hint=f"add {key}: without it no experiment is better than another",
     )
 

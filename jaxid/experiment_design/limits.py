@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -17,6 +17,8 @@ from jaxid.experiment_design.shapes import largest
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.schema import stated
+from jaxid.settings import LimitsTable
 from jaxid.simulation.loops import Trajectory
 
 # From this part of a limit on, an experiment is penalised: at the limit by as much as a factor e in evidence.
@@ -47,33 +49,33 @@ class Limits:
     stated: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, stated: Mapping[str, Any], machine: Machine, log: Log, data: Prepared) -> Limits:
+    def of(cls, table: LimitsTable, machine: Machine, log: Log, data: Prepared) -> Limits:
         """Take the limits that a case states, and the extremes of the log for the others.
 
         Without a stated force the limit is the controller's saturation, if it has one, since the drive is
         known to stand it.
 
         Args:
-            stated: Table [limits] of the case.
+            table: Table [limits] of the case.
             machine: The machine of the log.
             log, data: The log, before and after preparation.
         """
         n, m = log.position.shape[1], log.force.shape[1]
-        stroke = stated.get("stroke")
+        stroke = table.stroke
         if stroke is None:
             low, high = data.q.min(axis=0), data.q.max(axis=0)
         else:
             low, high = np.broadcast_to(np.asarray(stroke, float), (n, 2)).T
-        speed = np.abs(data.qd).max(axis=0) if "speed" not in stated else stated["speed"]
+        speed = np.abs(data.qd).max(axis=0) if table.speed is None else table.speed
         saturation = None if machine.controller is None else machine.controller.limit
         used = np.abs(log.force).max(axis=0) if saturation is None else np.asarray(saturation)
-        force = stated.get("force", used)
+        force = used if table.force is None else table.force
         return cls(
             low=np.array(low, float),
             high=np.array(high, float),
             speed=np.broadcast_to(speed, n).astype(float),
             force=np.broadcast_to(force, m).astype(float),
-            stated=tuple(stated),
+            stated=tuple(stated(table)),
         )
 
     def broken(self, peaks: Peaks) -> bool:

@@ -1,5 +1,6 @@
 """Measured logs: the columns that a case names, checked and in SI units."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,10 @@ from jaxtyping import Float
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers import read_columns
 from jaxid.logs.timebase import sound_time
+from jaxid.names import HOLDS, OPTIONAL_COLUMNS
+from jaxid.schema import Spot, read_settings
+from jaxid.settings import LogTable
 
-HOLDS = ("zero_order", "linear", "band_limited")
-OPTIONAL_COLUMNS = (
-    "velocity",
-    "acceleration",
-    "reference",
-    "load_position",
-    "load_acceleration",
-    "temperature",
-)
-LOG_KEYS = ("time", "sample_rate", "position", "force", "hold", "rows", *OPTIONAL_COLUMNS)
 # Chosen: with fewer samples nothing remains after filtering and trimming.
 MINIMUM_SAMPLES = 50
 # No shape here: columns may be flat, and `Log` checks their lengths.
@@ -172,7 +166,11 @@ def _frozen(values: Any) -> np.ndarray:
 
 
 def read_log(
-    path: str | Path, columns: dict[str, Any], *, joints: int | None = 1, drives: int | None = None
+    path: str | Path,
+    columns: LogTable | Mapping[str, Any],
+    *,
+    joints: int | None = 1,
+    drives: int | None = None,
 ) -> Log:
     """Read a log, and refuse one that no estimator could use.
 
@@ -190,11 +188,10 @@ def read_log(
         InputError: If a key, the file, a column, a cell or the time base is unsound.
     """
     path = Path(path)
-    _check_keys(columns)
-    names = {key: _names(columns, key) for key in _given_quantities(columns)}
+    table = log_table(columns)
+    names = _names(table)
     _check_distinct(names)
-    rows = _rows(columns)
-    data, rows = read_columns(path, [name for group in names.values() for name in group], rows)
+    data, rows = read_columns(path, [name for group in names.values() for name in group], table.rows)
     _check_finite(data, rows[0], path)
 
     groups = {key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()}
@@ -203,55 +200,37 @@ def read_log(
     if samples < MINIMUM_SAMPLES:
         hint = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
         raise InputError(f"is too short: {samples} samples", where=str(path), hint=hint)
-
-    time = _time(groups.pop("time", None), columns, rows, path)
-    hold = columns.get("hold", "zero_order")
-    return Log(time=time, hold=hold, rows=rows, source=str(path), **groups)
+    time = _time(groups.pop("time", None), table, rows, path)
+    return Log(time=time, hold=table.hold, rows=rows, source=str(path), **groups)
 
 
-def _check_keys(columns: dict[str, Any]) -> None:
-    """Refuse unknown keys of `[log]`, missing columns, and values that are no hold or rate."""
-    for key in columns:
-        if key not in LOG_KEYS:
-            raise InputError(f"unknown key '{key}'", where="[log]", hint=suggest(key, LOG_KEYS))
-    for key in ("position", "force"):
-        if not columns.get(key):
-            hint = f'add {key} = "<name of the column>"'
-            raise InputError(f"'{key}' is missing", where="[log]", hint=hint)
-    hold = columns.get("hold", "zero_order")
-    if hold not in HOLDS:
-        raise InputError(f"hold = {hold!r} is unknown", where="[log]", hint=suggest(str(hold), HOLDS))
-    rate = columns.get("sample_rate")
-    if rate is None and not columns.get("time"):
+_LOG = Spot("", "[log]")
+
+
+def log_table(columns: LogTable | Mapping[str, Any], spot: Spot = _LOG) -> LogTable:
+    """Read a [log] table.
+
+    Args:
+        columns: The table, checked already or as it stands in a case.
+        spot: Position of the table, for messages.
+
+    Raises:
+        InputError: If a key is unknown, missing or impossible, or there is no time base.
+    """
+    if isinstance(columns, LogTable):
+        return columns
+    table = read_settings(LogTable, dict(columns), spot)
+    if table.time is None and table.sample_rate is None:
         hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
-        raise InputError("neither time nor sample_rate is given", where="[log]", hint=hint)
-    if rate is not None and not (_is_number(rate) and 0 < rate < np.inf):
-        hint = "give the samples per second, e.g. sample_rate = 1000.0"
-        raise InputError(f"sample_rate = {rate!r} is not a rate in Hz", where="[log]", hint=hint)
+        raise spot.fault("neither time nor sample_rate is given", hint)
+    return table
 
 
-def _is_number(value: Any) -> bool:
-    """Check that a value of TOML is a number; booleans are not."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _given_quantities(columns: dict[str, Any]) -> list[str]:
-    """List the quantities that have a column."""
+def _names(table: LogTable) -> dict[str, list[str]]:
+    """Return the names of columns by quantity."""
     quantities = ("time", "position", "force", *OPTIONAL_COLUMNS)
-    return [key for key in quantities if columns.get(key) is not None]
-
-
-def _names(columns: dict[str, Any], key: str) -> list[str]:
-    """Return the names of the columns of one quantity."""
-    given = columns[key]
-    names = given if isinstance(given, list | tuple) else [given]
-    if not names or not all(isinstance(name, str) for name in names):
-        hint = "give the name of a column, or a list of names"
-        raise InputError(f"{key} = {given!r} is not the name of a column", where="[log]", hint=hint)
-    if len(set(names)) < len(names):
-        hint = "name one column for each joint"
-        raise InputError(f"{key} names a column twice: {names}", where="[log]", hint=hint)
-    return list(names)
+    given = {quantity: getattr(table, quantity) for quantity in quantities}
+    return {q: [g] if isinstance(g, str) else list(g) for q, g in given.items() if g is not None}
 
 
 def _check_distinct(names: dict[str, list[str]]) -> None:
@@ -260,21 +239,6 @@ def _check_distinct(names: dict[str, list[str]]) -> None:
         if set(names.get(one, ())) & set(names.get(other, ())):
             hint = "give each quantity a separate column"
             raise InputError(f"{one} and {other} are the same column", where="[log]", hint=hint)
-
-
-def _rows(columns: dict[str, Any]) -> tuple[int, int] | None:
-    """Return the first row and the end of `rows`, if they are given."""
-    rows = columns.get("rows")
-    if rows is None:
-        return None
-    if (
-        not isinstance(rows, list | tuple)
-        or len(rows) != 2
-        or not all(isinstance(row, int) and not isinstance(row, bool) for row in rows)
-    ):
-        hint = "give two whole numbers, first and end (0-based, half open): rows = [0, 25000]"
-        raise InputError(f"rows = {rows!r} is not a range", where="[log]", hint=hint)
-    return (rows[0], rows[1])
 
 
 def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
@@ -318,13 +282,14 @@ def _check_widths(
 
 
 def _time(
-    column: np.ndarray | None, columns: dict[str, Any], rows: tuple[int, int], path: Path
+    column: np.ndarray | None, table: LogTable, rows: tuple[int, int], path: Path
 ) -> Float[np.ndarray, " samples"]:
     """Return the time of the samples, from the time column or the sampling rate."""
-    rate = columns.get("sample_rate")
+    rate = table.sample_rate
     if column is None:
-        return np.arange(*rows) / float(columns["sample_rate"])
-    where = f"{path}, column '{columns['time']}'"
+        assert rate is not None, "`log_table` refuses a log without time and rate"
+        return np.arange(*rows) / rate
+    where = f"{path}, column '{table.time}'"
     time = sound_time(column[:, 0], rows[0], where)
     logged = (time.size - 1) / (time[-1] - time[0])
     if rate is not None and abs(logged / rate - 1) > 0.01:

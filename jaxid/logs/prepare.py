@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.numerics import filters as signals
+from jaxid.settings import Preprocess
 
 # The omitted samples around reversals are at most this part of the motion.
 _MOSTLY = 0.5
@@ -217,7 +218,11 @@ class Prepared:
         return x[self.kept]
 
 
-def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
+# Everything is chosen from the log.
+_CHOSEN = Preprocess()
+
+
+def choose_recipe(log: Log, stated: Preprocess = _CHOSEN) -> Recipe:
     """Complete a stated recipe from the log, or choose all of it.
 
     The parallel filter ends at the first frequency at which the position is less than four times above its
@@ -237,46 +242,45 @@ def choose_recipe(log: Log, stated: dict | None = None) -> Recipe:
         InputError: If it states a cut-off that the log's sampling rate does not allow, or a median or a
             parabola that is longer than the log.
     """
-    stated = dict(stated or {})
     rate = log.rate_hz
-    if stated.get("cutoff_hz", 0.0) >= 0.5 * rate:
+    if stated.cutoff_hz is not None and stated.cutoff_hz >= 0.5 * rate:
         raise InputError(
-            f"[preprocess] cutoff_hz = {stated['cutoff_hz']:g} is not below half the sampling rate of "
+            f"[preprocess] cutoff_hz = {stated.cutoff_hz:g} is not below half the sampling rate of "
             f"{rate:.6g} Hz",
             where=log.source,
             hint="lower it, or remove it: it is then chosen",
         )
-    parabolic, reach = stated.get("derivatives") == "parabolic", int(stated.get("reach", 2))
-    _require_length(log, stated.get("median"), reach if parabolic else None)
+    parabolic, reach = stated.derivatives == "parabolic", stated.reach
+    _require_length(log, stated.median, reach if parabolic else None)
 
     # A literal recipe has no edge of its parallel filter beside that of the decimation.
-    literal = "cutoff_hz" in stated or (parabolic and "decimation" in stated)
-    how = stated.get("derivatives", "central" if literal else "spectral")
+    literal = stated.cutoff_hz is not None or (parabolic and stated.decimation is not None)
+    how = stated.derivatives or ("central" if literal else "spectral")
     edge = None if literal else _noise_cutoff(log)
     if parabolic:
         cutoff = signals.parabolic_cutoff(reach) * rate
         edge = None if edge is None else min(edge, _FLAT * cutoff)
     else:
-        cutoff = float(stated["cutoff_hz"]) if edge is None else min(2 * edge, 0.45 * rate)
+        cutoff = min(2 * edge, 0.45 * rate) if stated.cutoff_hz is None else stated.cutoff_hz
     band = cutoff if edge is None else edge
-    decimation = int(stated.get("decimation", _decimation(log, band)))
+    decimation = _decimation(log, band) if stated.decimation is None else stated.decimation
 
-    if "rest_velocity" in stated:
-        rest = np.full(log.position.shape[1], stated["rest_velocity"], float)
+    if stated.rest_velocity is not None:
+        rest = np.full(log.position.shape[1], stated.rest_velocity, float)
     else:
         rest = _rest_velocity(log, cutoff, how, reach)
     return Recipe(
         cutoff_hz=cutoff,
-        order=int(stated.get("order", 4)),
+        order=4 if stated.order is None else stated.order,
         decimation=decimation,
-        trim=int(stated.get("trim", trimmed(log, band, decimation, literal=literal))),
+        trim=trim,
         rest_velocity=tuple(float(r) for r in rest),
-        align_hold=bool(stated.get("align_hold", not literal)),
+        align_hold=not literal if stated.align_hold is None else stated.align_hold,
         derivatives=how,
         keeps_reversals=literal,
         edge=None if edge is None else 2 * edge / rate,
         reach=reach,
-        median=stated.get("median"),
+        median=stated.median,
     )
 
 

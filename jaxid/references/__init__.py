@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxid.errors import InputError, suggest
 from jaxid.references.bezier import BEZIER
 from jaxid.references.csv import CSV
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid
 from jaxid.references.fourier import FOURIER
 from jaxid.references.moves import POINT_TO_POINT, TRAPEZOID
 from jaxid.references.multisine import MULTISINE
@@ -23,7 +23,7 @@ from jaxid.references.synchronized import SYNCHRONIZED
 if TYPE_CHECKING:
     from jaxid.model.plant import Plant
 
-__all__ = ["REFERENCES", "Family", "Key", "make_reference"]
+__all__ = ["REFERENCES", "Family", "make_reference"]
 
 REFERENCES: dict[str, Family] = {
     family.kind: family
@@ -46,9 +46,9 @@ def make_reference(
         table: `kind` and the family's keys; a list in place of a value goes by joint.
         rate_hz: Samples per second [Hz].
         duration: Length [s]; round(duration * rate_hz) samples, the first at time zero.
-        base_dir: Folder that relative file names start from: the case's own.
+        base_dir: Folder from which relative file names start: that of the case.
         where: File and table, for messages.
-        plant: What is to follow; needed where points are those of its tool.
+        plant: Plant that follows; needed if the points are those of its tool.
 
     Returns:
         The position (or, for an input, the command) of each joint [unit of the axis].

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid, is_number_list, number_list
+from jaxid.schema import Key, flag, number
 
 # Two points stand for a move from rest to rest: five control points at the start and six at the
 # end, which is z^5 (252 - 1050 z + 1800 z^2 - 1575 z^3 + 700 z^4 - 126 z^5), the profile of
@@ -56,10 +57,12 @@ BEZIER = Family(
     kind="bezier",
     doc="a Bezier polynomial; between two points a move from rest to rest",
     keys={
-        "points": Key("control points, the order plus one", "position", shape="list", shortest=2),
-        "duration": Key("of the curve; absent: to the end", "s", default=None, positive=True),
-        "start_time": Key("rest before it", "s", default=0.0, minimum=0.0),
-        "repeat": Key("run it to and fro until the end", shape="flag", default=False),
+        "points": Key(
+            number_list(2), "control points, the order plus one", True, "position", single=is_number_list
+        ),
+        "duration": Key(number("positive"), "duration of the curve", unit="s", note="to the end"),
+        "start_time": Key(number("nonnegative"), "rest before it", unit="s", default=0.0),
+        "repeat": Key(flag, "run it to and fro until the end", default=False),
     },
     sample=_sample,
 )

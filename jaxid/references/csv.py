@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from jaxid.logs.readers import read_columns
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid
+from jaxid.schema import Key, number, text
 
 
 def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
@@ -40,14 +41,11 @@ CSV = Family(
     kind="csv",
     doc="a column of a file, from its first row on; past the last one it holds",
     keys={
-        "file": Key("the file, relative to the case", shape="text"),
-        "column": Key("the column with the reference", shape="text"),
-        "time": Key("the column with its time", "s", shape="text", default=None),
+        "file": Key(text, "the file, relative to the case", True),
+        "column": Key(text, "the column with the reference", True),
+        "time": Key(text, "the column with its time", unit="s"),
         "sample_rate": Key(
-            "of its rows, where it has no time; absent: the simulation's",
-            "Hz",
-            default=None,
-            positive=True,
+            number("positive"), "rows per second, if the file has no time", unit="Hz", note="the simulation's"
         ),
     },
     sample=_sample,

@@ -1,4 +1,4 @@
-"""What a family of references declares, and how a table of the case is read against it."""
+"""Families of references: their keys, and the reading of a table of the case."""
 
 from __future__ import annotations
 
@@ -6,49 +6,89 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxid.errors import InputError, suggest
+from jaxid.schema import (
+    Key,
+    Reader,
+    Spot,
+    either,
+    is_list,
+    list_of,
+    number,
+    schema_of,
+    several,
+)
 
 if TYPE_CHECKING:
     from jaxid.model.plant import Plant
 
-REQUIRED = object()
-Shape = Literal["number", "whole", "flag", "text", "list", "range", "points"]
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-@dataclass(frozen=True)
-class Key:
-    """One parameter of a family.
+def number_list(shortest: int = 1) -> Reader:
+    """Return the reader of a list of numbers, which becomes an array."""
+    read = several(number(), shortest=shortest)
+    return Reader(lambda value, spot: np.array(read(value, spot)), read.schema)
 
-    Attributes:
-        doc: What it means.
-        unit: Its unit; "position" stands for that of the axis.
-        default: Taken where the table has none; `REQUIRED` where it must be given.
-        shape: A number, a whole number, a flag, text, or a list of numbers; a range: two numbers, the
-            lower negative, the upper positive, or one for both; points: a list of lists, one number a joint,
-            for all joints together.
-        minimum: Smallest value allowed.
-        positive: Whether zero is refused as well.
-        choices: The texts allowed; empty for any.
-        shortest: Fewest entries of a list.
-    """
 
-    doc: str
-    unit: str = ""
-    default: Any = REQUIRED
-    shape: Shape = "number"
-    minimum: float = -math.inf
-    positive: bool = False
-    choices: tuple[str, ...] = ()
-    shortest: int = 1
+def is_number_list(value: Any) -> bool:
+    """Return whether a value is one list of numbers, rather than a list of such lists by joint."""
+    return not (is_list(value) and len(value) > 0 and all(is_list(entry) for entry in value))
+
+
+def _about_zero(value: Any, spot: Spot) -> np.ndarray:
+    pair = value if is_list(value) else (value, value)
+    if len(pair) == 2 and all(_is_number(entry) for entry in pair):
+        low, high = pair if is_list(value) else (-value, value)
+        if low < 0 < high:
+            return np.array([low, high], dtype=float)
+    hint = "give [lower, upper], the lower negative, or one positive number for both"
+    raise spot.refuse(value, "is not a range about zero", hint)
+
+
+# Two numbers, the lower negative and the upper positive, or one positive number for both ends.
+about_zero = Reader(
+    _about_zero, either({"type": "number", "exclusiveMinimum": 0}, list_of({"type": "number"}, 2, 2))
+)
+
+
+def is_about_zero(value: Any) -> bool:
+    """Return whether a value is one range about zero, rather than a list of them by joint."""
+    listed = is_list(value) and len(value) > 0
+    pair = listed and len(value) == 2 and all(_is_number(entry) for entry in value) and min(value) < 0
+    return not listed or pair
+
+
+def point_list(shortest: int = 1) -> Reader:
+    """Return the reader of a list of points, each with one number for every joint, which becomes a matrix."""
+    read_row = several(number())
+
+    def read(value: Any, spot: Spot) -> np.ndarray:
+        rows = value if is_list(value) else ()
+        if len(rows) < shortest or not all(is_list(row) and len(row) for row in rows):
+            hint = f"give a list of at least {shortest}, e.g. {spot.key} = [[0.1, 0.2], [0.3, 0.1]]"
+            raise spot.refuse(value, "is not a list of points", hint)
+        if len({len(row) for row in rows}) > 1:
+            raise spot.refuse(value, "has points of different lengths", "give each one number a joint")
+        return np.array([read_row(row, spot.entry(k)) for k, row in enumerate(rows, start=1)], dtype=float)
+
+    return Reader(read, list_of(list_of({"type": "number"}), shortest))
+
+
+def for_all_joints(value: Any) -> bool:
+    """Return that a value is never a list by joint."""
+    return True
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The instants at which a reference is wanted, and what else a family may need.
+    """The instants of a reference, and the context that a family may need.
 
     Attributes:
         rate_hz: Samples per second.
@@ -56,7 +96,7 @@ class Grid:
         base_dir: Folder that relative file names start from.
         joint: 0-based joint, so that random ones differ.
         where: File and table, for messages.
-        plant: What is to follow, for a family that asks for its kinematics; None where it is not known.
+        plant: Plant that follows, for a family that needs its kinematics; None: not known.
     """
 
     rate_hz: float | int
@@ -77,7 +117,7 @@ class Grid:
         return self.samples / self.rate_hz
 
     def fault(self, what: str, hint: str) -> InputError:
-        """An error that names the table."""
+        """Return an error that names the table."""
         return InputError(what, where=self.where, hint=hint)
 
 
@@ -89,10 +129,10 @@ class Family:
         kind: Its name in a case.
         doc: One line for the user.
         keys: Every parameter allowed, by name.
-        sample: From the values of one joint to its positions at the grid's instants; or, where
-            `together`, from those of all joints to theirs, (samples, joints).
+        sample: Function from the values of one joint to its positions at the grid's instants; with
+            `together`, from the values of all joints to their positions, (samples, joints).
         unknown: Parameters that may be unknown, and are then fitted by `output_error`.
-        follow: As `sample`, from values and instants [s] as JAX's arrays; where any may be unknown.
+        follow: Like `sample`, with values and instants [s] as JAX arrays; for families with unknowns.
         together: Whether the joints are sampled together.
     """
 
@@ -118,102 +158,48 @@ class Family:
             InputError: If a key is unknown, missing or has a value that cannot be.
         """
         given = {name: value for name, value in table.items() if name != "kind"}
-        place = f"{where} kind = '{self.kind}'"
+        spot = Spot(f"{where} kind = '{self.kind}'")
         for name in given:
             if name not in self.keys:
-                hint = suggest(name, self.keys)
-                raise InputError(f"unknown key '{name}'", where=place, hint=hint)
-        spread = {}
-        for name, key in self.keys.items():
-            if name in given:
-                spread[name] = _by_joint(name, key, given[name], place)
-            elif key.default is REQUIRED:
-                hint = f"add {name}" + (f" [{key.unit}]" if key.unit else "") + f": {key.doc}"
-                raise InputError(f"'{name}' is missing", where=place, hint=hint)
-            else:
-                spread[name] = [key.default]
-        joints = max(len(values) for values in spread.values())
-        for name, key in self.keys.items():
-            if key.shape == "points" and spread[name][0] is not None:
-                joints = max(joints, spread[name][0].shape[1])
-        for name, values in spread.items():
-            points = self.keys[name].shape == "points" and values[0] is not None
-            count = values[0].shape[1] if points else len(values)
-            if count != joints and (points or count != 1):
-                hint = f"{'' if points else 'one value for all, or '}{joints} as in the longest list"
-                raise InputError(f"'{name}' has {count} joints", where=place, hint=hint)
+                raise spot.fault(f"unknown key '{name}'", suggest(name, self.keys))
+        spread = {name: _by_joint(name, key, given, spot) for name, key in self.keys.items()}
+
+        # Points hold one number for every joint; else the longest list gives the number of joints.
+        matrices = {n for n, v in spread.items() if v[0] is not None and np.ndim(v[0]) == 2}
+        widths = {n: v[0].shape[1] if n in matrices else len(v) for n, v in spread.items()}
+        joints = max(widths.values())
+        for name, width in widths.items():
+            if width != joints and (name in matrices or width != 1):
+                alone = "" if name in matrices else "one value for all, or "
+                hint = f"give {alone}{joints} as in the longest list"
+                raise spot.fault(f"'{name}' has {width} joints", hint)
         return [
             {name: values[joint % len(values)] for name, values in spread.items()} for joint in range(joints)
         ]
 
-
-def _by_joint(name: str, key: Key, value: Any, place: str) -> list[Any]:
-    """One checked value a joint; a list (of lists, where the key is a list) holds several."""
-    several = isinstance(value, list | tuple) and len(value) > 0
-    if key.shape == "list":
-        several = several and all(isinstance(entry, list | tuple) for entry in value)
-    if key.shape == "range" and several:
-        pair = len(value) == 2 and all(_is_number(entry) for entry in value) and min(value) < 0
-        several = not pair
-    if key.shape == "points":
-        several = False
-    return [_checked(name, key, one, place) for one in (value if several else [value])]
-
-
-def _checked(name: str, key: Key, value: Any, place: str) -> Any:
-    if key.shape == "list":
-        if not isinstance(value, list | tuple) or len(value) < key.shortest:
-            hint = f"give a list of at least {key.shortest}, or a list of such lists by joint"
-            raise InputError(f"{name} = {value!r} is too short", where=place, hint=hint)
-        return np.array([_number(name, key, one, place) for one in value])
-    if key.shape == "range":
-        pair = value if isinstance(value, list | tuple) else (value, value)
-        if len(pair) == 2 and all(_is_number(entry) for entry in pair):
-            low, high = pair if isinstance(value, list | tuple) else (-value, value)
-            if low < 0 < high:
-                return np.array([low, high], dtype=float)
-        hint = f"give [lower, upper], the lower negative, or one positive number for both [{key.unit}]"
-        raise InputError(f"{name} = {value!r} is no range about zero", where=place, hint=hint)
-    if key.shape == "points":
-        return _points(name, key, value, place)
-    if key.shape == "flag":
-        if not isinstance(value, bool):
-            raise InputError(f"{name} = {value!r} is no flag", where=place, hint="true or false")
-        return value
-    if key.shape == "text":
-        if not isinstance(value, str) or not value:
-            raise InputError(f"{name} = {value!r} is no text", where=place, hint=key.doc)
-        if key.choices and value not in key.choices:
-            hint = suggest(value, key.choices)
-            raise InputError(f"{name} = '{value}' is unknown", where=place, hint=hint)
-        return value
-    return _number(name, key, value, place)
+    @property
+    def schema(self) -> dict[str, Any]:
+        """JSON Schema of a table of this kind: a value, a list by joint, or an unknown."""
+        unknown = {"type": "object", "required": ["guess"]}
+        out = schema_of(self.keys, self.doc)
+        for name, entry in out["properties"].items():
+            if self.keys[name].single is for_all_joints:
+                continue
+            about = {k: entry.pop(k) for k in ("description", "default") if k in entry}
+            kinds = [entry, list_of(entry), *([unknown] if name in self.unknown else [])]
+            out["properties"][name] = {**either(*kinds), **about}
+        out["properties"] = {"kind": {"const": self.kind}, **out["properties"]}
+        out["required"] = ["kind", *out.get("required", [])]
+        return out
 
 
-def _points(name: str, key: Key, value: Any, place: str) -> np.ndarray:
-    """A list of points, one number a joint."""
-    rows = value if isinstance(value, list | tuple) else ()
-    if len(rows) < key.shortest or not all(isinstance(row, list | tuple) and len(row) for row in rows):
-        hint = f"give a list of at least {key.shortest} points, e.g. {name} = [[0.1, 0.2], [0.3, 0.1]]"
-        raise InputError(f"{name} = {value!r} is no list of points", where=place, hint=hint)
-    if len({len(row) for row in rows}) > 1:
-        hint = "give each one number a joint"
-        raise InputError(f"the points of {name} are of unlike lengths", where=place, hint=hint)
-    return np.array([[_number(name, key, one, place) for one in row] for row in rows], dtype=float)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _number(name: str, key: Key, value: Any, place: str) -> float | int:
-    unit = f" {key.unit}" if key.unit else ""
-    if not _is_number(value):
-        hint = f"give a finite number [{key.unit or '1'}]"
-        raise InputError(f"{name} = {value!r} is not a number", where=place, hint=hint)
-    if key.shape == "whole" and value != int(value):
-        raise InputError(f"{name} = {value!r} is not whole", where=place, hint="round it")
-    if value < key.minimum or (key.positive and value <= 0):
-        bound = "positive" if key.positive else f"at least {key.minimum:g}{unit}"
-        raise InputError(f"{name} = {value:g}{unit}", where=place, hint=f"it must be {bound}")
-    return int(value) if key.shape == "whole" else float(value)
+def _by_joint(name: str, key: Key, given: Mapping[str, Any], spot: Spot) -> list[Any]:
+    """Return one checked value a joint, or a single one for all joints."""
+    if name not in given:
+        if key.required:
+            raise spot.fault(f"'{name}' is missing", f"add {name}: {key.described}")
+        return [key.default]
+    value, at = given[name], spot.at(name)
+    if key.single(value):
+        return [key.read(value, at)]
+    return [key.read(one, at.entry(k)) for k, one in enumerate(value, start=1)]

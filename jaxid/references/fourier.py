@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid, is_number_list, number_list
+from jaxid.schema import Key, number
 
 
 def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
@@ -26,14 +27,20 @@ def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
     return position
 
 
+_COEFFICIENTS = number_list(1)
+
 FOURIER = Family(
     kind="fourier",
     doc="offset + sum over k of sine[k] sin(2 pi k f t) + cosine[k] cos(2 pi k f t)",
     keys={
-        "base_frequency_hz": Key("frequency of the first harmonic", "Hz", positive=True),
-        "sine": Key("coefficients by harmonic", "position", shape="list", default=()),
-        "cosine": Key("likewise", "position", shape="list", default=()),
-        "offset": Key("mean", "position", default=0.0),
+        "base_frequency_hz": Key(number("positive"), "frequency of the first harmonic", True, "Hz"),
+        "sine": Key(
+            _COEFFICIENTS, "coefficients of the sines", unit="position", default=(), single=is_number_list
+        ),
+        "cosine": Key(
+            _COEFFICIENTS, "coefficients of the cosines", unit="position", default=(), single=is_number_list
+        ),
+        "offset": Key(number(), "mean", unit="position", default=0.0),
     },
     sample=_sample,
 )

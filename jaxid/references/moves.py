@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid, is_number_list, number_list
 from jaxid.references.s_curve import MotionBounds, SCurve, plan_s_curve
+from jaxid.schema import Key, flag, number
 
 _NO_TIME = 1e-300
 
@@ -76,8 +77,8 @@ def string_moves(
     """Visit targets one after the other.
 
     Args:
-        start: Where the axis stands at time zero [position].
-        targets: Where it goes, in turn [position].
+        start: Position at time zero [position].
+        targets: Positions to visit in turn [position].
         limits: Speed, acceleration and perhaps jerk, for `plan_move`.
         values: Holds `onset` [s] of the first move, `dwell` [s] at each target and `repeat`: whether the
             targets are visited anew until the grid ends, or the last one is held.
@@ -135,23 +136,23 @@ def _point_to_point(values: dict[str, Any], grid: Grid) -> np.ndarray:
     return string_moves(start, [end, start] if values["repeat"] else [end], limits, values, grid)
 
 
-_START = Key("where it stands at time zero", "position", default=0.0)
-_SPEED = Key("limit of speed", "position/s", positive=True)
-_ACCELERATION = Key("limit of acceleration", "position/s^2", positive=True)
-_ONSET = Key("rest before the first move", "s", default=0.0)
-_DWELL = Key("rest at each target", "s", default=0.0, minimum=0.0)
+_START = Key(number(), "position at time zero", unit="position", default=0.0)
+_SPEED = Key(number("positive"), "limit of speed", True, "position/s")
+_ACCELERATION = Key(number("positive"), "limit of acceleration", True, "position/s^2")
+_ONSET = Key(number(), "rest before the first move", unit="s", default=0.0)
+_DWELL = Key(number("nonnegative"), "rest at each target", unit="s", default=0.0)
 
 TRAPEZOID = Family(
     kind="trapezoid",
     doc="from target to target with trapezoids of velocity",
     keys={
         "start": _START,
-        "targets": Key("positions to visit in turn", "position", shape="list"),
+        "targets": Key(number_list(1), "positions to visit in turn", True, "position", single=is_number_list),
         "speed": _SPEED,
         "acceleration": _ACCELERATION,
         "onset": _ONSET,
         "dwell": _DWELL,
-        "repeat": Key("visit the targets anew until the end", shape="flag", default=True),
+        "repeat": Key(flag, "visit the targets anew until the end", default=True),
     },
     sample=_trapezoid,
     unknown=("onset", "speed", "acceleration"),
@@ -162,13 +163,13 @@ POINT_TO_POINT = Family(
     doc="time-optimal moves between two points, limited in jerk (S-curve)",
     keys={
         "start": _START,
-        "end": Key("where it goes", "position"),
+        "end": Key(number(), "the other point", True, "position"),
         "speed": _SPEED,
         "acceleration": _ACCELERATION,
-        "jerk": Key("limit of jerk", "position/s^3", positive=True),
+        "jerk": Key(number("positive"), "limit of jerk", True, "position/s^3"),
         "onset": _ONSET,
         "dwell": _DWELL,
-        "repeat": Key("go to and fro until the end", shape="flag", default=True),
+        "repeat": Key(flag, "go to and fro until the end", default=True),
     },
     sample=_point_to_point,
 )

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid, is_number_list, number_list
+from jaxid.schema import Key, choice, flag, number, whole
 
 
 def _lines(values: dict[str, Any], samples: int, grid: Grid) -> np.ndarray:
@@ -31,7 +32,7 @@ def _phases(count: int, values: dict[str, Any], joint: int) -> Float[np.ndarray,
     if values["phases"] == "schroeder":
         k = np.arange(1, count + 1)
         return -np.pi * k * (k - 1) / count
-    # The joint is part of the seed: joints that move alike could not be told apart.
+    # The joint is part of the seed: joints with equal motions could not be separated.
     return np.random.default_rng([values["seed"], joint]).uniform(0.0, 2.0 * np.pi, count)
 
 
@@ -51,23 +52,13 @@ MULTISINE = Family(
     kind="multisine",
     doc="a periodic sum of equally strong sines, at every (odd) line of a band",
     keys={
-        "band_hz": Key("lowest and highest frequency", "Hz", shape="list", shortest=2),
-        "amplitude": Key("largest excursion from the offset", "position", positive=True),
-        "offset": Key("mean", "position", default=0.0),
-        "period": Key(
-            "of the signal, to a whole sample; absent: the duration",
-            "s",
-            default=None,
-            positive=True,
-        ),
-        "odd": Key("only odd harmonics of the period", shape="flag", default=False),
-        "phases": Key(
-            "random, or schroeder for a low crest",
-            shape="text",
-            default="random",
-            choices=("random", "schroeder"),
-        ),
-        "seed": Key("of the random phases", shape="whole", default=0, minimum=0.0),
+        "band_hz": Key(number_list(2), "lowest and highest frequency", True, "Hz", single=is_number_list),
+        "amplitude": Key(number("positive"), "largest excursion from the offset", True, "position"),
+        "offset": Key(number(), "mean", unit="position", default=0.0),
+        "period": Key(number("positive"), "period, to a whole sample", unit="s", note="the duration"),
+        "odd": Key(flag, "only odd harmonics of the period", default=False),
+        "phases": Key(choice(("random", "schroeder")), "schroeder for a low crest", default="random"),
+        "seed": Key(whole(0), "seed of the random phases", default=0),
     },
     sample=_sample,
 )

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from jaxid.references.bezier import bezier_curve, rest_to_rest
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid
+from jaxid.schema import Key, number
 
 
 def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
@@ -24,11 +25,13 @@ QUARTER_SINE = Family(
     kind="quarter_sine",
     doc="a quarter sine to a level, a hold, and a Bezier polynomial from rest to rest",
     keys={
-        "level": Key("where it holds", "position"),
-        "rise_time": Key("of the quarter sine, which starts at full speed", "s", positive=True),
-        "hold_until": Key("when the polynomial begins", "s", positive=True),
-        "return_until": Key("when it ends", "s", positive=True),
-        "end": Key("where it ends", "position", default=0.0),
+        "level": Key(number(), "position that it holds", True, "position"),
+        "rise_time": Key(
+            number("positive"), "duration of the quarter sine, which starts at full speed", True, "s"
+        ),
+        "hold_until": Key(number("positive"), "time at which the polynomial begins", True, "s"),
+        "return_until": Key(number("positive"), "time at which it ends", True, "s"),
+        "end": Key(number(), "position at its end", unit="position", default=0.0),
     },
     sample=_sample,
 )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 
 class MotionBounds(NamedTuple):
-    """What a motion forwards may do; each positive.
+    """Bounds of a forward motion; each positive.
 
     Args:
         speed: Largest velocity [position/s].
@@ -31,7 +31,7 @@ class SCurve:
 
     Attributes:
         distance: Way, with its sign [position].
-        durations: Of the segments [s]; zero where a limit is not reached, (7,).
+        durations: Durations of the segments [s]; zero if a limit is not reached, (7,).
         jerks: In the segments [position/s^3], (7,).
     """
 
@@ -73,7 +73,7 @@ def plan_s_curve(distance: float, bounds: MotionBounds) -> SCurve:
 
     Args:
         distance: Way, not negative [position].
-        bounds: Of a motion forwards; a motion backwards is one forwards in the mirror.
+        bounds: Bounds of a forward motion; a backward motion is its mirror image.
 
     Source:
         Biagiotti & Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), section 3.4,
@@ -129,6 +129,7 @@ def _peak(distance: float, bounds: MotionBounds) -> float:
         return (-linear + np.sqrt(linear**2 - 4 * square * constant)) / (2 * square)
     if excess(low) >= 0:  # by rounding
         return low
-    import scipy.optimize  # only where no closed form serves
+    import scipy.optimize  # only if there is no closed form
 
-    return scipy.optimize.brentq(excess, low, high, xtol=1e-300, rtol=4 * np.finfo(float).eps)
+    root: Any = scipy.optimize.brentq(excess, low, high, xtol=1e-300, rtol=4 * np.finfo(float).eps)
+    return root

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.references.family import Family, Grid, Key
+from jaxid.references.family import Family, Grid, about_zero, for_all_joints, is_about_zero, point_list
 from jaxid.references.s_curve import MotionBounds, SCurve, plan_s_curve
+from jaxid.schema import Key, choice, flag, number, whole
 
 
 def plan_line(
@@ -24,10 +25,10 @@ def plan_line(
     acceleration: Float[np.ndarray, "n 2"],
     jerk: Float[np.ndarray, "n 2"],
 ) -> SCurve:
-    """The path parameter, from 0 to 1, of the fastest motion along a straight line.
+    """Plan the path parameter, from 0 to 1, of the fastest motion along a straight line.
 
     Args:
-        way: Of each joint, with its sign [position].
+        way: Distance of each joint, with its sign [position].
         velocity, acceleration, jerk: Lowest (negative) and highest of each joint [position/s and so on].
     """
     lowest, highest = zip(*(_tightest(way, b) for b in (velocity, acceleration, jerk)), strict=True)
@@ -35,19 +36,19 @@ def plan_line(
 
 
 def _tightest(way: np.ndarray, bounds: np.ndarray) -> tuple[float, float]:
-    """Of a path parameter, how far below and above zero all joints let it be."""
+    """Return the lowest and highest path parameter that all joints allow."""
     moved = way != 0
     ends = bounds[moved] / way[moved, None]
     return float(-ends.min(axis=1).max()), float(ends.max(axis=1).min())
 
 
 def _sample(joints: list[dict[str, Any]], grid: Grid) -> Float[np.ndarray, "samples joints"]:
-    own, time = joints[0], grid.time
+    values, time = joints[0], grid.time
     bounds = [np.stack([j[k] for j in joints]) for k in ("velocity", "acceleration", "jerk")]
-    here, now = np.array([j["start"] for j in joints]), own["onset"]
+    here, now = np.array([j["start"] for j in joints]), values["onset"]
     out = np.full((grid.samples, len(joints)), here)
     still = 0
-    for target in _targets(own, grid):
+    for target in _targets(values, grid):
         if now >= time[-1]:
             break
         if np.any(target != here):
@@ -55,31 +56,31 @@ def _sample(joints: list[dict[str, Any]], grid: Grid) -> Float[np.ndarray, "samp
             first, last = np.searchsorted(time, (now, now + curve.duration))
             out[first:last] = here + np.outer(curve.position(time[first:last] - now), target - here)
             out[last:] = target
-            if curve.duration + own["dwell"] < 2.0 / grid.rate_hz:
+            if curve.duration + values["dwell"] < 2.0 / grid.rate_hz:
                 hint = "move further, more slowly, or raise the sampling rate"
                 raise grid.fault("a motion takes less than two samples", hint)
             now, here, still = now + curve.duration, target, 0
-        elif own["dwell"] == 0:
+        elif values["dwell"] == 0:
             # A round of nowhere to go would last for ever.
             still += 1
-            if own["points"] is not None and still >= len(own["points"]):
+            if values["points"] is not None and still >= len(values["points"]):
                 break
-        now += own["dwell"]
+        now += values["dwell"]
     return out
 
 
-def _targets(own: dict[str, Any], grid: Grid) -> Iterator[np.ndarray]:
+def _targets(values: dict[str, Any], grid: Grid) -> Iterator[np.ndarray]:
     """Points of joint space, in turn."""
-    points, polygon = own["points"], own["polygon"]
+    points, polygon = values["points"], values["polygon"]
     if (points is None) == (polygon is None):
         what = "neither points nor polygon" if points is None else "both points and polygon"
         raise grid.fault(what, "give points to visit in turn, or the corners of a polygon to draw them from")
     if polygon is not None:
-        for drawn in _drawn(polygon, own["seed"], grid):
-            yield _at_joints(drawn, own, grid)
-    at = [_at_joints(p, own, grid) for p in points]
+        for drawn in _drawn(polygon, values["seed"], grid):
+            yield _at_joints(drawn, values, grid)
+    at = [_at_joints(p, values, grid) for p in points]
     yield from at
-    while own["repeat"]:
+    while values["repeat"]:
         yield from at
 
 
@@ -96,7 +97,7 @@ def _drawn(polygon: np.ndarray, seed: int, grid: Grid) -> Iterator[np.ndarray]:
 
 
 def _simplices(polygon: np.ndarray, grid: Grid) -> Float[np.ndarray, "k n1 n"]:
-    """A polygon as triangles, by their corners."""
+    """Split a polygon into triangles, and return their corners."""
     import scipy.spatial  # a third of a second, which no other kind of reference needs
 
     n = polygon.shape[1]
@@ -119,9 +120,9 @@ def _simplices(polygon: np.ndarray, grid: Grid) -> Float[np.ndarray, "k n1 n"]:
     return polygon[triangles]
 
 
-def _at_joints(point: np.ndarray, own: dict[str, Any], grid: Grid) -> np.ndarray:
-    """A point in joint space."""
-    if own["coordinates"] == "joint":
+def _at_joints(point: np.ndarray, values: dict[str, Any], grid: Grid) -> np.ndarray:
+    """Return a point in joint space."""
+    if values["coordinates"] == "joint":
         return point
     q = None if grid.plant is None else grid.plant.joint_positions(point)
     if q is None:
@@ -133,28 +134,39 @@ def _at_joints(point: np.ndarray, own: dict[str, Any], grid: Grid) -> np.ndarray
     return np.asarray(q, dtype=float)
 
 
+def _lowest_and_highest(unit: str) -> Key:
+    return Key(about_zero, "lowest and highest, or one number for both", True, unit, single=is_about_zero)
+
+
 SYNCHRONIZED = Family(
     kind="synchronized",
     doc="time-optimal motions of all joints together along straight lines, limited in jerk",
     keys={
-        "start": Key("where it stands at time zero", "position", default=0.0),
-        "points": Key("to visit in turn, one number a joint", "position", default=None, shape="points"),
+        "start": Key(number(), "position at time zero", unit="position", default=0.0),
+        "points": Key(
+            point_list(),
+            "points to visit in turn, one number a joint",
+            unit="position",
+            single=for_all_joints,
+        ),
         "polygon": Key(
-            "corners of a convex region; targets are drawn from it", "position", default=None, shape="points"
+            point_list(),
+            "corners of a convex region; targets are drawn from it",
+            unit="position",
+            single=for_all_joints,
         ),
         "coordinates": Key(
-            "what points and corners are of: the joints, or the tool",
-            shape="text",
+            choice(("joint", "task")),
+            "coordinates of points and corners: those of the joints, or of the tool",
             default="joint",
-            choices=("joint", "task"),
         ),
-        "velocity": Key("lowest and highest", "position/s", shape="range"),
-        "acceleration": Key("lowest and highest", "position/s^2", shape="range"),
-        "jerk": Key("lowest and highest", "position/s^3", shape="range"),
-        "onset": Key("rest before the first motion", "s", default=0.0, minimum=0.0),
-        "dwell": Key("rest at each target", "s", default=0.0, minimum=0.0),
-        "seed": Key("of the targets", shape="whole", default=0, minimum=0.0),
-        "repeat": Key("visit the points anew until the end", shape="flag", default=True),
+        "velocity": _lowest_and_highest("position/s"),
+        "acceleration": _lowest_and_highest("position/s^2"),
+        "jerk": _lowest_and_highest("position/s^3"),
+        "onset": Key(number("nonnegative"), "rest before the first motion", unit="s", default=0.0),
+        "dwell": Key(number("nonnegative"), "rest at each target", unit="s", default=0.0),
+        "seed": Key(whole(0), "seed of the targets", default=0),
+        "repeat": Key(flag, "visit the points anew until the end", default=True),
     },
     sample=_sample,
     together=True,

@@ -1,4 +1,4 @@
-"""A reference of which some numbers are unknown: what a loop followed when nobody logged it."""
+"""References with unknown numbers, for loops whose reference was not logged."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
@@ -21,8 +22,8 @@ class UnknownReference(eqx.Module):
     Args:
         numbers: Values of the unknowns.
         time: Instants from the start of the log [s].
-        names: Of the unknowns.
-        kind: Of the family.
+        names: Names of the unknowns.
+        kind: Kind of the family.
         known: Its other values.
     """
 
@@ -34,24 +35,27 @@ class UnknownReference(eqx.Module):
 
     @classmethod
     def of(cls, table: Mapping[str, Any], unknown: Mapping[str, float]) -> UnknownReference:
-        """Of a table of a case, and values for what it leaves unknown."""
+        """Build the reference of a table of a case, with values of its unknowns."""
         family = REFERENCES[table["kind"]]
         (values,) = family.read({**table, **unknown}, f"[{REFERENCE}]")
-        lists = {k: tuple(v.tolist()) for k, v in values.items() if family.keys[k].shape == "list"}
+        # Static fields must be hashable.
+        lists = {k: tuple(v.tolist()) for k, v in values.items() if isinstance(v, np.ndarray)}
         numbers = jnp.asarray(list(unknown.values()), dtype=jnp.float64)
         rest = tuple((k, v) for k, v in (values | lists).items() if k not in unknown)
         return cls(numbers, jnp.zeros(1), tuple(unknown), family.kind, rest)
 
     def at(self, time: Float[Array, " ticks"]) -> UnknownReference:
-        """The same reference at other instants."""
+        """Return the reference at other instants."""
         return replace(self, time=jnp.asarray(time))
 
     def with_unknowns(self, places: tuple, theta: Float[Array, " p"]) -> UnknownReference:
-        """The same reference with theta[k] where places[k] is one of its unknowns."""
-        own = [k for k, (path, _) in enumerate(places) if path[0] == REFERENCE]
-        return replace(self, numbers=jnp.stack([jnp.asarray(theta[k]) for k in own])) if own else self
+        """Return the reference with theta[k] for each places[k] that is one of its unknowns."""
+        ours = [k for k, (path, _) in enumerate(places) if path[0] == REFERENCE]
+        return replace(self, numbers=jnp.stack([jnp.asarray(theta[k]) for k in ours])) if ours else self
 
     def __call__(self) -> Float[Array, "ticks 1"]:
-        """The position of the one drive at its instants [m or rad]."""
+        """Return the position of the one drive at its instants [m or rad]."""
         values = dict(self.known) | dict(zip(self.names, self.numbers, strict=True))
-        return REFERENCES[self.kind].follow(values, self.time)[:, None]
+        follow = REFERENCES[self.kind].follow
+        assert follow is not None, "only families that can be followed have unknowns"
+        return follow(values, self.time)[:, None]

@@ -275,11 +275,11 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
         lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
     session = result.session
     loop = session.machine.controller is not None and session.fit.log.reference is not None
-    if result.verdict == "unexplained" and loop and "prior" not in session.case.output_error:
+    if result.verdict == "unexplained" and loop and session.case.within_prior is None:
         # Force rows hold no sample at rest, and what depends on whether speed grows is blurred in them.
         lines.append(
             "what acts at rest, or where speed stands still, may show in the simulated loop: state "
-            "`[output_error] prior`, how far off the guesses may be, and effects are looked for there"
+            "`[within_prior] prior`, how far off the guesses may be, and effects are looked for there"
         )
     last = [s for s in steps if s.added is None and s.dropped is None][-1]
     left = [s for s in last.scores if s.reason and s.evidence > last.threshold]

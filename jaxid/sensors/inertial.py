@@ -20,8 +20,6 @@ from jaxid.dynamics.rhs import small_solve
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
 
-KINDS = ("gyroscope", "accelerometer")
-AXES = ("x", "y", "z")
 # Weight of the held value relative to the readings: it matters only if these do not determine a motion.
 _HELD = 1e-9
 # A motion is determined if less than this fraction of its variance by the held value alone remains.
@@ -32,7 +30,7 @@ class Inertial(eqx.Module):
     """One sensor on a link.
 
     Args:
-        kind: One of `KINDS`.
+        kind: One of `jaxid.names.INERTIAL_KINDS`.
         link: Index of its link, 0-based.
         axes: Axes of the sensor that it reads, 0-based.
         position: Place of an accelerometer in the link's frame, (3,) [m].

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.logs.readers import read_columns
+from jaxid.settings import Disturbance
 
 # A disturbance switches at start + k (on + off); the tick at that very instant still sees the
 # old value, and a time stamp that is off by its rounding must not change that. In parts of
@@ -18,7 +17,7 @@ _SWITCH = 1e-6
 
 
 def disturbance_at(
-    disturbance: Mapping[str, float] | str | None,
+    disturbance: Disturbance | str | None,
     times: Float[np.ndarray, " ticks"],
     log: Log | None = None,
 ) -> Float[np.ndarray, "ticks _"]:
@@ -43,10 +42,10 @@ def disturbance_at(
         return np.zeros((times.size, 1))
     if isinstance(disturbance, str):
         return _column(disturbance, times, log)
-    cycle = disturbance["on"] + disturbance["off"]
-    since = times - disturbance.get("start", 0.0) - _SWITCH * cycle
-    on = (since > 0) & (np.mod(since, cycle) < disturbance["on"])
-    return np.where(on, disturbance["level"], 0.0)[:, None]
+    cycle = disturbance.on + disturbance.off
+    since = times - disturbance.start - _SWITCH * cycle
+    on = (since > 0) & (np.mod(since, cycle) < disturbance.on)
+    return np.where(on, disturbance.level, 0.0)[:, None]
 
 
 def _column(name: str, times: np.ndarray, log: Log | None) -> np.ndarray:

@@ -44,7 +44,7 @@ class Numerics:
         substeps: Integration steps between samples of the command.
         longest_delay: Samples of past command kept, for delays in a loop.
         segment: Samples after which an open-loop run restarts from the log; None: never.
-        solver: One of `jaxid.simulation.solvers.SOLVERS`, which takes the place of the fixed steps and
+        solver: One of `jaxid.names.SOLVERS`, which takes the place of the fixed steps and
             smooths dry friction; None: fixed steps.
     """
 

@@ -17,17 +17,8 @@ from jaxid.arrays import Array
 from jaxid.dynamics.rhs import State, derivative, hold_polynomial
 from jaxid.errors import InputError, suggest
 from jaxid.model.plant import Plant
+from jaxid.names import SOLVERS
 
-# Those of diffrax with an error estimate whose one right-hand side is all they ask for, by the names
-# of their classes: diffrax takes a third of a second to import, and few runs need it.
-SOLVERS = {
-    "tsit5": "Tsit5",
-    "dopri5": "Dopri5",
-    "dopri8": "Dopri8",
-    "bosh3": "Bosh3",
-    "kvaerno3": "Kvaerno3",
-    "kvaerno5": "Kvaerno5",
-}
 # Error of a step, relative to the state; near zero, to a tenth of the motion's size.
 RELATIVE = 1e-8
 _NEAR_ZERO = 0.1

@@ -11,7 +11,7 @@ from jaxid.build import build_machine
 from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.machine import Machine
-from jaxid.scene import Scene
+from jaxid.scene import Scene, sampling_of
 from jaxid.studies.settings import SETTINGS
 
 
@@ -44,49 +44,51 @@ def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...
         InputError: If the case cannot be simulated so, or a factor of the noise has nothing to act on.
     """
     setting = case.study
-    noises = [float(x) for x in setting.get("noise", (1.0,))]
-    if not {"position_noise", "force_noise"} & set(case.sensor) and set(noises) != {1.0}:
+    noises = [float(x) for x in setting.noise]
+    noisy = case.sensor.position_noise is not None or case.sensor.force_noise is not None
+    if not noisy and set(noises) != {1.0}:
         raise InputError(
             "there is no noise to multiply",
-            where=f"{case.path}, [study] noise",
+            where=f"{case.where}, [study] noise",
             hint="give position_noise or force_noise in [sensor]",
         )
-    others = [name for name in SETTINGS[:-1] if name in setting]
+    others = [name for name in SETTINGS[:-1] if getattr(setting, name) is not None]
     for name in (*others, "noise"):
-        values = [float(x) for x in setting.get(name, ())]
+        values = [float(x) for x in getattr(setting, name)]
         twice = next((x for x in values if values.count(x) > 1), None)
         if twice is not None:
             raise InputError(
-                f"{twice:g} stands there twice", where=f"{case.path}, [study] {name}", hint="once is enough"
+                f"{twice:g} stands there twice", where=f"{case.where}, [study] {name}", hint="once is enough"
             )
     if "sample_rate" in others and _follows_rate(case):
         raise InputError(
             "the file's samples have no time of their own, and would be played faster or slower",
-            where=f"{case.path}, [study] sample_rate",
+            where=f"{case.where}, [study] sample_rate",
             hint="give its time or sample_rate beside its kind",
         )
     levels = []
-    for values in itertools.product(*[[float(x) for x in setting[name]] for name in others]):
+    for values in itertools.product(*[[float(x) for x in getattr(setting, name)] for name in others]):
         own = dict(zip(others, values, strict=True))
         scene = Scene.of(_under(case, own), longer_delays=longer_delays)
         of_model = _under(model, own)
-        machine = build_machine(of_model, period=1 / float(of_model.simulation["sample_rate"]))
+        machine = build_machine(of_model, period=1 / sampling_of(of_model)[0])
         for noise in noises:
-            noisy = replace(scene, machine=_noisier(scene.machine, noise))
-            levels.append(Level(own | {"noise": noise}, of_model, noisy, _noisier(machine, noise)))
+            louder = replace(scene, machine=_noisier(scene.machine, noise))
+            levels.append(Level(own | {"noise": noise}, of_model, louder, _noisier(machine, noise)))
     return tuple(levels)
 
 
 def _under(case: Case, setting: dict[str, float]) -> Case:
     """A case whose log is sampled and resolved otherwise; its loop stays."""
-    simulation, sensor, controller = dict(case.simulation), dict(case.sensor), case.controller
+    simulation, sensor, controller = case.simulation, case.sensor, case.controller
     if "sample_rate" in setting:
-        if controller is not None and "sample_rate" in simulation:
-            rate = case.log.get("sample_rate") or simulation["sample_rate"]
-            controller = {**controller, "period": controller.get("period") or 1.0 / rate}
-        simulation["sample_rate"] = setting["sample_rate"]
+        if controller is not None and simulation.sample_rate is not None:
+            logged = None if case.log is None else case.log.sample_rate
+            rate = logged or simulation.sample_rate
+            controller = replace(controller, period=controller.period or 1.0 / rate)
+        simulation = replace(simulation, sample_rate=setting["sample_rate"])
     if "position_resolution" in setting:
-        sensor["position_resolution"] = setting["position_resolution"]
+        sensor = replace(sensor, position_resolution=setting["position_resolution"])
     return replace(case, simulation=simulation, sensor=sensor, controller=controller)
 
 

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 import os
-import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,13 +17,11 @@ from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.estimators import need_consistent
 from jaxid.machine import Machine
+from jaxid.names import DISCOVER, IN_LOOP
 from jaxid.numerics.lanes import cores
 from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
 
-# What may stand among the estimators beside the methods: the search, and what a law found by itself.
-DISCOVER, IN_LOOP = "discover", "in_loop"
-_RUNS = 100
 # Part of the memory that the chunks in work may take together.
 _MEMORY = 0.25
 # On a processor's cores: most runs in a chunk of long logs, of more the arrays no longer fit its cache; of
@@ -78,27 +76,27 @@ class Plan:
                 nothing to act on, what the law found is asked of one that does not identify, or links must
                 be what bodies can be and an estimator cannot keep to it.
         """
-        setting, where = case.study, str(case.path)
+        setting, where = case.study, case.where
         if not 0 <= seed < 2**31:
             raise InputError(f"the seed is {seed}", hint="give one from 0 to 2147483647")
-        draw = float(setting.get("draw", 0.0))
-        model = _without(case, setting.get("hidden", ()))
+        draw = setting.draw
+        model = _without(case, setting.hidden)
         levels = levels_of(case, model, float(np.exp(_FARTHEST * draw)))
         if not levels[0].machine.parameters.free:
             raise InputError(
                 "nothing is unknown", where=where, hint="give at least one parameter as { guess = ... }"
             )
-        estimators = tuple(setting.get("estimators", ("output_error",)))
+        estimators = setting.estimators
         for method in estimators:
             if method == IN_LOOP:
                 _need_learner(case, levels[0].scene)
             elif method != DISCOVER:
                 need_consistent(method, case)
-        runs = int(setting.get("runs", _RUNS) if runs is None else runs)
+        runs = int(setting.runs if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, hint="give one or more")
-        chunk = int(setting.get("chunk", _fitting(levels, runs, workers or at_once())))
-        start_spread = float(setting.get("start_spread", 0.0))
+        chunk = _fitting(levels, runs, workers or at_once()) if setting.chunk is None else setting.chunk
+        start_spread = setting.start_spread
         return cls(case, levels, estimators, draw, start_spread, runs, chunk, seed)
 
     @property
@@ -171,10 +169,10 @@ class Plan:
 
         packages = ("jaxid", "jax", "jaxlib", "numpy", "scipy")
         return {
-            "case": self.case.path.name,
+            "case": self.case.name,
             "fingerprint": fingerprint(self.case),
             "estimators": list(self.estimators),
-            "hidden": list(self.case.study.get("hidden", ())),
+            "hidden": list(self.case.study.hidden),
             **self.settings,
             "draw": self.draw,
             "start_spread": self.start_spread,
@@ -189,11 +187,11 @@ class Plan:
 
 def _need_learner(case: Case, scene: Scene) -> None:
     """Refuse to ask a law what it found that does not identify, or that knows what is to be hidden."""
-    law, where = scene.machine.controller, f"{case.path}, [study] estimators"
+    law, where = scene.machine.controller, f"{case.where}, [study] estimators"
     if law is None or "estimator" not in law.of_machine:
         hint = 'take [controller] kind = "adaptive", or leave in_loop out'
         raise InputError("in_loop: no law identifies in this case", where=where, hint=hint)
-    if case.study.get("hidden"):
+    if case.study.hidden:
         what = "in_loop: the law has the whole case for its model, and nothing is hidden from it"
         raise InputError(what, where=where, hint="leave hidden out")
 
@@ -204,7 +202,7 @@ def _without(case: Case, hidden: tuple[str, ...]) -> Case:
         if kind not in kinds:
             raise InputError(
                 f"{kind!r} is not among the effects of this case",
-                where=f"{case.path}, [study] hidden",
+                where=f"{case.where}, [study] hidden",
                 hint=f"name what is to be hidden from the model: {', '.join(kinds)}",
             )
     return replace(case, effects=tuple(e for e in case.effects if e.cls.kind not in hidden))
@@ -242,7 +240,7 @@ def at_once() -> int:
 
 def fingerprint(case: Case) -> str:
     """Of a case as it is in memory, and of every file that it names and that is there."""
-    digest = hashlib.sha256(repr(replace(case, path=Path(case.path.name))).encode())
+    digest = hashlib.sha256(repr(replace(case, path=Path(case.name))).encode())
     for path in named_files(case):
         digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -253,7 +251,7 @@ def named_files(case: Case) -> list[Path]:
     found: set[Path] = set()
 
     def look(value: object) -> None:
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             for entry in value.values():
                 look(entry)
         elif isinstance(value, (list, tuple)):
@@ -264,7 +262,7 @@ def named_files(case: Case) -> list[Path]:
             if value and path.is_file():
                 found.add(path)
 
-    look(tomllib.loads(case.path.read_text(encoding="utf-8-sig")))
+    look(case.tables)
     return sorted(found)
 
 

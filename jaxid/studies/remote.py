@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from jaxid.case.case import load_case
+from jaxid.case.case import load_case, read_case
 from jaxid.errors import InputError
 from jaxid.studies.plan import Plan, digest_of, fingerprint, named_files
 from jaxid.studies.runs import Arrays, Runner
@@ -22,13 +23,13 @@ class Bundle:
     """A study as it travels: a case with the files that it names, and what was asked of it.
 
     Args:
-        case: Name of the case file.
+        case: Name of the case file; of a case that was given as a dict, its tables.
         files: Contents by path, relative to the case's folder.
         runs, chunk, seed: Of the plan.
         manifest: What the plan says of itself.
     """
 
-    case: str
+    case: str | Mapping[str, Any]
     files: dict[str, bytes]
     runs: int
     chunk: int
@@ -44,23 +45,25 @@ class Bundle:
                 worker would not find.
         """
         case, files = plan.case, {}
-        if fingerprint(load_case(case.path)) != fingerprint(case):
+        given = load_case(case.path) if case.path else read_case(case.tables, None, case.folder)
+        if fingerprint(given) != fingerprint(case):
             raise InputError(
                 "is not the case that was given",
-                where=str(case.path),
+                where=case.where,
                 hint="write what was changed in Python to the file: workers read it",
             )
-        for path in (case.path, *named_files(case)):
+        for path in (*([case.path] if case.path else []), *named_files(case)):
             try:
-                name = path.resolve().relative_to(case.folder.resolve())
+                relative = path.resolve().relative_to(case.folder.resolve())
             except ValueError:
                 raise InputError(
                     f"names {path}, which other machines do not have",
-                    where=str(case.path),
+                    where=case.where,
                     hint="put it beside the case, and name it without its folder",
                 ) from None
-            files[name.as_posix()] = path.read_bytes()
-        return cls(case.path.name, files, plan.runs, plan.chunk, plan.seed, plan.manifest)
+            files[relative.as_posix()] = path.read_bytes()
+        name = case.path.name if case.path else case.tables
+        return cls(name, files, plan.runs, plan.chunk, plan.seed, plan.manifest)
 
     def plan(self) -> Plan:
         """The plan again, where it has arrived.
@@ -73,7 +76,9 @@ class Bundle:
             for file, content in self.files.items():
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 (folder / file).write_bytes(content)
-            plan = Plan.of(load_case(folder / self.case), runs=self.runs, seed=self.seed)
+            case = self.case
+            case = load_case(folder / case) if isinstance(case, str) else read_case(case, None, folder)
+            plan = Plan.of(case, runs=self.runs, seed=self.seed)
             plan = replace(plan, chunk=self.chunk)
             own, wanted = plan.manifest["versions"], self.manifest["versions"]
         if own != wanted:

@@ -182,7 +182,7 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
             "run": np.arange(plan.runs, dtype=np.int32),
             "parameter": np.array(plan.names, dtype=object),
         },
-        attrs={"case": plan.case.path.name, "seed": plan.seed},
+        attrs={"case": plan.case.name, "seed": plan.seed},
     )
     tracking = by_run("tracking")[0]
     if tracking.shape[-2]:
@@ -191,7 +191,7 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
             table[name] = own, tracking[..., k], unit
         table = table.assign_coords(drive=np.arange(1, tracking.shape[-2] + 1, dtype=np.int32))
     seconds = float(sum(c["seconds"] for c in chunks))
-    return Study(table, seconds, plan.case.path.stem)
+    return Study(table, seconds, plan.case.title)
 
 
 def _tracking_unit(machine: Machine) -> str:

@@ -14,11 +14,12 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics
 from jaxid.logs.prepare import Recipe
+from jaxid.names import DISCOVER, IN_LOOP
 from jaxid.numerics.lanes import Steps, run_alone, run_batched
 from jaxid.session import Session, session_around
 from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics
-from jaxid.studies.plan import DISCOVER, IN_LOOP, Plan
+from jaxid.studies.plan import Plan
 
 Arrays = dict[str, np.ndarray]
 

@@ -11,6 +11,7 @@ from jaxid.arms.base_parameters import base_parameters, inertial_regressor, stan
 from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.plants import Axis, pa10
+from jaxid.settings import Actuator
 from tests.plants.test_serial_arm import ROWS, arm
 from truth.arm import oracle as arm_oracle
 
@@ -180,7 +181,7 @@ def test_closed_rules_give_the_numerical_mapping_of_the_pa10(rotors):
 
 def test_closed_rules_give_the_numerical_mapping_of_the_tx40():
     case = Path(__file__).parents[2] / "experiments" / "cases" / "tx40.toml"
-    machine = build_machine(dataclasses.replace(load_case(case), transmission=None))
+    machine = build_machine(dataclasses.replace(load_case(case), actuator=Actuator()))
     # the case lets those be unknown
     assert set(agree(machine.plant).chosen_names) == {n for n in machine.parameters.names if "." not in n}
 

@@ -8,6 +8,7 @@ from jaxid.case.case import load_case
 from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS
 from jaxid.errors import InputError
+from jaxid.settings import LogTable, Preprocess, StudyTable
 from tests.support.case_faults import CASCADE, FAULTS, GOOD, message, more, swapped, write
 
 # The example of the documentation, to the letter.
@@ -97,21 +98,22 @@ def test_good_case_comes_through(tmp_path):
     assert [e.cls.kind for e in case.effects] == ["viscous_friction", "coulomb_friction"]
     assert case.effects[0].parameters["coefficient"][0] == Value(100.0, True)
     assert case.effects[1].parameters == {"level": (Value(20.0),)}
-    assert case.gain == 35.15
-    assert case.columns == {"time": "t", "position": "q", "force": "u"}
+    assert case.actuator.gain == 35.15
+    assert case.columns == LogTable(time="t", position="q", force="u")
     assert case.folder == tmp_path
-    assert case.preprocess == {} == case.study
+    assert case.preprocess == Preprocess()
+    assert case.study == StudyTable()
 
 
 def test_documented_example_comes_through(tmp_path):
     case = load_case(write(tmp_path, DOCUMENTED))
     assert case.plant.units.label("force") == "V"
-    assert case.preprocess["cutoff_hz"] == 100.0
+    assert case.preprocess.cutoff_hz == 100.0
     assert case.reference is None
     (validation,) = case.validations
     assert validation.log == tmp_path / "second.csv"
-    assert validation.columns["rows"] == [0, 20000]
-    assert validation.columns["position"] == "q"
+    assert validation.columns.rows == (0, 20000)
+    assert validation.columns.position == "q"
 
 
 def test_smallest_case_needs_no_log_until_it_is_read(tmp_path):
@@ -158,17 +160,19 @@ chunk = 4
             ),
         )
     )
-    assert case.preprocess["align_hold"] is False
-    assert case.study["estimators"] == ("output_error", "inverse_dynamics")
+    assert case.preprocess.align_hold is False
+    assert case.study.estimators == ("output_error", "inverse_dynamics")
     assert case.reference["kind"] == "multisine"
-    assert case.simulation["initial_velocity"] == (0.0,)
+    assert case.simulation.initial_velocity == (0.0,)
 
 
 @pytest.mark.parametrize("kind", CONTROLLERS)
 def test_every_controller_states_its_own_keys(tmp_path, kind):
     told = message(tmp_path, swapped(CASCADE, f'kind = "{kind}"\n'))
     first = "poles" if kind == "flatness" else "kp"
-    assert f"[controller]: '{first}' is missing; add {first}: it belongs to kind = '{kind}'" in told
+    doc = "poles of the closed loop [1/s]" if kind == "flatness" else "gain of the position error"
+    hint = f"add {first}: {doc}; it belongs to kind = '{kind}'"
+    assert f"[controller]: '{first}' is missing; {hint}" in told
 
 
 def test_other_file_does_not_inherit_rows(tmp_path):
@@ -176,9 +180,9 @@ def test_other_file_does_not_inherit_rows(tmp_path):
     text += '[[validation]]\nname = "a"\nlog = "b.csv"\nsample_rate = 500.0\n'
     text += '[[validation]]\nname = "b"\nrows = [500, 900]\n'
     other, same = load_case(write(tmp_path, text)).validations
-    assert other.columns == {"position": "q", "force": "u", "sample_rate": 500.0}
+    assert other.columns == LogTable(position="q", force="u", sample_rate=500.0)
     assert same.log is None
-    assert same.columns == {"time": "t", "position": "q", "force": "u", "rows": [500, 900]}
+    assert same.columns == LogTable(time="t", position="q", force="u", rows=(500, 900))
 
 
 def test_validation_inherits_the_disturbance(tmp_path):

@@ -13,6 +13,7 @@ from jaxid.estimators.recursive.estimate import recursive_steps
 from jaxid.experiment_design.in_loop import _DesignProblem
 from jaxid.numerics.lanes import run_alone
 from jaxid.session import open_session
+from jaxid.settings import Recursive
 from tests.support.case_faults import message
 from tests.support.cli_setup import run
 from tests.support.written_logs import write_csv
@@ -80,7 +81,7 @@ def session(log, tmp_path_factory):
 
 
 def recursive(machine, data):
-    return run_alone(recursive_steps(machine, data, {}))
+    return run_alone(recursive_steps(machine, data, Recursive()))
 
 
 @pytest.mark.parametrize("method", [inverse_dynamics, recursive])

@@ -251,7 +251,11 @@ def test_branches_ask_for_a_tip(tmp_path):
     ("old", "new", "words"),
     [
         (BY_NAME, '{ shoulder = "q1" }', ["position", "no column for joint 'elbow'", "shoulder, elbow"]),
-        (BY_NAME, '{ shoulder = "q1", elbow = "q2", hand = "q3" }', ["position", "a joint 'hand'"]),
+        (
+            BY_NAME,
+            '{ shoulder = "q1", elbow = "q2", hand = "q3" }',
+            ["position", "names an unknown joint 'hand'"],
+        ),
         (BY_NAME, '["q1", "q2", "q3"]', ["does not fit 2 joints", "shoulder, elbow"]),
         ('urdf = "arm.urdf"', 'urdf = "arms.urdf"', ["no such file", "arm.urdf"]),
         ('urdf = "arm.urdf"', 'links = []\nurdf = "arm.urdf"', ["both urdf and [[plant.links]]"]),

@@ -336,7 +336,7 @@ def test_refuses_what_it_cannot_find(tmp_path):
     known = [("{ guess = 1.0, true = 0.93 }", "1.0"), ("{ guess = 1.0, true = 1.06 }", "1.0")]
     known += [(f"{{ guess = 0.0, true = {x} }}", "0.0") for x in (1.5, 0.8, 4.0, 2.4)]
     for message, swap in (
-        ("has nothing to find: all is known; take kind = 'computed_torque'", known),
+        ("kind = 'adaptive' needs at least one unknown parameter; take kind = 'computed_torque'", known),
         (
             "the balance is not linear in",
             [

@@ -98,7 +98,7 @@ def test_unlogged_bursts_are_unexplained(tmp_path):
     assert d.verdict == "unexplained"
     assert d.effects == ()
     # The forces did not say; the loop may.
-    assert "[output_error] prior" in str(d)
+    assert "[within_prior] prior" in str(d)
     seen = [any(a - 0.05 <= s + 0.025 <= b + 0.05 for a, b in d.where.intervals) for s, *_ in bursts]
     assert np.mean(seen) >= 0.8
 

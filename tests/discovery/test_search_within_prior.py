@@ -99,7 +99,7 @@ def test_what_no_effect_explains_is_said_to_be_unexplained(tmp_path):
     assert found.effects == ()
     assert found.where.variable == "time"
     # It has looked at the loop already.
-    assert "[output_error] prior" not in str(found)
+    assert "[within_prior] prior" not in str(found)
 
 
 @pytest.mark.slow

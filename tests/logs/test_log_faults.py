@@ -193,9 +193,8 @@ def test_rate_and_time_must_agree(csv_file):
     refuse(csv_file, columns, match="time column gives 1000 Hz, but sample_rate is 1 Hz.*in seconds")
 
 
-@pytest.mark.parametrize("rows", [[0, 201], [-5, 100], [100, 100], [150, 20]])
-def test_rows_out_of_range(csv_file, rows):
-    refuse(csv_file, {**COLUMNS, "rows": rows}, match="out of range; the file has 200 rows")
+def test_rows_out_of_range(csv_file):
+    refuse(csv_file, {**COLUMNS, "rows": [0, 201]}, match="out of range; the file has 200 rows")
 
 
 def test_too_short(csv_file):
@@ -210,12 +209,15 @@ def test_too_short(csv_file):
     [
         ({"time": None}, "neither time nor sample_rate"),
         ({"position": None}, "'position' is missing; add position"),
-        ({"forse": "u"}, "unknown key 'forse'; did you mean 'force'"),
-        ({"hold": "zero-order"}, "hold = 'zero-order' is unknown; did you mean 'zero_order'"),
-        ({"sample_rate": -1.0}, "sample_rate = -1.0 is not a rate"),
-        ({"rows": [0.5, 7]}, "rows = .* is not a range"),
-        ({"rows": 7}, "rows = 7 is not a range"),
-        ({"force": 3}, "force = 3 is not the name of a column"),
+        ({"forse": "u"}, "unknown key 'forse'; there is: time, sample_rate, position, force"),
+        ({"hold": "zero-order"}, "hold = \"zero-order\" is unknown; did you mean 'zero_order'"),
+        ({"sample_rate": -1.0}, "sample_rate = -1.0 is not positive; it must be > 0"),
+        ({"rows": [-5, 100]}, r"rows = \[-5, 100\] is not a range of rows"),
+        ({"rows": [100, 100]}, r"rows = \[100, 100\] is not a range of rows"),
+        ({"rows": [150, 20]}, r"rows = \[150, 20\] is not a range of rows"),
+        ({"rows": [0.5, 7]}, "rows = .* is not a range of rows"),
+        ({"rows": 7}, "rows = 7 is not a range of rows"),
+        ({"force": 3}, "force = 3 names no column; give the name of a column"),
         ({"force": ["u", "u"]}, "names a column twice"),
     ],
 )

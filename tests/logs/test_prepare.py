@@ -14,6 +14,7 @@ from jaxid.logs.prepare import choose_recipe, differentiate, prepare
 from jaxid.numerics.filters import parabolic_cutoff
 from jaxid.results.as_json import recipe_json
 from jaxid.session import open_session
+from jaxid.settings import Preprocess
 from tests.support.axis_log import log_of as stepper_log
 from tests.support.cli_setup import TRUTH, text
 from truth.axis.cases import write_case
@@ -51,7 +52,7 @@ STATED = {
 
 
 def test_stated_recipe_is_applied_to_the_letter():
-    recipe = choose_recipe(log_of(multisine()), STATED)
+    recipe = choose_recipe(log_of(multisine()), Preprocess(**STATED))
     assert {k: getattr(recipe, k) for k in STATED if k != "rest_velocity"} == {
         k: v for k, v in STATED.items() if k != "rest_velocity"
     }
@@ -62,7 +63,7 @@ def test_stated_recipe_is_applied_to_the_letter():
     assert recipe.decimator.factor == 7
     assert recipe.decimator.trim == 11
     assert recipe.band_hz(RATE) == pytest.approx(0.4 * RATE / 7)
-    assert choose_recipe(log_of(multisine()), {**STATED, "align_hold": True}).align_hold
+    assert choose_recipe(log_of(multisine()), Preprocess(**STATED, align_hold=True)).align_hold
 
 
 def test_chosen_band_holds_the_motion_and_not_the_noise():
@@ -94,10 +95,10 @@ def test_chosen_rest_velocity_is_five_deviations_of_the_velocitys_noise():
     assert 0.5 < 5 * velocity[500:-500].std() / recipe.rest_velocity[0] < 1.0
 
 
-@pytest.mark.parametrize("stated", [None, STATED])
+@pytest.mark.parametrize("stated", [{}, STATED])
 def test_prepared_motion_is_the_true_one(stated):
     log = log_of(multisine())
-    recipe = choose_recipe(log, stated)
+    recipe = choose_recipe(log, Preprocess(**stated))
     data = prepare(log, np.array([2.5]), recipe)
     w = 2 * np.pi * LINES[:, None]
     terms = 0.02 / LINES[:, None] * np.array(
@@ -114,10 +115,10 @@ def test_prepared_motion_is_the_true_one(stated):
     np.testing.assert_array_equal(data.at_kept(TIME), TIME[data.kept])
 
 
-@pytest.mark.parametrize("stated", [None, STATED])
+@pytest.mark.parametrize("stated", [{}, STATED])
 def test_rests_are_left_out_and_moves_are_not(stated):
     log = log_of(tour())
-    data = prepare(log, np.ones(1), choose_recipe(log, stated))
+    data = prepare(log, np.ones(1), choose_recipe(log, Preprocess(**stated)))
     phase = np.mod(data.at_kept(TIME), 1.0)
     for mask in (data.moving, data.fitted):
         assert not mask[(phase > 0.55) & (phase < 0.95), 0].any()
@@ -128,7 +129,7 @@ def test_reversals_are_fitted_under_a_stated_recipe_only():
     """A sine only passes through zero: published recipes keep that, a chosen one does not."""
     log = log_of(0.1 * np.sin(2 * np.pi * TIME))
     turn = lambda data: np.abs(np.mod(data.at_kept(TIME), 0.5) - 0.25) < 2e-3
-    stated = prepare(log, np.ones(1), choose_recipe(log, STATED))
+    stated = prepare(log, np.ones(1), choose_recipe(log, Preprocess(**STATED)))
     assert not stated.moving[turn(stated)].any()
     assert stated.fitted.all()
     chosen = prepare(log, np.ones(1), choose_recipe(log))
@@ -140,41 +141,41 @@ def test_reversals_are_fitted_under_a_stated_recipe_only():
 @pytest.mark.parametrize(
     ("hold", "stated", "hold_period", "expected"),
     [
-        ("zero_order", None, None, 1e-3),
-        ("zero_order", None, 2.5e-4, 2.5e-4),
-        ("linear", None, None, 0.0),
+        ("zero_order", {}, None, 1e-3),
+        ("zero_order", {}, 2.5e-4, 2.5e-4),
+        ("linear", {}, None, 0.0),
         ("zero_order", STATED, None, 0.0),
         ("zero_order", {**STATED, "align_hold": True}, None, 1e-3),
     ],
 )
 def test_hold_counts_where_it_should(hold, stated, hold_period, expected):
     log = log_of(multisine(), hold=hold)
-    data = prepare(log, np.ones(1), choose_recipe(log, stated), hold_period)
+    data = prepare(log, np.ones(1), choose_recipe(log, Preprocess(**stated)), hold_period)
     assert data.hold == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_cutoff_beyond_half_the_rate_is_refused():
     log = log_of(tour())
     with pytest.raises(InputError, match="cutoff_hz = .* is not below half the sampling rate"):
-        choose_recipe(log, {"cutoff_hz": 0.5 * log.rate_hz})
+        choose_recipe(log, Preprocess(cutoff_hz=0.5 * log.rate_hz))
 
 
 @pytest.mark.parametrize("how", ["central", "spectral", "parabolic"])
 def test_stated_derivatives_win(how):
     log = log_of(multisine())
-    recipe = choose_recipe(log, {"derivatives": how})
+    recipe = choose_recipe(log, Preprocess(derivatives=how))
     assert recipe.derivatives == how
     # all else stays chosen
     assert recipe.align_hold
     assert not recipe.keeps_reversals
     assert recipe.edge is not None
     if how != "parabolic":
-        assert choose_recipe(log, {**STATED, "derivatives": how}).derivatives == how
+        assert choose_recipe(log, Preprocess(**STATED, derivatives=how)).derivatives == how
 
 
 def test_parabolic_leaves_the_position_as_it_is():
     log = log_of(multisine())
-    recipe = choose_recipe(log, {"derivatives": "parabolic", "reach": 4, "decimation": 1})
+    recipe = choose_recipe(log, Preprocess(derivatives="parabolic", reach=4, decimation=1))
     assert not recipe.decimator.filters
     data = prepare(log, np.ones(1), recipe)
     np.testing.assert_array_equal(data.q, log.position)
@@ -184,12 +185,12 @@ def test_parabolic_leaves_the_position_as_it_is():
     np.testing.assert_allclose(data.qd[4:-4, 0], fitted[1] * RATE, atol=1e-9)
     np.testing.assert_allclose(data.qdd[4:-4, 0], 2 * fitted[2] * RATE**2, atol=1e-6)
     # the parallel filter ends where the parabola is still flat
-    wide = choose_recipe(log, {"derivatives": "parabolic", "reach": 40})
+    wide = choose_recipe(log, Preprocess(derivatives="parabolic", reach=40))
     assert 0.5 * RATE * wide.edge < 0.34 * wide.cutoff_hz
 
 
 def test_rest_velocity_of_a_parabola_is_five_deviations_of_its_noise():
-    recipe = choose_recipe(log_of(multisine(), noise=1e-3), {"derivatives": "parabolic", "reach": 3})
+    recipe = choose_recipe(log_of(multisine(), noise=1e-3), Preprocess(derivatives="parabolic", reach=3))
     white = 1e-3 * np.random.default_rng(4).standard_normal((8000, 1))
     velocity = differentiate(white, 1 / RATE, recipe.cutoff_hz, 4, "parabolic", reach=3)[1]
     assert recipe.rest_velocity[0] == pytest.approx(5 * velocity.std(), rel=0.1)

@@ -275,7 +275,7 @@ def test_a_coefficient_needs_a_weight(tmp_path, gravity):
     text = BARE.replace('"chain"', f'"chain"\ngravity = {gravity}') + effect
     case = load_case(write(tmp_path, text))
     if gravity == "0.0":
-        with pytest.raises(InputError, match=r"friction\[1\] has a friction_coefficient where nothing"):
+        with pytest.raises(InputError, match=r"\[1\] has a friction_coefficient, but its joint carries no"):
             build_machine(case)
     else:
         assert len(build_machine(case).plant.effects) == 3

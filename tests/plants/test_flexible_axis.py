@@ -199,7 +199,7 @@ FAULTS = {
         "[actuator]",
         '[[effects]]\nkind = "joint_flexibility"\nstiffness = 1e5\ndamping = 1.0\nload_inertia = 1.0\n'
         "[actuator]",
-        ["springs of its own", "axis"],
+        ["does not go with a plant that has springs", "axis"],
     ),
     "friction on the spring": (
         "[actuator]",

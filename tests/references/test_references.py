@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from jaxid.errors import InputError
 from jaxid.references import REFERENCES, make_reference
 from jaxid.references.bezier import bezier_curve
-from jaxid.references.family import REQUIRED
 from jaxid.references.moves import plan_move
 
 RATE = 1000.0
@@ -54,7 +53,7 @@ def test_every_key_is_told(kind):
 def test_required_unknown_and_kind(table):
     keys = REFERENCES[table["kind"]].keys
     for name, key in keys.items():
-        if key.default is REQUIRED:
+        if key.required:
             without = {k: v for k, v in table.items() if k != name}
             refuse(without, rf"\[reference\] kind = '{table['kind']}': '{name}' is missing; add")
     first = next(iter(keys))
@@ -66,34 +65,36 @@ def test_required_unknown_and_kind(table):
 @pytest.mark.parametrize("table", VALID, ids=lambda table: table["kind"])
 @pytest.mark.parametrize("bad", ["fast", math.nan, math.inf, True, None])
 def test_values_must_be_finite_numbers(table, bad):
-    name = next(k for k, key in REFERENCES[table["kind"]].keys.items() if key.shape == "number")
-    refuse({**table, name: bad}, f"{name} = .* is not a number")
+    keys = REFERENCES[table["kind"]].keys.items()
+    name = next(k for k, key in keys if key.read.schema.get("type") == "number")
+    finite = "a number" if bad is True or not isinstance(bad, float) else "a finite number"
+    refuse({**table, name: bad}, f"{name} = .* is not {finite}; give ")
 
 
 @pytest.mark.parametrize(
     ("table", "match"),
     [
-        ({**TRAPEZOID, "speed": 0.0}, "speed = 0 position/s; it must be positive"),
-        ({**TRAPEZOID, "acceleration": -1.0}, "acceleration = -1 .*positive"),
-        ({**TRAPEZOID, "dwell": -0.1}, "dwell = -0.1 s; it must be at least 0 s"),
-        ({**TRAPEZOID, "targets": []}, "targets = .* is too short"),
-        ({**TRAPEZOID, "targets": 0.3}, "targets = 0.3 is too short"),
-        ({**TRAPEZOID, "repeat": "yes"}, "repeat = 'yes' is no flag"),
+        ({**TRAPEZOID, "speed": 0.0}, "speed = 0.0 is not positive; it must be > 0"),
+        ({**TRAPEZOID, "acceleration": -1.0}, "acceleration = -1.0 is not positive; it must be > 0"),
+        ({**TRAPEZOID, "dwell": -0.1}, "dwell = -0.1 is negative; it must be >= 0"),
+        ({**TRAPEZOID, "targets": []}, r"targets = \[\] is empty; give a list of at least 1"),
+        ({**TRAPEZOID, "targets": 0.3}, "targets = 0.3 is not a list; give a list of at least 1"),
+        ({**TRAPEZOID, "repeat": "yes"}, 'repeat = "yes" is neither true nor false; write true'),
         ({**TRAPEZOID, "targets": [1e-9, 0.0]}, "less than two samples; move further"),
-        ({**S_CURVE, "jerk": 0.0}, "jerk = 0 .*positive"),
+        ({**S_CURVE, "jerk": 0.0}, "jerk = 0.0 is not positive; it must be > 0"),
         ({**S_CURVE, "end": 0.0}, "start and end are both 0"),
-        ({**BEZIER, "points": [0.1]}, "points = .* at least 2"),
-        ({**BEZIER, "duration": 0.0}, "duration = 0 s; it must be positive"),
+        ({**BEZIER, "points": [0.1]}, "points = .* has 1 entry; give a list of at least 2"),
+        ({**BEZIER, "duration": 0.0}, "duration = 0.0 is not positive; it must be > 0"),
         ({**BEZIER, "start_time": 5.0}, "start_time = 5 s is past the end"),
         ({**FOURIER, "base_frequency_hz": 200.0}, "harmonic 3 at 600 Hz is beyond half"),
-        ({**FOURIER, "sine": [0.1, "x"]}, "sine = 'x' is not a number"),
+        ({**FOURIER, "sine": [0.1, "x"]}, r"sine\[2\] = \"x\" is not a number; give a number"),
         ({"kind": "fourier", "base_frequency_hz": 1.0}, "neither sine nor cosine"),
         ({**MULTISINE, "band_hz": [20.0, 1.0]}, "is no band; 0 <= lowest < highest < 500 Hz"),
         ({**MULTISINE, "band_hz": [1.0, 500.0]}, "is no band"),
         ({**MULTISINE, "band_hz": [1.0, 2.0, 3.0]}, "must hold two frequencies"),
         ({**MULTISINE, "band_hz": [1.05, 1.1]}, "no line in the band: they are 0.25 Hz apart"),
         ({**MULTISINE, "period": 0.002}, "shorter than four samples"),
-        ({**MULTISINE, "seed": 1.5}, "seed = 1.5 is not whole"),
+        ({**MULTISINE, "seed": 1.5}, "seed = 1.5 is not a whole number"),
         ({**MULTISINE, "phases": "schröder"}, "phases = .* is unknown; did you mean 'schroeder'"),
         ({**S_CURVE, "end": [0.1, 0.2], "speed": [1.0, 1.0, 1.0]}, "'end' has 2 joints"),
     ],
@@ -309,7 +310,7 @@ def test_file_faults(folder):
     refuse({**table, "file": "rf.csv"}, r"no such file; .*ref\.csv", base_dir=folder)
     refuse({**table, "column": "A"}, "no column 'A'; did you mean 'a'", base_dir=folder)
     refuse({**table, "time": "b"}, "time does not run forward in row 1", base_dir=folder)
-    refuse({**table, "column": 3}, "column = 3 is no text", base_dir=folder)
+    refuse({**table, "column": 3}, "column = 3 is not a text", base_dir=folder)
     np.savez(folder / "ref.npz", m=np.ones((9, 2)), bad=np.array([1.0, np.nan, 2.0]))
     matrix = {"kind": "csv", "file": "ref.npz", "column": "m"}
     refuse(matrix, r"is a matrix; name one of its columns: 'm\[1\]'", base_dir=folder)

@@ -199,13 +199,16 @@ def test_a_loop_learns_by_inertial_sensors(tmp_path):
 
 REFUSED = [
     ('kind = "gyro"\nlink = 1\nnoise = 1.0', "kind = \"gyro\" is unknown; did you mean 'gyroscope'"),
-    ('kind = "gyroscope"\nlink = 3\nnoise = 1.0', "link = 3 is not there; the plant has 2 links"),
+    ('kind = "gyroscope"\nlink = 3\nnoise = 1.0', "link = 3 does not exist; the plant has 2 links"),
     ('kind = "gyroscope"\nlink = 1', "'noise' is missing"),
-    ('kind = "gyroscope"\nlink = 1\nnoise = 1.0', "the gyroscopes do not tell the motion of every joint"),
-    ('kind = "gyroscope"\nlink = 2\nnoise = 1.0\naxes = ["z"]', "do not tell the motion of every joint"),
+    (
+        'kind = "gyroscope"\nlink = 1\nnoise = 1.0',
+        "the gyroscopes do not determine the motion of every joint",
+    ),
+    ('kind = "gyroscope"\nlink = 2\nnoise = 1.0\naxes = ["z"]', "do not determine the motion of every joint"),
     ('kind = "gyroscope"\nlink = 1\nnoise = 1.0\naxes = ["z", "z"]', "names an axis twice"),
     ('kind = "gyroscope"\nlink = 1\nnoise = 1.0\naxes = ["z"]\nscale = [1.0, 1.0]', "scale .* has 2 entries"),
-    ('kind = "gyroscope"\nlink = 1\nnoise = 1.0\nposition = [0.0, 0.0, 0.1]', "is of an accelerometer"),
+    ('kind = "gyroscope"\nlink = 1\nnoise = 1.0\nposition = [0.0, 0.0, 0.1]', "is a key of accelerometers"),
     ('kind = "accelerometer"\nlink = 1\nnoise = 1.0', "there are accelerometers only; add gyroscopes"),
     ('kind = "gyroscope"\nlink = 2\nnoise = 1.0\nrate = 3000.0', "rate = 3000 Hz does not fit the loop"),
     ('kind = "gyroscope"\nlink = 2\nnoise = 1.0\nrotation = [0.0]', "rotation .* has 1 entry"),

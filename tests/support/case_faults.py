@@ -242,10 +242,10 @@ FAULTS = {
     "resolution": (more("[sensor]\nposition_resolution = 0"), ["position_resolution", "> 0"]),
     "noise": (more("[sensor]\nforce_noise = -1"), ["[sensor]", "force_noise = -1", ">= 0"]),
     # validation
-    "same log": (second(""), ["[[validation]] 1", "the fit itself", "rows"]),
+    "same log": (second(""), ["[[validation]] 1", "validation log is identical to the fitted log", "rows"]),
     "same name": (
         second('log = "a.csv"') + '[[validation]]\nname = "second"\nlog = "b.csv"',
-        ["[[validation]] 2", '"second"', "its own name"],
+        ["[[validation]] 2", '"second"', "a different name"],
     ),
     "validation key": (second('file = "a.csv"'), ["[[validation]] 1", "'file'", "there is"]),
     "validation disturbance": (

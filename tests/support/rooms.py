@@ -6,6 +6,9 @@ A newcomer reads the package in this order. A room is a folder or a module direc
 ROOMS = {
     "arrays": "the array type of annotations",
     "errors": "one-line errors with a hint",
+    "names": "methods, outputs, solvers and other names that users write",
+    "schema": "readers of the keys of a case, and their JSON Schema",
+    "settings": "tables of a case as dataclasses: keys, defaults, documentation",
     "_platform": "float64 and XLA's loop option",
     "_cache": "compiled code on disk",
     "files": "writing outputs whole or not at all",

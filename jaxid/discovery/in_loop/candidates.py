@@ -66,10 +66,9 @@ class LoopFit:
     @classmethod
     def of(cls, session: Session, machine: Machine, widths: dict[str, float], estimate: Estimate) -> LoopFit:
         """Refit the optimum of the loop without rounding, since the estimate is corrected for rounding."""
-        stated, log = session.case.output_error, session.fit.log
-        numerics = choose_numerics(machine, log, solver=stated.get("solver"))
-        on = stated.get("on", "position")
-        problem = Problem.of(machine, log, stated["prior"], on, numerics, widths)
+        settings, log = session.case.need_prior(), session.fit.log
+        numerics = choose_numerics(machine, log, solver=settings.solver)
+        problem = Problem.of(machine, log, settings.prior, settings.on, numerics, widths)
         point = problem.prior.inward(problem.padded(estimate.theta))
 
         here = run_alone(linearise(problem, problem.sharpnesses[-1], point))

@@ -37,7 +37,7 @@ UNSEEN = "a fit within a prior examines the simulated loop only"
 
 
 def explore_within(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
-    """Run `discover` for a case with `[output_error] prior`.
+    """Run `discover` for a case with `[within_prior]`.
 
     Args:
         session: Case and log.
@@ -48,7 +48,7 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
         InputError: If the loop cannot be simulated, or a guess is zero.
     """
     progress("fitting the baseline")
-    first = run_alone(steps_of("output_error", session))
+    first = run_alone(steps_of(session.case.prior_method, session))
     before = after = LoopFit.of(session, session.machine, {}, first)
     effects: list[NamedEffect] = []
     rounds = []
@@ -78,7 +78,7 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
             break
         # Fits for the comparison were made without draws about them.
         fit, effect = addition
-        drawn = session.case.output_error.get("drawn", True)
+        drawn = session.case.need_prior().drawn
         after = _fit(session, fit.machine, fit.widths, fit.estimate.theta, drawn=drawn)
         effects.append(effect)
         added = effect.score
@@ -163,22 +163,22 @@ def _fit(
     drawn: bool,
 ) -> LoopFit:
     """Fit within the prior from some values of the unknowns; for `drawn` see `within_prior_steps`."""
-    stated, log = session.case.output_error, session.fit.log
-    numerics = choose_numerics(machine, log, solver=stated.get("solver"))
+    settings, log = session.case.need_prior(), session.fit.log
+    numerics = choose_numerics(machine, log, solver=settings.solver)
     result = run_alone(
         within_prior_steps(
             machine,
             log,
-            prior=stated["prior"],
-            on=stated.get("on", "position"),
+            prior=settings.prior,
+            on=settings.on,
             widths=widths,
             begin=begin,
             drawn=drawn,
             numerics=numerics,
-            minimiser=stated.get("minimiser"),
+            minimiser=settings.minimiser,
         )
     )
-    return LoopFit.of(session, machine, widths, result)
+    return LoopFit.of(session, machine, widths, replace(result, method=session.case.prior_method))
 
 
 def _width(free: Free, starts: Float[np.ndarray, " starts"]) -> float:

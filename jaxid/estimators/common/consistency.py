@@ -30,7 +30,7 @@ def need_bodies(session: Session) -> Session:
     Raises:
         InputError: If a link is known in part, bounded by min or max, or its guess is no body.
     """
-    machine, where = session.machine, str(session.case.path)
+    machine, where = session.machine, session.case.where
     if not machine.plant.linked:
         return session
     unknown, bodies = machine.parameters.free, []

@@ -9,6 +9,7 @@ import functools
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from jaxid.errors import InputError, suggest
+from jaxid.names import MINIMISERS
 
 if TYPE_CHECKING:
     import optimistix as optx
@@ -17,20 +18,6 @@ if TYPE_CHECKING:
 else:
     Minimiser = Any
 
-# The default comes first. Solvers of optimistix that need no more than tolerances go by their names; any
-# other may be given from Python as an instance.
-MINIMISERS = (
-    "levenberg_marquardt",
-    "optimistix.LevenbergMarquardt",
-    "optimistix.IndirectLevenbergMarquardt",
-    "optimistix.GaussNewton",
-    "optimistix.Dogleg",
-    "optimistix.BFGS",
-    "optimistix.DFP",
-    "optimistix.LBFGS",
-    "optimistix.NonlinearCG",
-    "optimistix.NelderMead",
-)
 # On the scale of `jaxid.estimators.common.minimise` unknowns and residual are of order one. The cost at the
 # end is far below the one at the start, hence the smaller absolute tolerance.
 _RTOL, _ATOL = 1e-8, 1e-10

@@ -13,6 +13,7 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import A_PERIOD, Recipe, choose_recipe, spaced, trimmed
 from jaxid.machine import Machine
 from jaxid.numerics import filters as signals
+from jaxid.settings import Preprocess
 from jaxid.simulation.sensor_noise import position_noise
 
 # Edge of the band over the highest natural frequency, as published (60 for 30 Hz).
@@ -105,7 +106,7 @@ def highest_order(structure: Structure) -> int:
 
 
 def choose_filtering(
-    log: Log, stated: dict, structure: Structure, spectrum: Spectrum
+    log: Log, stated: Preprocess, structure: Structure, spectrum: Spectrum
 ) -> tuple[Recipe, tuple[str, ...]]:
     """Choose the filters for a minimal model.
 
@@ -123,10 +124,10 @@ def choose_filtering(
     Returns:
         The recipe, and notes about the choice.
     """
-    order = int(stated.get("order", highest_order(structure) + 2))
-    if "cutoff_hz" in stated:
+    order = highest_order(structure) + 2 if stated.order is None else stated.order
+    if stated.cutoff_hz is not None:
         recipe = replace(choose_recipe(log, stated), order=order)
-        if "trim" not in stated:
+        if stated.trim is None:
             trim = trimmed(log, recipe.cutoff_hz, recipe.decimation, literal=True, periods=_ENDS)
             recipe = replace(recipe, trim=trim)
         return recipe, _folding_notes(recipe, log.rate_hz)
@@ -136,8 +137,10 @@ def choose_filtering(
         return recipe, ()
     top, limit = float(spectrum.natural.max()), spectrum.limit_hz
     edge = min(max(min(_ABOVE * top, limit), _AT_LEAST * top), 0.3 * log.rate_hz)
-    decimation = int(stated.get("decimation", spaced(log.rate_hz, edge)))
-    trim = int(stated.get("trim", trimmed(log, edge, decimation, literal=False, periods=_ENDS)))
+    decimation = spaced(log.rate_hz, edge) if stated.decimation is None else stated.decimation
+    trim = stated.trim
+    if trim is None:
+        trim = trimmed(log, edge, decimation, literal=False, periods=_ENDS)
     recipe = replace(
         recipe,
         cutoff_hz=min(2 * edge, 0.45 * log.rate_hz),

@@ -71,7 +71,7 @@ def minimal_model_steps(
         measurements availability".
     """
     machine, log, stated = session.machine, session.fit.log, session.case.preprocess
-    where = str(session.case.path)
+    where = session.case.where
     form = _form(session, printed)
     model = _model(machine.plant, machine.parameters, form, session, where)
     parameters, coefficients = machine.parameters, model.guess
@@ -83,7 +83,7 @@ def minimal_model_steps(
     for k in range(_PASSES):
         natural = now
         spectrum = spectrum_of(
-            log, machine, model.structure, coefficients, model.known, natural, stated.get("median")
+            log, machine, model.structure, coefficients, model.known, natural, stated.median
         )
         recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
         balance = _linear_balance(machine.plant, parameters.places, theta)
@@ -112,7 +112,7 @@ def minimal_model_steps(
         now = natural_frequencies(machine.plant, parameters.places, theta).hz
         moved = np.abs(now / natural - 1) if natural.size else np.zeros(1)
         # At the guesses the reversals of a hidden joint are not known: it needs a second pass.
-        if k >= bool(form.hidden) and (moved.max() < _SETTLED or "cutoff_hz" in stated):
+        if k >= bool(form.hidden) and (moved.max() < _SETTLED or stated.cutoff_hz is not None):
             break
     assert results is not None, "there is at least one pass"
     data, fit, weights, solved, recipe, notes = results
@@ -134,12 +134,10 @@ def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Rec
     """
     machine, log = session.machine, session.fit.log
     form = _form(session, printed)
-    model = _model(machine.plant, machine.parameters, form, session, str(session.case.path))
+    model = _model(machine.plant, machine.parameters, form, session, session.case.where)
     natural = natural_frequencies(machine.plant, machine.parameters.places, machine.parameters.guess).hz
     stated = session.case.preprocess
-    spectrum = spectrum_of(
-        log, machine, model.structure, model.guess, model.known, natural, stated.get("median")
-    )
+    spectrum = spectrum_of(log, machine, model.structure, model.guess, model.known, natural, stated.median)
     return spectrum, *choose_filtering(log, stated, model.structure, spectrum)
 
 
@@ -149,9 +147,9 @@ def _form(session: Session, printed: bool) -> Form:
     Raises:
         InputError: If they do not.
     """
-    plant, log, where = session.machine.plant, session.fit.log, str(session.case.path)
+    plant, log, where = session.machine.plant, session.fit.log, session.case.where
     require_linear(plant, where)
-    if session.case.preprocess.get("derivatives") == "parabolic":
+    if session.case.preprocess.derivatives == "parabolic":
         raise InputError(
             "[preprocess] derivatives = 'parabolic' filters each derivative differently, and a minimal model "
             "needs one filter for all of its columns",

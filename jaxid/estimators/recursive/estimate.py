@@ -28,9 +28,8 @@ from jaxid.machine import Machine
 from jaxid.model.effect import carries_force
 from jaxid.model.parameter import parameters_of
 from jaxid.numerics.lanes import SolveRequest, Steps
+from jaxid.settings import Recursive
 
-# Weight of the start, in samples.
-REGULARIZATION = 1e-3
 # Largest number of instants in the history of a log.
 _MOST = 200
 # A right-hand side below this fraction of the row's force is zero.
@@ -60,7 +59,7 @@ def gains_of(machine: Machine) -> tuple[int | None, ...]:
 
 
 def recursive_steps(
-    machine: Machine, data: Prepared, stated: Mapping[str, Any], saved: Mapping[str, Any] | None = None
+    machine: Machine, data: Prepared, settings: Recursive, saved: Mapping[str, Any] | None = None
 ) -> Steps[Estimate]:
     """Estimate the unknowns sample by sample.
 
@@ -68,8 +67,7 @@ def recursive_steps(
         machine: The machine. The guesses of the plant's parameters are their start, and those of the effects
             too if `start` is "guess".
         data: The filtered log.
-        stated: Keys of the case's [recursive], each with a default: `half_life` [s of motion],
-            `regularization` (samples), `gate_velocity`, `gate_acceleration`, `rows`, `start`, `instrument`.
+        settings: Table [recursive] of the case.
         saved: Memory of an earlier run to continue, as `jaxid.estimators.recursive.memory` reads it.
 
     Returns:
@@ -80,13 +78,13 @@ def recursive_steps(
         InputError: If the balance is not linear in the unknowns, a gain has no known term to scale it, an
             instrument has no gain, or rows of different units are to be summed.
     """
-    gains, noisy = gains_of(machine), stated.get("instrument") == "model"
-    _check(machine, stated, gains, saved)
-    full = yield from rows_steps(machine, data, _gates(data, stated))
+    gains, noisy = gains_of(machine), settings.instrument == "model"
+    _check(machine, settings, gains, saved)
+    full = yield from rows_steps(machine, data, _gates(data, settings))
     _check_rows(machine, full, gains)
 
-    used = full.summed if stated.get("rows") == "summed" else full
-    recursion, memory = _recursion(machine, data, used, stated, gains)
+    used = full.summed if settings.rows == "summed" else full
+    recursion, memory = _recursion(machine, data, used, settings, gains)
     if saved is not None:
         recursion = replace(recursion, start=saved["start"], information=saved["information"])
         memory = RecursiveMemory(**{k: jnp.asarray(v) for k, v in saved["memory"].items()})
@@ -109,23 +107,24 @@ def recursive_steps(
         message="converged" if converged else "the estimate is not finite",
         residual=np.where(used.counts, used.rows @ theta - used.target, np.nan),
         samples=int(used.counts.sum()),
-        notes=_notes(machine, theta, stated, noisy),
-        details={"recursive": details_of(machine, recursion, memory, history, times, inflation, stated)},
+        notes=_notes(machine, theta, settings, noisy),
+        details={"recursive": details_of(machine, recursion, memory, history, times, inflation, settings)},
     )
 
 
 def _recursion(
-    machine: Machine, data: Prepared, used: Rows, stated: Mapping[str, Any], gains: tuple
+    machine: Machine, data: Prepared, used: Rows, settings: Recursive, gains: tuple
 ) -> tuple[Recursion, RecursiveMemory]:
     """Build the estimator that the case states, and its memory before the first sample."""
-    period, half_life = data.period * data.recipe.decimation, stated.get("half_life", np.inf)
+    period = data.period * data.recipe.decimation
+    half_life = np.inf if settings.half_life is None else settings.half_life
     recursion = Recursion(
-        start=machine.parameters.guess if stated.get("start") == "guess" else start_of(machine),
-        information=stated.get("regularization", REGULARIZATION) * _sizes(machine, used),
+        start=machine.parameters.guess if settings.start == "guess" else start_of(machine),
+        information=settings.regularization * _sizes(machine, used),
         forgetting=np.asarray(2.0 ** (-period / half_life)),
-        summed=stated.get("rows") == "summed",
+        summed=settings.rows == "summed",
         gains=gains,
-        instrument=stated.get("instrument") == "model",
+        instrument=settings.instrument == "model",
     )
     return recursion, recursion.memory()
 
@@ -136,29 +135,27 @@ def _sizes(machine: Machine, used: Rows) -> Float[np.ndarray, " p"]:
     return np.asarray(column_squares(used.rows, used.counts, used.force, natural)[0])
 
 
-def _gates(data: Prepared, stated: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
+def _gates(data: Prepared, settings: Recursive) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the stated gates by joint; the velocity gate defaults to the recipe's rest velocity."""
-    if "gate_velocity" not in stated and "gate_acceleration" not in stated:
+    if settings.gate_velocity is None and settings.gate_acceleration is None:
         return None
     joints = data.q.shape[1]
-    velocity = stated.get("gate_velocity", data.recipe.rest_velocity)
-    acceleration = stated.get("gate_acceleration", np.inf)
+    velocity = data.recipe.rest_velocity if settings.gate_velocity is None else settings.gate_velocity
+    acceleration = np.inf if settings.gate_acceleration is None else settings.gate_acceleration
     return _by_joint(velocity, joints), _by_joint(acceleration, joints)
 
 
-def _by_joint(value: float | list[float], joints: int) -> np.ndarray:
+def _by_joint(value: Any, joints: int) -> np.ndarray:
     return np.broadcast_to(np.asarray(value, float), (joints,))
 
 
-def _check(
-    machine: Machine, stated: Mapping[str, Any], gains: tuple, saved: Mapping[str, Any] | None
-) -> None:
+def _check(machine: Machine, settings: Recursive, gains: tuple, saved: Mapping[str, Any] | None) -> None:
     """Check the settings, independently of the log.
 
     Raises:
         InputError: If settings contradict one another, the machine or the saved memory.
     """
-    rows, instrument = stated.get("rows", "full"), stated.get("instrument", "none")
+    rows, instrument = settings.rows, settings.instrument
     if instrument == "model" and not any(g is not None for g in gains):
         raise InputError(
             'instrument = "model" needs an unknown gain of a drive',
@@ -204,9 +201,7 @@ def _check_rows(machine: Machine, rows: Rows, gains: tuple) -> None:
             )
 
 
-def _notes(
-    machine: Machine, theta: np.ndarray, stated: Mapping[str, Any], instrument: bool
-) -> tuple[str, ...]:
+def _notes(machine: Machine, theta: np.ndarray, settings: Recursive, instrument: bool) -> tuple[str, ...]:
     """Return the notes about forgetting, bounds and instruments."""
     lower, upper = machine.parameters.bounds
     out = [n for n, o in zip(machine.parameters.names, (theta < lower) | (theta > upper), strict=True) if o]
@@ -215,7 +210,7 @@ def _notes(
     )
     if instrument:
         notes.append("instruments: the drive's force that the model fitted by least squares predicts")
-    half = stated.get("half_life")
+    half = settings.half_life
     if not half:
         return ("nothing is forgotten", *notes)
     return (f"the weight of a sample halves every {half:g} s of motion", *notes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +12,7 @@ from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, R
 from jaxid.estimators.recursive.rows import Rows
 from jaxid.machine import Machine
 from jaxid.numerics.precision import NoiseModel, Precision, assess, sandwich
+from jaxid.settings import Recursive
 
 
 def weights(rows: Rows, forgetting: float) -> Float[np.ndarray, " kept"]:
@@ -128,7 +128,7 @@ def details_of(
     history: RecursiveEstimate,
     times: np.ndarray,
     inflation: np.ndarray,
-    stated: Mapping[str, Any],
+    settings: Recursive,
 ) -> dict[str, Any]:
     """Return the `recursive` object of result.json: settings, history, and the memory for a warm restart.
 
@@ -145,7 +145,7 @@ def details_of(
     variance = np.where(history.identifiable, np.diagonal(history.covariance, axis1=1, axis2=2), np.nan)
     std = np.sqrt(variance) * inflation
     return {
-        "half_life": stated.get("half_life"),
+        "half_life": settings.half_life,
         "rows": "summed" if recursion.summed else "full",
         "instrument": "model" if recursion.instrument else "none",
         "forgetting": float(recursion.forgetting),

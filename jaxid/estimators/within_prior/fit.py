@@ -176,7 +176,7 @@ def _estimate(
         message = "the simulation is not finite at the end of the fit"
     of_cost = {"criterion_percent": problem.criterion(minimum), "effective_parameters": fit.effective}
     return Estimate(
-        method="output_error",
+        method="within_prior",
         machine=machine.with_estimate(theta),
         theta=theta,
         precision=precision,

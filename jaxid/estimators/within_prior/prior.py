@@ -73,7 +73,7 @@ class Prior(eqx.Module):
             if f.guess == 0.0 and f.name not in widths:
                 raise InputError(
                     f"a relative prior needs a nonzero guess, and {f.name} has guess = 0",
-                    where="[output_error] prior",
+                    where="prior",
                     hint="give it a guess of its natural size",
                 )
 

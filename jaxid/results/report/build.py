@@ -42,7 +42,7 @@ def identification_report(result: Identification) -> str:
     rows, below = minimal_rows(content["minimal"]) if "minimal" in content else ((), ())
     return render(
         ReportData(
-            title=f"Identification of {session.case.path.stem}",
+            title=f"Identification of {session.case.title}",
             command="identify",
             verdict=None,
             summary_lines=(),
@@ -66,7 +66,7 @@ def discovery_report(result: Discovery) -> str:
     before = result.gaps_before if result.effects else None
     return render(
         ReportData(
-            title=f"What is missing in {session.case.path.stem}",
+            title=f"What is missing in {session.case.title}",
             command="discover",
             verdict=result.verdict,
             summary_lines=(),
@@ -105,7 +105,7 @@ def history_of(estimate: Estimate) -> HistoryView | None:
 
 def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
     return {
-        "case_name": session.case.path.name,
+        "case_name": session.case.name,
         "log_name": Path(session.fit.log.source).name,
         "parameters": _rows(estimate),
         "derived": _derived(session, estimate),

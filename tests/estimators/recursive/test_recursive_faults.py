@@ -7,6 +7,7 @@ from jaxid.case.case import load_case
 from jaxid.commands.identify import identify
 from jaxid.errors import InputError
 from jaxid.estimators.recursive.estimate import recursive_steps
+from jaxid.settings import Recursive
 from tests.support.recursive_axis import COULOMB, GAIN, VISCOUS, estimate, slide, with_table, written_axis
 from truth.axis.cases import case_text, write_case
 
@@ -83,7 +84,7 @@ force = "u"
 def test_forces_and_torques_have_no_sum(tmp_path):
     machine = build_machine(load_case(write_case(tmp_path, STAGE)))
     with pytest.raises(InputError, match="would add forces to torques; take rows"):
-        next(recursive_steps(machine, None, {"rows": "summed"}))
+        next(recursive_steps(machine, None, Recursive(rows="summed")))
 
 
 def test_a_restart_about_other_unknowns(axis, tmp_path):

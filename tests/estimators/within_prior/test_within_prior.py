@@ -338,6 +338,24 @@ def test_a_log_of_noise_tells_nothing(folder):
     assert np.all(np.isnan(estimate.std[~estimate.identifiable]))
 
 
+def test_the_method_and_the_older_key_give_the_same_numbers(folder, tmp_path):
+    text = (folder / "case.toml").read_text() + "drawn = false\n"
+    (tmp_path / "older.toml").write_text(text)
+    (tmp_path / "case.toml").write_text(text.replace("[output_error]", "[within_prior]"))
+    older = jaxid.identify(tmp_path / "older.toml", logged(0)).estimate
+    for file in ("case.toml", "older.toml"):
+        estimate = jaxid.identify(tmp_path / file, logged(0), method="within_prior").estimate
+        np.testing.assert_array_equal(estimate.theta, older.theta)
+        np.testing.assert_array_equal(estimate.std, older.std)
+        assert (older.method, estimate.method) == ("output_error", "within_prior")
+    (tmp_path / "case.toml").write_text(text.replace(STATED, "[output_error]\n").replace("drawn = false", ""))
+    with pytest.raises(jaxid.InputError, match=r"table \[within_prior\] is missing; add \[within_prior\]"):
+        jaxid.identify(tmp_path / "case.toml", logged(0), method="within_prior")
+    (tmp_path / "case.toml").write_text(text + "[within_prior]\nprior = 0.3\n")
+    with pytest.raises(jaxid.InputError, match=r"\[output_error\]: prior is given beside \[within_prior\]"):
+        jaxid.load_case(tmp_path / "case.toml")
+
+
 def test_wrong_priors_are_refused(folder, tmp_path, capsys):
     text = (folder / "case.toml").read_text()
     stages.write(stages.record(STAGE, REFERENCE, noise=NOISE, resolution=0.0), tmp_path / "log.csv")

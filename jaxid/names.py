@@ -1,0 +1,73 @@
+"""Names that users write: methods, outputs, solvers, holds and other choices, each list once.
+
+It imports nothing, so that the command line can list them without loading JAX.
+"""
+
+# Estimators, in the order in which help texts list them; `jaxid.estimators.METHODS` has one entry for each.
+METHODS = (
+    "output_error",
+    "within_prior",
+    "inverse_dynamics",
+    "algebraic",
+    "instrumental_variable",
+    "didim",
+    "power",
+    "recursive",
+    "algebraic_single_time",
+    "algebraic_ratio",
+    "algebraic_sign_changed",
+    "algebraic_sign_unchanged",
+    "minimal_model",
+    "minimal_model_printed",
+)
+# Further entries of [study] estimators: the search, and the estimate of an adaptive controller.
+DISCOVER, IN_LOOP = "discover", "in_loop"
+# Signals of a simulated loop that output error compares with the log.
+OUTPUTS = ("position", "force", "both")
+# Methods that output error may take its start from.
+STARTS = ("inverse_dynamics", "recursive", "guess")
+# Solvers of diffrax by their classes: those with an error estimate that need one right-hand side.
+SOLVERS = {
+    "tsit5": "Tsit5",
+    "dopri5": "Dopri5",
+    "dopri8": "Dopri8",
+    "bosh3": "Bosh3",
+    "kvaerno3": "Kvaerno3",
+    "kvaerno5": "Kvaerno5",
+}
+# Minimisers of output error: the default is jaxid's Levenberg-Marquardt; the solvers of optimistix here
+# need only tolerances. Any other may be given from Python as an instance.
+MINIMISERS = (
+    "levenberg_marquardt",
+    "optimistix.LevenbergMarquardt",
+    "optimistix.IndirectLevenbergMarquardt",
+    "optimistix.GaussNewton",
+    "optimistix.Dogleg",
+    "optimistix.BFGS",
+    "optimistix.DFP",
+    "optimistix.LBFGS",
+    "optimistix.NonlinearCG",
+    "optimistix.NelderMead",
+)
+# Methods of `jaxid.register_method`, which a case and the command line may then name.
+USER_METHODS: list[str] = []
+# Course of the command between two samples.
+HOLDS = ("zero_order", "linear", "band_limited")
+# Columns of a log beside time, position and force.
+OPTIONAL_COLUMNS = (
+    "velocity",
+    "acceleration",
+    "reference",
+    "load_position",
+    "load_acceleration",
+    "temperature",
+)
+# Ways to differentiate a position, see `jaxid.logs.prepare`.
+DERIVATIVES = ("central", "spectral", "parabolic")
+# Criteria by which `jaxid design` improves a trajectory.
+CRITERIA = ("determinant", "condition")
+MOTIONS = ("linear", "rotary")
+ORIENTATIONS = ("horizontal", "vertical")
+# Kinds of inertial sensors, and the axes that they may read.
+INERTIAL_KINDS = ("gyroscope", "accelerometer")
+AXES = ("x", "y", "z")
