@@ -15,6 +15,7 @@ from jaxid.logs.log import Log, read_log, with_load
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine
+from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.references import make_reference
 from jaxid.settings import Actuator, Disturbance, LogTable

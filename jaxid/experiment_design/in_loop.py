@@ -33,7 +33,7 @@ from jaxid.scene import refuse_impossible, sampling_of
 from jaxid.schema import stated
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive, needed_substeps
-from jaxid.simulation.replay import Replay
+from jaxid.simulation.replay import Replay, with_sensor
 
 # Relative width of the guesses if the case states none.
 _PRIOR = 0.5

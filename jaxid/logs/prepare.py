@@ -261,7 +261,10 @@ def choose_recipe(log: Log, stated: Preprocess = _CHOSEN) -> Recipe:
         cutoff = signals.parabolic_cutoff(reach) * rate
         edge = None if edge is None else min(edge, _FLAT * cutoff)
     else:
-        cutoff = min(2 * edge, 0.45 * rate) if stated.cutoff_hz is None else stated.cutoff_hz
+        cutoff = (
+            stated.cutoff_hz if edge is None or stated.cutoff_hz is not None else min(2 * edge, 0.45 * rate)
+        )
+        assert cutoff is not None, "a literal recipe has a cut-off"
     band = cutoff if edge is None else edge
     decimation = _decimation(log, band) if stated.decimation is None else stated.decimation
 
@@ -269,6 +272,7 @@ def choose_recipe(log: Log, stated: Preprocess = _CHOSEN) -> Recipe:
         rest = np.full(log.position.shape[1], stated.rest_velocity, float)
     else:
         rest = _rest_velocity(log, cutoff, how, reach)
+    trim = trimmed(log, band, decimation, literal=literal) if stated.trim is None else stated.trim
     return Recipe(
         cutoff_hz=cutoff,
         order=4 if stated.order is None else stated.order,

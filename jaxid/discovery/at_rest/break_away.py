@@ -23,6 +23,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.session import OpenedLog
@@ -170,7 +171,7 @@ class _Trial:
         drive = Drive(jnp.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
         plant = machine.plant
         for joint in self.joints:
-            plant = plant.with_effect(StaticFriction(level=0.0, port=joint))
+            plant = plant.with_effect(StaticFriction(level=as_array(0.0), port=joint))
         prior = _prior(self.estimate)
         places, theta = machine.parameters.places, jnp.asarray(self.estimate.theta)
 

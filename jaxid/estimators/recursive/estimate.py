@@ -166,8 +166,8 @@ def _check(machine: Machine, settings: Recursive, gains: tuple, saved: Mapping[s
         raise InputError(
             'rows = "summed" would add forces to torques', where="recursive", hint='take rows = "full"'
         )
-    settings = {"summed": rows == "summed", "instrument": instrument == "model"}
-    if saved and any(saved[k] != v for k, v in settings.items()):
+    wanted = {"summed": rows == "summed", "instrument": instrument == "model"}
+    if saved and any(saved[k] != v for k, v in wanted.items()):
         raise InputError(
             "the run to restart from had other rows or another instrument",
             where="recursive",
