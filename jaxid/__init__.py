@@ -32,7 +32,10 @@ if TYPE_CHECKING:
     from jaxid.estimators.algebraic.online import OnlineEstimate as OnlineEstimate
     from jaxid.estimators.estimate import Estimate as Estimate
     from jaxid.estimators.recursive.real_time import RealTime as RealTime
+    from jaxid.experiment_design.along_reference import Excitation as Excitation
+    from jaxid.experiment_design.in_loop import Design as Design
     from jaxid.gap import Gap as Gap
+    from jaxid.logs.in_memory import as_log as as_log
     from jaxid.logs.log import Log as Log
     from jaxid.logs.log import read_log as read_log
     from jaxid.machine import Machine as Machine
@@ -44,6 +47,10 @@ if TYPE_CHECKING:
     from jaxid.plants import PLANTS as PLANTS
     from jaxid.references import REFERENCES as REFERENCES
     from jaxid.references import make_reference as make_reference
+    from jaxid.results.parameters import Covariance as Covariance
+    from jaxid.results.parameters import Parameter as Parameter
+    from jaxid.results.parameters import ParameterTable as ParameterTable
+    from jaxid.results.parameters import Residuals as Residuals
     from jaxid.scene import SimulatedLog as SimulatedLog
     from jaxid.sensors.encoder import Sensor as Sensor
     from jaxid.session import Session as Session
@@ -75,6 +82,7 @@ _HOMES = {
     "load_case": ("jaxid.case.case", "load_case"),
     "Case": ("jaxid.case.case", "Case"),
     "read_log": ("jaxid.logs.log", "read_log"),
+    "as_log": ("jaxid.logs.in_memory", "as_log"),
     "Log": ("jaxid.logs.log", "Log"),
     "open_session": ("jaxid.session", "open_session"),
     "Session": ("jaxid.session", "Session"),
@@ -84,6 +92,12 @@ _HOMES = {
     "Discovery": ("jaxid.discovery.result", "Discovery"),
     "Check": ("jaxid.commands.check", "Check"),
     "Study": ("jaxid.studies.result", "Study"),
+    "Design": ("jaxid.experiment_design.in_loop", "Design"),
+    "Excitation": ("jaxid.experiment_design.along_reference", "Excitation"),
+    "Parameter": ("jaxid.results.parameters", "Parameter"),
+    "ParameterTable": ("jaxid.results.parameters", "ParameterTable"),
+    "Covariance": ("jaxid.results.parameters", "Covariance"),
+    "Residuals": ("jaxid.results.parameters", "Residuals"),
     "SimulatedLog": ("jaxid.scene", "SimulatedLog"),
     "Estimate": ("jaxid.estimators.estimate", "Estimate"),
     "Gap": ("jaxid.gap", "Gap"),

@@ -313,9 +313,14 @@ def _run_identify(args: argparse.Namespace) -> int:
 def _run_discover(args: argparse.Namespace) -> int:
     if args.max_effects < 0:
         raise InputError(f"--max-effects is {args.max_effects}", hint="give zero or more")
-    # An experiment's name follows from what is found: any that is there already may be meant.
-    there = [] if args.o is None else [p.name for p in Path(args.o).glob("separate_*.csv")]
-    _ready(args, "discovery.json", "report.html", *there)
+    # An experiment's name follows from the effects found: any that exists already may be meant.
+    if args.o is not None:
+        from jaxid.files import found_case_file
+
+        folder = Path(args.o)
+        experiments = [p.name for p in folder.glob("separate_*.csv")]
+        corrected = found_case_file(Path(args.case), folder)
+        _ready(args, "discovery.json", "report.html", corrected, *experiments)
     with _progress(args, 40) as tell:
         tell("starting")
         from jaxid.commands.discover import discover
@@ -331,7 +336,7 @@ def _run_discover(args: argparse.Namespace) -> int:
     print(result)
     from jaxid.results.as_json import discovery_files
 
-    return _finish(args, result, *discovery_files(result))
+    return _finish(args, result, *discovery_files(result, Path(args.o or ".")))
 
 
 def _run_study(args: argparse.Namespace) -> int:

@@ -74,6 +74,16 @@ def check_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False)
         )
 
 
+def found_case_file(case: Path, folder: Path) -> str:
+    """Return the name of the corrected case in a folder: never that of the case itself.
+
+    Args:
+        case: The case file.
+        folder: The folder of the results.
+    """
+    return "case_found.toml" if case.resolve() == (folder / "case.toml").resolve() else "case.toml"
+
+
 def ready_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False) -> Path:
     """Make a folder for results, where there is none.
 

@@ -12,7 +12,8 @@ import numpy as np
 from jaxid.build import build_machine
 from jaxid.case.case import Case, load_case
 from jaxid.errors import InputError
-from jaxid.logs.log import Log, read_log, with_load
+from jaxid.logs.in_memory import LogLike, as_log
+from jaxid.logs.log import Log, with_load
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine
@@ -52,6 +53,7 @@ class Session:
         validations: Others, by name; prepared by the same recipe.
         recipe: How the logs are filtered.
         findings: Warnings on the logs.
+        given: The case as it was given, where `case` is that of the joints (see `at_joints`).
     """
 
     case: Case
@@ -60,6 +62,12 @@ class Session:
     validations: tuple[OpenedLog, ...]
     recipe: Recipe
     findings: tuple[Finding, ...]
+    given: Case | None = None
+
+    @property
+    def declared(self) -> Case:
+        """The case as it was given, gears of the motors included."""
+        return self.case if self.given is None else self.given
 
     @property
     def runs(self) -> tuple[OpenedLog, ...]:
@@ -73,8 +81,8 @@ class Session:
 
 def open_session(
     case: Case | str | Path,
-    log: Log | str | Path,
-    validate: Sequence[Log | str | Path] = (),
+    log: LogLike,
+    validate: Sequence[LogLike] = (),
     *,
     align_hold: bool | None = None,
     method: str = "output_error",
@@ -83,7 +91,7 @@ def open_session(
 
     Args:
         case: The case, or its file.
-        log: The log to fit, or its file.
+        log: The log to fit, its file, or a table with the columns that [log] names.
         validate: More logs to validate on, beside the case's own.
         align_hold: See `jaxid.logs.prepare.Recipe`; absent: what the case's recipe implies.
         method: That is to fit the log: only `output_error` can do with a short one, within a prior, and
@@ -92,9 +100,11 @@ def open_session(
     Raises:
         InputError: If anything in case or logs is unsound.
     """
-    case = case if isinstance(case, Case) else load_case(case)
-    read = functools.partial(_read, case)
-    case = at_joints(case)
+    if isinstance(validate, str) or not isinstance(validate, Sequence):
+        raise InputError("validate is not a list of logs", hint="put it into a list: validate=[log]")
+    given = case if isinstance(case, Case) else load_case(case)
+    read = functools.partial(_read, given)
+    case = at_joints(given)
     fit = read(log)
     machine = build_machine(case, period=fit.period)
     held = method in ("output_error", "discover") and "prior" in case.output_error
@@ -122,7 +132,26 @@ def open_session(
         names.add(name)
         opened.append(_run(name, measured, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
-    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
+    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), given)
+
+
+def open_another(session: Session, log: LogLike) -> OpenedLog:
+    """Open one more log for a session, prepared by the recipe of its others.
+
+    Args:
+        session: The session.
+        log: The log, its file, or a table; all its rows are taken.
+
+    Raises:
+        InputError: If the log is unsound.
+    """
+    case, machine = session.declared, session.machine
+    measured = _read(case, log, whole=True)
+    held = "prior" in case.output_error
+    _check(at_joints(case), measured, machine, held)
+    needed = 0 if held else enough(machine)
+    name = Path(measured.source).stem
+    return _run(name, measured, machine, session.recipe, needed, machine.disturbance)
 
 
 def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None = None) -> Session:
@@ -143,14 +172,14 @@ def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None
     return Session(case, _scaled(machine, run.data), run, (), recipe, ())
 
 
-def _read(case: Case, log: Log | str | Path, *, columns: dict | None = None, whole: bool = False) -> Log:
+def _read(case: Case, log: LogLike, *, columns: dict | None = None, whole: bool = False) -> Log:
     """A log, or that of a file by the case's columns or others; `whole`: all its rows."""
     joints, drives, load = case.plant.joints, case.plant.drives, case.plant.cls.load
     if not isinstance(log, Log):
         columns = case.columns if columns is None else columns
         kept = {k: v for k, v in columns.items() if not (whole and k == "rows")}
         own = joints if load is None else None
-        log = read_log(log, kept, joints=own, drives=drives)
+        log = as_log(log, kept, joints=own, drives=drives)
         return _followed(case, with_load(_without_gears(case, log), load, joints))
     log = _followed(case, with_load(log, load, joints))
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):

@@ -26,6 +26,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import output_error
 from jaxid.gap import Gap, gaps, noise_floor
+from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.unknowns import free_effect
@@ -44,9 +45,9 @@ _BARRED = 3
 
 def discover(
     case: Case | str | Path,
-    log: Log | str | Path,
+    log: LogLike,
     *,
-    validate: Sequence[Log | str | Path] = (),
+    validate: Sequence[LogLike] = (),
     max_effects: int = 5,
     refit: bool = True,
     experiments: bool | None = None,
@@ -56,7 +57,7 @@ def discover(
 
     Args:
         case: The case, or its file.
-        log: The log, or its file.
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         validate: Logs that must confirm each effect, beside the case's own.
         max_effects: Most effects to add.
         refit: Refit the parameters in simulation too; without, they are inverse dynamics'.

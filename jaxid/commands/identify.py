@@ -15,20 +15,21 @@ from jaxid.estimators import METHODS, steps_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import OUTPUTS
 from jaxid.gap import Gap, gaps, noise_floor
-from jaxid.logs.log import Log
+from jaxid.logs.in_memory import LogLike
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
+from jaxid.results.result import FitResult
 from jaxid.session import Session, open_session
 from jaxid.simulation.solvers import SOLVERS
 
 
-@dataclass(frozen=True)
-class Identification:
-    """What `identify` returns.
+@dataclass(frozen=True, repr=False)
+class Identification(FitResult):
+    """Result of `identify`; for its parameters, plots and tables see `FitResult`.
 
     Args:
         session: Case and logs.
         estimate: Parameters and their precision.
-        gaps: The fitted log's first, then the validations'.
+        gaps: Disagreement with each log, the fitted log first.
         noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
     """
 
@@ -37,19 +38,20 @@ class Identification:
     gaps: tuple[Gap, ...]
     noise_floor: np.ndarray
 
-    @property
-    def converged(self) -> bool:
-        """Whether the solver did."""
-        return self.estimate.converged
+    def __repr__(self) -> str:
+        from jaxid.results.as_text import identification_summary
 
-    def value(self, name: str) -> float:
-        """Estimate of one parameter, by its name in results."""
-        return self.estimate.value(name)
+        return identification_summary(self)
 
     def __str__(self) -> str:
         from jaxid.results.as_text import identification_table
 
         return identification_table(self)
+
+    def _repr_html_(self) -> str:
+        from jaxid.results.as_html import identification_html
+
+        return identification_html(self)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write `result.json` and `report.html` to a folder.
@@ -64,19 +66,19 @@ class Identification:
 
 def identify(
     case: Case | str | Path,
-    log: Log | str | Path,
+    log: LogLike,
     *,
     method: str = "output_error",
     solver: str | None = None,
     on: str | None = None,
-    validate: Sequence[Log | str | Path] = (),
+    validate: Sequence[LogLike] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
     """Identify the unknowns of a case from a log.
 
     Args:
         case: The case, or its file.
-        log: The log, or its file.
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         method: One of `jaxid.estimators.METHODS`.
         solver: For `output_error`, one of `jaxid.simulation.solvers.SOLVERS`: diffrax then integrates between
             samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
@@ -116,7 +118,7 @@ def identify(
 
 def identify_many(
     case: Case | str | Path | Sequence[Case | str | Path],
-    logs: Sequence[Log | str | Path],
+    logs: Sequence[LogLike],
     *,
     method: str = "output_error",
     lanes: int = 16,
@@ -145,7 +147,7 @@ def identify_many(
     else:
         raise InputError(f"{len(case)} cases for {len(logs)} logs", hint="give one case, or one for each log")
 
-    def steps(case: Case, log: Log | str | Path) -> Steps[Estimate]:
+    def steps(case: Case, log: LogLike) -> Steps[Estimate]:
         return (yield from steps_of(method, open_session(case, log, method=method)))
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)

@@ -24,6 +24,7 @@ from jaxid.controllers import Controller, Tick, base
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import Online, OnlineEstimate, OnlineMemory
 from jaxid.estimators.recursive.recursion import RecursiveEstimate
+from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.scene import Scene
@@ -178,18 +179,20 @@ class Live:
             self.switched = self._tick
 
 
-def follow(case: Case | str | Path, log: Log, *, tolerance: float = 0.05) -> OnlineEstimate:
-    """What the on-line estimator tells at every sample of a log but the first, (time, p) each.
+def follow(case: Case | str | Path, log: LogLike, *, tolerance: float = 0.05) -> OnlineEstimate:
+    """Return the estimates of the on-line estimator at every sample of a log but the first, (time, p) each.
 
     Args:
         case: The case, or its file.
-        log: The log; its command is held between samples.
+        log: The log, its file, or a table of the columns that [log] names; its command is held.
         tolerance: Of trust (see `jaxid.estimators.algebraic.online.OnlineEstimate`).
 
     Raises:
         InputError: If the case asks for what cannot be identified on-line.
     """
     case = case if isinstance(case, Case) else load_case(case)
+    if not isinstance(log, Log):
+        log = as_log(log, case.columns, joints=case.plant.joints, drives=case.plant.drives)
     log.need_every_encoder("on-line identification")
     machine = build_machine(case, period=log.period)
     fast = np.abs(np.diff(log.position, axis=0)).max(axis=0) / log.period

@@ -1,5 +1,6 @@
 """Measured logs: the columns that a case names, checked and in SI units."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers import read_columns
+from jaxid.logs.readers.array_files import Columns
+from jaxid.logs.readers.rows import Rows
 from jaxid.logs.timebase import sound_time
 
 HOLDS = ("zero_order", "linear", "band_limited")
@@ -171,7 +174,12 @@ def _frozen(values: Any) -> np.ndarray:
 
 
 def read_log(
-    path: str | Path, columns: dict[str, Any], *, joints: int | None = 1, drives: int | None = None
+    path: str | Path,
+    columns: dict[str, Any],
+    *,
+    joints: int | None = 1,
+    drives: int | None = None,
+    read: Callable[[Path, list[str], Rows | None], Columns] = read_columns,
 ) -> Log:
     """Read a log and refuse what no estimator could use.
 
@@ -181,6 +189,7 @@ def read_log(
             `sample_rate` [Hz] where there is no time, `hold`, `rows`.
         joints: Number of positions expected; None takes what there is.
         drives: Number of forces and references expected; None: no more than positions.
+        read: Function that reads named columns, for a source other than a file.
 
     Returns:
         The log.
@@ -193,7 +202,7 @@ def read_log(
     names = {key: _names(columns, key) for key in _wanted(columns)}
     _check_distinct(names)
     rows = _rows(columns)
-    data, rows = read_columns(path, [name for group in names.values() for name in group], rows)
+    data, rows = read(path, [name for group in names.values() for name in group], rows)
     _check_finite(data, rows[0], path)
     groups = {key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()}
     _check_widths(groups, names, joints, drives, path)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.files import ready_folder, signal_csv, write_json, write_whole
+from jaxid.files import found_case_file, ready_folder, signal_csv, write_json, write_whole
 from jaxid.model.unknowns import leaf, several_places
+from jaxid.results.found_case import case_text, changed_in_python
+from jaxid.results.parameters import Covariance
 from jaxid.results.proposals import proposal_json
 
 if TYPE_CHECKING:
@@ -61,8 +64,8 @@ def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
     return {"value": known.tolist(), "std": std.tolist(), "unit": unit, "identifiable": told.tolist()}
 
 
-def _one(x: np.ndarray | None) -> Any:
-    """A number where there is one joint, a list where there are several."""
+def one_or_list(x: np.ndarray | None) -> Any:
+    """Return a number for one joint, a list for several."""
     if x is None:
         return None
     x = np.atleast_1d(x)
@@ -72,7 +75,7 @@ def _one(x: np.ndarray | None) -> Any:
 def _worst(gaps: Sequence[Gap], pick: str) -> Any:
     values = [_pick(g, pick) for g in gaps]
     values = [v for v in values if v is not None]
-    return _one(np.max(values, axis=0)) if values else None
+    return one_or_list(np.max(values, axis=0)) if values else None
 
 
 def _pick(gap: Gap, what: str) -> np.ndarray | None:
@@ -88,20 +91,20 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     out: dict[str, Any] = {
         "unit": units.label("force"),
         "band_hz": session.recipe.band_hz(session.fit.log.rate_hz),
-        "fit": _one(fit.force.rms),
+        "fit": one_or_list(fit.force.rms),
         "validation": _worst(others, "force.rms"),
-        "noise_floor": _one(floor),
-        "relative": {"fit": _one(fit.force.relative), "validation": _worst(others, "force.relative")},
+        "noise_floor": one_or_list(floor),
+        "relative": {"fit": one_or_list(fit.force.relative), "validation": _worst(others, "force.relative")},
         "simulation": {
             "unit": units.label("position"),
-            "fit": _one(_pick(fit, "simulation.rms")),
+            "fit": one_or_list(_pick(fit, "simulation.rms")),
             "validation": _worst(others, "simulation.rms"),
             "relative": {
-                "fit": _one(_pick(fit, "simulation.relative")),
+                "fit": one_or_list(_pick(fit, "simulation.relative")),
                 "validation": _worst(others, "simulation.relative"),
             },
             "command_relative": {
-                "fit": _one(_pick(fit, "simulation.command_relative")),
+                "fit": one_or_list(_pick(fit, "simulation.command_relative")),
                 "validation": _worst(others, "simulation.command_relative"),
             },
         },
@@ -109,14 +112,24 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     if len(others) > 1:
         out["validations"] = {
             g.name: {
-                "force": _one(g.force.rms),
-                "relative": _one(g.force.relative),
-                "simulation": _one(_pick(g, "simulation.rms")),
-                "simulation_relative": _one(_pick(g, "simulation.relative")),
+                "force": one_or_list(g.force.rms),
+                "relative": one_or_list(g.force.relative),
+                "simulation": one_or_list(_pick(g, "simulation.rms")),
+                "simulation_relative": one_or_list(_pick(g, "simulation.relative")),
             }
             for g in others
         }
     return out
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what the numbers depend on."""
+    return {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")}
+
+
+def covariance_of(estimate: Estimate) -> Covariance:
+    """Return the covariance of an estimate's parameters."""
+    return Covariance(tuple(estimate.names), estimate.precision.covariance)
 
 
 def derived(session: Session, estimate: Estimate) -> list[Derived]:
@@ -144,10 +157,12 @@ def identification_json(result: Identification) -> dict[str, Any]:
         "samples": estimate.samples,
         "parameters": parameters_json(estimate),
         **derived_json(result.session, estimate),
+        "covariance": covariance_of(estimate).json(),
         "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
         **estimate.details,
         "gap": gap_json(result.session, result.gaps, result.noise_floor),
         "preprocess": recipe_json(result.session),
+        "versions": versions(),
         "notes": notes(result.session, estimate),
     }
 
@@ -237,7 +252,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
             "band_hz": result.session.recipe.band_hz(result.session.fit.log.rate_hz),
             "before": _worst(before[judged], "force.rms"),
             "after": _worst(after[judged], "force.rms"),
-            "noise_floor": _one(result.noise_floor),
+            "noise_floor": one_or_list(result.noise_floor),
             "on": on,
             "relative": {
                 "before": _worst(before[judged], "force.relative"),
@@ -255,10 +270,12 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
             if any(n == k or n.startswith(f"{k}[") for n in own)
         },
         **derived_json(result.session, result.after),
+        "covariance": covariance_of(result.after).json(),
         "unidentifiable": [{"combination": c} for c in result.after.precision.unidentifiable],
         "fit_gap": gap_json(result.session, after, result.noise_floor),
         "method": result.after.method,
         "preprocess": recipe_json(result.session),
+        "versions": versions(),
         "notes": [*notes(result.session, result.after), *turned_down(result)],
     }
 
@@ -299,8 +316,8 @@ def step_json(r: Any, plant: Plant) -> dict[str, Any]:
     out = {
         "added": step.added.candidate.kind if step.added else None,
         **(_place(changed, plant) if changed else {}),
-        "fit": _one(r.fit),
-        "validation": _one(r.validation),
+        "fit": one_or_list(r.fit),
+        "validation": one_or_list(r.validation),
     }
     if step.dropped is not None:
         out["dropped"] = step.dropped.kind
@@ -317,19 +334,29 @@ def save_identification(result: Identification, folder: Path, *, overwrite: bool
     return folder
 
 
-def discovery_files(result: Discovery) -> list[str]:
-    """Names of what `save_discovery` writes."""
-    return ["discovery.json", "report.html", *[p.file for p in result.proposals if p.separates]]
+def discovery_files(result: Discovery, folder: Path) -> list[str]:
+    """Return the names of the files that `save_discovery` writes to a folder."""
+    experiments = [p.file for p in result.proposals if p.separates]
+    case = result.session.declared
+    corrected = [] if changed_in_python(case) else [found_case_file(case.path, folder)]
+    return ["discovery.json", "report.html", *corrected, *experiments]
 
 
 def save_discovery(result: Discovery, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write discovery.json, report.html and a CSV for every experiment that is proposed."""
+    """Write discovery.json, report.html, the corrected case, and a CSV for every proposed experiment.
+
+    A case that was changed in Python has no file to correct, and none is written.
+    """
     from jaxid.results.report.build import discovery_report
 
-    ready_folder(folder, discovery_files(result), overwrite=overwrite)
+    files = discovery_files(result, folder)
+    ready_folder(folder, files, overwrite=overwrite)
     for proposal in result.proposals:
         if proposal.separates:
             write_whole(folder / proposal.file, signal_csv(proposal.signal, proposal.time, proposal.values))
+    for name in files:
+        if name == found_case_file(result.session.declared.path, folder):
+            write_whole(folder / name, case_text(result, folder))
     write_whole(folder / "report.html", discovery_report(result))
     write_json(folder / "discovery.json", discovery_json(result))
     return folder

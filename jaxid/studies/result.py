@@ -18,6 +18,9 @@ from jaxid.files import ready_folder, write_json, write_whole
 from jaxid.studies.settings import SETTINGS
 
 if TYPE_CHECKING:
+    import pandas
+    from matplotlib.axes import Axes
+
     from jaxid.studies.plan import Plan
     from jaxid.studies.runs import Arrays
 
@@ -26,9 +29,9 @@ FILES = ("study.nc", "summary.json", "report.html")
 COVERAGES = (0.68, 0.95)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Study:
-    """What `study` returns.
+    """Result of `study`.
 
     Args:
         table: Every run: `estimate`, `std`, `identifiable` (estimator, noise, run, parameter),
@@ -104,6 +107,44 @@ class Study:
             for what, runs in Counter(own["named"].values.tolist()).most_common()
             if what
         ]
+
+    def plot(
+        self, kind: str, ax: Axes | None = None, *, parameter: str | None = None, step: int | None = None
+    ) -> Axes:
+        """Draw one plot for one parameter.
+
+        Args:
+            kind: "errors" (RMS error against the setting with most values), "coverage" (of 95 % intervals)
+                or "scatter" (errors in units of their reported deviation).
+            ax: Axes to draw on; None: a new figure, which a notebook shows.
+            parameter: Name of the parameter; None: the first.
+            step: Setting of "scatter", in the order of the table; None: the first.
+
+        Returns:
+            The axes.
+
+        Raises:
+            InputError: If the kind or the parameter is unknown.
+        """
+        from jaxid.results.plotting import Selection, plot_study
+
+        return plot_study(self, kind, ax, Selection(parameter=parameter, step=step))
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return `summary` as a table; needs pandas. All runs are `table.to_dataframe()`."""
+        from jaxid.results.parameters import frame
+
+        return frame(self.summary)
+
+    def __repr__(self) -> str:
+        from jaxid.results.as_text import study_summary
+
+        return study_summary(self)
+
+    def _repr_html_(self) -> str:
+        from jaxid.results.as_html import study_html
+
+        return study_html(self)
 
     def __str__(self) -> str:
         from jaxid.results.as_text import study_table

@@ -12,8 +12,8 @@ from jaxid.results.report.data import WherePlot as WherePlot
 
 def __getattr__(name: str) -> Any:
     """The page itself, which imports matplotlib, only where it is asked for."""
-    if name in ("render", "write_report"):
-        from jaxid.results.report import page
+    if name == "render":
+        from jaxid.results.report.page import render
 
-        return getattr(page, name)
+        return render
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -43,14 +43,11 @@ def span(ax: Axes, view: LogView) -> None:
     ax.set_xlim(start - margin, end + margin)
 
 
-def legend(ax: Axes, names: Sequence[str] | None = None) -> None:
-    """Put the legend above the plot, for the first lines where names are given."""
-    where = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
+def legend(ax: Axes) -> None:
+    """Put the legend above the plot."""
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
     style = {"frameon": False, "fontsize": FONT, "handlelength": 1.6, "columnspacing": 1.2}
-    if names is None:
-        ax.legend(ncols=3, **where, **style)
-    else:
-        ax.legend(ax.get_lines()[: len(names)], names, ncols=3, **where, **style)
+    ax.legend(ncols=3, **place, **style)
 
 
 def dress(ax: Axes, xlabel: str, ylabel: str) -> None:
@@ -62,5 +59,5 @@ def dress(ax: Axes, xlabel: str, ylabel: str) -> None:
     ax.spines[["left", "bottom"]].set_color("#999999")
     ax.grid(color="#e6e6e6", lw=0.7)
     ax.set_axisbelow(True)
-    ax.xaxis.set_major_locator(MaxNLocator(6 if ax.figure.get_figwidth() < 8 else 12))
+    ax.xaxis.set_major_locator(MaxNLocator(6 if ax.get_figure(root=True).get_figwidth() < 8 else 12))
     ax.yaxis.set_major_locator(MaxNLocator(5))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,7 +43,6 @@ def identification_report(result: Identification) -> str:
             title=f"Identification of {session.case.path.stem}",
             command="identify",
             verdict=None,
-            summary_lines=(),
             gap=content["gap"],
             unidentifiable=tuple(content["unidentifiable"]),
             views=_views(session, None, result.gaps, drives="directions" in content),
@@ -62,21 +60,19 @@ def discovery_report(result: Discovery) -> str:
     """The report of `discover`, as one page of HTML."""
     content = results.discovery_json(result)
     session = result.session
-    before = result.gaps_before if result.effects else None
     return render(
         ReportData(
             title=f"What is missing in {session.case.path.stem}",
             command="discover",
             verdict=result.verdict,
-            summary_lines=(),
             gap=content["gap"],
             unidentifiable=tuple(content["unidentifiable"]),
             effects=tuple(content["effects"]),
             where=content["where"],
-            steps=tuple(_step(r) for r in result.rounds),
-            where_plot=_where_plot(result),
+            steps=tuple(search_step(r) for r in result.rounds),
+            where_plot=where_plot(result),
             experiments=tuple(_experiment(p, session) for p in result.proposals),
-            views=_views(session, before, result.gaps_after),
+            views=views(result),
             converged=result.converged,
             **_common(session, result.after, content["notes"]),
         )
@@ -84,10 +80,27 @@ def discovery_report(result: Discovery) -> str:
 
 
 def views(result: Identification | Discovery) -> tuple[LogView, ...]:
-    """The logs of a result as the plots take them, for notebooks."""
-    if hasattr(result, "gaps"):
-        return _views(result.session, None, result.gaps)
-    return _views(result.session, result.gaps_before, result.gaps_after)
+    """Return the logs of a result, by joint, as the plots take them."""
+    return _views(result.session, _gaps_before(result), result.gaps)
+
+
+def view_of(result: Identification | Discovery, run: int, joint: int) -> LogView:
+    """Return one joint of one log of a result.
+
+    Args:
+        result: The result.
+        run: Number of the log, 0 for the fitted one.
+        joint: Joint with an encoder, 0-based.
+    """
+    before = _gaps_before(result)
+    joints = int(np.sum(result.session.fit.log.measured))
+    earlier = None if before is None else before[run]
+    return _view(result.session.runs[run], earlier, result.gaps[run], joint, joints)
+
+
+def _gaps_before(result: Identification | Discovery) -> Sequence[Gap] | None:
+    """Return the gaps of the baseline of a search that changed it; None of any other result."""
+    return getattr(result, "gaps_before", None) if getattr(result, "effects", ()) else None
 
 
 def history_of(estimate: Estimate) -> HistoryView | None:
@@ -110,7 +123,7 @@ def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
         "derived": _derived(session, estimate),
         "units": units_of(session),
         "notes": tuple(notes),
-        "versions": {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")},
+        "versions": results.versions(),
     }
 
 
@@ -193,7 +206,8 @@ def _view(run: OpenedLog, before: Gap | None, after: Gap, joint: int, joints: in
     )
 
 
-def _step(r: Round) -> SearchStep:
+def search_step(r: Round) -> SearchStep:
+    """Return one step of a search as it is drawn."""
     step = r.step
     added = step.added.candidate if step.added else None
     return SearchStep(
@@ -226,8 +240,9 @@ def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
     )
 
 
-def _where_plot(result: Discovery) -> WherePlot | None:
-    w = result.where
+def where_plot(result: Identification | Discovery) -> WherePlot | None:
+    """Return the bins of the residual's mean; None if nothing is missing or nothing was searched."""
+    w = getattr(result, "where", None)
     if w is None:
         return None
     label = result.session.machine.units.label

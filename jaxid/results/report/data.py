@@ -174,7 +174,6 @@ class ReportData:
         case_name: Name of the case.
         log_name: Name of the log that was fitted.
         verdict: "found", "nothing_missing", "unexplained", or None for `identify`.
-        summary_lines: Sentences of the answer; composed from the rest where empty.
         gap: The `gap` object of the JSON result.
         parameters: The case's unknowns after the last fit.
         unidentifiable: `{"combination": {name: weight}}`, one for each.
@@ -201,7 +200,6 @@ class ReportData:
     case_name: str
     log_name: str
     verdict: str | None
-    summary_lines: tuple[str, ...]
     gap: Mapping
     parameters: tuple[ParameterRow, ...]
     unidentifiable: tuple[Mapping, ...] = ()

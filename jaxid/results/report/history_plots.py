@@ -36,10 +36,9 @@ def plot_history(
     rows = -(-(len(view.names) + 1) // columns)
     figure = Figure(figsize=(size[0], min(size[1], 2.2) * rows), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-    for k, (name, unit) in enumerate(zip(view.names, view.units, strict=True)):
-        axes[k].set_title(name, loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
-        _parameter(axes[k], view.time, view.value[:, k], view.std[:, k])
-        dress(axes[k], "", f"[{pretty_unit(unit)}]" if pretty_unit(unit) else "[1]")
+    for ax, name in zip(axes, view.names, strict=False):
+        draw_history(ax, view, units, name)
+        ax.set_xlabel("")
     last = axes[len(view.names)]
     factor, unit = scaled_unit(units["force"], [view.residual])
     last.set_title("running residual (RMS)", loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
@@ -52,6 +51,21 @@ def plot_history(
         ax.set_xlabel(time_label(units), fontsize=FONT, color=TEXT)
         ax.tick_params(labelbottom=True)
     return figure
+
+
+def draw_history(ax: Axes, view: HistoryView, units: Mapping[str, str], name: str) -> None:
+    """Draw one parameter over time on one axes, with a band of one standard deviation.
+
+    Args:
+        ax: The axes to draw on.
+        view: The history.
+        units: Label of "time".
+        name: Name of the parameter.
+    """
+    k = list(view.names).index(name)
+    ax.set_title(name, loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
+    _parameter(ax, view.time, view.value[:, k], view.std[:, k])
+    dress(ax, time_label(units), f"[{pretty_unit(view.units[k]) or '1'}]")
 
 
 def _parameter(ax: Axes, time: np.ndarray, value: np.ndarray, std: np.ndarray) -> None:

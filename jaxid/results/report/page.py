@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 import re
 from collections.abc import Mapping
 from importlib import resources
-from pathlib import Path
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
@@ -25,24 +23,6 @@ View = LogView | ExperimentView | HistoryView
 
 _NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
 _RASTER_DPI = 130  # chosen: sharp on a phone, and ten clouds stay below a megabyte
-
-
-def write_report(data: ReportData, path: Path) -> None:
-    """Write the report, whole or not at all.
-
-    Args:
-        data: What it shows.
-        path: The HTML file; its folder must exist. A file that is there is replaced.
-    """
-    path = Path(path)
-    text = render(data)
-    # In the same folder, as only there replacing is one step of the file system.
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def render(data: ReportData) -> str:

@@ -25,6 +25,8 @@ _IDLE = "#b4bcc4"
 _DARK = {BEFORE: "#7a3600", AFTER: "#00344f"}
 _MOST_POINTS = 4000
 _FEW = 200
+# Pieces of a line over time on axes of the user's, whose width may change: that of the widest of a report.
+_MANY = bucket_count((11.5, 4.8))
 _JOINTS = (AFTER, "#009e73", "#cc79a7", "#56b4e9")
 
 
@@ -65,25 +67,77 @@ def _compared(
     units: Mapping[str, str],
     size: tuple[float, float],
 ) -> Figure:
-    """A measured quantity and lines beside it over time, with what parts them below."""
+    """Draw a measured quantity and lines beside it over time, with the differences below."""
     figure, top, below = time_axes(size, 2 if simulated else 1, ratios=(3, 2))
     many = bucket_count(size)
-    factor, unit = scaled_unit(units[what], [measured])
-    top.plot(*envelope(view.time, measured / factor, many), color=MEASURED, lw=3.0)
-    names = ["measured"]
-    small, small_unit = scaled_unit(units[what], [measured - s[2] for s in simulated])
-    for label, color, line in simulated:
-        top.plot(*envelope(view.time, line / factor, many), color=color, lw=1.1)
-        gap = (measured - line) / small
-        below.plot(*envelope(view.time, gap, many), color=color, lw=1.1)
-        names.append(label)
-    span(top, view)
-    dress(top, "" if simulated else time_label(units), f"{what} [{unit}]")
-    if simulated:
-        below.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
-        dress(below, time_label(units), f"measured −\nsimulated [{small_unit}]")
-    legend(top, names)
+    _draw_compared(top, view, measured, simulated, what, units, many)
+    if below is not None:
+        top.set_xlabel("")
+        _draw_difference(below, view, measured, simulated, what, units, many)
     return figure
+
+
+def _draw_compared(
+    ax: Axes,
+    view: LogView,
+    measured: np.ndarray,
+    simulated: Sequence[tuple[str, str, np.ndarray]],
+    what: str,
+    units: Mapping[str, str],
+    many: int,
+) -> None:
+    """Draw a measured quantity and its simulations over time."""
+    factor, unit = scaled_unit(units[what], [measured])
+    ax.plot(*envelope(view.time, measured / factor, many), color=MEASURED, lw=3.0, label="measured")
+    for label, color, line in simulated:
+        ax.plot(*envelope(view.time, line / factor, many), color=color, lw=1.1, label=label)
+    span(ax, view)
+    dress(ax, time_label(units), f"{what} [{unit}]")
+    legend(ax)
+
+
+def _draw_difference(
+    ax: Axes,
+    view: LogView,
+    measured: np.ndarray,
+    simulated: Sequence[tuple[str, str, np.ndarray]],
+    what: str,
+    units: Mapping[str, str],
+    many: int,
+) -> None:
+    """Draw measured minus simulated over time."""
+    small, unit = scaled_unit(units[what], [measured - line for *_, line in simulated])
+    for label, color, line in simulated:
+        gap = (measured - line) / small
+        ax.plot(*envelope(view.time, gap, many), color=color, lw=1.1, label=label)
+    ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
+    dress(ax, time_label(units), f"measured −\nsimulated [{unit}]")
+
+
+def draw_fit(ax: Axes, view: LogView, units: Mapping[str, str]) -> None:
+    """Draw the measured and the simulated position over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; without simulated positions only the measured one is drawn.
+        units: Labels of "position" and "time".
+    """
+    measured, lines = drawable(view.position_measured), _simulated(view)
+    _draw_compared(ax, view, measured, lines, "position", units, _MANY)
+
+
+def draw_difference(ax: Axes, view: LogView, units: Mapping[str, str]) -> None:
+    """Draw measured minus simulated position over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; it must have a simulated position.
+        units: Labels of "position" and "time".
+    """
+    measured, lines = drawable(view.position_measured), _simulated(view)
+    _draw_difference(ax, view, measured, lines, "position", units, _MANY)
+    span(ax, view)
+    legend(ax)
 
 
 def plot_residual_over_time(
@@ -107,25 +161,58 @@ def plot_residual_over_time(
     residuals = _residuals(view)
     figure, top, below = time_axes(size, 2 if residuals else 1, ratios=(2, 3))
     many = bucket_count(size)
+    draw_force(top, view, units, many=many)
+    if below is not None:
+        top.set_xlabel("")
+        draw_residual(below, view, units, noise_floor=noise_floor, many=many)
+    return figure
+
+
+def draw_force(ax: Axes, view: LogView, units: Mapping[str, str], *, many: int = _MANY) -> None:
+    """Draw the measured force over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log.
+        units: Labels of "force" and "time".
+        many: Pieces into which the line is cut before it is thinned.
+    """
     factor, unit = scaled_unit(units["force"], [view.force_measured])
     line = envelope(view.band_time, np.asarray(view.force_measured) / factor, many)
-    top.plot(*line, color=MEASURED, lw=1.0)
-    span(top, view)
-    dress(top, "" if residuals else time_label(units), f"force\nmeasured [{unit}]")
-    if not residuals:
-        return figure
+    ax.plot(*line, color=MEASURED, lw=1.0)
+    span(ax, view)
+    dress(ax, time_label(units), f"force\nmeasured [{unit}]")
+
+
+def draw_residual(
+    ax: Axes,
+    view: LogView,
+    units: Mapping[str, str],
+    *,
+    noise_floor: float | None = None,
+    many: int = _MANY,
+) -> None:
+    """Draw the force residual over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; it must have a residual.
+        units: Labels of "force" and "time".
+        noise_floor: RMS that sensor noise alone leaves, drawn as a pair of lines; may be None.
+        many: Pieces into which each line is cut before it is thinned.
+    """
+    residuals = _residuals(view)
     small, small_unit = scaled_unit(units["force"], [r[2] for r in residuals])
     for label, color, residual in residuals:
         line = envelope(view.band_time, residual / small, many)
-        below.plot(*line, color=color, lw=0.9, label=label)
-    if is_number(noise_floor):
-        for sign in (-1.0, 1.0):
-            line = below.axhline(sign * noise_floor / small, color=TEXT, lw=0.9, ls=(0, (4, 3)))
-        line.set_label("± noise floor (RMS)")
-    below.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
-    dress(below, time_label(units), f"force residual [{small_unit}]")
-    legend(below)
-    return figure
+        ax.plot(*line, color=color, lw=0.9, label=label)
+    if noise_floor is not None and is_number(noise_floor):
+        style = {"color": TEXT, "lw": 0.9, "ls": (0, (4, 3))}
+        ax.axhline(-noise_floor / small, **style)
+        ax.axhline(noise_floor / small, **style, label="± noise floor (RMS)")
+    ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
+    dress(ax, time_label(units), f"force residual [{small_unit}]")
+    legend(ax)
 
 
 def plot_residual_against(
@@ -158,15 +245,42 @@ def plot_residual_against(
     axes = figure.subplots(rows, columns, sharey=True, sharex="col", squeeze=False)
     small, unit = scaled_unit(units["force"], [r[2] for r in residuals])
     for column, variable in enumerate(variables):
-        x = view.band_time if variable == "time" else getattr(view, variable)
-        factor, x_unit = scaled_unit(units[variable], [] if variable == "time" else [x])
+        x, factor, x_unit = _abscissa(view, variable, units)
         for row, (label, color, residual) in enumerate(residuals):
             ax = axes[row, column]
-            _cloud(ax, np.asarray(x) / factor, residual / small, color, _groups(variable, x))
+            _cloud(ax, x / factor, residual / small, color, _groups(variable, x))
             name = f"{variable} [{x_unit}]" if row == rows - 1 else ""
             dress(ax, name, f"residual [{unit}]" if column == 0 else "")
             ax.set_title(label, loc="left", fontsize=FONT, color=color, fontweight="bold")
     return figure
+
+
+def draw_residual_against(
+    ax: Axes, view: LogView, units: Mapping[str, str], variable: str = "velocity"
+) -> None:
+    """Draw the force residual against one quantity on one axes: samples as dots, their mean as a line.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; it must have a residual.
+        units: Labels of "force" and of the variable.
+        variable: One of "velocity", "position" and "time".
+    """
+    residuals = _residuals(view)
+    small, unit = scaled_unit(units["force"], [r[2] for r in residuals])
+    x, factor, x_unit = _abscissa(view, variable, units)
+    for label, color, residual in residuals:
+        _cloud(ax, x / factor, residual / small, color, _groups(variable, x), label)
+    dress(ax, f"{variable} [{x_unit}]", f"force residual [{unit}]")
+    legend(ax)
+
+
+def _abscissa(view: LogView, variable: str, units: Mapping[str, str]) -> tuple[np.ndarray, float, str]:
+    """Return a quantity of a view, the factor of its unit's prefix, and the label of that unit."""
+    if variable == "time":
+        return np.asarray(view.band_time), *scaled_unit(units["time"], [])
+    x = np.asarray(getattr(view, variable))
+    return x, *scaled_unit(units[variable], [x])
 
 
 def ranked(step: SearchStep) -> list[CandidateScore]:
@@ -187,11 +301,21 @@ def plot_candidates(step: SearchStep) -> Figure:
     Returns:
         The figure.
     """
+    height = 0.95 + 0.235 * max(len(step.candidates), 1)
+    figure = Figure(figsize=(4.9, height), layout="constrained")
+    draw_candidates(figure.add_subplot(), step)
+    return figure
+
+
+def draw_candidates(ax: Axes, step: SearchStep) -> None:
+    """Draw the evidence of all candidates of one step on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        step: The step; candidates that could not be fitted are listed without a bar.
+    """
     candidates = ranked(step)
     scores = np.array([c.evidence if is_number(c.evidence) else 0.0 for c in candidates])
-    height = 0.95 + 0.235 * max(len(candidates), 1)
-    figure = Figure(figsize=(4.9, height), layout="constrained")
-    ax = figure.add_subplot()
     right = max(scores.max(initial=0.0), step.threshold, 1e-9)
     # A candidate that does great harm must not squeeze the bars that matter.
     left = max(scores.min(initial=0.0), -0.5 * right)
@@ -215,7 +339,6 @@ def plot_candidates(step: SearchStep) -> Figure:
     dress(ax, "evidence: gain in held-out log-likelihood [nats]", "")
     ax.set_yticks(rows, [c.kind for c in candidates], fontsize=FONT - 0.5)
     ax.grid(axis="y", visible=False)
-    return figure
 
 
 def plot_where(
@@ -231,13 +354,27 @@ def plot_where(
     Returns:
         The figure.
     """
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    draw_where(figure.add_subplot(), plot, units, region)
+    return figure
+
+
+def draw_where(
+    ax: Axes, plot: WherePlot | tuple, units: Mapping[str, str], region: Sequence[float] | None = None
+) -> None:
+    """Draw the residual's mean over one variable on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        plot: The bins.
+        units: Label of "force".
+        region: The two ends of the stretch where the residual stands out; may be None.
+    """
     plot = WherePlot(*plot)
     small, unit = scaled_unit(units["force"], [plot.mean, plot.low, plot.high])
     factor, x_unit = scaled_unit(plot.unit, [plot.x])
     x = np.asarray(plot.x) / factor
     mean, low, high = (drawable(v) / small for v in plot[3:])
-    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
-    ax = figure.add_subplot()
     if region is not None and len(region) == 2 and all(is_number(r) for r in region):
         ends = [r / factor for r in region]
         ax.axvspan(*ends, color="#f0e442", alpha=0.28, lw=0, label="region named")
@@ -246,7 +383,6 @@ def plot_where(
     ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
     dress(ax, f"{plot.variable} [{x_unit}]", f"force residual [{unit}]")
     legend(ax)
-    return figure
 
 
 def plot_experiment(
@@ -315,11 +451,14 @@ def _groups(variable: str, x: np.ndarray) -> np.ndarray | None:
     return (np.asarray(x) >= 0.0).astype(int) if variable == "velocity" else None
 
 
-def _cloud(ax: Axes, x: np.ndarray, y: np.ndarray, color: str, groups: np.ndarray | None) -> None:
+def _cloud(
+    ax: Axes, x: np.ndarray, y: np.ndarray, color: str, groups: np.ndarray | None, label: str | None = None
+) -> None:
+    """Draw samples as dots, and their mean over bins as a line."""
     some = thinned(len(x), _MOST_POINTS)
     # As an image: thousands of dots would be megabytes of SVG. A handful is drawn to be seen one by one.
     few = len(x) <= _FEW
     look = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.4}
     ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, **look)
     ax.axhline(0.0, color=TEXT, lw=0.6)
-    ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8)
+    ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8, label=label)

@@ -63,22 +63,23 @@ def verdict_class(data: ReportData) -> str:
 
 
 def answer(data: ReportData) -> str:
-    """Join the summary's lines into one paragraph; compose one where there is none."""
-    lines = [line.strip() for line in data.summary_lines if line.strip()]
-    if not lines:
-        openings = {
-            "found": "The declared model lacks physics that the log shows",
-            "nothing_missing": "What the declared model leaves unexplained is sensor noise",
-            "unexplained": "Model and log disagree, and no known effect explains it",
-        }
-        lines = [openings.get(data.verdict, "The declared model was fitted to the log")]
-        # One line for each quantity, of two joints at most one each: the table below has the other logs.
-        rows = [r for r in _gap_rows(data) if is_number(r.after)]
-        groups: dict[str, list[GapRow]] = {}
-        for row in (r for r in rows if r.log == rows[0].log):
-            groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
-        for quantity, own in groups.items():
-            lines += [_gaps_words(quantity, own)] if len(own) > 2 else [_gap_words(row) for row in own]
+    """Compose the answer as one paragraph: the verdict, and how far the gaps have changed."""
+    openings = {
+        "found": "The declared model lacks physics that the log shows",
+        "nothing_missing": "What the declared model leaves unexplained is sensor noise",
+        "unexplained": "Model and log disagree, and no known effect explains it",
+    }
+    lines = [openings.get(data.verdict or "", "The declared model was fitted to the log")]
+
+    # One line for each quantity, of two joints at most one each: the table below has the other logs.
+    rows = [r for r in _gap_rows(data) if is_number(r.after)]
+    groups: dict[str, list[GapRow]] = {}
+    for row in (r for r in rows if r.log == rows[0].log):
+        groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
+    for quantity, of_joints in groups.items():
+        several = len(of_joints) > 2
+        lines += [_gaps_words(quantity, of_joints)] if several else [_gap_words(row) for row in of_joints]
+
     return unbroken(" ".join(line if line[-1] in ".!?:;" else f"{line}." for line in lines))
 
 
