@@ -7,8 +7,10 @@ from jaxid import _platform
 _platform.configure()
 
 if TYPE_CHECKING:
+    from jaxid.arms.base_by_rules import base_parameters_by_rules as base_parameters_by_rules
     from jaxid.arms.base_parameters import BaseParameters as BaseParameters
     from jaxid.arms.base_parameters import base_parameters as base_parameters
+    from jaxid.arms.base_parameters import inertial_regressor as inertial_regressor
     from jaxid.build import build_machine as build_machine
     from jaxid.case.case import Case as Case
     from jaxid.case.case import load_case as load_case
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
     from jaxid.commands.simulate import simulate as simulate
     from jaxid.commands.study import study as study
     from jaxid.controllers import CONTROLLERS as CONTROLLERS
+    from jaxid.controllers import Controller as Controller
+    from jaxid.controllers import Tick as Tick
     from jaxid.discovery.result import Discovery as Discovery
     from jaxid.effects import EFFECTS as EFFECTS
     from jaxid.effects import register as _register
@@ -120,6 +124,8 @@ _HOMES = {
     "Machine": ("jaxid.machine", "Machine"),
     "Sensor": ("jaxid.sensors.encoder", "Sensor"),
     "CONTROLLERS": ("jaxid.controllers", "CONTROLLERS"),
+    "Controller": ("jaxid.controllers", "Controller"),
+    "Tick": ("jaxid.controllers", "Tick"),
     "REFERENCES": ("jaxid.references", "REFERENCES"),
     "make_reference": ("jaxid.references", "make_reference"),
     "make_replay": ("jaxid.simulation.replay", "make_replay"),
@@ -133,6 +139,8 @@ _HOMES = {
     "METHODS": ("jaxid.estimators", "METHODS"),
     "base_parameters": ("jaxid.arms.base_parameters", "base_parameters"),
     "BaseParameters": ("jaxid.arms.base_parameters", "BaseParameters"),
+    "base_parameters_by_rules": ("jaxid.arms.base_by_rules", "base_parameters_by_rules"),
+    "inertial_regressor": ("jaxid.arms.base_parameters", "inertial_regressor"),
 }
 # A checker reads the imports above instead.
 __all__ = ["__version__", *_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]

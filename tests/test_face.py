@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -75,3 +76,21 @@ def test_help_and_version_load_neither_jax_nor_numpy():
     for option in ("--help", "--version"):
         ran = subprocess.run([sys.executable, "-c", code, option], cwd=ROOT, capture_output=True, text=True)
         assert ran.stdout.splitlines()[-1] == "[]", ran.stderr
+
+
+@pytest.mark.parametrize("name", sorted(jaxid.__all__))
+def test_every_name_is_documented(name):
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    assert re.search(rf"`(?:jaxid\.)?{name}\b[^`]*`", text), name
+
+
+@pytest.mark.parametrize("name", ["FitResult", "Study"])
+def test_every_plot_is_documented(name):
+    from jaxid.results.plotting import KINDS, STUDY_KINDS
+    from jaxid.results.result import FitResult
+
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    cls, kinds = (FitResult, KINDS) if name == "FitResult" else (jaxid.Study, STUDY_KINDS)
+    for kind in kinds:
+        assert f'"{kind}"' in text
+        assert f'"{kind}"' in cls.plot.__doc__

@@ -170,7 +170,7 @@ def test_discover_adds_nothing_where_nothing_is_missing(folder, capsys):
     ran = run(capsys, *argv, folder=folder / "nothing")
     assert (ran.status, ran.err) == (0, "")
     written = [p.name for p in sorted(ran.folder.iterdir())]
-    assert written == [".jaxid", "discovery.json", "report.html"]
+    assert written == [".jaxid", "case.toml", "discovery.json", "report.html"]
     found = ran.json("discovery.json")
     judge_discovery(found, [None])
     assert (found["verdict"], found["where"], found["effects"]) == ("nothing_missing", None, [])

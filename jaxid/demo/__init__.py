@@ -35,7 +35,7 @@ def run_demo(
     Raises:
         InputError: If the folder cannot be written to.
     """
-    results = ("check.json", "result.json", "discovery.json", "report.html")
+    results = ("check.json", "result.json", "discovery.json", "report.html", "case_found.toml")
     ready_folder(folder, [*_FILES, *results], overwrite=overwrite)
     for name in _FILES:
         with resources.as_file(resources.files("jaxid.demo") / name) as source:

@@ -237,18 +237,19 @@ def html_table(rows: Sequence[Sequence[str]], caption: str = "") -> str:
     """Return a plain HTML table.
 
     Args:
-        rows: Text of each cell, the header first; numbers go to the right from the second column on.
+        rows: Text of each cell, the header first; in a column "unit" powers are raised.
         caption: Line above the table; empty: none.
     """
+    heads = rows[0]
 
     def line(cells: Sequence[str], tag: str) -> str:
-        shown = [escape(pretty_unit(str(cell))) for cell in cells]
-        style = ' style="text-align: left"'
-        return f"<tr>{''.join(f'<{tag}{style}>{cell}</{tag}>' for cell in shown)}</tr>"
+        shown = [pretty_unit(c) if h == "unit" else c for h, c in zip(heads, cells, strict=True)]
+        inner = "".join(f'<{tag} style="text-align: left">{escape(cell)}</{tag}>' for cell in shown)
+        return f"<tr>{inner}</tr>"
 
     head = f'<caption style="text-align: left">{escape(caption)}</caption>' if caption else ""
     body = "".join(line(row, "td") for row in rows[1:])
-    return f"<table>{head}<thead>{line(rows[0], 'th')}</thead><tbody>{body}</tbody></table>"
+    return f"<table>{head}<thead>{line(heads, 'th')}</thead><tbody>{body}</tbody></table>"
 
 
 def _some(names: Sequence[str], most: int = 6) -> str:
