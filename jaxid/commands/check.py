@@ -152,7 +152,7 @@ def check(case: Case | str | Path, log: LogLike, *, validate: Sequence[LogLike] 
     Args:
         case: The case, or its file.
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
-        validate: More logs to check, beside the case's own.
+        validate: More logs to check, beside those of the case.
 
     Raises:
         InputError: If case or log are unsound.

@@ -1,4 +1,4 @@
-"""Identification of a case's unknowns from a log: estimate, gap, noise floor."""
+"""The command `identify`: estimates of a case's unknowns from a log, the gap, and the noise floor."""
 
 from __future__ import annotations
 
@@ -81,12 +81,12 @@ def identify(
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         method: One of `jaxid.estimators.METHODS`.
         solver: For `output_error`, one of `jaxid.simulation.solvers.SOLVERS`: diffrax then integrates between
-            samples, dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
-            of the fixed steps either way.
-        on: For `output_error`, what of the simulated loop is to meet its log: one of
-            `jaxid.estimators.output_error.OUTPUTS`; None: as the case says, or position.
-        validate: Logs to validate on, beside the case's own.
-        progress: Called with a line at every stage.
+            samples and dry friction is smoothed; None: fixed steps and exact dry friction. The gap is
+            computed with fixed steps either way.
+        on: For `output_error`, the outputs of the simulated loop that are fitted: one of
+            `jaxid.estimators.output_error.OUTPUTS`; None: those that the case names, or position.
+        validate: Logs to validate on, beside those of the case.
+        progress: Function called with a line of text at every stage.
 
     Raises:
         InputError: If case, log, method, solver or `on` are unsound.
@@ -101,7 +101,7 @@ def identify(
     session = open_session(case, log, validate, method=method)
     if not session.machine.parameters.free:
         raise InputError(
-            "nothing is unknown",
+            "no parameter is unknown",
             where=str(session.case.path),
             hint="give at least one parameter as { guess = ... }",
         )
@@ -129,10 +129,10 @@ def identify_many(
         case: The case, or its file; or one for each log, which may differ in their guesses.
         logs: Logs, or their files.
         method: One of `jaxid.estimators.METHODS`.
-        lanes: Logs in a compiled call.
+        lanes: Number of logs in a compiled call.
 
     Returns:
-        The estimate of each log, or what kept it from one: no log fails for another.
+        The estimate of each log, or the exception that ended its fit, which leaves the other logs alone.
 
     Raises:
         InputError: If a case or the method is unsound, or cases are not as many as logs.
@@ -164,12 +164,12 @@ def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
     return value
 
 
-# Samples beyond which the gap would take memory beside the fit that a fit may need.
+# Samples beyond which the compilation of the gap could take memory that the fit needs.
 _COMPILED_BESIDE = 100_000
 
 
 def _gaps_of(session: Session) -> Precompile | None:
-    """What a fit is followed by."""
+    """Return the call that follows a fit, to be compiled in the background meanwhile."""
     machine, samples = session.machine, tuple(r.log.samples for r in session.runs)
     if sum(samples) > _COMPILED_BESIDE:
         return None

@@ -1,4 +1,4 @@
-"""The JSON results and the tables that commands print."""
+"""Results as JSON, and the files that commands write."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Value, standard deviation, unit and identifiability by name; plant lists as lists."""
+    """Return value, standard deviation, unit and identifiability by name, and plant lists as lists."""
     out: dict[str, Any] = {}
     plant = estimate.machine.plant
     rows = zip(
@@ -58,7 +58,7 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
 
 
 def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
-    """A list of the plant's before its unknown entries are filled in."""
+    """Return the entry of a plant's list before its unknown elements are filled in."""
     known = np.asarray(values, float)
     std, told = np.full(known.shape, None), np.full(known.shape, True)
     return {"value": known.tolist(), "std": std.tolist(), "unit": unit, "identifiable": told.tolist()}
@@ -85,7 +85,7 @@ def _pick(gap: Gap, what: str) -> np.ndarray | None:
 
 
 def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[str, Any]:
-    """The `gap` object of result.json."""
+    """Return the object `gap` of result.json."""
     fit, others = gaps[0], gaps[1:]
     units = session.machine.units
     out: dict[str, Any] = {
@@ -133,7 +133,7 @@ def covariance_of(estimate: Estimate) -> Covariance:
 
 
 def derived(session: Session, estimate: Estimate) -> list[Derived]:
-    """Natural frequency; friction in its other form where the case states the gravity that it refers to."""
+    """Return the natural frequency, and friction in its other form if the case states gravity."""
     from jaxid.estimators.common.derived import dry_friction, natural_frequency
 
     friction = [] if session.case.plant.gravity is None else dry_friction(estimate)
@@ -141,14 +141,14 @@ def derived(session: Session, estimate: Estimate) -> list[Derived]:
 
 
 def derived_json(session: Session, estimate: Estimate) -> dict[str, Any]:
-    """The `derived` object of results; nothing where there is none."""
-    told = [d for d in derived(session, estimate) if np.isfinite(d.std)]
-    follows = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in told}
-    return {"derived": follows} if follows else {}
+    """Return the object `derived` of results, with its key; empty if nothing is derived."""
+    known = [d for d in derived(session, estimate) if np.isfinite(d.std)]
+    entries = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in known}
+    return {"derived": entries} if entries else {}
 
 
 def identification_json(result: Identification) -> dict[str, Any]:
-    """Content of result.json."""
+    """Return the content of result.json."""
     estimate = result.estimate
     return {
         "method": estimate.method,
@@ -168,7 +168,7 @@ def identification_json(result: Identification) -> dict[str, Any]:
 
 
 def recipe_json(session: Session) -> dict[str, Any]:
-    """How the logs were filtered, chosen or stated."""
+    """Return the settings of the filter, chosen or stated."""
     r = session.recipe
     stated = {"median": r.median} if r.median else {}
     if r.derivatives == "parabolic":
@@ -186,20 +186,20 @@ def recipe_json(session: Session) -> dict[str, Any]:
 
 
 def notes(session: Session, estimate: Estimate) -> list[str]:
-    """What a reader should know: warnings on the logs, and how the fit was done."""
+    """Return the warnings on the logs, and remarks on the fit."""
     warnings = [f"{f.where}: {f.what}; {f.hint}" for f in session.findings]
     return [*warnings, *estimate.notes]
 
 
-def effect_json(found: NamedEffect, estimate: Estimate) -> dict[str, Any]:
-    """One entry of `effects` in discovery.json."""
-    own = parameters_json(estimate, found.names)
+def effect_json(effect: NamedEffect, estimate: Estimate) -> dict[str, Any]:
+    """Return one entry of `effects` in discovery.json."""
+    parameters = parameters_json(estimate, effect.names)
     return {
-        "kind": found.kind,
-        found.place[0]: found.place[1],
-        "parameters": {name.rpartition(".")[2]: entry for name, entry in own.items()},
-        "evidence": found.score.evidence,
-        "alternatives": [_alternative(s, estimate.machine.plant) for s in found.alternatives],
+        "kind": effect.kind,
+        effect.place[0]: effect.place[1],
+        "parameters": {name.rpartition(".")[2]: entry for name, entry in parameters.items()},
+        "evidence": effect.score.evidence,
+        "alternatives": [_alternative(s, estimate.machine.plant) for s in effect.alternatives],
     }
 
 
@@ -209,12 +209,12 @@ def _alternative(score: Score, plant: Plant) -> dict[str, Any]:
 
 
 def _place(c: Candidate, plant: Plant) -> dict[str, int]:
-    """Joint or spring of a candidate, where the machine has several."""
+    """Return the joint or spring of a candidate, if the machine has several."""
     return dict([plant.place(c.port)]) if several_places(plant) else {}
 
 
 def where_json(result: Discovery) -> dict[str, Any] | None:
-    """The `where` object of discovery.json."""
+    """Return the object `where` of discovery.json."""
     w = result.where
     if w is None:
         return None
@@ -229,8 +229,8 @@ def where_json(result: Discovery) -> dict[str, Any] | None:
 
 
 def discovery_json(result: Discovery) -> dict[str, Any]:
-    """Content of discovery.json."""
-    own = result.session.machine.parameters.names
+    """Return the content of discovery.json."""
+    declared = result.session.machine.parameters.names
     before, after = result.gaps_before, result.gaps_after
     on = "validation" if len(after) > 1 else "fit"
     judged = slice(1, None) if len(after) > 1 else slice(0, 1)
@@ -267,7 +267,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "parameters": {
             k: v
             for k, v in parameters_json(result.after).items()
-            if any(n == k or n.startswith(f"{k}[") for n in own)
+            if any(n == k or n.startswith(f"{k}[") for n in declared)
         },
         **derived_json(result.session, result.after),
         "covariance": covariance_of(result.after).json(),
@@ -281,36 +281,36 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
 
 
 def turned_down(result: Discovery, most: int = 3) -> list[str]:
-    """Why effects were taken out again, and why the best of what the last round left were not added."""
+    """Return the reasons for removed effects, and for the best candidates that were not added."""
     if not result.rounds:
         return []
     present = {e.kind for e in result.session.machine.plant.effects}
     steps = [r.step for r in result.rounds]
     lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.why]
     if "static_friction" not in present and result.unseen:
-        lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
+        lines.append(f"break-away friction (static_friction) was not searched for: {result.unseen}")
     session = result.session
     loop = session.machine.controller is not None and session.fit.log.reference is not None
     if result.verdict == "unexplained" and loop and "prior" not in session.case.output_error:
-        # Force rows hold no sample at rest, and what depends on whether speed grows is blurred in them.
+        # Force rows hold no sample at rest, and blur effects that depend on whether speed grows.
         lines.append(
-            "what acts at rest, or where speed stands still, may show in the simulated loop: state "
-            "`[output_error] prior`, how far off the guesses may be, and effects are looked for there"
+            "effects at rest, or at constant speed, may show in the simulated loop: state `[output_error] "
+            "prior`, the relative error of the guesses, and effects are searched for there"
         )
     last = [s for s in steps if s.added is None and s.dropped is None][-1]
-    left = [s for s in last.scores if s.reason and s.evidence > last.threshold]
-    for score in left[:most]:
+    refused = [s for s in last.scores if s.reason and s.evidence > last.threshold]
+    for score in refused[:most]:
         name, nats = score.candidate.label, score.evidence
         lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
     if session.machine.plant.coupled and not result.proposals:
         tied = [e.label for e in result.effects if e.alternatives]
-        told = f"no experiment was designed that tells {', '.join(tied)} from rivals"
-        lines += [f"{told}: --experiments does, in minutes"] if tied else []
+        missing = f"no experiment was designed to separate {', '.join(tied)} from rivals"
+        lines += [f"{missing}: --experiments does, in minutes"] if tied else []
     return lines
 
 
 def step_json(r: Any, plant: Plant) -> dict[str, Any]:
-    """One entry of `steps`: what was added (or dropped), where, and the gap after it."""
+    """Return one entry of `steps`: the effect added or dropped, its place, and the gap after it."""
     step = r.step
     changed = step.added.candidate if step.added else step.dropped
     out = {

@@ -19,13 +19,13 @@ _PATIENCE = 20
 
 @dataclass(frozen=True)
 class Bundle:
-    """A study as it travels: a case with the files that it names, and what was asked of it.
+    """A study as it is sent to workers: a case with the files that it names, and the options of the plan.
 
     Args:
         case: Name of the case file.
         files: Contents by path, relative to the case's folder.
-        runs, chunk, seed: Of the plan.
-        manifest: What the plan says of itself.
+        runs, chunk, seed: Numbers of the plan.
+        manifest: Manifest of the plan.
     """
 
     case: str
@@ -37,10 +37,10 @@ class Bundle:
 
     @classmethod
     def of(cls, plan: Plan) -> Bundle:
-        """Of a plan.
+        """Build the bundle of a plan.
 
         Raises:
-            InputError: If the case is not what its file says, or names a file outside its folder, which a
+            InputError: If the case differs from its file, or names a file outside its folder, which a
                 worker would not find.
         """
         case, files = plan.case, {}
@@ -48,7 +48,7 @@ class Bundle:
             raise InputError(
                 "is not the case that was given",
                 where=str(case.path),
-                hint="write what was changed in Python to the file: workers read it",
+                hint="write the changes made in Python to the file, which workers read",
             )
         for path in (case.path, *named_files(case)):
             try:
@@ -63,10 +63,10 @@ class Bundle:
         return cls(case.path.name, files, plan.runs, plan.chunk, plan.seed, plan.manifest)
 
     def plan(self) -> Plan:
-        """The plan again, where it has arrived.
+        """Rebuild the plan on a worker.
 
         Raises:
-            InputError: If this machine has other versions of what the bits depend on.
+            InputError: If this machine has other versions of the libraries that the numbers depend on.
         """
         with tempfile.TemporaryDirectory(prefix="jaxid-study-") as name:
             folder = Path(name)
@@ -75,21 +75,21 @@ class Bundle:
                 (folder / file).write_bytes(content)
             plan = Plan.of(load_case(folder / self.case), runs=self.runs, seed=self.seed)
             plan = replace(plan, chunk=self.chunk)
-            own, wanted = plan.manifest["versions"], self.manifest["versions"]
-        if own != wanted:
+            present, wanted = plan.manifest["versions"], self.manifest["versions"]
+        if present != wanted:
             raise InputError(
-                f"a worker has {own} where {wanted} belong", hint="install the same on every machine"
+                f"a worker has {present} in place of {wanted}", hint="install the same on every machine"
             )
         return plan
 
 
-# Of this process, by what was asked: a worker loads a case and compiles once.
+# The runners of this process by manifest, so that a worker loads a case and compiles it once.
 _RUNNERS: dict[str, Runner] = {}
 _LOCK = threading.Lock()
 
 
 def run_chunk(bundle: Bundle, number: int) -> Arrays:
-    """One chunk of a bundle, on the worker that this runs on."""
+    """Run one chunk of a bundle on this worker."""
     key = digest_of(bundle.manifest)
     with _LOCK:
         if key not in _RUNNERS:
@@ -101,7 +101,7 @@ class Remote:
     """The workers of a Dask scheduler, while a study lasts.
 
     Args:
-        address: Of the scheduler, such as `tcp://host:8786`.
+        address: Address of the scheduler, such as `tcp://host:8786`.
     """
 
     def __init__(self, address: str) -> None:
@@ -132,11 +132,11 @@ class Remote:
 
     @property
     def threads(self) -> int:
-        """Chunks that run at once."""
+        """Number of chunks that run at once."""
         return max(1, sum(self.client.nthreads().values()))
 
     def run(self, bundle: Bundle, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
-        """Chunks as they come back; what a worker took with it, Dask gives to another.
+        """Yield chunks as they come back; Dask gives those of a lost worker to another.
 
         Raises:
             InputError: If a chunk ended several workers, or the scheduler is lost.
@@ -144,13 +144,13 @@ class Remote:
         from distributed import CancelledError, KilledWorker, as_completed
         from distributed.comm import CommClosedError
 
-        left = {self.client.submit(run_chunk, bundle, k, pure=False): k for k in numbers}
+        pending = {self.client.submit(run_chunk, bundle, k, pure=False): k for k in numbers}
         try:
-            for future in as_completed(list(left), loop=self.client.loop):
-                yield left[future], future.result()
+            for future in as_completed(list(pending), loop=self.client.loop):
+                yield pending[future], future.result()
                 future.release()
         except (KilledWorker, CancelledError, CommClosedError) as error:
             raise InputError(
                 f"the workers at {self.address} are lost: {error}",
-                hint="what is done is kept: see what ended them, then --resume",
+                hint="finished chunks are kept: see the workers' logs, then --resume",
             ) from error

@@ -1,4 +1,4 @@
-"""What a study found: the table of all runs, and what it says of every estimator."""
+"""The result of a study: the table of all runs, and the statistics of every estimator."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Study:
     Args:
         table: Every run: `estimate`, `std`, `identifiable` (estimator, noise, run, parameter),
             `converged`, `steps`, `message`, `named` (estimator, noise, run), `truth` and `start` (run,
-            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter); of loops
-            `tracking_rms` and `tracking_peak` (noise, run, drive), of the last quarter of a run. SI. Before
-            noise come `sample_rate` [Hz] and `position_resolution`, where the study varies them.
-        seconds: That all chunks took, added up over the threads; of those resumed, then.
+            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter); for loops
+            `tracking_rms` and `tracking_peak` (noise, run, drive) in the last quarter of a run. SI units.
+            `sample_rate` [Hz] and `position_resolution` come before noise if the study varies them.
+        seconds: Time of all chunks [s], added up over the threads, those of earlier starts included.
         title: Name of the case.
     """
 
@@ -54,9 +54,9 @@ class Study:
 
     @property
     def tracking(self) -> list[dict[str, Any]]:
-        """How well loops follow in the last quarter of a run, by setting and drive; nothing of open loops.
+        """Tracking errors in the last quarter of a run, by setting and drive; empty for open loops.
 
-        Of `rms` and of `peak` the median of the runs, what 95 % of them keep below, and the worst.
+        `rms` and `peak` hold the median of the runs, the value that 95 % of them stay below, and the worst.
         """
         if "tracking_rms" not in self.table:
             return []
@@ -78,9 +78,9 @@ class Study:
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """`why` runs gave no value for all parameters, and how many by that, by estimator and setting.
+        """Reasons (`why`) for which runs lack a value for some parameter, with their number of `runs`.
 
-        Reasons that differ in numbers only count as one, told as the first run has it.
+        Rows are by estimator and setting. Reasons that differ only in numbers count as one.
         """
         out = []
         for estimator, setting, own in cells(self.table):
@@ -100,7 +100,7 @@ class Study:
 
     @property
     def named(self) -> list[dict[str, Any]]:
-        """`what` discover named, or its verdict, and in how many `runs`, by setting."""
+        """Effects that discover named, or its verdict (`what`), with the number of `runs`, by setting."""
         return [
             {"estimator": estimator, **setting, "what": str(what), "runs": runs}
             for estimator, setting, own in cells(self.table)
@@ -177,7 +177,7 @@ def cells(table: xr.Dataset) -> Iterator[tuple[str, dict[str, float], xr.Dataset
 
 
 def conditions(table: xr.Dataset) -> Iterator[tuple[dict[str, float], xr.Dataset]]:
-    """Every setting, and what was found under it."""
+    """Yield every setting with the part of the table under it."""
     dims = [name for name in SETTINGS if name in table.dims]
     for index in itertools.product(*[range(table.sizes[name]) for name in dims]):
         own = table.isel(dict(zip(dims, index, strict=True)))
@@ -185,7 +185,7 @@ def conditions(table: xr.Dataset) -> Iterator[tuple[dict[str, float], xr.Dataset
 
 
 def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
-    """One table of all chunks, in their order."""
+    """Gather the chunks, in their order, in one table."""
     levels = [[c for c, (level, _) in zip(chunks, plan.chunks, strict=True) if level == k]
               for k in range(len(plan.levels))]  # fmt: skip
     settings = plan.settings
@@ -232,23 +232,23 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
 
 
 def _why(run: xr.Dataset) -> str:
-    """Why a run has no value for all parameters; empty where it has."""
+    """Return the reason for which a run lacks a value for some parameter; empty if it has all."""
     if not run["converged"].item():
         return str(run["message"].item())
-    untold = run.parameter.values[run["identifiable"].values == 0]
-    return f"the log cannot tell {', '.join(map(str, untold))}" if len(untold) else ""
+    missing = run.parameter.values[run["identifiable"].values == 0]
+    return f"not identifiable: {', '.join(map(str, missing))}" if len(missing) else ""
 
 
 def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
-    """Bias, spread and coverage of every estimator, setting and parameter.
+    """Compute bias, spread and coverage of every estimator, setting and parameter.
 
     Returns:
-        Rows with `runs` and `used` (converged, and the parameter told); `failed`, the part that is
-        not; of those used `bias` (mean error), `bias_std` (its own deviation), `spread`
-        (standard deviation of the error), `rmse`, `std` (mean of those reported), `bound`
-        (Cramer-Rao), and `coverage_68`, `coverage_95`: the part of intervals of that nominal coverage
-        that hold the truth. NaN where there is nothing to say it of, as of an estimator that
-        gives no standard deviation.
+        Rows with `runs` and `used` (converged, and the parameter identifiable); `failed`, the fraction of
+        the others; over the runs used `bias` (mean error), `bias_std` (standard deviation of the mean),
+        `spread` (standard deviation of the error), `rmse`, `std` (mean of those reported), `bound`
+        (Cramer-Rao), and `coverage_68`, `coverage_95`: the fraction of intervals of that nominal coverage
+        that hold the truth. NaN if no run has the quantity, such as for an estimator without a
+        standard deviation.
     """
     rows = []
     for estimator, setting, whole in cells(table):

@@ -1,4 +1,4 @@
-"""One HTML page that tells what was found, with its plots inside."""
+"""One HTML page with the results of a command, its plots inside."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxid.results.report.data import WherePlot as WherePlot
 
 
 def __getattr__(name: str) -> Any:
-    """The page itself, which imports matplotlib, only where it is asked for."""
+    """Load the page, which imports matplotlib, on first use."""
     if name == "render":
         from jaxid.results.report.page import render
 

@@ -1,4 +1,4 @@
-"""Axes as all figures of a report wear them."""
+"""The common style of all axes of a report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FONT = 9.0  # pt
 
 
 def time_axes(size: tuple[float, float], rows: int, ratios: tuple[int, int]) -> tuple:
-    """Make one plot over time, or two on one time axis; the second is None where there is one."""
+    """Make one plot over time, or two on one time axis; the second is None if there is one."""
     figure = Figure(figsize=size, layout="constrained")
     if rows == 1:
         figure.set_size_inches(size[0], 0.6 * size[1])
@@ -26,13 +26,13 @@ def time_axes(size: tuple[float, float], rows: int, ratios: tuple[int, int]) -> 
 
 
 def bucket_count(size: tuple[float, float]) -> int:
-    """Say into how many pieces a line is cut before it is thinned."""
-    # chosen: about one bucket a pixel of the drawn width.
+    """Return the number of pieces into which a line is cut before it is thinned."""
+    # Chosen: about one bucket a pixel of the drawn width.
     return max(200, int(80 * size[0]))
 
 
 def time_label(units: Mapping[str, str]) -> str:
-    """Label the time axis."""
+    """Return the label of the time axis."""
     return f"time [{units['time']}]"
 
 
@@ -51,7 +51,7 @@ def legend(ax: Axes) -> None:
 
 
 def dress(ax: Axes, xlabel: str, ylabel: str) -> None:
-    """Label an axes and give it the report's look."""
+    """Label an axes and give it the report's style."""
     ax.set_xlabel(xlabel, fontsize=FONT, color=TEXT)
     ax.set_ylabel(ylabel, fontsize=FONT, color=TEXT)
     ax.tick_params(labelsize=FONT - 0.5, color="#999999", labelcolor=TEXT)

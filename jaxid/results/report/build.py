@@ -1,4 +1,4 @@
-"""From the results of identify and discover to a report."""
+"""The reports of `identify` and `discover`, from their results."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def identification_report(result: Identification) -> str:
-    """The report of `identify`, as one page of HTML."""
+    """Return the report of `identify` as one page of HTML."""
     content = results.identification_json(result)
     session = result.session
     rows, below = minimal_rows(content["minimal"]) if "minimal" in content else ((), ())
@@ -57,7 +57,7 @@ def identification_report(result: Identification) -> str:
 
 
 def discovery_report(result: Discovery) -> str:
-    """The report of `discover`, as one page of HTML."""
+    """Return the report of `discover` as one page of HTML."""
     content = results.discovery_json(result)
     session = result.session
     return render(
@@ -104,7 +104,7 @@ def _gaps_before(result: Identification | Discovery) -> Sequence[Gap] | None:
 
 
 def history_of(estimate: Estimate) -> HistoryView | None:
-    """How a recursive estimate went, for the report and for notebooks; None for any other."""
+    """Return the history of a recursive estimate; None for any other."""
     history = estimate.details.get("recursive", {}).get("history")
     if history is None:
         return None
@@ -128,7 +128,7 @@ def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
 
 
 def units_of(session: Session) -> dict[str, str]:
-    """Labels of position, velocity, force and time."""
+    """Return the labels of position, velocity, force and time."""
     units = session.machine.units
     return {
         "position": units.label("position"),
@@ -147,21 +147,21 @@ def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         strict=True,
     )
     return tuple(
-        ParameterRow(f.name, float(v) if told else None, float(s) if told else None, f.unit, bool(told))
-        for f, v, s, told in rows
+        ParameterRow(f.name, float(v) if ok else None, float(s) if ok else None, f.unit, bool(ok))
+        for f, v, s, ok in rows
     )
 
 
 def _derived(session: Session, estimate: Estimate) -> tuple[ParameterRow, ...]:
-    """What follows from the parameters."""
-    told = [d for d in results.derived(session, estimate) if np.isfinite(d.std)]
-    return tuple(ParameterRow(d.name, d.value, d.std, d.unit) for d in told)
+    """Return the quantities derived from the parameters."""
+    known = [d for d in results.derived(session, estimate) if np.isfinite(d.std)]
+    return tuple(ParameterRow(d.name, d.value, d.std, d.unit) for d in known)
 
 
 def _views(
     session: Session, before: Sequence[Gap] | None, after: Sequence[Gap], drives: bool = False
 ) -> tuple[LogView, ...]:
-    """The logs, by joint; `drives`: with what their loops command."""
+    """Return the logs by joint; with `drives` also the commands of their loops."""
     earlier = before or [None] * len(after)
     joints = np.flatnonzero(session.fit.log.measured).tolist()
     driven = _driven if drives else lambda *of: {}
@@ -173,7 +173,7 @@ def _views(
 
 
 def _driven(session: Session, run: OpenedLog, gap: Gap, joint: int) -> dict[str, np.ndarray]:
-    """Declared force of a joint's drive, logged and simulated; nothing where either is not there."""
+    """Return the declared force of a joint's drive, logged and simulated; empty if either is missing."""
     gain = session.machine.gain
     drive = session.machine.plant.drive_of(joint, gain.size)
     if drive is None or gap.simulation is None or gap.simulation.command is None:
@@ -226,13 +226,13 @@ def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
     units, limits = session.machine.units, proposal.limits
     loop = proposal.signal == "reference"
     driven = session.machine.plant.at_drives
-    # A command has no unit of its own where the gain turns it into a force.
-    own = np.all(session.machine.gain == 1.0)
+    # A command has no known unit if a gain turns it into a force.
+    is_force = np.all(session.machine.gain == 1.0)
     ends = (driven(limits.low), driven(limits.high)) if loop else (-limits.force, limits.force)
     return ExperimentView(
         text=sentence(proposal, units),
         signal=proposal.signal,
-        unit=units.label("position") if loop else units.label("force") if own else "command",
+        unit=units.label("position") if loop else units.label("force") if is_force else "command",
         time=proposal.time,
         values=proposal.values if proposal.separates else None,
         limits=np.stack(ends, axis=1),

@@ -20,7 +20,7 @@ def drawable(values: np.ndarray | None) -> np.ndarray | None:
 
 
 def segments(time: np.ndarray) -> np.ndarray:
-    """Number the runs of samples between gaps in time, from 0."""
+    """Assign a number to each run of samples between gaps in time, from 0."""
     steps = np.diff(time)
     if steps.size == 0:
         return np.zeros(len(time), dtype=int)
@@ -68,9 +68,9 @@ def binned_mean(
     """Average y over bins of equal width in x.
 
     Args:
-        x: Where, (K,).
-        y: What, (K,).
-        bins: How many bins.
+        x: Abscissa, (K,).
+        y: Values, (K,).
+        bins: Number of bins.
         least: A bin with fewer samples is left out.
         group: Number of the group to which each sample belongs, rising with x, (K,); groups
             are averaged apart and the line is broken between them. None: one group.

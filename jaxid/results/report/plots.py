@@ -1,7 +1,8 @@
-"""The figures of a report, one function each; notebooks may call them too.
+"""The figures of a report, one function each.
 
-They return bare `matplotlib.figure.Figure` objects and leave matplotlib's global state alone.
-Colours are Okabe and Ito's, which stay apart for colour-blind readers.
+Functions `plot_*` return `matplotlib.figure.Figure` objects and leave pyplot's state alone; functions
+`draw_*` draw on axes that they are given. The colours are those of Okabe and Ito, which colour-blind
+readers can distinguish.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _JOINTS = (AFTER, "#009e73", "#cc79a7", "#56b4e9")
 
 
 def plot_fit(view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)) -> Figure:
-    """Measured and simulated position over time, with what parts them below.
+    """Draw measured and simulated position over time, with the difference below.
 
     Args:
         view: The log; without simulated positions only the measured one is drawn.
@@ -45,7 +46,7 @@ def plot_fit(view: LogView, units: Mapping[str, str], *, size: tuple[float, floa
 
 
 def plot_drive(view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)) -> Figure:
-    """Declared force of the drive over time, as logged and as the simulated loop commands it.
+    """Draw the declared force of the drive over time, as logged and as the simulated loop commands it.
 
     Args:
         view: The log; it must have both.
@@ -53,7 +54,7 @@ def plot_drive(view: LogView, units: Mapping[str, str], *, size: tuple[float, fl
         size: Width and height [inch].
 
     Returns:
-        The figure, with what parts them below.
+        The figure, with the difference below.
     """
     simulated = [("simulated", AFTER, drawable(view.drive_simulated))]
     return _compared(view, drawable(view.drive_measured), simulated, "force", units, size)
@@ -147,7 +148,7 @@ def plot_residual_over_time(
     noise_floor: float | None = None,
     size: tuple[float, float] = (11.5, 4.8),
 ) -> Figure:
-    """Measured force over time, and below it what the model leaves unexplained.
+    """Draw measured force over time, and below it the force residual.
 
     Args:
         view: The log.
@@ -222,12 +223,12 @@ def plot_residual_against(
     variables: Sequence[str] = ("velocity", "position", "time"),
     size: tuple[float, float] | None = None,
 ) -> Figure:
-    """Force residual against other quantities: before above, after below, on one scale.
+    """Draw the force residual against other quantities: before above, after below, on one scale.
 
     Args:
         view: The log.
         units: Labels of "force" and of the variables.
-        variables: Which of "velocity", "position" and "time", one column each.
+        variables: Abscissas among "velocity", "position" and "time", one column each.
         size: Width and height [inch]; by default by the number of panels.
 
     Returns:
@@ -293,7 +294,7 @@ def ranked(step: SearchStep) -> list[CandidateScore]:
 
 
 def plot_candidates(step: SearchStep) -> Figure:
-    """Evidence of all candidates of one step, best first, against the threshold.
+    """Draw the evidence of all candidates of one step, best first, against the threshold.
 
     Args:
         step: The step; candidates that could not be fitted are listed without a bar.
@@ -317,7 +318,7 @@ def draw_candidates(ax: Axes, step: SearchStep) -> None:
     candidates = ranked(step)
     scores = np.array([c.evidence if is_number(c.evidence) else 0.0 for c in candidates])
     right = max(scores.max(initial=0.0), step.threshold, 1e-9)
-    # A candidate that does great harm must not squeeze the bars that matter.
+    # A candidate with a large loss must not compress the other bars.
     left = max(scores.min(initial=0.0), -0.5 * right)
     rows = np.arange(len(candidates))
     colors = [AFTER if c.accepted else _IDLE for c in candidates]
@@ -344,7 +345,7 @@ def draw_candidates(ax: Axes, step: SearchStep) -> None:
 def plot_where(
     plot: WherePlot | tuple, units: Mapping[str, str], region: Sequence[float] | None = None
 ) -> Figure:
-    """The residual's mean over one variable, and where it leaves the model.
+    """Draw the residual's mean over one variable, and the region in which it is significant.
 
     Args:
         plot: The bins.
@@ -388,10 +389,10 @@ def draw_where(
 def plot_experiment(
     view: ExperimentView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
 ) -> Figure:
-    """A proposed signal over time within its limits; below a reference, its speed.
+    """Draw a proposed signal over time within its limits, and below a reference its speed.
 
     Args:
-        view: The experiment; its values must be there.
+        view: The experiment, with its values.
         units: Labels of "velocity" and "time".
         size: Width and height [inch].
 
@@ -419,7 +420,7 @@ def plot_experiment(
 
 
 def _limits(ax: Axes, limits: np.ndarray) -> None:
-    """Dashed lines at the ends of every joint's range."""
+    """Draw dashed lines at the ends of every joint's range."""
     for k, value in enumerate(np.unique(limits)):
         ax.axhline(value, color=BEFORE, lw=1.0, ls=(0, (4, 3)), label="limits" if k == 0 else None)
 
@@ -439,12 +440,12 @@ def _residuals(view: LogView) -> list[tuple[str, str, np.ndarray]]:
         ("after", AFTER, drawable(view.residual_after)),
     )
     there = [entry for entry in named if entry[2] is not None]
-    # Alone it is neither before nor after anything.
+    # A single residual is neither before nor after another.
     return there if len(there) > 1 else [("residual", *entry[1:]) for entry in there]
 
 
 def _groups(variable: str, x: np.ndarray) -> np.ndarray | None:
-    """Number the stretches over which a mean may be drawn as one line."""
+    """Assign numbers to the stretches over which a mean may be drawn as one line."""
     if variable == "time":
         return segments(np.asarray(x))
     # Dry friction jumps where the velocity changes its sign.
@@ -456,9 +457,9 @@ def _cloud(
 ) -> None:
     """Draw samples as dots, and their mean over bins as a line."""
     some = thinned(len(x), _MOST_POINTS)
-    # As an image: thousands of dots would be megabytes of SVG. A handful is drawn to be seen one by one.
+    # As an image, because thousands of dots would be megabytes of SVG; a few dots are drawn one by one.
     few = len(x) <= _FEW
-    look = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.4}
-    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, **look)
+    style = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.4}
+    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, **style)
     ax.axhline(0.0, color=TEXT, lw=0.6)
     ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8, label=label)

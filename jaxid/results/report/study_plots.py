@@ -17,7 +17,7 @@ from jaxid.results.report.numbers import pretty_unit
 from jaxid.studies.settings import widest, words_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#6b6b6b")
-# One more than colours, so that pairs of both do not soon come again.
+# One more than colours, so that pairs of both repeat late.
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 _COLUMNS = 3
 # Standard deviations beyond which errors are counted in the outermost bar.
@@ -161,7 +161,7 @@ def draw_scatter(ax: Axes, table: xr.Dataset, name: str) -> None:
 
 
 def others_of(rows: Sequence[dict]) -> list[str]:
-    """What is varied beside that, in words; one that says nothing where nothing is."""
+    """Return the other settings in words; one empty text if nothing else is varied."""
     return list(dict.fromkeys(words_of(r, without=widest(rows)) for r in rows))
 
 
@@ -182,14 +182,14 @@ def _grid(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def _estimators(rows: Sequence[dict], what: str) -> list[tuple[int, str]]:
-    """Those of which there is any such number, each with its place among all."""
+    """Return the estimators with a finite number, each with its position among all."""
     names = list(dict.fromkeys(r["estimator"] for r in rows))
-    told = {r["estimator"] for r in rows if np.isfinite(r[what])}
-    return [(k, name) for k, name in enumerate(names) if name in told]
+    finite = {r["estimator"] for r in rows if np.isfinite(r[what])}
+    return [(k, name) for k, name in enumerate(names) if name in finite]
 
 
 def _look(k: int) -> dict:
-    """Colour and mark of an estimator."""
+    """Return the colour and mark of an estimator."""
     return {"color": COLOURS[k % len(COLOURS)], "marker": _MARKS[k % len(_MARKS)], "ms": 5}
 
 
@@ -206,14 +206,14 @@ def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, str]] = ()) -> N
     for label, dash in more:
         handles.append(ax.plot([], [], color=TEXT, lw=0.9, ls=dash)[0])
         labels.append(label)
-    # As many columns as the longest label lets stand side by side.
+    # The number of columns that fit beside each other with the longest label.
     fits = int(figure.get_figwidth() / (0.6 + 0.075 * max(map(len, labels))))
     columns = max(1, min(4, fits))
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, frameon=False, fontsize=FONT)
 
 
 def _proportion(part: float, of: int) -> tuple[float, float]:
-    """95 % interval of a proportion: Wilson (1927)."""
+    """Return the 95 % interval of a proportion by Wilson (1927)."""
     z = 1.96
     middle = (part + z**2 / (2 * of)) / (1 + z**2 / of)
     half = z / (1 + z**2 / of) * np.sqrt(part * (1 - part) / of + z**2 / (4 * of**2))
