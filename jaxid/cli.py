@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
@@ -202,6 +202,12 @@ def _study(commands: argparse._SubParsersAction) -> None:
     )
 
 
+class Savable(Protocol):
+    """A result that writes itself to a folder."""
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path: ...
+
+
 @contextmanager
 def _progress(args: argparse.Namespace, stages: int):
     """A bar on a terminal, nothing when piped or quiet."""
@@ -380,7 +386,8 @@ def _run_demo(args: argparse.Namespace) -> int:
     return 0 if converged else 1
 
 
-def _finish(args: argparse.Namespace, result: object, *files: str) -> int:
+def _finish(args: argparse.Namespace, result: Savable, *files: str) -> int:
+    """Save a result where the user wants it, and return the exit status."""
     if args.o is not None:
         result.save(args.o, overwrite=args.force)
         print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in files)}")

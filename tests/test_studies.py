@@ -257,7 +257,7 @@ def test_what_a_law_found_in_its_loop_is_a_row(tmp_path):
     strict = case.read_text().replace("velocity_average = 4", "tolerance = 1e-9\nvelocity_average = 4")
     case.write_text(strict)
     early = jaxid.study(case)
-    assert [f["why"] for f in early.failures] == ["the law never trusted what it found"]
+    assert [f["why"] for f in early.failures] == ["the law never trusted its estimate"]
     assert np.isfinite(early.tracking[0]["rms"]["median"])
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Array
 from jaxid.case.case import Case
 from jaxid.estimators.inverse_dynamics import force_precision
 from jaxid.files import ready_folder, write_json
@@ -176,7 +177,7 @@ def check(case: Case | str | Path, log: LogLike, *, validate: Sequence[LogLike] 
 
 
 @eqx.filter_jit
-def _jacobian(plant: Any, places: tuple, data: ForceData, theta: jax.Array) -> jax.Array:
+def _jacobian(plant: Any, places: tuple, data: ForceData, theta: Array) -> Array:
     if theta.size == 0:
         return jnp.zeros((*data.weight.shape, 0))
     return jax.jacfwd(lambda t: force_residual(scatter(places, plant, t), data))(theta)

@@ -267,6 +267,7 @@ def _refit(session: Session, start: Estimate) -> Estimate:
 
 
 def _length(gap: Gap) -> float:
+    assert gap.simulation is not None, "the simulation of this gap has run"
     return float(np.sqrt(np.nansum(gap.simulation.rms**2)))
 
 

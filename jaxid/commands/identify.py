@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -153,7 +153,7 @@ def identify_many(
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
 
-def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
+def _checked(option: str, value: str, known: Collection[str], method: str) -> str:
     if method != "output_error":
         raise InputError(
             f"{option} {value!r} goes only with output_error",

@@ -131,12 +131,22 @@ class Live:
         fresh = tuple(self._tick % hold == 0 for hold in self._holds)
         if self._tick == 0:
             path = jax.tree.map(lambda x: x[0], self._path)
-            tick = Tick(position, path, self._driven, np.asarray(fresh[0]), *others, np.asarray(fresh[1]))
+            tick = Tick(
+                joints=position,
+                path=path,
+                driven=self._driven,
+                fresh=np.asarray(fresh[0]),
+                velocity=others[0],
+                acceleration=others[1],
+                measured=others[2],
+                renewed=np.asarray(fresh[1]),
+            )
             start, saved = self._controller.start(tick, np.zeros_like(position), self._path), self.memory
             # A difference of readings of an earlier run and of this one would have no meaning.
             self.memory = start if saved is None else self._controller.resumed(start, saved)
         if self._online is not None and self.switched is None:
             self._identify(position)
+        assert self._memory is not None, "the first tick has set it"
         u, self._memory, closed = self._law(self._tick, position, fresh, others, self._memory)
         if self.adapts and self.switched is None and closed:
             self.switched = self._tick
@@ -165,16 +175,19 @@ class Live:
         if not self.adapts or self.memory is None:
             what = "no reading yet" if self.adapts else "the controller does not identify"
             raise InputError(what, where="Live", hint="take kind = 'adaptive', and give it readings")
-        return self._controller.estimate(self.memory)
+        # Only laws that adapt have it, which `adapts` says.
+        return self._controller.estimate(self.memory)  # pyright: ignore[reportAttributeAccessIssue]  # see above
 
     def _identify(self, position: np.ndarray) -> None:
+        assert self._online is not None, "the caller has asked"
         if self._rows is None:
             self._rows = self._online.start(jnp.asarray(position))
             return
+        assert self._last is not None, "a command follows the first reading"
         self._rows, estimate = _learned(self._online, self._rows, position, self._last)
-        self.online_estimate = jax.tree.map(np.asarray, estimate)
-        if self.online_estimate.trusted.all():
-            model = self.machine.with_estimate(self.online_estimate.theta).plant
+        self.online_estimate = found = jax.tree.map(np.asarray, estimate)
+        if found.trusted.all():
+            model = self.machine.with_estimate(found.theta).plant
             self._controller = eqx.tree_at(lambda c: c.model, self._controller, model)
             self._law.take(self._controller)
             self.switched = self._tick
@@ -282,8 +295,17 @@ class _Law:
             fresh = now.pop(0) != 0
             others = [now.pop(0) if there else None for there in given]
             path = jax.tree.unflatten(self._path, path)
-            tick = Tick(position, path, self._driven, fresh[0], *others, fresh[1])
-            controller = eqx.combine(self._values.unpacked(values), self._static)
+            tick = Tick(
+                joints=position,
+                path=path,
+                driven=self._driven,
+                fresh=fresh[0],
+                velocity=others[0],
+                acceleration=others[1],
+                measured=others[2],
+                renewed=fresh[1],
+            )
+            controller: Controller = eqx.combine(self._values.unpacked(values), self._static)  # pyright: ignore[reportAssignmentType]  # both halves of one
             u, memory = controller.command(tick, self.memory.unpacked(memory), jnp.zeros(1))
             learned = controller.learned(memory)
             closed = jnp.zeros(1) if learned is None else learned.closed.astype(float)[None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import zipfile
@@ -26,7 +27,8 @@ from jaxid.studies.levels import Level
 from jaxid.studies.plan import Plan, at_once, digest_of, same
 from jaxid.studies.remote import Bundle, Remote
 from jaxid.studies.result import FILES, Study, gathered
-from jaxid.studies.runs import Arrays, Runner
+from jaxid.studies.rows import Arrays
+from jaxid.studies.runs import Runner
 
 _MANIFEST = "study.json"
 _CHUNKS = "chunks"
@@ -74,7 +76,7 @@ def study(
                 where=str(where),
                 hint="continue it with --resume, or choose another -o",
             )
-    begun = _begun(where) if resume else {}
+    begun = _begun(where) if resume and where is not None else {}
     with contextlib.ExitStack() as stack:
         remote = None if scheduler is None else stack.enter_context(Remote(scheduler))
         plan = Plan.of(case, runs=runs, seed=seed, workers=remote and remote.threads)
@@ -91,16 +93,20 @@ def study(
         runner = Runner(plan)
         for level in range(len(plan.levels)):
             runner.ways(level)
-        bundle = None if remote is None else Bundle.of(plan)
+        solved = (
+            functools.partial(_solved, runner)
+            if remote is None
+            else functools.partial(remote.run, Bundle.of(plan))
+        )
         bound = np.stack([_bound(plan, level) for level in plan.levels])
         identity = digest_of(plan.manifest)
-        kept = _kept(where, plan, identity) if resume else {}
+        kept = _kept(where, plan, identity) if resume and where is not None else {}
         if where is not None and not resume:
             _begin(where, plan)
         missing = [k for k in range(len(plan.chunks)) if k not in kept]
         total, done = plan.runs * len(plan.levels), sum(len(plan.chunks[k][1]) for k in kept)
         progress(done, total)
-        for number, arrays in remote.run(bundle, missing) if remote else _solved(runner, missing):
+        for number, arrays in solved(missing):
             kept[number] = arrays
             if where is not None:
                 write_whole(_path(where, number), _packed(arrays, identity))
@@ -166,7 +172,7 @@ def _path(folder: Path, number: int) -> Path:
 
 def _packed(arrays: Arrays, identity: str) -> bytes:
     buffer = io.BytesIO()
-    np.savez(buffer, study=np.asarray(identity), **arrays)
+    np.savez(buffer, allow_pickle=False, study=np.asarray(identity), **arrays)
     return buffer.getvalue()
 
 

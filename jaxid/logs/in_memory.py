@@ -51,14 +51,16 @@ def as_log(
     return read_log(name, columns, joints=joints, drives=drives, read=read)
 
 
-def _arrays(table: Any) -> tuple[str, Mapping[str, Any]]:
+def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:
     """Return what a table is called in messages, and its columns by name.
 
     No library is imported: one whose tables are given has been.
     """
-    library, kind = type(table).__module__.partition(".")[0], type(table).__name__
-    if isinstance(table, Mapping) and library != "xarray":
-        return "arrays", {str(name): values for name, values in table.items()}
+    library, kind = type(log).__module__.partition(".")[0], type(log).__name__
+    if isinstance(log, Mapping) and library != "xarray":
+        return "arrays", {str(name): values for name, values in log.items()}
+    # The libraries are optional, and their classes are known by name only.
+    table: Any = log
     if library == "pandas" and kind == "DataFrame":
         return kind, _of_pandas(table)
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):

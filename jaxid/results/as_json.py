@@ -50,7 +50,7 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
         if f.index is None:
             out[f.name] = entry
             continue
-        listed = out.setdefault(f.name.partition("[")[0], _known(leaf(plant, f.path), f.unit))
+        listed = out.setdefault(f.name.partition("[")[0], _known(np.asarray(leaf(plant, f.path)), f.unit))
         for key in ("value", "std", "identifiable"):
             *row, at = np.atleast_1d(f.index)
             (listed[key][row[0]] if row else listed[key])[at] = entry[key]
@@ -286,7 +286,7 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
         return []
     present = {e.kind for e in result.session.machine.plant.effects}
     steps = [r.step for r in result.rounds]
-    lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.why]
+    lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.dropped and s.why]
     if "static_friction" not in present and result.unseen:
         lines.append(f"break-away friction (static_friction) was not searched for: {result.unseen}")
     session = result.session
@@ -352,7 +352,7 @@ def save_discovery(result: Discovery, folder: Path, *, overwrite: bool = False) 
     files = discovery_files(result, folder)
     ready_folder(folder, files, overwrite=overwrite)
     for proposal in result.proposals:
-        if proposal.separates:
+        if proposal.separates and proposal.values is not None:
             write_whole(folder / proposal.file, signal_csv(proposal.signal, proposal.time, proposal.values))
     for name in files:
         if name == found_case_file(result.session.declared.path, folder):

@@ -105,19 +105,18 @@ def _findings(result: FitResult) -> Findings:
     rows = zip(machine.parameters.free, result.estimate.theta, result.estimate.identifiable, strict=True)
     for f, estimate, identifiable in rows:
         guess = _rounded(estimate)
-        first, *rest = f.path
-        if first == "effects" and rest[0] >= len(places):
-            # Its value is all that is known of an effect that was added, however well it is.
-            added.setdefault(rest[0], {})[rest[1]] = Value(guess, free=True)
-        elif not (identifiable and math.isfinite(guess)):
-            continue
-        elif first == REFERENCE:
-            reference[rest[0]] = guess
-        elif first == "effects":
-            number, at = places[rest[0]]
-            effects.setdefault(number, {}).setdefault(rest[1], {})[at] = guess
-        else:
-            plant.setdefault(first, {})[f.index] = guess
+        known = bool(identifiable) and math.isfinite(guess)
+        match f.path:
+            case ("effects", int(number), str(name)) if number >= len(places):
+                # An effect that was added has no other value, however well this one is known.
+                added.setdefault(number, {})[name] = Value(guess, free=True)
+            case ("effects", int(number), str(name)) if known:
+                table, at = places[number]
+                effects.setdefault(table, {}).setdefault(name, {})[at] = guess
+            case (first, str(name)) if first == REFERENCE and known:
+                reference[name] = guess
+            case (str(name),) if known:
+                plant.setdefault(name, {})[f.index] = guess
 
     return Findings(
         plant, effects, reference, tuple(_added(machine.plant, k, values) for k, values in added.items())
@@ -226,29 +225,26 @@ def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
 
 def _put_plant(table: Any, case: Case, name: str, guesses: Mapping[Index, float]) -> None:
     """Put new guesses of one parameter into [plant]; those of a URDF file have no place there."""
-    values = case.plant.parameters[name]
+    values: Any = case.plant.parameters[name]
     if "links" in table:
         for index, guess in guesses.items():
             key, entry = _LINKS.get(name, (name, None))
             # Of one link's list this is one entry; the others are put by their own names.
             link = table["links"][index]
             places = 1 if entry is None else len([part for part in _LINKS.values() if part[0] == key])
-            value = values[index]  # pyright: ignore[reportIndexIssue]  # a list, one value a link
-            known = (value,) * places
-            _put(link, key, {entry or 0: guess}, places, known)
+            _put(link, key, {entry or 0: guess}, places, (values[index],) * places)
     elif "parameters" in table:
-        stated, parameters = None, table["parameters"]
+        parameters = table["parameters"]
         if isinstance(values, Value):
             _put(parameters, name, {0: guesses[None]}, 1, (values,))
             return
-        stated = parameters[name]
         rows: dict[int, dict[int, float]] = {}
         for index, guess in guesses.items():
             if isinstance(index, tuple):
                 rows.setdefault(index[0], {})[index[1]] = guess
         if rows:
             for row, of_row in rows.items():
-                _put(stated, row, of_row, len(values[row]), values[row])
+                _put(parameters[name], row, of_row, len(values[row]), values[row])
         else:
             _put(
                 parameters,
@@ -339,9 +335,10 @@ def _renamer(old: Path, new: Path) -> Any:
 
 def _rename_in(tables: Any, rename: Any, key: str = "") -> None:
     """Rewrite the file names of a document in place, so that its layout stays."""
-    entries = tables.items() if isinstance(tables, Mapping) else enumerate(tables)
-    for k, value in list(entries):
-        name = k if isinstance(tables, Mapping) else key
+    named = isinstance(tables, Mapping)
+    entries: list[tuple[Any, Any]] = list(tables.items() if named else enumerate(tables))
+    for k, value in entries:
+        name = k if named else key
         if isinstance(value, Mapping | list):
             _rename_in(value, rename, name)
         elif isinstance(value, str) and (new := rename(value, name)) != value:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -159,11 +159,13 @@ def _parameters(ax: Axes, result: Fitted, at: Selection) -> None:
 
 def _correlation(ax: Axes, result: Fitted, at: Selection) -> None:
     covariance = result.covariance
+    figure = ax.get_figure(root=True)
+    assert figure is not None, "axes to draw on belong to a figure"
     image = ax.imshow(covariance.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     places = np.arange(len(covariance.names))
     ax.set_xticks(places, covariance.names, rotation=45, ha="right", fontsize=FONT - 0.5)
     ax.set_yticks(places, covariance.names, fontsize=FONT - 0.5)
-    ax.get_figure(root=True).colorbar(image, ax=ax, label="correlation [-]")
+    figure.colorbar(image, ax=ax, label="correlation [-]")
 
 
 def _gaps(ax: Axes, result: Fitted, at: Selection) -> None:
@@ -198,8 +200,8 @@ def _where(ax: Axes, result: Fitted, at: Selection) -> None:
     shown = where_plot(result)
     if shown is None or not len(shown.x):
         raise InputError("this result has no curve of the mean residual", hint="choose another plot")
-    region = result.where.region if getattr(result, "where", None) else None
-    plots.draw_where(ax, shown, units_of(result.session), region)
+    where = getattr(result, "where", None)
+    plots.draw_where(ax, shown, units_of(result.session), None if where is None else where.region)
 
 
 def _candidates(ax: Axes, result: Fitted, at: Selection) -> None:
@@ -213,7 +215,7 @@ def _candidates(ax: Axes, result: Fitted, at: Selection) -> None:
     plots.draw_candidates(ax, search_step(scored[step]))
 
 
-def _named(name: str | None, names: list[str] | tuple[str, ...]) -> str:
+def _named(name: str | None, names: Sequence[str]) -> str:
     """Return a name that is among those known, the first where none is given."""
     if name is not None and name not in names:
         raise InputError(f"parameter {name!r} is not known", hint=suggest(name, names))

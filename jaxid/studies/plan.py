@@ -277,4 +277,4 @@ def same(one: dict, other: dict) -> str:
     """Return the differences of two manifests in words; empty if the studies are the same."""
     words = {"fingerprint": "the case or a file that it names"}
     keys = [k for k in one if json.dumps(one[k]) != json.dumps(other.get(k))]
-    return ", ".join(words.get(k, k) for k in keys)
+    return ", ".join(words[k] if k in words else str(k) for k in keys)

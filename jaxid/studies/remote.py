@@ -7,11 +7,13 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.studies.plan import Plan, digest_of, fingerprint, named_files
-from jaxid.studies.runs import Arrays, Runner
+from jaxid.studies.rows import Arrays
+from jaxid.studies.runs import Runner
 
 # Seconds to wait for a scheduler, and for a first worker.
 _PATIENCE = 20
@@ -106,6 +108,8 @@ class Remote:
 
     def __init__(self, address: str) -> None:
         self.address = address
+        # A client of Dask, whose methods answer at once or later by its mode: no type says which.
+        self.client: Any = None
 
     def __enter__(self) -> Remote:
         try:
@@ -114,12 +118,12 @@ class Remote:
             raise InputError(
                 "--scheduler needs Dask's distributed", hint="install jaxid with its extra: jaxid[scheduler]"
             ) from None
-        self.client = None
+        client: Any = None
         try:
-            self.client = Client(self.address, timeout=_PATIENCE, set_as_default=False)
-            self.client.wait_for_workers(1, timeout=_PATIENCE)
+            client = self.client = Client(self.address, timeout=_PATIENCE, set_as_default=False)
+            client.wait_for_workers(1, timeout=_PATIENCE)
         except (OSError, ValueError, TimeoutError) as error:
-            what = "no scheduler answers" if self.client is None else "there is no worker"
+            what = "no scheduler answers" if client is None else "there is no worker"
             self.__exit__()
             raise InputError(
                 f"{what} at {self.address}: {error}", hint="give its address, as it prints it"
@@ -142,7 +146,7 @@ class Remote:
             InputError: If a chunk ended several workers, or the scheduler is lost.
         """
         from distributed import CancelledError, KilledWorker, as_completed
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
 
         pending = {self.client.submit(run_chunk, bundle, k, pure=False): k for k in numbers}
         try:

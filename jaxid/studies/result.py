@@ -15,6 +15,7 @@ import scipy.stats
 import xarray as xr
 
 from jaxid.files import ready_folder, write_json, write_whole
+from jaxid.studies.rows import COLUMNS, Arrays, variables
 from jaxid.studies.settings import SETTINGS
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from jaxid.studies.plan import Plan
-    from jaxid.studies.runs import Arrays
 
 FILES = ("study.nc", "summary.json", "report.html")
 # Nominal coverage of the intervals that are counted.
@@ -196,18 +196,11 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
         return whole.reshape(len(whole), *sizes, *whole.shape[2:])
 
     run = ("estimator", *settings, "run")
-    each = (*run, "parameter")
     once = {n: np.concatenate([c[n] for c in levels[0]]) for n in ("truth", "start")}
     free = plan.machine.parameters.free
     table = xr.Dataset(
         {
-            "estimate": (each, by_run("estimate")),
-            "std": (each, by_run("std")),
-            "identifiable": (each, by_run("identifiable").astype(np.int8)),
-            "converged": (run, by_run("converged").astype(np.int8)),
-            "steps": (run, by_run("steps").astype(np.int32)),
-            "message": (run, by_run("message").astype(object)),
-            "named": (run, by_run("named").astype(object)),
+            **variables({name: by_run(name) for name in COLUMNS}, run),
             "truth": (("run", "parameter"), once["truth"]),
             "start": (("run", "parameter"), once["start"]),
             "bound": ((*settings, "parameter"), bound.reshape(*sizes, -1)),

@@ -59,5 +59,7 @@ def dress(ax: Axes, xlabel: str, ylabel: str) -> None:
     ax.spines[["left", "bottom"]].set_color("#999999")
     ax.grid(color="#e6e6e6", lw=0.7)
     ax.set_axisbelow(True)
-    ax.xaxis.set_major_locator(MaxNLocator(6 if ax.get_figure(root=True).get_figwidth() < 8 else 12))
+    figure = ax.get_figure(root=True)
+    narrow = figure is not None and figure.get_figwidth() < 8
+    ax.xaxis.set_major_locator(MaxNLocator(6 if narrow else 12))
     ax.yaxis.set_major_locator(MaxNLocator(5))

@@ -236,7 +236,7 @@ def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
         time=proposal.time,
         values=proposal.values if proposal.separates else None,
         limits=np.stack(ends, axis=1),
-        speed=driven(limits.speed) if loop else None,
+        speed=np.asarray(driven(limits.speed)) if loop else None,
     )
 
 

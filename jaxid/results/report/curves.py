@@ -1,19 +1,17 @@
-"""Lines with thousands of samples, thinned to what the eye can tell apart."""
+"""Lines with thousands of samples, thinned to the resolution of a drawing."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# chosen: a step longer than this many usual steps is a gap, not jitter.
+# Chosen: a step longer than this many usual steps is a gap, not jitter.
 _GAP = 1.5
 # Beyond this a diverged simulation would only overflow the drawing [any unit].
 _DRAWABLE = 1e30
 
 
-def drawable(values: np.ndarray | None) -> np.ndarray | None:
-    """Replace what cannot be drawn by NaN, which matplotlib leaves out."""
-    if values is None:
-        return None
+def drawable(values: np.ndarray) -> np.ndarray:
+    """Replace values that cannot be drawn by NaN, which matplotlib omits."""
     values = np.asarray(values, dtype=float)
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) < _DRAWABLE, values, np.nan)
@@ -33,7 +31,7 @@ def envelope(time: np.ndarray, values: np.ndarray, buckets: int) -> tuple[np.nda
     Args:
         time: Increasing instants, (N,); where they jump, the line is broken.
         values: The line, (N,).
-        buckets: How many buckets the whole time is cut into.
+        buckets: Number of buckets into which the whole time is cut.
 
     Returns:
         Instants and values of the thinned line, with NaN in the gaps.

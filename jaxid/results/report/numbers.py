@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import TypeGuard
 
 import numpy as np
 
@@ -14,7 +15,7 @@ _SCALED = {"m", "rad", "m/s", "rad/s", "N", "N m", "V", "A"}
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
-def is_number(value: object) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Return whether a value is a finite number."""
     return (
         isinstance(value, (int, float, np.integer, np.floating))
@@ -74,11 +75,11 @@ def with_std(value: object, std: object) -> tuple[str, str]:
     largest = max(abs(float(value)), float(std))
     exponent = math.floor(math.log10(largest))
     shift = exponent if not -4 <= exponent <= 5 else 0
-    value, std = float(value) / 10.0**shift, float(std) / 10.0**shift
+    shifted, deviation = float(value) / 10.0**shift, float(std) / 10.0**shift
     # Rounding 0.0996 to two digits gives 0.10: take the exponent after the rounding.
-    places = 1 - math.floor(math.log10(float(f"{std:.1e}")))
+    places = 1 - math.floor(math.log10(float(f"{deviation:.1e}")))
     tail = f" {_power(shift)}" if shift else ""
-    return _fixed(value, places) + tail, _fixed(std, places) + tail
+    return _fixed(shifted, places) + tail, _fixed(deviation, places) + tail
 
 
 def percent(part: object, whole: object = 1.0, digits: int = 2) -> str:

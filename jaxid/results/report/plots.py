@@ -56,6 +56,8 @@ def plot_drive(view: LogView, units: Mapping[str, str], *, size: tuple[float, fl
     Returns:
         The figure, with the difference below.
     """
+    if view.drive_measured is None or view.drive_simulated is None:
+        raise ValueError(f"log {view.name!r} has no force of the drive to compare.")
     simulated = [("simulated", AFTER, drawable(view.drive_simulated))]
     return _compared(view, drawable(view.drive_measured), simulated, "force", units, size)
 
@@ -371,11 +373,11 @@ def draw_where(
         units: Label of "force".
         region: The two ends of the stretch where the residual stands out; may be None.
     """
-    plot = WherePlot(*plot)
+    plot = plot if isinstance(plot, WherePlot) else WherePlot(*plot)
     small, unit = scaled_unit(units["force"], [plot.mean, plot.low, plot.high])
     factor, x_unit = scaled_unit(plot.unit, [plot.x])
     x = np.asarray(plot.x) / factor
-    mean, low, high = (drawable(v) / small for v in plot[3:])
+    mean, low, high = (drawable(v) / small for v in (plot.mean, plot.low, plot.high))
     if region is not None and len(region) == 2 and all(is_number(r) for r in region):
         ends = [r / factor for r in region]
         ax.axvspan(*ends, color="#f0e442", alpha=0.28, lw=0, label="region named")
@@ -399,17 +401,18 @@ def plot_experiment(
     Returns:
         The figure.
     """
-    loop = view.speed is not None
-    figure, top, below = time_axes(size, 2 if loop else 1, ratios=(3, 2))
+    if view.values is None:
+        raise ValueError("the experiment has no values to plot.")
+    figure, top, below = time_axes(size, 1 if view.speed is None else 2, ratios=(3, 2))
     many, joints = bucket_count(size), view.values.shape[1]
     factor, unit = scaled_unit(view.unit, [view.values])
     for k, values in enumerate(view.values.T):
         name = view.signal if joints == 1 else f"{view.signal}, joint {k + 1}"
         top.plot(*envelope(view.time, values / factor, many), lw=1.2, label=name, color=_JOINTS[k % 4])
     _limits(top, view.limits / factor)
-    dress(top, "" if loop else time_label(units), f"{view.signal} [{unit}]")
+    dress(top, "" if view.speed is not None else time_label(units), f"{view.signal} [{unit}]")
     legend(top)
-    if loop:
+    if view.speed is not None:
         speed = np.gradient(view.values, view.time, axis=0)
         factor, unit = scaled_unit(units["velocity"], [speed])
         for k, values in enumerate(speed.T):
@@ -426,22 +429,21 @@ def _limits(ax: Axes, limits: np.ndarray) -> None:
 
 
 def _simulated(view: LogView) -> list[tuple[str, str, np.ndarray]]:
-    named = (
-        ("simulated before", BEFORE, drawable(view.position_simulated_before)),
-        ("after", AFTER, drawable(view.position_simulated_after)),
-    )
-    there = [entry for entry in named if entry[2] is not None]
-    return there if len(there) > 1 else [("simulated", *entry[1:]) for entry in there]
+    before, after = view.position_simulated_before, view.position_simulated_after
+    return _present((("simulated before", BEFORE, before), ("after", AFTER, after)), "simulated")
 
 
 def _residuals(view: LogView) -> list[tuple[str, str, np.ndarray]]:
-    named = (
-        ("before", BEFORE, drawable(view.residual_before)),
-        ("after", AFTER, drawable(view.residual_after)),
-    )
-    there = [entry for entry in named if entry[2] is not None]
-    # A single residual is neither before nor after another.
-    return there if len(there) > 1 else [("residual", *entry[1:]) for entry in there]
+    both = (("before", BEFORE, view.residual_before), ("after", AFTER, view.residual_after))
+    return _present(both, "residual")
+
+
+def _present(
+    lines: Sequence[tuple[str, str, np.ndarray | None]], alone: str
+) -> list[tuple[str, str, np.ndarray]]:
+    """Return the lines that have values; a single one, neither before nor after another, under a name."""
+    present = [(label, color, drawable(line)) for label, color, line in lines if line is not None]
+    return present if len(present) > 1 else [(alone, color, line) for _, color, line in present]
 
 
 def _groups(variable: str, x: np.ndarray) -> np.ndarray | None:
@@ -459,7 +461,7 @@ def _cloud(
     some = thinned(len(x), _MOST_POINTS)
     # As an image, because thousands of dots would be megabytes of SVG; a few dots are drawn one by one.
     few = len(x) <= _FEW
-    style = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.4}
-    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, **style)
+    size, alpha = (6.0, 0.7) if few else (2.8, 0.4)
+    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, ms=size, alpha=alpha)
     ax.axhline(0.0, color=TEXT, lw=0.6)
     ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8, label=label)

@@ -20,9 +20,10 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7
 # One more than colours, so that pairs of both repeat late.
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 _COLUMNS = 3
+Dash = str | tuple[int, tuple[int, ...]]
 # Standard deviations beyond which errors are counted in the outermost bar.
 _REACH = 4.5
-_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
+_DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _AXES = {
     "noise": "noise, times the sensor's",
     "sample_rate": "sampling rate [Hz]",
@@ -153,9 +154,9 @@ def draw_scatter(ax: Axes, table: xr.Dataset, name: str) -> None:
         used = one["converged"].values.astype(bool) & np.isfinite(one["std"].values)
         z = ((one["estimate"] - one["truth"]) / one["std"]).values[used]
         if len(z):
-            bins = np.linspace(-_REACH, _REACH, max(11, min(41, 2 * int(np.sqrt(len(z))) + 1)))
+            ends = np.linspace(-_REACH, _REACH, max(11, min(41, 2 * int(np.sqrt(len(z))) + 1)))
             style = {"color": _look(i)["color"], "lw": 1.4, "histtype": "step", "density": True}
-            ax.hist(np.clip(z, -_REACH, _REACH), bins, label=str(estimator), **style)
+            ax.hist(np.clip(z, -_REACH, _REACH), ends.tolist(), label=str(estimator), **style)
     ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
     dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
 
@@ -201,7 +202,7 @@ def _logarithmic(ax: Axes, at: np.ndarray) -> None:
     ax.set_xticks(at, [f"{n:g}" for n in at])
 
 
-def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, str]] = ()) -> None:
+def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, Dash]] = ()) -> None:
     handles, labels = ax.get_legend_handles_labels()
     for label, dash in more:
         handles.append(ax.plot([], [], color=TEXT, lw=0.9, ls=dash)[0])

@@ -337,9 +337,13 @@ def _by_joint(**columns: object) -> list[GapRow]:
 def _gap_cells(row: GapRow) -> list[str]:
     numbers = (row.before, row.after, row.floor)
     scale, unit = scaled_unit(row.unit, [n for n in numbers if is_number(n)])
-    texts = [f"{plain(n / scale)} {unit}".strip() if is_number(n) else ABSENT for n in numbers]
-    judged = is_number(row.after) and is_number(row.floor) and row.floor > 0
-    ratio = f"{row.after / row.floor:.2f}" if judged else ABSENT
+    texts = [
+        f"{plain(n / scale)} {unit}".strip() if n is not None and is_number(n) else ABSENT for n in numbers
+    ]
+    after, floor = row.after, row.floor
+    ratio = ABSENT
+    if after is not None and floor is not None and is_number(after) and is_number(floor) and floor > 0:
+        ratio = f"{after / floor:.2f}"
     return [row.quantity, row.log, *texts, ratio, percent(row.relative)]
 
 
