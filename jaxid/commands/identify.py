@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -140,7 +140,7 @@ def identify_many(
     if method not in METHODS:
         raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     loaded = lambda c: c if isinstance(c, Case) else load_case(c)
-    if isinstance(case, Case | str | Path):
+    if isinstance(case, Case | str | Path | Mapping):
         cases = [loaded(case)] * len(logs)
     elif len(case) == len(logs):
         cases = [loaded(c) for c in case]

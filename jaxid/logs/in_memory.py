@@ -20,19 +20,19 @@ class Table(Protocol):
     def __getitem__(self, name: Any, /) -> Any: ...
 
 
-# All that is accepted where a log is expected.
+# Every type that a command takes for a log.
 LogLike = Log | str | Path | Table
 
 
 def as_log(
     log: LogLike, columns: dict[str, Any], *, joints: int | None = 1, drives: int | None = None
 ) -> Log:
-    """Return a log with the checks of a file, whatever it is given as.
+    """Return a log, in memory or from a file, with the same checks.
 
     Args:
         log: A log, which is returned as it is; a file; or a table, whose columns `columns` names.
         columns: The `[log]` table of a case, see `jaxid.logs.log.read_log`. The index of a DataFrame counts
-            as a column where it has a name.
+            as a column if it has a name.
         joints: Number of positions expected; None takes what there is.
         drives: Number of forces and references expected; None: no more than positions.
 
@@ -52,9 +52,9 @@ def as_log(
 
 
 def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:
-    """Return what a table is called in messages, and its columns by name.
+    """Return the name of a table in messages, and its columns by name.
 
-    No library is imported: one whose tables are given has been.
+    No library is imported, because the library of a given table is loaded already.
     """
     library, kind = type(log).__module__.partition(".")[0], type(log).__name__
     if isinstance(log, Mapping) and library != "xarray":
@@ -75,7 +75,7 @@ def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:
 
 
 def _of_pandas(table: Any) -> dict[str, np.ndarray]:
-    """Return the columns of a pandas table, and its index where that has a name."""
+    """Return the columns of a pandas table, and its index if that has a name."""
     twice = table.columns[table.columns.duplicated()]
     if len(twice):
         raise InputError(f"has two columns {str(twice[0])!r}", where="DataFrame", hint="rename one of them")

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jaxid.estimators.estimate import Estimate
     from jaxid.gap import Gap
     from jaxid.model.plant import Plant
+    from jaxid.model.unknowns import Free
     from jaxid.session import Session
 
 
@@ -50,11 +51,16 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
         if f.index is None:
             out[f.name] = entry
             continue
-        listed = out.setdefault(f.name.partition("[")[0], _known(np.asarray(leaf(plant, f.path)), f.unit))
+        listed = out.setdefault(_key(f), _known(np.asarray(leaf(plant, f.path)), f.unit))
         for key in ("value", "std", "identifiable"):
             *row, at = np.atleast_1d(f.index)
             (listed[key][row[0]] if row else listed[key])[at] = entry[key]
     return out
+
+
+def _key(f: Free) -> str:
+    """Return the key of an unknown in results: its name, or that of the plant's list in which it is."""
+    return f.name if f.index is None else str(f.path[0])
 
 
 def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
@@ -194,10 +200,11 @@ def notes(session: Session, estimate: Estimate) -> list[str]:
 def effect_json(effect: NamedEffect, estimate: Estimate) -> dict[str, Any]:
     """Return one entry of `effects` in discovery.json."""
     parameters = parameters_json(estimate, effect.names)
+    fields = {f.name: str(f.path[-1]) for f in estimate.machine.parameters.free}
     return {
         "kind": effect.kind,
         effect.place[0]: effect.place[1],
-        "parameters": {name.rpartition(".")[2]: entry for name, entry in parameters.items()},
+        "parameters": {fields[name]: entry for name, entry in parameters.items()},
         "evidence": effect.score.evidence,
         "alternatives": [_alternative(s, estimate.machine.plant) for s in effect.alternatives],
     }
@@ -230,7 +237,7 @@ def where_json(result: Discovery) -> dict[str, Any] | None:
 
 def discovery_json(result: Discovery) -> dict[str, Any]:
     """Return the content of discovery.json."""
-    declared = result.session.machine.parameters.names
+    declared = {_key(f) for f in result.session.machine.parameters.free}
     before, after = result.gaps_before, result.gaps_after
     on = "validation" if len(after) > 1 else "fit"
     judged = slice(1, None) if len(after) > 1 else slice(0, 1)
@@ -264,11 +271,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
                 "after": _worst(after[judged], "simulation.rms"),
             },
         },
-        "parameters": {
-            k: v
-            for k, v in parameters_json(result.after).items()
-            if any(n == k or n.startswith(f"{k}[") for n in declared)
-        },
+        "parameters": {k: v for k, v in parameters_json(result.after).items() if k in declared},
         **derived_json(result.session, result.after),
         "covariance": covariance_of(result.after).json(),
         "unidentifiable": [{"combination": c} for c in result.after.precision.unidentifiable],

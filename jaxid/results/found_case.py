@@ -196,19 +196,30 @@ def save_found_case(result: FitResult, path: Path, *, overwrite: bool = False) -
 
 
 def changed_in_python(case: Case) -> bool:
-    """Whether a case is no longer what its file says."""
-    return not case.path.is_file() or repr(load_case(case.path)) != repr(case)
+    """Return whether a case differs from the file, or the tables, that it was read from."""
+    source = _source(case)
+    return source is None or repr(load_case(source)) != repr(case)
+
+
+def _source(case: Case) -> Any:
+    """Return the file or the tables that a case was read from; None if there are none."""
+    if case.path is None:
+        return getattr(case, "tables", None)
+    return case.path if case.path.is_file() else None
 
 
 def _text(case: Case) -> str:
     """Return the TOML of a case as it was read."""
+    import tomlkit
+
     if changed_in_python(case):
         raise InputError(
-            "the case was changed in Python, and its file cannot say what was found",
+            "the case was changed in Python, and differs from its file",
             where=str(case.path),
             hint="use case(), or write the changes to the file first",
         )
-    return case.path.read_bytes().decode("utf-8-sig")
+    source = _source(case)
+    return source.read_bytes().decode("utf-8-sig") if isinstance(source, Path) else tomlkit.dumps(source)
 
 
 def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:

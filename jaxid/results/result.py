@@ -35,7 +35,7 @@ class FitResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the solver converged."""
+        """The flag of the solver's convergence."""
         return self.estimate.converged
 
     @property
@@ -119,7 +119,7 @@ class FitResult:
     def case(self) -> Case:
         """Return the case with what was found: estimates as guesses, and the effects that a search added.
 
-        What the case knows stays known. An unknown that the log does not determine keeps its guess.
+        A known value stays known. An unknown that the log does not determine keeps its guess.
         """
         from jaxid.results.found_case import found_case
 

@@ -113,7 +113,7 @@ class Plan:
 
     @property
     def fits(self) -> bool:
-        """Whether anything is fitted to the logs."""
+        """The flag of a study that fits anything to the logs."""
         return set(self.estimators) != {IN_LOOP}
 
     @property
