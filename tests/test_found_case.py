@@ -15,7 +15,7 @@ from jaxid import Action, Effect, parameter
 
 class Lump(Effect):
     kind = "lump"
-    level = parameter("force", "nonnegative", "height")
+    level: object = parameter("force", "nonnegative", "height")
 
     def act(self, x, state):
         import jax.numpy as jnp

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+import xarray
 from cli_setup import COULOMB, TRUTH, VISCOUS, place, recorded, text
 from matplotlib.figure import Figure
 
@@ -196,3 +197,46 @@ def test_a_discovery_looks_like_an_identification(found):
     assert [*found.parameters] == found.after.names
     assert found.parameters["coulomb_friction.level"].guess is None
     assert COULOMB[0] in found.kinds
+
+
+@pytest.fixture(scope="module")
+def studied():
+    """A study of two estimators, two noise levels and two parameters, forty runs each."""
+    rng, shape = np.random.default_rng(0), (2, 2, 40, 2)
+    dims, run = ("estimator", "noise", "run", "parameter"), ("estimator", "noise", "run")
+    table = xarray.Dataset(
+        {
+            "estimate": (dims, 1.0 + 0.1 * rng.standard_normal(shape)),
+            "std": (dims, np.full(shape, 0.1)),
+            "identifiable": (dims, np.ones(shape, np.int8)),
+            "converged": (run, np.ones(shape[:3], np.int8)),
+            "message": (run, np.full(shape[:3], "", object)),
+            "named": (run, np.full(shape[:3], "", object)),
+            "truth": (("run", "parameter"), np.ones((40, 2))),
+            "bound": (("noise", "parameter"), np.full((2, 2), 0.09)),
+            "unit": ("parameter", np.array(["kg", "N"], object)),
+        },
+        coords={
+            "estimator": np.array(["output_error", "didim"], object),
+            "noise": [1.0, 2.0],
+            "parameter": np.array(["inertia", "friction"], object),
+        },
+    )
+    return jaxid.Study(table, 1.0, "axis")
+
+
+@pytest.mark.parametrize("kind", ["errors", "coverage", "scatter"])
+def test_plots_of_a_study(kind, studied):
+    ax = Figure().add_subplot()
+    assert studied.plot(kind, ax, parameter="friction") is ax
+    assert ax.get_ylabel().startswith("friction")
+    with pytest.raises(jaxid.InputError, match="parameter 'fricton' is not known; did you mean 'friction'"):
+        studied.plot(kind, ax, parameter="fricton")
+    with pytest.raises(jaxid.InputError, match="plot 'fit' is not known"):
+        studied.plot("fit")
+
+
+def test_tables_of_a_study(studied):
+    assert len(studied.to_pandas()) == len(studied.summary) == 8
+    assert repr(studied).splitlines()[0].startswith("Study of axis: 40 runs under 2 setting(s)")
+    assert studied._repr_html_().count("<tr>") == 9
