@@ -42,7 +42,7 @@ def checked(folder):
 def test_parameters_by_name(fitted):
     inertia = fitted.parameters["inertia"]
     assert inertia.value == fitted.value("inertia") == pytest.approx(TRUTH["inertia"], rel=0.05)
-    assert (inertia.unit, inertia.identifiable, inertia.guess) == ("kg", True, pytest.approx(47.55))
+    assert (inertia.unit, inertia.identifiable, inertia.guess) == ("kg", True, pytest.approx(95.1 / 1.5))
     assert 0 < inertia.std < 0.05 * inertia.value
     assert [*fitted.parameters] == fitted.estimate.names
     with pytest.raises(KeyError, match="did you mean 'inertia'"):
