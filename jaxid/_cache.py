@@ -1,7 +1,7 @@
-"""Compiled code that commands keep on disk: the second run of a command compiles nothing.
+"""Compiled code that commands keep on disk, so that the second run of a command compiles nothing.
 
-JAX's own persistent cache does the work. Here is where it lies, how large it may grow, and what
-becomes of an entry that cannot be read: another run may be writing it, or was killed while it did.
+It is the persistent cache of JAX. This module chooses its folder, limits its size, and removes entries that
+cannot be read because another run is writing them or was killed while it did.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 _MOST_BYTES = 500_000_000
-# Faster than that, compiling costs little more than reading.
+# Below this time [s], compiling costs little more than reading.
 _SECONDS = 0.02
 _ENTRIES = "*-cache"
 _UNREADABLE = "Error reading persistent compilation cache entry for '([^']*)'"
@@ -26,9 +26,9 @@ _UNWRITTEN = "Error writing persistent compilation cache entry"
 
 
 def configure() -> None:
-    """Keep compiled code, unless the user has told JAX where to, or `JAXID_CACHE` is `off`.
+    """Keep compiled code, unless the user has set the folder of JAX's cache, or `JAXID_CACHE` is `off`.
 
-    To be called before JAX is imported; it goes through the environment, as JAX's users do.
+    Call it before JAX is imported, because it sets environment variables.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or os.environ.get("JAXID_CACHE") == "off":
         return
@@ -51,7 +51,7 @@ def _home() -> Path:
 
 
 def _host() -> str:
-    """What code compiled for this processor goes under: a home may be shared by many."""
+    """Return a name for this kind of processor, because machines of several kinds may share a home."""
     try:
         info = Path("/proc/cpuinfo").read_text()
         features = next((line for line in info.split("\n") if line.startswith(("flags", "Features"))), "")
@@ -61,7 +61,7 @@ def _host() -> str:
 
 
 def _shrink(folder: Path) -> None:
-    """Remove what was written first where it is too much."""
+    """Remove the oldest entries of a cache that is too large."""
     stats = [(path.stat(), path) for path in folder.glob(_ENTRIES)]
     total = 0
     for _, size, path in sorted(((s.st_mtime, s.st_size, path) for s, path in stats), reverse=True):
@@ -71,25 +71,25 @@ def _shrink(folder: Path) -> None:
 
 
 def _heal(folder: Path) -> None:
-    """Compile again what cannot be read, without a word, and remove it when the command ends.
+    """Compile unreadable entries again without a warning, and remove them when the command ends.
 
-    JAX compiles such an entry anew but leaves it as it is, to warn of it again in every run. It names
-    the function; of its entries those go that are older than this run. What another run is writing
-    just now is whole by then, and newer.
+    JAX compiles such an entry anew but keeps the file, and warns of it again in every run. Its warning names
+    the function, and the entries of that name are removed if they are older than this run. An entry that
+    another run is writing at this moment is whole by then, and newer.
     """
-    found: set[str] = set()
+    unreadable_names: set[str] = set()
     shown, begun = warnings.showwarning, time.time()
 
     def note(message: Any, *rest: Any, **more: Any) -> None:
         unreadable = re.match(_UNREADABLE, str(message))
         if unreadable:
-            found.add(unreadable[1])
+            unreadable_names.add(unreadable[1])
         elif not str(message).startswith(_UNWRITTEN):
             shown(message, *rest, **more)
 
     def clear() -> None:
         for path in folder.glob(_ENTRIES):
-            if any(path.name.startswith(name) for name in found):
+            if any(path.name.startswith(name) for name in unreadable_names):
                 with contextlib.suppress(OSError):
                     if path.stat().st_mtime < begun:
                         path.unlink()

@@ -1,7 +1,7 @@
 """The two process-wide settings that jaxid needs: float64, and XLA's loop flag.
 
-Both are made through the environment, so that importing jaxid does not import JAX; where JAX is
-already imported its configuration is updated instead. What the user had set is kept.
+Both are set through the environment, so that importing jaxid does not import JAX. If JAX is imported
+already, its configuration is updated instead. Settings of the user are kept.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def configure() -> None:
 
 
 def _with_loop_flag(flags: str) -> str:
-    """Append the option, inside the user's own xla_backend_extra_options where there is one.
+    """Append the option, inside the user's xla_backend_extra_options if that is set.
 
     XLA keeps only the last occurrence of a flag, so a second one would undo the user's.
     """

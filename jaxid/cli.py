@@ -1,4 +1,4 @@
-"""The command line: thin covers of the Python interface, loaded only when asked for."""
+"""The command line: a thin layer over the Python interface, which is loaded when a command needs it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("jaxid: interrupted", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        # Whoever read the output has gone; Python would complain once more when it ends.
+        # The reader of the output has ended; Python would report that once more at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -48,10 +48,20 @@ def entry() -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose complaints are one line too, with exit status 2."""
+    """A parser whose errors are one line, with exit status 2."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(message, hint=f"see {self.prog} --help")
+
+
+class _Version(argparse.Action):
+    """The option `--version`, which looks the version up only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from jaxid import __version__
+
+        print(f"jaxid {__version__}")
+        parser.exit()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -59,13 +69,14 @@ def _parser() -> argparse.ArgumentParser:
         prog="jaxid",
         description="Identify machines with friction, and find the physics that a simulation is missing.",
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _demo(commands)
-    for name, what, run in (
-        ("plants", "the plants there are, with parameters and units", _run_plants),
-        ("effects", "the effects there are, with parameters and units", _run_effects),
+    for name, purpose, run in (
+        ("plants", "list the plants with their parameters and units", _run_plants),
+        ("effects", "list the effects with their parameters and units", _run_effects),
     ):
-        commands.add_parser(name, help=what, description=what).set_defaults(run=run)
+        commands.add_parser(name, help=purpose, description=purpose).set_defaults(run=run)
     _schema(commands)
     _simulate(commands)
     _design(commands)
@@ -84,39 +95,41 @@ def _schema(commands: argparse._SubParsersAction) -> None:
 
 
 def _add(
-    commands: argparse._SubParsersAction, name: str, what: str, run: Callable
+    commands: argparse._SubParsersAction, name: str, purpose: str, run: Callable
 ) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=what, description=what)
+    parser = commands.add_parser(name, help=purpose, description=purpose)
     parser.set_defaults(run=run)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    parser.add_argument("--force", action="store_true", help="overwrite what jaxid did not make")
+    parser.add_argument("--force", action="store_true", help="overwrite files that jaxid did not make")
     return parser
 
 
 def _demo(commands: argparse._SubParsersAction) -> None:
-    what = "the whole way, check to report, on a log that ships with jaxid"
-    parser = _add(commands, "demo", what, _run_demo)
-    parser.add_argument("-o", metavar="DIR", default="jaxid-demo", help="default: jaxid-demo")
+    purpose = "run check, identify and discover on a log that ships with jaxid"
+    parser = _add(commands, "demo", purpose, _run_demo)
+    parser.add_argument(
+        "-o", metavar="DIR", default="jaxid-demo", help="folder for the results; default: jaxid-demo"
+    )
 
 
 def _simulate(commands: argparse._SubParsersAction) -> None:
-    parser = _add(commands, "simulate", "the log that a case would give", _run_simulate)
+    parser = _add(commands, "simulate", "simulate the log that a case describes", _run_simulate)
     parser.add_argument("case", metavar="CASE.toml")
-    parser.add_argument("-o", metavar="LOG.csv", required=True)
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the sensors' noise")
+    parser.add_argument("-o", metavar="LOG.csv", required=True, help="file to write the log to")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the noise; default: 0")
 
 
 def _design(commands: argparse._SubParsersAction) -> None:
-    what = "the reference, or input, within [limits] whose log would tell the unknowns best"
-    parser = _add(commands, "design", what, _run_design)
+    purpose = "find the reference or input within [limits] whose log identifies the unknowns best"
+    parser = _add(commands, "design", purpose, _run_design)
     parser.add_argument("case", metavar="CASE.toml")
-    parser.add_argument("-o", metavar="SIGNAL.csv", required=True)
+    parser.add_argument("-o", metavar="SIGNAL.csv", required=True, help="file to write the signal to")
 
 
 def _logs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("case", metavar="CASE.toml")
     parser.add_argument("log", metavar="LOG")
-    parser.add_argument("-o", metavar="DIR", help="where results go; absent: only printed")
+    parser.add_argument("-o", metavar="DIR", help="folder for the results; default: only print them")
 
 
 def _validate(parser: argparse.ArgumentParser) -> None:
@@ -125,7 +138,7 @@ def _validate(parser: argparse.ArgumentParser) -> None:
         metavar="LOG2",
         action="append",
         default=[],
-        help="a log to validate on, beside the case's own; may be repeated",
+        help="a log to validate on, beside those of the case; may be repeated",
     )
 
 
@@ -154,8 +167,8 @@ def _need_numerics(args: argparse.Namespace) -> None:
 
 
 def _check(commands: argparse._SubParsersAction) -> None:
-    what = "before any fit: is the log sound, does it excite what is asked, what can be told apart"
-    _logs(_add(commands, "check", what, _run_check))
+    purpose = "check before any fit whether a log is sound and excites the unknowns of a case"
+    _logs(_add(commands, "check", purpose, _run_check))
 
 
 def _identify(commands: argparse._SubParsersAction) -> None:
@@ -164,8 +177,8 @@ def _identify(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--method", metavar="M", default="output_error", help=", ".join(METHODS))
     parser.add_argument(
         "--on",
-        metavar="WHAT",
-        help=f"what output_error fits in a closed loop: {', '.join(OUTPUTS)}; absent: as the case says, "
+        metavar="OUTPUT",
+        help=f"output of the loop that output_error fits: {', '.join(OUTPUTS)}; default: that of the case, "
         "or position",
     )
     _numerics(parser)
@@ -173,38 +186,46 @@ def _identify(commands: argparse._SubParsersAction) -> None:
 
 
 def _discover(commands: argparse._SubParsersAction) -> None:
-    what = "find the effects that a case's model is missing, add them, show the gap shrink"
-    parser = _add(commands, "discover", what, _run_discover)
+    purpose = "find the effects that a case's model lacks, and write the case with them"
+    parser = _add(commands, "discover", purpose, _run_discover)
     _logs(parser)
     _validate(parser)
-    parser.add_argument("--max-effects", metavar="N", type=int, default=5, help="default: 5")
+    parser.add_argument(
+        "--max-effects", metavar="N", type=int, default=5, help="most effects to add; default: 5"
+    )
     _numerics(parser)
     parser.add_argument(
         "--experiments",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="design experiments that tell rivals apart; default: not of arms, where it takes minutes",
+        help="design experiments that separate rival effects; default: except for arms (minutes)",
     )
 
 
 def _study(commands: argparse._SubParsersAction) -> None:
-    what = "simulate and identify a case over and over: bias, spread, and whether intervals hold the truth"
-    parser = _add(commands, "study", what, _run_study)
+    purpose = "simulate and identify a case many times: bias, spread and coverage of the intervals"
+    parser = _add(commands, "study", purpose, _run_study)
     parser.add_argument("case", metavar="CASE.toml")
-    parser.add_argument("-o", metavar="DIR", help="where chunks and results go; absent: only printed")
+    parser.add_argument("-o", metavar="DIR", help="folder for chunks and results; default: only print them")
     parser.add_argument(
-        "--runs", metavar="N", type=int, help="under each setting; absent: the case's, or 100"
+        "--runs", metavar="N", type=int, help="runs under each setting; default: those of the case, or 100"
     )
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything drawn; default: 0")
-    parser.add_argument("--resume", action="store_true", help="go on with what was interrupted")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of all draws; default: 0")
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted study")
     parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a Dask scheduler, whose workers share the work"
+        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers run the chunks"
     )
+
+
+class Savable(Protocol):
+    """A result that writes itself to a folder."""
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path: ...
 
 
 @contextmanager
 def _progress(args: argparse.Namespace, stages: int):
-    """A bar on a terminal, nothing when piped or quiet."""
+    """Show a progress bar on a terminal, and nothing when piped or quiet."""
     from tqdm import tqdm
 
     with tqdm(
@@ -215,16 +236,16 @@ def _progress(args: argparse.Namespace, stages: int):
         bar_format="{desc:42.42s} |{bar}| {elapsed}",
     ) as bar:
 
-        def tell(text: str) -> None:
+        def show(text: str) -> None:
             bar.set_description_str(text)
             if bar.n < stages - 1:
                 bar.update()
 
-        yield tell
+        yield show
 
 
 def _ready(args: argparse.Namespace, *files: str) -> None:
-    """Refuse before the work what could not be written after it."""
+    """Refuse a folder before the work if the results could not be written to it."""
     if args.o is not None:
         from jaxid.files import check_folder
 
@@ -260,8 +281,8 @@ def _run_simulate(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}", hint="give zero or more")
     path = ready_file(Path(args.o), overwrite=args.force)
-    with _progress(args, 2) as tell:
-        tell("simulating")
+    with _progress(args, 2) as show:
+        show("simulating")
         from jaxid.commands.simulate import simulate
 
         simulated_log = simulate(args.case, seed=args.seed)
@@ -274,10 +295,10 @@ def _run_design(args: argparse.Namespace) -> int:
     from jaxid.files import ready_file
 
     path = ready_file(Path(args.o), overwrite=args.force)
-    with _progress(args, 4) as tell:
+    with _progress(args, 4) as show:
         from jaxid.commands.design import design
 
-        found = design(args.case, progress=tell)
+        found = design(args.case, progress=show)
     found.save(path)
     print(f"{found}\n{len(found.time)} ticks of the {found.signal} in {path}")
     return 0
@@ -285,8 +306,8 @@ def _run_design(args: argparse.Namespace) -> int:
 
 def _run_check(args: argparse.Namespace) -> int:
     _ready(args, "check.json")
-    with _progress(args, 2) as tell:
-        tell("checking")
+    with _progress(args, 2) as show:
+        show("checking")
         from jaxid.commands.check import check
 
         result = check(args.case, args.log)
@@ -301,8 +322,8 @@ def _run_identify(args: argparse.Namespace) -> int:
     if args.on is not None and args.on not in OUTPUTS:
         raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
     _ready(args, "result.json", "report.html")
-    with _progress(args, 4) as tell:
-        tell("starting")
+    with _progress(args, 4) as show:
+        show("starting")
         from jaxid.commands.identify import identify
 
         result = identify(
@@ -313,7 +334,7 @@ def _run_identify(args: argparse.Namespace) -> int:
             minimiser=args.minimiser,
             on=args.on,
             validate=args.validate,
-            progress=tell,
+            progress=show,
         )
     print(result)
     return _finish(args, result, "result.json", "report.html")
@@ -323,11 +344,16 @@ def _run_discover(args: argparse.Namespace) -> int:
     if args.max_effects < 0:
         raise InputError(f"--max-effects is {args.max_effects}", hint="give zero or more")
     _need_numerics(args)
-    # An experiment's name follows from what is found: any that is there already may be meant.
-    there = [] if args.o is None else [p.name for p in Path(args.o).glob("separate_*.csv")]
-    _ready(args, "discovery.json", "report.html", *there)
-    with _progress(args, 40) as tell:
-        tell("starting")
+    # An experiment's name follows from the effects found: any that exists already may be meant.
+    if args.o is not None:
+        from jaxid.files import found_case_file
+
+        folder = Path(args.o)
+        experiments = [p.name for p in folder.glob("separate_*.csv")]
+        corrected = found_case_file(Path(args.case), folder)
+        _ready(args, "discovery.json", "report.html", corrected, *experiments)
+    with _progress(args, 40) as show:
+        show("starting")
         from jaxid.commands.discover import discover
 
         result = discover(
@@ -338,12 +364,12 @@ def _run_discover(args: argparse.Namespace) -> int:
             solver=args.solver,
             minimiser=args.minimiser,
             experiments=args.experiments,
-            progress=tell,
+            progress=show,
         )
     print(result)
     from jaxid.results.as_json import discovery_files
 
-    return _finish(args, result, *discovery_files(result))
+    return _finish(args, result, *discovery_files(result, Path(args.o or ".")))
 
 
 def _run_study(args: argparse.Namespace) -> int:
@@ -353,7 +379,7 @@ def _run_study(args: argparse.Namespace) -> int:
 
     with tqdm(disable=args.quiet or not sys.stderr.isatty(), leave=False, unit="run") as bar:
 
-        def tell(done: int, runs: int) -> None:
+        def show(done: int, runs: int) -> None:
             if bar.total is None:
                 bar.reset(total=runs)
                 bar.initial = done
@@ -367,7 +393,7 @@ def _run_study(args: argparse.Namespace) -> int:
             resume=args.resume,
             overwrite=args.force,
             scheduler=args.scheduler,
-            progress=tell,
+            progress=show,
         )
     print(result)
     if args.o is not None:
@@ -380,14 +406,15 @@ def _run_study(args: argparse.Namespace) -> int:
 def _run_demo(args: argparse.Namespace) -> int:
     from jaxid.demo import run_demo
 
-    with _progress(args, 40) as tell:
-        tell("starting")
-        text, converged = run_demo(Path(args.o), overwrite=args.force, progress=tell)
+    with _progress(args, 40) as show:
+        show("starting")
+        text, converged = run_demo(Path(args.o), overwrite=args.force, progress=show)
     print(text)
     return 0 if converged else 1
 
 
-def _finish(args: argparse.Namespace, result: object, *files: str) -> int:
+def _finish(args: argparse.Namespace, result: Savable, *files: str) -> int:
+    """Save a result where the user wants it, and return the exit status."""
     if args.o is not None:
         result.save(args.o, overwrite=args.force)
         print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in files)}")

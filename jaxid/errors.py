@@ -1,4 +1,4 @@
-"""The one exception for bad input, and the words that help to correct it."""
+"""The exception for bad input, and hints that help to correct it."""
 
 import difflib
 from collections.abc import Iterable
@@ -16,26 +16,26 @@ class InputError(ValueError):
 
         Args:
             what: The fault, with the offending value and its unit.
-            where: File, table, column or row in which it stands.
-            hint: What the user can do about it.
+            where: File, table, column or row of the fault.
+            hint: Action that corrects it.
         """
         line = f"{where}: {what}" if where else what
         if hint:
             line = f"{line}; {hint}"
-        # Texts of other libraries may hold line breaks; a shell user wants one line.
+        # Texts of other libraries may hold line breaks.
         super().__init__(" ".join(line.split()))
 
 
 def suggest(name: str, known: Iterable[str], *, limit: int = 12) -> str:
-    """Help with a misspelt name: the nearest one known, and what there is.
+    """Suggest the nearest known name for a misspelt one, and list the known names.
 
     Args:
-        name: What was asked for.
-        known: All names that would have done.
-        limit: At most so many names are listed.
+        name: The name that was given.
+        known: All names that are accepted.
+        limit: Largest number of names to list.
 
     Returns:
-        Build the hint of an `InputError`.
+        The hint of an `InputError`.
     """
     names = list(known)
     if not names:

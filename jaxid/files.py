@@ -1,4 +1,4 @@
-"""Writing results: whole or not at all, and never over what jaxid did not make."""
+"""Writing results: whole or not at all, and never over files that jaxid did not make."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MARK = ".jaxid"
 
 
 def plain(value: Any) -> Any:
-    """Turn arrays and numbers into what JSON knows; what is not finite becomes null."""
+    """Convert arrays and numbers to JSON types; numbers that are not finite become null."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray):
@@ -56,15 +56,15 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def check_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False) -> None:
-    """See that results may be written to a folder, before the work that makes them.
+    """Check that results may be written to a folder, before the work that makes them.
 
     Raises:
-        InputError: If it holds one of the files, jaxid did not make it, and `overwrite` is not given;
-            or if it is no folder.
+        InputError: If the folder holds one of the files, jaxid did not make it, and `overwrite` is false;
+            or if the path is that of a file.
     """
-    there = next((p for p in (folder, *folder.parents) if p.exists()), folder)
-    if there.exists() and not there.is_dir():
-        raise InputError("is a file, not a folder", where=str(there), hint="choose another -o")
+    existing = next((p for p in (folder, *folder.parents) if p.exists()), folder)
+    if existing.exists() and not existing.is_dir():
+        raise InputError("is a file, not a folder", where=str(existing), hint="choose another -o")
     taken = [f for f in files if (folder / f).exists()]
     if taken and not (folder / _MARK).exists() and not overwrite:
         raise InputError(
@@ -74,11 +74,22 @@ def check_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False)
         )
 
 
+def found_case_file(case: Path | None, folder: Path) -> str:
+    """Return the name of the corrected case in a folder: never that of the case itself.
+
+    Args:
+        case: The case file; None for a case without one.
+        folder: The folder of the results.
+    """
+    same = case is not None and case.resolve() == (folder / "case.toml").resolve()
+    return "case_found.toml" if same else "case.toml"
+
+
 def ready_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False) -> Path:
-    """Make a folder for results, where there is none.
+    """Make a folder for results if it does not exist.
 
     Raises:
-        InputError: As `check_folder`, or if it cannot be made.
+        InputError: If `check_folder` refuses it, or it cannot be made.
     """
     check_folder(folder, files, overwrite=overwrite)
     if not folder.exists():
@@ -87,7 +98,7 @@ def ready_folder(folder: Path, files: Sequence[str], *, overwrite: bool = False)
 
 
 def mark_folder(folder: Path) -> None:
-    """Make a folder jaxid's own, so that it may write there again.
+    """Make a folder and mark it as made by jaxid, which may then write there again.
 
     Raises:
         InputError: If it cannot be made.
@@ -102,11 +113,11 @@ def mark_folder(folder: Path) -> None:
 
 
 def ready_file(path: Path, *, overwrite: bool = False) -> Path:
-    """See that a log may be written, before the work that makes it.
+    """Check that a log may be written, before the work that makes it.
 
     Raises:
-        InputError: If it exists and `overwrite` is not given, or its folder does not; or if it is a
-            folder, or no CSV by its name.
+        InputError: If the file exists and `overwrite` is false, its folder does not exist, it is a folder, or
+            its name does not end in .csv.
     """
     if path.is_dir():
         raise InputError("is a folder", where=str(path), hint="name a file: -o LOG.csv")
@@ -126,12 +137,12 @@ def ready_file(path: Path, *, overwrite: bool = False) -> Path:
 
 
 def signal_csv(signal: str, time: np.ndarray, values: np.ndarray) -> str:
-    """Time and a signal as `[reference] kind = "csv"` (or `[input]`) takes them, every digit kept.
+    """Format time and a signal as `[reference] kind = "csv"` or `[input]` reads them, with every digit.
 
     Args:
         signal: "reference" or "input".
-        time: Ticks [s].
-        values: (ticks, m).
+        time: Time of the ticks [s].
+        values: Signal by drive, (ticks, m).
     """
     names = [signal] if values.shape[1] == 1 else [f"{signal}_{k + 1}" for k in range(values.shape[1])]
     rows = np.column_stack([time, values])

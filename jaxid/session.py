@@ -11,7 +11,8 @@ import numpy as np
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.errors import InputError
-from jaxid.logs.log import Log, read_log, with_load
+from jaxid.logs.in_memory import LogLike, as_log
+from jaxid.logs.log import Log, with_load
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine
@@ -55,6 +56,7 @@ class Session:
         validations: Further logs with their names, prepared by the same recipe.
         recipe: Filtering of all logs.
         findings: Warnings on the logs.
+        given: The case as it was given, where `case` is that of the joints (see `at_joints`).
     """
 
     case: Case
@@ -63,6 +65,12 @@ class Session:
     validations: tuple[OpenedLog, ...]
     recipe: Recipe
     findings: tuple[Finding, ...]
+    given: Case | None = None
+
+    @property
+    def declared(self) -> Case:
+        """The case as it was given, gears of the motors included."""
+        return self.case if self.given is None else self.given
 
     @property
     def runs(self) -> tuple[OpenedLog, ...]:
@@ -76,8 +84,8 @@ class Session:
 
 def open_session(
     case: CaseLike,
-    log: Log | str | Path,
-    validate: Sequence[Log | str | Path] = (),
+    log: LogLike,
+    validate: Sequence[LogLike] = (),
     *,
     align_hold: bool | None = None,
     method: str | None = None,
@@ -86,7 +94,7 @@ def open_session(
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log to fit, or its file.
+        log: The log to fit, its file, or a table with the columns that [log] names.
         validate: More logs to validate on, beside those of the case.
         align_hold: See `jaxid.logs.prepare.Recipe`; None: as the case's recipe implies.
         method: Method that will fit the log, or "discover": a fit within a prior can do with a short log.
@@ -95,6 +103,8 @@ def open_session(
     Raises:
         InputError: If anything in case or logs is unsound.
     """
+    if isinstance(validate, str) or not isinstance(validate, Sequence):
+        raise InputError("validate is not a list of logs", hint="put it into a list: validate=[log]")
     as_logged = load_case(case)
     case = at_joints(as_logged)
     fit = _read(as_logged, log)
@@ -132,7 +142,26 @@ def open_session(
         opened.append(_run(name, measured, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
     need_finite_effects(machine.plant, opened[0].data, fit.source)
-    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings))
+    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged)
+
+
+def open_another(session: Session, log: LogLike) -> OpenedLog:
+    """Open one more log for a session, prepared by the recipe of its others.
+
+    Args:
+        session: The session.
+        log: The log, its file, or a table; all its rows are taken.
+
+    Raises:
+        InputError: If the log is unsound.
+    """
+    case, machine = session.declared, session.machine
+    measured = _read(case, log, whole=True)
+    held = case.within_prior is not None
+    _check(at_joints(case), measured, machine, held)
+    needed = 0 if held else enough(machine)
+    name = Path(measured.source).stem
+    return _run(name, measured, machine, session.recipe, needed, machine.disturbance)
 
 
 def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None = None) -> Session:
@@ -153,20 +182,20 @@ def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None
     return Session(case, _scaled(machine, run.data), run, (), recipe, ())
 
 
-def _read(case: Case, log: Log | str | Path, *, columns: LogTable | None = None, whole: bool = False) -> Log:
+def _read(case: Case, log: LogLike, *, columns: LogTable | None = None, whole: bool = False) -> Log:
     """Return a log, or read it from a file; its forces and positions are those of the joints.
 
     Args:
         case: The case, as it was logged.
-        log: The log, or its file.
-        columns: Columns of the file; None: those of [log].
+        log: The log, its file, or a table of columns.
+        columns: Columns of the file or table; None: those of [log].
         whole: Whether to read all rows of the file.
     """
     joints, drives, load = case.plant.joints, case.plant.drives, case.plant.cls.load
     if not isinstance(log, Log):
         columns = case.columns if columns is None else columns
         columns = replace(columns, rows=None) if whole else columns
-        log = read_log(log, columns, joints=joints if load is None else None, drives=drives)
+        log = as_log(log, columns, joints=joints if load is None else None, drives=drives)
         return with_load(_without_gears(case, log), load, joints)
     log = with_load(log, load, joints)
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):

@@ -36,10 +36,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxid
-from jaxid.results.report import plots
-from jaxid.results.report.build import units_of, views
-from jaxid.sensors.encoder import Sensor
-from jaxid.simulation.replay import make_replay
 
 FAST = os.environ.get("JAXID_FAST") == "1"
 
@@ -79,8 +75,8 @@ plt.show()
 # %% [markdown]
 # ## Before any fit
 #
-# `check` looks whether the log is sound, and how well each unknown could be told if noise alone
-# stood between model and log.
+# `check` says whether the log is sound, and how well each unknown could be identified if noise
+# alone separated model and log.
 
 # %%
 print(jaxid.check(case_file, log_file))
@@ -94,26 +90,35 @@ print(jaxid.check(case_file, log_file))
 
 # %%
 declared = jaxid.identify(case_file, log_file, method="inverse_dynamics")
-print(declared)
+declared
 
 # %% [markdown]
-# The fit converged, and still the force gap stands far above the noise floor: what the sensors'
-# noise alone would leave. Something is there that the model does not have. Where? We draw the
-# residual, force measured minus force of the model, against velocity and against position.
+# Each parameter has a value, a standard deviation and a unit. `declared.covariance` holds their
+# covariance, and `declared.to_pandas()` makes a table of them.
 
 # %%
-fitted = views(declared)[0]
-units = units_of(declared.session)
-plots.plot_residual_against(fitted, units, variables=("velocity", "position"), size=(13, 3.6))
+inertia = declared.parameters["inertia"]
+print(f"inertia: {inertia.value:.2f} ± {inertia.std:.2f} {inertia.unit}, from a guess of {inertia.guess}")
+
+# %% [markdown]
+# The fit converged, and still the force gap is far above the noise floor, the part that the
+# sensors' noise alone would cause. The machine has something that the model does not have. We draw
+# the residual, force measured minus force of the model, against velocity and against position.
+
+# %%
+figure, axes = plt.subplots(1, 2, sharey=True, figsize=(13, 3.6), layout="constrained")
+declared.plot("scatter", axes[0], against="velocity")
+declared.plot("scatter", axes[1], against="position")
+plt.show()
 
 # %% [markdown]
 # Over velocity it is a cloud. Over position it is a wave: a force that repeats every 20 mm or so.
-# We have seen it; now let jaxid find it without being told.
+# We can see it; now let jaxid find it by itself.
 #
 # ## Find what is missing
 #
 # `discover` fits each effect that it knows to one part of the log and scores it on another,
-# then asks the second log to confirm. It adds the best, and goes on until nothing is worth it.
+# then asks the second log to confirm. It adds the best, and goes on until no effect is accepted.
 
 # %%
 quicker = {"refit": False, "max_effects": 1} if FAST else {}
@@ -125,37 +130,31 @@ print(found)
 # this is how it stood against all others:
 
 # %%
-step = next(step for step in found.rounds if step.step.added)
-scores = sorted(step.step.scores, key=lambda score: -score.evidence)
-for score in scores[:6]:
-    print(f"{score.candidate.kind:22s} {score.evidence:9.1f} nats")
+figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+found.plot("candidates", axes)
+plt.show()
 
 # %% [markdown]
-# The same residual, before and after, on one scale:
+# The same residual, before and after:
 
 # %%
-searched = views(found)[0]
-plots.plot_residual_against(searched, units, variables=("velocity", "position"), size=(13, 5.6))
+figure, axes = plt.subplots(1, 2, sharey=True, figsize=(13, 3.6), layout="constrained")
+found.plot("scatter", axes[0], against="velocity")
+found.plot("scatter", axes[1], against="position")
+plt.show()
 
 # %% [markdown]
 # ## Make it part of the model
 #
-# What was found goes into the case file, as any other effect would. The values found make good
-# guesses.
+# `save_case` writes the case with the effect in it and the estimates as guesses; everything else
+# of the case file stays, comments too. `found.case()` is the same case without a file.
 
 # %%
-lines = []
-for effect in found.effects:
-    lines += ["", "[[effects]]", f'kind = "{effect.kind}"']
-    for name in effect.names:
-        guess = found.after.value(name)
-        lines.append(f"{name.rpartition('.')[2]} = {{ guess = {guess:.5g} }}")
-print("\n".join(lines))
+extended_file = found.save_case(folder / "extended.toml")
+print(extended_file.read_text())
 
-extended_file = folder / "extended.toml"
-extended_file.write_text(case_file.read_text() + "\n".join(lines) + "\n")
 extended = jaxid.identify(extended_file, log_file, method="inverse_dynamics")
-print(extended)
+extended
 
 # %% [markdown]
 # Now compare: the force that each model leaves unexplained (RMS), on the log that was fitted and
@@ -168,7 +167,7 @@ for before, after in zip(declared.gaps, extended.gaps, strict=True):
     print(f"{before.name:12s} {row[0]:8.3f} N {row[1]:8.3f} N {row[2]:10.3f} N")
 
 # %% [markdown]
-# What is left is close to noise, and inertia and friction are at their true values (95.1 kg,
+# The rest is close to noise, and inertia and friction are at their true values (95.1 kg,
 # 203.5 N s/m, 20.39 N), known far better than before.
 #
 # ## Everything is differentiable
@@ -176,11 +175,11 @@ for before, after in zip(declared.gaps, extended.gaps, strict=True):
 # A fitted machine is a function that JAX can differentiate: from parameters to the position over
 # the whole log, controller, dry friction and all. `make_replay` holds the log's reference; call it
 # with a plant and get the motion. (The encoder's rounding is left out: we are about to compare
-# with finite differences, and these see steps where a derivative sees none.)
+# with finite differences, and rounding would turn these into steps.)
 
 # %%
-machine = replace(extended.estimate.machine, sensor=Sensor())
-replay = make_replay(machine, extended.session.fit.log)
+machine = replace(extended.estimate.machine, sensor=jaxid.Sensor())
+replay = jaxid.make_replay(machine, extended.session.fit.log)
 
 
 @jax.jit
@@ -199,8 +198,8 @@ for k, name in enumerate(machine.parameters.names):
     print(f"{name:30s} derivative and finite difference: {off:.0e} apart")
 
 # %% [markdown]
-# How far the simulated position moves if a parameter grows by one percent: what a fit in position
-# would see of it, and when. Micrometres, as said: the loop is stiff.
+# How far the simulated position moves if a parameter grows by one percent, which is what a fit in
+# position depends on. It moves by micrometres, because the loop is stiff.
 
 # %%
 figure, axes = plt.subplots(figsize=(10, 3.6), layout="constrained")
@@ -223,4 +222,4 @@ plt.show()
 # jaxid discover case.toml log.csv -o results
 # ```
 #
-# For a machine of your own: write its case file, name the columns of its log, and run `check`.
+# For your machine: write its case file, name the columns of its log, and run `check`.

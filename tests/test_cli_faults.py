@@ -78,7 +78,7 @@ def test_faults_of_the_case(tmp_path, sound, capsys, old, new, told):
 def test_a_case_without_unknowns_has_nothing_to_identify(tmp_path, sound, capsys):
     known = "\n".join(line.replace("{ guess = ", "").replace(" }", "") for line in text().splitlines())
     case, log = place(tmp_path / "in", sound, known)
-    refused(capsys, tmp_path, "identify", case, log, told="nothing is unknown")
+    refused(capsys, tmp_path, "identify", case, log, told="no parameter is unknown")
 
 
 def test_simulate_needs_to_know_what(tmp_path, files, capsys):

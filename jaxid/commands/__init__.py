@@ -1,1 +1,1 @@
-"""The commands, one file each: check, identify, discover and study, and following a machine live."""
+"""The commands, one file each, and the controller of a case in a running loop."""

@@ -1,37 +1,43 @@
-"""Before any fit: is the log sound, does it excite what is asked, what can be told apart."""
+"""The command `check`: whether a log is sound and excites the unknowns of a case, before any fit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Array
 from jaxid.case.case import CaseLike
 from jaxid.estimators.inverse_dynamics import force_precision
 from jaxid.files import ready_folder, write_json
 from jaxid.gap import noise_floor
-from jaxid.logs.log import Log
+from jaxid.logs.in_memory import LogLike
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.precision import Precision
 from jaxid.session import Session, open_session
 from jaxid.simulation.force_balance import ForceData, force_residual, force_size, sharpened
 
+if TYPE_CHECKING:
+    import pandas
 
-@dataclass(frozen=True)
+    from jaxid.results.parameters import Covariance, ParameterTable
+
+
+@dataclass(frozen=True, repr=False)
 class Check:
-    """What `check` returns.
+    """Result of `check`.
 
     Args:
         session: Case and logs.
-        precision: What the log could tell at best, linearised at the guesses, if noise alone
-            stood between model and log.
+        precision: Smallest standard deviations that the log allows, linearised at the guesses, if noise alone
+            separates model and log.
         noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
     """
 
@@ -41,17 +47,52 @@ class Check:
 
     @property
     def warnings(self) -> list[str]:
-        """What is doubtful about the logs."""
+        """Doubts about the logs, a line each."""
         return [f"{f.where}: {f.what}; {f.hint}" for f in self.session.findings]
 
+    @property
+    def parameters(self) -> ParameterTable:
+        """The unknowns by name: their guess, and the smallest standard deviation that the log allows."""
+        from jaxid.results.parameters import Parameter, ParameterTable
+
+        free = self.session.machine.parameters.free
+        rows = zip(free, self.precision.std, self.precision.identifiable, strict=True)
+        return ParameterTable(
+            [
+                Parameter(
+                    name=f.name,
+                    value=f.guess,
+                    std=float(std) if ok else np.nan,
+                    unit=f.unit,
+                    identifiable=bool(ok),
+                    guess=f.guess,
+                )
+                for f, std, ok in rows
+            ]
+        )
+
+    @property
+    def covariance(self) -> Covariance:
+        """Smallest covariance that the log allows, with the names of the unknowns."""
+        from jaxid.results.parameters import Covariance
+
+        return Covariance(tuple(self.session.machine.parameters.names), self.precision.covariance)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table with a row for each unknown; needs pandas."""
+        return self.parameters.to_pandas()
+
     def json(self) -> dict[str, Any]:
-        """Content of check.json."""
+        """Return the content of check.json."""
         from jaxid.results.as_json import recipe_json
 
         session, log = self.session, self.session.fit.log
         free = session.machine.parameters.free
-        told = self.precision.identifiable
-        seen = lambda x: np.where(log.measured, x, np.nan)
+        identifiable = self.precision.identifiable
+
+        def at_encoders(x: np.ndarray) -> np.ndarray:
+            return np.where(log.measured, x, np.nan)
+
         return {
             "sound": True,
             "warnings": self.warnings,
@@ -60,10 +101,10 @@ class Check:
                 "rate_hz": log.rate_hz,
                 "duration_s": log.period * log.samples,
                 "stroke": np.ptp(log.position, axis=0),
-                "peak_velocity": np.abs(seen(session.fit.data.qd)).max(axis=0),
+                "peak_velocity": np.abs(at_encoders(session.fit.data.qd)).max(axis=0),
                 "peak_force": np.abs(session.fit.data.force).max(axis=0),
                 "moving": float(session.fit.data.moving.mean()),
-                "position_noise": seen(signals.high_band_std(log.filled)),
+                "position_noise": at_encoders(signals.high_band_std(log.filled)),
             },
             "preprocess": recipe_json(session),
             "noise_floor": self.noise_floor,
@@ -74,16 +115,26 @@ class Check:
                     "unit": f.unit,
                     "identifiable": bool(ok),
                 }
-                for f, s, ok in zip(free, self.precision.std, told, strict=True)
+                for f, s, ok in zip(free, self.precision.std, identifiable, strict=True)
             },
             "unidentifiable": [{"combination": c} for c in self.precision.unidentifiable],
             "condition": float(np.sqrt(1 / max(self.precision.information[0], 1e-30))) if len(free) else None,
         }
 
+    def __repr__(self) -> str:
+        from jaxid.results.as_text import check_summary
+
+        return check_summary(self)
+
     def __str__(self) -> str:
         from jaxid.results.as_text import check_table
 
         return check_table(self)
+
+    def _repr_html_(self) -> str:
+        from jaxid.results.as_html import check_html
+
+        return check_html(self)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write `check.json` to a folder.
@@ -96,13 +147,13 @@ class Check:
         return folder
 
 
-def check(case: CaseLike, log: Log | str | Path, *, validate: Sequence[Log | str | Path] = ()) -> Check:
+def check(case: CaseLike, log: LogLike, *, validate: Sequence[LogLike] = ()) -> Check:
     """Check a log against a case before any fit.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log, or its file.
-        validate: More logs to check, beside the case's own.
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
+        validate: More logs to check, beside those of the case.
 
     Raises:
         InputError: If case or log are unsound.
@@ -126,7 +177,7 @@ def check(case: CaseLike, log: Log | str | Path, *, validate: Sequence[Log | str
 
 
 @eqx.filter_jit
-def _jacobian(plant: Any, places: tuple, data: ForceData, theta: jax.Array) -> jax.Array:
+def _jacobian(plant: Any, places: tuple, data: ForceData, theta: Array) -> Array:
     if theta.size == 0:
         return jnp.zeros((*data.weight.shape, 0))
     return jax.jacfwd(lambda t: force_residual(scatter(places, plant, t), data))(theta)

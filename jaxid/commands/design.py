@@ -1,4 +1,4 @@
-"""The command `design`: the experiment whose log would identify a case's unknowns best."""
+"""The command `design`: the experiment whose log identifies the unknowns of a case best."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from jaxid.scene import sampling_of
 
 
 def design(case: CaseLike, *, progress: Callable[[str], None] = lambda text: None) -> Design | Excitation:
-    """Find the reference (in a loop) or the input that tells a case's unknowns best, at its guesses.
+    """Find the reference, or in open loop the input, that identifies the unknowns of a case best.
 
-    Of an arm, and of any case with a key in [design], the reference is taken to be followed: see
-    `jaxid.experiment_design.along_reference.excite`. Else:
-
-    The logarithm of the information's determinant is raised through the simulation by gradients (D-optimal;
-    Bayesian: each guess is a prior of the relative width `[within_prior] prior`, 0.5 where absent), over sums
-    of sines and a tour from end to end, within [limits].
+    For an arm, and for any case with a key in [design], the machine is assumed to follow the reference: see
+    `jaxid.experiment_design.along_reference.excite`. Otherwise gradients through the simulation maximise the
+    logarithm of the determinant of the information matrix at the guesses (D-optimal; Bayesian: each guess is
+    a prior of the relative width `[within_prior] prior`, by default 0.5). Candidates are sums of sines and
+    a tour from end to end, within [limits].
 
     Args:
         case: The case, its file, or a dict with its tables; it needs [simulation] duration and sample_rate,
-            [limits] stroke and speed (in open loop force), and in [sensor] the noise of what
+            [limits] stroke and speed (in open loop force), and in [sensor] the noise of the signal that
             `[output_error] on` compares.
-        progress: Called with a line at every stage.
+        progress: Function called with a line of text at every stage.
 
     Raises:
         InputError: If the case lacks any of these, or no experiment keeps within the limits.
@@ -42,7 +41,7 @@ def design(case: CaseLike, *, progress: Callable[[str], None] = lambda text: Non
 
 
 def _check(case: Case) -> None:
-    """Refuse a case without what any design needs."""
+    """Refuse a case that lacks a key which every design needs."""
     where = case.where
     for table, key in (
         ("simulation", "duration"),
@@ -53,4 +52,4 @@ def _check(case: Case) -> None:
         if getattr(getattr(case, table), key) is None:
             raise InputError(f"[{table}] has no {key}", where=where, hint=f"add {key} = ... to [{table}]")
     if not build_machine(case, period=1 / sampling_of(case)[0]).parameters.free:
-        raise InputError("nothing is unknown", where=where, hint="give a parameter as { guess = ... }")
+        raise InputError("no parameter is unknown", where=where, hint="give a parameter as { guess = ... }")

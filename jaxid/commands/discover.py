@@ -1,10 +1,9 @@
-"""The whole way: gap, where, what, refit, simulate again, verdict."""
+"""The command `discover`: the search for missing effects, the refit with them, and the verdict."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics, output_error
 from jaxid.gap import Gap, gaps, noise_floor
+from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.parameter import parameters_of
@@ -36,20 +36,20 @@ from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.solvers import SOLVERS
 from jaxid.simulation.step_size import TooStiffError
 
-# A refit in simulation may cost this factor in the force domain, not more: then it has bent the
-# parameters around something else, such as a reference that is not known between samples.
+# A refit in simulation may raise the force residual by this factor. Beyond it the fit has bent the
+# parameters around another error, such as a reference that is not known between samples.
 _WORSE = 1.5
-# A residual counts as a disagreement only where it stands this far above the noise floor.
+# A residual counts as a disagreement only if it exceeds the noise floor by this factor.
 _ABOVE_FLOOR = 1.3
-# So many effects that hinder the simulation are replaced; further ones are only taken out.
+# Number of effects that hinder the simulation and are replaced; further ones are only removed.
 _BARRED = 3
 
 
 def discover(
     case: CaseLike,
-    log: Log | str | Path,
+    log: LogLike,
     *,
-    validate: Sequence[Log | str | Path] = (),
+    validate: Sequence[LogLike] = (),
     max_effects: int = 5,
     refit: bool = True,
     experiments: bool | None = None,
@@ -57,18 +57,18 @@ def discover(
     minimiser: str | Minimiser | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
-    """Find the effects that a case's model is missing, on a log.
+    """Find the effects that a case's model lacks, from a log.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log, or its file.
-        validate: Logs that must confirm each effect, beside the case's own.
-        max_effects: Most effects to add.
-        refit: Refit the parameters in simulation too; without, they are inverse dynamics'.
-        experiments: Whether experiments are designed that tell rivals apart. Absent: not where joints push
-            one another, as of an arm, whose simulation takes minutes to compile for it.
-        solver, minimiser: Numerics of the fits in simulation, as of `identify`; None: as the case says.
-        progress: Called with a line at every stage.
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
+        validate: Logs that must confirm each effect, beside those of the case.
+        max_effects: Largest number of effects to add.
+        refit: Whether the parameters are refitted in simulation; if not, they are those of inverse dynamics.
+        experiments: Whether experiments are designed that separate rival effects. None: unless joints are
+            coupled, as in an arm, whose simulation takes minutes to compile for it.
+        solver, minimiser: Numerics of the fits in simulation, as for `identify`; None: those of the case.
+        progress: Function called with a line of text at every stage.
 
     Raises:
         InputError: If case, log, solver or minimiser are unsound.
@@ -91,28 +91,28 @@ def explore(
     experiments: bool | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
-    """`discover` on what is open already.
+    """Run `discover` on a session that is open already.
 
     Args:
         session: Case and logs, prepared with the hold aligned.
-        max_effects, refit, experiments, progress: As there.
+        max_effects, refit, experiments, progress: Settings of `discover`.
 
     Raises:
         InputError: If the reference has unknowns.
     """
-    need_known_reference(session, "what it is would be taken for an effect")
+    need_known_reference(session, "an error of it would be taken for an effect")
     if session.case.fits_within_prior("discover"):
         return explore_within(session, max_effects=max_effects, progress=progress)
     data = session.fit.data
-    progress("fitting what is there")
+    progress("fitting the declared model")
     baseline, search = start_search(session, progress)
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
     where = where_of(search, steps[0], session.fit.log)
     final, effects = _final_machine(baseline.machine, search, alternatives, steps)
-    progress("simulating what was found")
+    progress("simulating the effects")
     while (c := hindering(search, session, final)) is not None:
-        # After some, nothing takes the place of what goes: a search must end.
+        # After some removals nothing is added in exchange, because a search must end.
         steps += search.bar(c, WHY, max_effects if len(search.barred) < _BARRED else 0)
         alternatives = search.alternatives(steps)
         final, effects = _final_machine(baseline.machine, search, alternatives, steps)
@@ -128,13 +128,13 @@ def explore(
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
     missing = [] if unseen else _break_aways(search)
     while missing:
-        progress("looking at the starts from rest")
+        progress("evaluating the starts from rest")
         leaving = break_away(after, session.runs, [c.port for c in missing])
         unseen = next((b for b in leaving if isinstance(b, str)), "")
         held = [b for b in leaving if isinstance(b, BreakAway) and b.holds]
         if not held or len(effects) >= max_effects:
             break
-        # The clearest first: what sticks at one joint makes its neighbours start late.
+        # The clearest first: a joint that sticks makes its neighbours start late.
         b = max(held, key=lambda b: b.evidence)
         c = missing.pop(leaving.index(b))
         where = where if effects else _at_starts(where, c, b)
@@ -163,7 +163,7 @@ def explore(
 def start_search(
     session: Session, progress: Callable[[str], None] = lambda text: None
 ) -> tuple[Estimate, Search]:
-    """The baseline of a session in the force domain, and the search for what it lacks."""
+    """Return the baseline of a session in the force domain, and the search for the effects that it lacks."""
     machine, log, data = session.machine, session.fit.log, session.fit.data
     baseline = inverse_dynamics(machine, data)
     floor = noise_floor(baseline.machine, log, data)
@@ -186,7 +186,7 @@ def _break_aways(search: Search) -> list[cand.Candidate]:
 def _with_break_away(
     estimate: Estimate, search: Search, c: cand.Candidate, b: BreakAway
 ) -> tuple[Estimate, NamedEffect, Step]:
-    """An estimate with break-away friction beside it, as the starts from rest tell it."""
+    """Return an estimate with break-away friction added at the level that the starts from rest show."""
     machine = estimate.machine
     cls = type(cand.effect_of(search.union, c))
     effect = cls(**{str(cls.break_away_level): b.level}, port=c.port)
@@ -200,7 +200,7 @@ def _with_break_away(
 
 
 def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
-    """Where break-away friction shows: at the starts from rest. There is no curve to it."""
+    """Return the region in which break-away friction shows: the starts from rest, without a curve."""
     text = f"joint {c.port + 1}: {b.count} starts from rest come later than sliding friction explains"
     spans = tuple((float(t), float(t)) for t in b.times)
     region = (float(b.times.min()), float(b.times.max())) if len(b.times) else where.region
@@ -223,19 +223,19 @@ def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
 
 
 def where_of(search: Search, baseline: Step, log: Log) -> Where:
-    """Where the baseline's residual lies, on the whole log."""
+    """Return the region of the whole log in which the baseline's residual is significant."""
     whole = [ForceData.of(search.data)]
     e, jacobian = cand.evaluate_on(search.superset, whole, baseline.theta, baseline.active)
     wanted = None
     if log.reference is not None:
-        # A mass that is not driven has no wanted motion but its own.
+        # A mass that is not driven has no wanted motion other than the measured one.
         wanted = search.data.at_kept(search.data.qd).copy()
         driven = search.superset.machine.plant.at_drives(np.arange(wanted.shape[1]))
         wanted[:, driven] = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
-    # What joints share cannot be moved for one of them alone.
+    # A parameter that joints share cannot change for one of them alone.
     alone = np.sum(search.superset.enters[:, baseline.active], axis=0) == 1
-    own = jacobian[..., baseline.active[alone]]
-    return locate(-e, own, search.data, search.colour, wanted, search.superset.machine.plant)
+    unshared = jacobian[..., baseline.active[alone]]
+    return locate(-e, unshared, search.data, search.colour, wanted, search.superset.machine.plant)
 
 
 def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], search: Search) -> str:
@@ -250,7 +250,7 @@ def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], 
 def _final_machine(
     machine: Machine, search: Search, alternatives: dict[int, tuple[Score, ...]], steps: list[Step]
 ) -> tuple[Machine, tuple[NamedEffect, ...]]:
-    """The case's machine with only the effects that were added, at their refitted values."""
+    """Return the case's machine with only the effects that were added, at their refitted values."""
     plant, parameters = machine.plant, machine.parameters
     theta = [*search.theta[search.superset.base]]
     effects = []
@@ -268,7 +268,7 @@ def _final_machine(
 
 
 def _refit(session: Session, start: Estimate) -> Estimate:
-    """Output error from the force-domain fit; the latter stands where simulation cannot follow."""
+    """Refit by output error from the force-domain fit; keep the latter if the simulation cannot follow."""
     blind = not bool(np.all(start.identifiable))
     if blind or session.fit.log.reference is None and session.machine.controller is not None:
         return start
@@ -279,18 +279,19 @@ def _refit(session: Session, start: Estimate) -> Estimate:
     except TooStiffError as error:
         return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
     if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
-        note = f"output error: {estimate.message}; parameters are inverse dynamics'"
+        note = f"output error: {estimate.message}; the parameters are those of inverse dynamics"
         return replace(start, notes=(*start.notes, note))
     old, new = (gaps(e.machine, (session.fit,))[0] for e in (start, estimate))
     worse = np.any(new.force.rms > _WORSE * old.force.rms)
     nearer = old.simulation is None or _length(new) < _length(old)
     if new.simulation is None or worse or not nearer:
-        note = "output error did not bring the simulation nearer; parameters are inverse dynamics'"
+        note = "output error did not reduce the simulation gap; the parameters are those of inverse dynamics"
         return replace(start, notes=(*start.notes, note))
     return estimate
 
 
 def _length(gap: Gap) -> float:
+    assert gap.simulation is not None, "the simulation of this gap has run"
     return float(np.sqrt(np.nansum(gap.simulation.rms**2)))
 
 

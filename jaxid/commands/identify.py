@@ -1,8 +1,8 @@
-"""Identification of a case's unknowns from a log: estimate, gap, noise floor."""
+"""The command `identify`: estimates of a case's unknowns from a log, the gap, and the noise floor."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,20 +15,21 @@ from jaxid.estimators import steps_of
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap, gaps, noise_floor
-from jaxid.logs.log import Log
+from jaxid.logs.in_memory import LogLike
 from jaxid.names import METHODS, OUTPUTS, SOLVERS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
+from jaxid.results.result import FitResult
 from jaxid.session import Session, open_session
 
 
-@dataclass(frozen=True)
-class Identification:
-    """What `identify` returns.
+@dataclass(frozen=True, repr=False)
+class Identification(FitResult):
+    """Result of `identify`; for its parameters, plots and tables see `FitResult`.
 
     Args:
         session: Case and logs.
         estimate: Parameters and their precision.
-        gaps: The fitted log's first, then the validations'.
+        gaps: Disagreement with each log, the fitted log first.
         noise_floor: RMS force that the sensors' noise leaves in the band, by joint.
     """
 
@@ -37,19 +38,20 @@ class Identification:
     gaps: tuple[Gap, ...]
     noise_floor: np.ndarray
 
-    @property
-    def converged(self) -> bool:
-        """Whether the solver did."""
-        return self.estimate.converged
+    def __repr__(self) -> str:
+        from jaxid.results.as_text import identification_summary
 
-    def value(self, name: str) -> float:
-        """Estimate of one parameter, by its name in results."""
-        return self.estimate.value(name)
+        return identification_summary(self)
 
     def __str__(self) -> str:
         from jaxid.results.as_text import identification_table
 
         return identification_table(self)
+
+    def _repr_html_(self) -> str:
+        from jaxid.results.as_html import identification_html
+
+        return identification_html(self)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write `result.json` and `report.html` to a folder.
@@ -64,30 +66,30 @@ class Identification:
 
 def identify(
     case: CaseLike,
-    log: Log | str | Path,
+    log: LogLike,
     *,
     method: str = "output_error",
     solver: str | None = None,
     minimiser: str | Minimiser | None = None,
     on: str | None = None,
-    validate: Sequence[Log | str | Path] = (),
+    validate: Sequence[LogLike] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
     """Identify the unknowns of a case from a log.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log, or its file.
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         method: One of `jaxid.names.METHODS`.
-        solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between samples,
-            dry friction smoothed; None: fixed steps, dry friction exact. The gap is that
-            of the fixed steps either way.
-        minimiser: For `output_error`, one of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of
-            optimistix; None: as the case says, or jaxid's Levenberg-Marquardt.
-        on: For `output_error`, what of the simulated loop is to meet its log: one of
-            `jaxid.names.OUTPUTS`; None: as the case says, or position.
-        validate: Logs to validate on, beside the case's own.
-        progress: Called with a line at every stage.
+        solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between
+            samples and dry friction is smoothed; None: fixed steps and exact dry friction. The gap is
+            computed with fixed steps either way.
+        minimiser: For `output_error` and `within_prior`, one of `jaxid.names.MINIMISERS`, or a solver of
+            optimistix; None: that of the case, or jaxid's Levenberg-Marquardt.
+        on: For `output_error`, the outputs of the simulated loop that are fitted: one of
+            `jaxid.names.OUTPUTS`; None: those that the case names, or position.
+        validate: Logs to validate on, beside those of the case.
+        progress: Function called with a line of text at every stage.
 
     Raises:
         InputError: If case, log, method, solver, minimiser or `on` are unsound.
@@ -106,7 +108,7 @@ def identify(
     session = open_session(case, log, validate, method=method)
     if not session.machine.parameters.free:
         raise InputError(
-            "nothing is unknown",
+            "no parameter is unknown",
             where=session.case.where,
             hint="give at least one parameter as { guess = ... }",
         )
@@ -123,7 +125,7 @@ def identify(
 
 def identify_many(
     case: CaseLike | Sequence[CaseLike],
-    logs: Sequence[Log | str | Path],
+    logs: Sequence[LogLike],
     *,
     method: str = "output_error",
     lanes: int = 16,
@@ -135,10 +137,10 @@ def identify_many(
             differ.
         logs: Logs, or their files.
         method: One of `jaxid.names.METHODS`.
-        lanes: Logs in a compiled call.
+        lanes: Number of logs in a compiled call.
 
     Returns:
-        The estimate of each log, or what kept it from one: no log fails for another.
+        The estimate of each log, or the exception that ended its fit, which leaves the other logs alone.
 
     Raises:
         InputError: If a case or the method is unsound, or cases are not as many as logs.
@@ -152,13 +154,13 @@ def identify_many(
     else:
         raise InputError(f"{len(case)} cases for {len(logs)} logs", hint="give one case, or one for each log")
 
-    def steps(case: Case, log: Log | str | Path) -> Steps[Estimate]:
+    def steps(case: Case, log: LogLike) -> Steps[Estimate]:
         return (yield from steps_of(method, open_session(case, log, method=method)))
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
 
-def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
+def _checked(option: str, value: str, known: Collection[str], method: str) -> str:
     _need_output_error(option, value, method)
     if value not in known:
         raise InputError(f"{option} {value!r} is not known", hint=suggest(value, known))
@@ -166,19 +168,20 @@ def _checked(option: str, value: str, known: Sequence[str], method: str) -> str:
 
 
 def _need_output_error(option: str, value: str, method: str) -> None:
-    if method not in ("output_error", "within_prior"):
+    methods = ("output_error", "within_prior")
+    if method not in methods:
         raise InputError(
             f"{option} {value!r} goes only with {' and '.join(methods)}",
             hint=f"leave out {option}, or method {method!r}",
         )
 
 
-# Samples beyond which the gap would take memory beside the fit that a fit may need.
+# Samples beyond which the compilation of the gap could take memory that the fit needs.
 _COMPILED_BESIDE = 100_000
 
 
 def _gaps_of(session: Session) -> Precompile | None:
-    """What a fit is followed by."""
+    """Return the call that follows a fit, to be compiled in the background meanwhile."""
     machine, samples = session.machine, tuple(r.log.samples for r in session.runs)
     if sum(samples) > _COMPILED_BESIDE:
         return None

@@ -1,6 +1,7 @@
-"""A case's controller one tick at a time, for a machine or a simulator that is not jaxid's.
+"""The controller of a case one tick at a time, for a real machine or another simulator.
 
-With `identify` it finds the unknowns in the first instants, algebraically, and goes on with what it found.
+With `identify` the unknowns are identified algebraically in the first instants. The controller uses them
+from then on.
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ from jaxid.controllers import Controller, Tick, base, laws_with_model
 from jaxid.errors import InputError
 from jaxid.estimators.algebraic.online import Online, OnlineEstimate, OnlineMemory
 from jaxid.estimators.recursive.recursion import RecursiveEstimate
+from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.scene import Scene
 
-# A joint is taken to rest below this part of its reference's largest speed, and below so many
-# standard deviations of a difference of two readings.
+# A joint counts as at rest below this fraction of its reference's largest speed, and below this number
+# of standard deviations of a difference of two readings.
 _REST = 5e-3
 _NOISE = 5.0
-# What may be measured beside positions.
+# Quantities that may be measured beside positions.
 _OTHERS = ("velocity", "acceleration", "measured")
 
 
@@ -41,14 +43,14 @@ class Live:
     Args:
         case: The case, its file, or a dict with its tables; it needs [controller], [reference] and
             [simulation].
-        identify: Identify the unknowns on-line and, once all may be trusted, put what was found into
+        identify: Whether to identify the unknowns on-line and, once all of them are trusted, to put them into
             the model of a controller that has one.
-        tolerance: Of that trust (see `jaxid.estimators.algebraic.online.OnlineEstimate`).
+        tolerance: Relative tolerance of that trust, see `jaxid.estimators.algebraic.online.OnlineEstimate`.
 
     Attributes:
         online_estimate: Estimate from the rows so far; None without `identify`, and before the second tick.
         adapts: Whether the controller identifies by itself.
-        switched: Tick from which on the controller knows what was found; None: not yet.
+        switched: First tick at which the controller uses the identified values; None: not yet.
 
     Raises:
         InputError: If the case has no controller or reference, or asks for what cannot be identified
@@ -81,7 +83,7 @@ class Live:
         if identify:
             if "model" not in self._controller.of_machine or self.adapts:
                 kind = "" if case.controller is None else case.controller.kind
-                what = "identifies by itself" if self.adapts else "has no model to put what is found into"
+                what = "identifies by itself" if self.adapts else "has no model for identified values"
                 laws = laws_with_model(self.machine.plant, case.plant.drives, case.plant.joints)
                 raise InputError(
                     f"a controller of kind {kind!r} {what}",
@@ -97,14 +99,14 @@ class Live:
         acceleration: Float[np.ndarray, " n"] | None = None,
         measured: Float[np.ndarray, " m"] | None = None,
     ) -> Float[np.ndarray, " m"]:
-        """The command to hold until the next tick.
+        """Return the command to hold until the next tick.
 
         Args:
             position: Readings of all joints [m or rad].
-            velocity, acceleration: Likewise, of a gyroscope and an accelerometer; absent: differenced.
-                The same are to be given at every tick, held where they are not new: at ticks that are no
-                multiple of what [[inertial_sensors]] rate says.
-            measured: Command that the drives report since the last tick; absent: as it was given.
+            velocity, acceleration: Readings of a gyroscope and an accelerometer; None: differenced positions.
+                Give the same ones at every tick, and hold them at ticks between two readings, whose rate
+                [[inertial_sensors]] states.
+            measured: Command that the drives report since the last tick; None: the command as it was given.
 
         Raises:
             InputError: If the reference has ended, or there is not one reading a joint, or command a drive.
@@ -122,7 +124,7 @@ class Live:
         if measured is None and self.adapts:
             measured = self._as_given
         others = [None if x is None else np.asarray(x, float) for x in (velocity, acceleration, measured)]
-        # All go into one vector, in which one of another length would push the next aside.
+        # All go into one vector, in which an entry of another length would shift the next.
         for name, x, like in zip(_OTHERS, others, (position, position, self._as_given), strict=True):
             if x is not None and x.shape != like.shape:
                 what = f"{name} has shape {x.shape}"
@@ -130,12 +132,22 @@ class Live:
         fresh = tuple(self._tick % hold == 0 for hold in self._holds)
         if self._tick == 0:
             path = jax.tree.map(lambda x: x[0], self._path)
-            tick = Tick(position, path, self._driven, np.asarray(fresh[0]), *others, np.asarray(fresh[1]))
+            tick = Tick(
+                joints=position,
+                path=path,
+                driven=self._driven,
+                fresh=np.asarray(fresh[0]),
+                velocity=others[0],
+                acceleration=others[1],
+                measured=others[2],
+                renewed=np.asarray(fresh[1]),
+            )
             start, saved = self._controller.start(tick, np.zeros_like(position), self._path), self.memory
-            # Readings of an earlier run would be differenced with those of this one.
+            # A difference of readings of an earlier run and of this one would have no meaning.
             self.memory = start if saved is None else self._controller.resumed(start, saved)
         if self._online is not None and self.switched is None:
             self._identify(position)
+        assert self._memory is not None, "the first tick has set it"
         u, self._memory, closed = self._law(self._tick, position, fresh, others, self._memory)
         if self.adapts and self.switched is None and closed:
             self.switched = self._tick
@@ -144,9 +156,9 @@ class Live:
 
     @property
     def memory(self) -> object:
-        """What the controller remembers, a tree of arrays.
+        """The controller's state, a tree of arrays.
 
-        Of one that was saved, and put back before the first tick, what was identified is kept.
+        If a saved state is assigned before the first tick, the identified values in it are kept.
         """
         return None if self._memory is None else self._law.memory.unpacked(self._memory)
 
@@ -156,7 +168,7 @@ class Live:
 
     @property
     def estimate(self) -> RecursiveEstimate:
-        """What a controller that identifies says of the unknowns, in the order of `machine.parameters`.
+        """The estimate of a controller that identifies, in the order of `machine.parameters`.
 
         Raises:
             InputError: If it does not identify, or nothing has been read yet.
@@ -164,33 +176,38 @@ class Live:
         if not self.adapts or self.memory is None:
             what = "no reading yet" if self.adapts else "the controller does not identify"
             raise InputError(what, where="Live", hint="take kind = 'adaptive', and give it readings")
-        return self._controller.estimate(self.memory)
+        # Only laws that adapt have it, which `adapts` says.
+        return self._controller.estimate(self.memory)  # pyright: ignore[reportAttributeAccessIssue]  # see above
 
     def _identify(self, position: np.ndarray) -> None:
+        assert self._online is not None, "the caller has asked"
         if self._rows is None:
             self._rows = self._online.start(jnp.asarray(position))
             return
-        self._rows, told = _learned(self._online, self._rows, position, self._last)
-        self.online_estimate = jax.tree.map(np.asarray, told)
-        if self.online_estimate.trusted.all():
-            model = self.machine.with_estimate(self.online_estimate.theta).plant
+        assert self._last is not None, "a command follows the first reading"
+        self._rows, estimate = _learned(self._online, self._rows, position, self._last)
+        self.online_estimate = found = jax.tree.map(np.asarray, estimate)
+        if found.trusted.all():
+            model = self.machine.with_estimate(found.theta).plant
             self._controller = eqx.tree_at(lambda c: c.model, self._controller, model)
             self._law.take(self._controller)
             self.switched = self._tick
 
 
-def follow(case: CaseLike, log: Log, *, tolerance: float = 0.05) -> OnlineEstimate:
-    """What the on-line estimator tells at every sample of a log but the first, (time, p) each.
+def follow(case: CaseLike, log: LogLike, *, tolerance: float = 0.05) -> OnlineEstimate:
+    """Return the estimates of the on-line estimator at every sample of a log but the first, (time, p) each.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log; its command is held between samples.
-        tolerance: Of trust (see `jaxid.estimators.algebraic.online.OnlineEstimate`).
+        log: The log, its file, or a table of the columns that [log] names; its command is held.
+        tolerance: Relative tolerance of trust, see `jaxid.estimators.algebraic.online.OnlineEstimate`.
 
     Raises:
         InputError: If the case asks for what cannot be identified on-line.
     """
     case = load_case(case)
+    if not isinstance(log, Log):
+        log = as_log(log, case.columns, joints=case.plant.joints, drives=case.plant.drives)
     log.need_every_encoder("on-line identification")
     machine = build_machine(case, period=log.period)
     fast = np.abs(np.diff(log.position, axis=0)).max(axis=0) / log.period
@@ -208,16 +225,16 @@ def _followed(online: Online, position: Array, command: Array) -> OnlineEstimate
 
 
 class _Law:
-    """A controller's command, compiled as a function of one vector: its own values, the tick, its memory.
+    """A controller's command, compiled as a function of one vector: its values, the tick, and its memory.
 
-    To build trees at every tick, and to hand over an array for each of their leaves, takes five times as long
+    Building trees at every tick, and passing an array for each of their leaves, takes five times as long
     as the law itself.
 
     Args:
-        controller: The law.
-        drives: How many commands it gives.
-        path: Its path, one row a tick.
-        driven: Joints that are driven.
+        controller: The control law.
+        drives: Number of commands that it gives.
+        path: Path of the reference, one row a tick.
+        driven: Joints that are driven, 0-based.
     """
 
     def __init__(self, controller: Controller, drives: int, path: base.Path, driven: tuple[int, ...]):
@@ -230,13 +247,13 @@ class _Law:
         self._once = jnp.asarray(1)
 
     def take(self, controller: Controller) -> None:
-        """Go on with a controller of the same structure."""
+        """Take another controller of the same structure."""
         arrays, self._static = eqx.partition(controller, eqx.is_array)
-        self._own = _Packed.of(arrays)
-        self._leaves = self._own.packed(arrays)
+        self._values = _Packed.of(arrays)
+        self._leaves = self._values.packed(arrays)
 
     def remembers(self, memory: object) -> np.ndarray:
-        """A memory as the law takes it."""
+        """Store the structure of a memory, and return it as the vector that the law takes."""
         self.memory = _Packed.of(memory)
         return self.memory.packed(memory)
 
@@ -248,14 +265,14 @@ class _Law:
         others: Sequence[np.ndarray | None],
         memory: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """The command, the new memory, and whether what the law found takes part in the command.
+        """Return the command, the new memory, and whether identified values take part in the command.
 
         Args:
-            k: The tick.
-            position: Readings.
-            fresh: Whether they are new, and those of inertial sensors.
+            k: Number of the tick.
+            position: Readings of all joints [m or rad].
+            fresh: Whether these are new, and whether those of inertial sensors are.
             others: Velocity, acceleration and command, as measured.
-            memory: Of the tick before.
+            memory: Memory of the tick before, as a vector.
         """
         given = tuple(x is not None for x in others)
         if given not in self._compiled:
@@ -269,33 +286,42 @@ class _Law:
         return after[-self._drives :], after[first:end], bool(after[-1 - self._drives])
 
     def _command(self, joints: int, given: tuple[bool, ...], before: Array, once: Array) -> Array:
-        sizes = [self._own.size, self.memory.size, joints, *(x.shape[1] for x in self._rows), 2]
+        sizes = [self._values.size, self.memory.size, joints, *(x.shape[1] for x in self._rows), 2]
         sizes += [size for size, there in zip((joints, joints, self._drives), given, strict=True) if there]
         ends = [int(x) for x in np.cumsum(sizes)]
 
         def body(_: Array, before: Array) -> Array:
-            own, memory, position, *now, _ = jnp.split(before, ends)
+            values, memory, position, *now, _ = jnp.split(before, ends)
             path = [now.pop(0).reshape(shape) for shape in self._shapes]
             fresh = now.pop(0) != 0
             others = [now.pop(0) if there else None for there in given]
             path = jax.tree.unflatten(self._path, path)
-            tick = Tick(position, path, self._driven, fresh[0], *others, fresh[1])
-            controller = eqx.combine(self._own.unpacked(own), self._static)
+            tick = Tick(
+                joints=position,
+                path=path,
+                driven=self._driven,
+                fresh=fresh[0],
+                velocity=others[0],
+                acceleration=others[1],
+                measured=others[2],
+                renewed=fresh[1],
+            )
+            controller: Controller = eqx.combine(self._values.unpacked(values), self._static)  # pyright: ignore[reportAssignmentType]  # both halves of one
             u, memory = controller.command(tick, self.memory.unpacked(memory), jnp.zeros(1))
-            told = controller.learned(memory)
-            closed = jnp.zeros(1) if told is None else told.closed.astype(float)[None]
+            learned = controller.learned(memory)
+            closed = jnp.zeros(1) if learned is None else learned.closed.astype(float)[None]
             memory = self.memory.packed(memory, jnp)
-            return jnp.concatenate([own, memory, before[ends[1] : ends[-1]], closed, u])
+            return jnp.concatenate([values, memory, before[ends[1] : ends[-1]], closed, u])
 
-        # A loop of one turn, whose number the compiler does not know, is one kernel (see `jaxid._platform`).
-        # All in one vector, or what the turn does not change would be taken out of it: else there are a
-        # hundred kernels, started one by one.
+        # A loop of one iteration, a number that the compiler does not know, is one kernel (see
+        # `jaxid._platform`). All is in one vector, because the compiler would move the entries that the
+        # iteration leaves unchanged out of it, and start a hundred kernels one by one.
         return jax.lax.fori_loop(0, once, body, before)
 
 
 @dataclass(frozen=True)
 class _Packed:
-    """A tree of arrays as one vector of float64: truths and whole numbers below 2^53 stay exact."""
+    """The layout of a tree of arrays in one vector of float64, exact for booleans and integers below 2^53."""
 
     structure: object
     shapes: tuple
@@ -343,7 +369,7 @@ def _online(
 
 
 def _noise(machine: Machine, joints: int) -> np.ndarray:
-    """Difference of two readings that noise alone hardly exceeds."""
+    """Return the difference of two readings that noise alone hardly exceeds, by joint."""
     stated = machine.sensor.position_std
     std = np.zeros(joints) if stated is None else np.broadcast_to(np.asarray(stated), joints)
     return _NOISE * np.sqrt(2) * std

@@ -1,4 +1,4 @@
-"""The command `simulate`: the log that a case would give."""
+"""The command `simulate`: the log that a case describes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from jaxid.scene import Scene, SimulatedLog
 
 
 def simulate(case: CaseLike, *, seed: int = 0) -> SimulatedLog:
-    """Simulate the log that a case would give, at its true values where it has any.
+    """Simulate the log of a case, at its `true` values if it states any.
 
     Args:
         case: The case, its file, or a dict with its tables; it needs [simulation] with duration and
             sample_rate, and [reference] (with a [controller]) or [input].
-        seed: Of the sensors' noise.
+        seed: Seed of the sensors' noise.
 
     Raises:
         InputError: If the case does not say what to simulate.

@@ -1,8 +1,9 @@
-"""`study`: run the chunks of a plan on all cores, keep each as it ends, and gather the table."""
+"""The command `study`: run the chunks of a plan on all cores, keep each, and gather the table."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import zipfile
@@ -26,13 +27,14 @@ from jaxid.studies.levels import Level
 from jaxid.studies.plan import Plan, at_once, digest_of, same
 from jaxid.studies.remote import Bundle, Remote
 from jaxid.studies.result import FILES, Study, gathered
-from jaxid.studies.runs import Arrays, Runner
+from jaxid.studies.rows import Arrays
+from jaxid.studies.runs import Runner
 
 _MANIFEST = "study.json"
 _CHUNKS = "chunks"
 
-# Called with runs done, and runs in all.
-Told = Callable[[int, int], None]
+# Called with the number of runs done, and of all runs.
+Progress = Callable[[int, int], None]
 
 
 def study(
@@ -44,22 +46,20 @@ def study(
     resume: bool = False,
     overwrite: bool = False,
     scheduler: str | None = None,
-    progress: Told = lambda done, runs: None,
+    progress: Progress = lambda done, runs: None,
 ) -> Study:
-    """Simulate and identify a case over and over.
+    """Simulate and identify a case many times.
 
     Args:
-        case: The case, its file, or a dict with its tables; [simulation] and [study] describe the study,
-            `true` gives a true value that differs from the guess.
-        runs: At each level; in place of the case's.
-        seed: Of everything drawn.
-        folder: Where each chunk is kept as soon as it ends, and the results at the end; absent: in
-            memory only.
-        resume: Go on where an interrupted study in that folder stopped: to the same bits.
-        overwrite: Write into a folder that jaxid did not make.
-        scheduler: Address of a Dask scheduler whose workers run the chunks; absent: this machine, all
-            cores.
-        progress: Called with the number of runs done, and of all.
+        case: The case, its file, or a dict with its tables; [simulation] and [study] describe the study, and
+            `true` states a true value that differs from the guess.
+        runs: Number of runs at each level; None: that of the case.
+        seed: Seed of everything that is drawn.
+        folder: Folder that keeps each chunk as soon as it ends, and the results; None: in memory only.
+        resume: Whether to continue an interrupted study in that folder, to the same bits.
+        overwrite: Whether to write into a folder that jaxid did not make.
+        scheduler: Address of a Dask scheduler whose workers run the chunks; None: all cores of this machine.
+        progress: Function called with the number of runs done, and of all runs.
 
     Raises:
         InputError: If the case does not say what to simulate, or the folder holds another study.
@@ -74,35 +74,39 @@ def study(
             raise InputError(
                 "holds a study already",
                 where=str(where),
-                hint="go on with it with --resume, or choose another -o",
+                hint="continue it with --resume, or choose another -o",
             )
-    begun = _begun(where) if resume else {}
+    begun = _begun(where) if resume and where is not None else {}
     with contextlib.ExitStack() as stack:
         remote = None if scheduler is None else stack.enter_context(Remote(scheduler))
         plan = Plan.of(case, runs=runs, seed=seed, workers=remote and remote.threads)
-        # How many runs are solved together changes the last bits: what was begun with stays.
+        # The number of runs solved together changes the last bits, so that of the first start is kept.
         plan = replace(plan, chunk=int(begun.get("chunk", plan.chunk)))
         differs = same(plan.manifest, begun) if resume else ""
         if differs:
             raise InputError(
-                f"the study there is another one: {differs} differ",
+                f"holds another study: {differs} differ",
                 where=str(where),
-                hint="give what it was begun with, or choose another -o",
+                hint="resume with the same case and options, or choose another -o",
             )
-        # All that can be refused is refused before anything is written.
+        # Every refusal comes before the first write.
         runner = Runner(plan)
         for level in range(len(plan.levels)):
             runner.ways(level)
-        bundle = None if remote is None else Bundle.of(plan)
+        solved = (
+            functools.partial(_solved, runner)
+            if remote is None
+            else functools.partial(remote.run, Bundle.of(plan))
+        )
         bound = np.stack([_bound(plan, level) for level in plan.levels])
         identity = digest_of(plan.manifest)
-        kept = _kept(where, plan, identity) if resume else {}
+        kept = _kept(where, plan, identity) if resume and where is not None else {}
         if where is not None and not resume:
             _begin(where, plan)
         missing = [k for k in range(len(plan.chunks)) if k not in kept]
         total, done = plan.runs * len(plan.levels), sum(len(plan.chunks[k][1]) for k in kept)
         progress(done, total)
-        for number, arrays in remote.run(bundle, missing) if remote else _solved(runner, missing):
+        for number, arrays in solved(missing):
             kept[number] = arrays
             if where is not None:
                 write_whole(_path(where, number), _packed(arrays, identity))
@@ -115,23 +119,23 @@ def study(
 
 
 def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
-    """Chunks as they end, as many at once as the device takes: compiled code leaves Python's lock alone.
+    """Yield chunks as they end, as many at once as the device takes; compiled code releases Python's lock.
 
-    Linear algebra keeps to one thread meanwhile: its own would wait for each other in a loop.
+    Linear algebra uses one thread meanwhile, because its threads would wait for each other in a loop.
     """
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(at_once()) as pool:
-        left: dict[Future, int] = {pool.submit(runner.chunk, number): number for number in numbers}
+        pending: dict[Future, int] = {pool.submit(runner.chunk, number): number for number in numbers}
         try:
-            while left:
-                finished, _ = wait(left, return_when=FIRST_COMPLETED)
+            while pending:
+                finished, _ = wait(pending, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    yield left.pop(future), future.result()
+                    yield pending.pop(future), future.result()
         finally:
             pool.shutdown(cancel_futures=True)
 
 
 def _begin(folder: Path, plan: Plan) -> None:
-    """A folder that is a study's: what it is comes last, so that it is there whole."""
+    """Make a folder that of a study; the manifest is written last, so that it marks a whole folder."""
     mark_folder(folder)
     (folder / _CHUNKS).mkdir(exist_ok=True)
     for old in (folder / _CHUNKS).iterdir():
@@ -140,7 +144,7 @@ def _begin(folder: Path, plan: Plan) -> None:
 
 
 def _begun(folder: Path) -> dict:
-    """What a folder's study was begun with."""
+    """Read the manifest with which the study of a folder was started."""
     path = folder / _MANIFEST
     if not path.exists():
         raise InputError(
@@ -150,12 +154,12 @@ def _begun(folder: Path) -> dict:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise InputError(
-            f"cannot be read: {error}", where=str(path), hint="begin anew in another folder"
+            f"cannot be read: {error}", where=str(path), hint="start again in another folder"
         ) from error
 
 
 def _kept(folder: Path, plan: Plan, identity: str) -> dict[int, Arrays]:
-    """The chunks that are there; what an interruption left of another is removed."""
+    """Read the chunks of a folder, and remove the parts of one that was interrupted."""
     for part in (folder / _CHUNKS).glob(".*.npz.*"):
         part.unlink()
     there = {k: _path(folder, k) for k in range(len(plan.chunks))}
@@ -168,41 +172,41 @@ def _path(folder: Path, number: int) -> Path:
 
 def _packed(arrays: Arrays, identity: str) -> bytes:
     buffer = io.BytesIO()
-    np.savez(buffer, study=np.asarray(identity), **arrays)
+    np.savez(buffer, allow_pickle=False, study=np.asarray(identity), **arrays)
     return buffer.getvalue()
 
 
 def _unpacked(path: Path, identity: str) -> Arrays:
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-            found = {name: arrays[name] for name in arrays.files}
-        own = str(found.pop("study"))
+            content = {name: arrays[name] for name in arrays.files}
+        study_of_chunk = str(content.pop("study"))
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(
             f"cannot be read: {error}", where=str(path), hint="remove this file, and resume again"
         ) from error
-    if own != identity:
+    if study_of_chunk != identity:
         raise InputError(
             "belongs to another study", where=str(path), hint="remove this file, and resume again"
         )
-    return found
+    return content
 
 
 def _bound(plan: Plan, level: Level) -> np.ndarray:
-    """Cramer-Rao bound on the deviation of each parameter at a level.
+    """Return the Cramer-Rao bound on the standard deviation of each parameter at a level.
 
-    Of an unbiased estimate from the readings of one log, their noise white, the start and the command
-    known exactly: in a loop too the readings so far give the command, so that what counts is the
-    derivative of the position under a given command. NaN where the case states no noise of the
-    readings, where nothing is fitted to logs, or where the log cannot tell. Where true values are drawn it
-    is that of their middle.
+    The bound holds for an unbiased estimate from the readings of one log with white noise, if the start and
+    the command are known exactly. In a loop too the command follows from the readings so far, so that the
+    derivative of the position under a given command counts. The bound is NaN if the case states no noise of
+    the readings, if nothing is fitted to logs, or if the log does not determine all parameters. If true
+    values are drawn, it is the bound at their median.
     """
     none, scene, machine = np.full(len(plan.names), np.nan), level.scene, level.scene.machine
     if machine.sensor.position_std is None or not plan.fits:
         return none
     silent = replace(machine, sensor=replace(machine.sensor, position_noise=None, force_noise=None))
     simulated_log = run_alone(scene.simulated_log(silent, np.random.default_rng(0)))
-    # The command of every tick, of which the log may have but some.
+    # The command of every tick; the log may hold only some of them.
     run = simulated_log.trajectory
     ticks = scene.drive.period * np.arange(len(run.command))
     log = Log(ticks, np.asarray(run.reading), np.asarray(run.command), hold=simulated_log.log.hold)

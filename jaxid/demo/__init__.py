@@ -1,4 +1,4 @@
-"""The demo: check, identify, discover and report on a log whose truth the case does not know.
+"""The demo: check, identify and discover on a log with an effect that the case does not declare.
 
 The two logs were made by an exact set-valued friction stepper that shares no code with jaxid
 (`truth/axis/demo_logs.py`), with an encoder's noise and rounding.
@@ -22,20 +22,20 @@ _FILES = ("case.toml", "log.csv", "validation.csv")
 def run_demo(
     folder: Path, *, overwrite: bool = False, progress: Callable[[str], None] = lambda text: None
 ) -> tuple[str, bool]:
-    """Run the whole way in a folder.
+    """Run check, identify and discover in a folder.
 
     Args:
-        folder: Where case, logs and results go.
-        overwrite: Overwrite what jaxid did not make.
-        progress: Called with a line at every stage.
+        folder: Folder for case, logs and results.
+        overwrite: Whether to overwrite files that jaxid did not make.
+        progress: Function called with a line of text at every stage.
 
     Returns:
-        What to print, and whether all fits converged.
+        The text to print, and whether all fits converged.
 
     Raises:
         InputError: If the folder cannot be written to.
     """
-    results = ("check.json", "result.json", "discovery.json", "report.html")
+    results = ("check.json", "result.json", "discovery.json", "report.html", "case_found.toml")
     ready_folder(folder, [*_FILES, *results], overwrite=overwrite)
     for name in _FILES:
         with resources.as_file(resources.files("jaxid.demo") / name) as source:

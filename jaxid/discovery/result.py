@@ -12,6 +12,7 @@ from jaxid.discovery.score import Score
 from jaxid.discovery.where import Where
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap
+from jaxid.results.result import FitResult
 from jaxid.session import Session
 
 if TYPE_CHECKING:
@@ -55,9 +56,9 @@ class Round:
     validation: np.ndarray | None
 
 
-@dataclass(frozen=True)
-class Discovery:
-    """Result of `discover`.
+@dataclass(frozen=True, repr=False)
+class Discovery(FitResult):
+    """Result of `discover`; for its parameters, plots and tables see `FitResult`.
 
     Args:
         session: Case and logs.
@@ -93,17 +94,32 @@ class Discovery:
         return [e.kind for e in self.effects]
 
     @property
-    def converged(self) -> bool:
-        """True if the last refit converged."""
-        return self.after.converged
+    def estimate(self) -> Estimate:
+        """The last refit, effects included; the same as `after`."""
+        return self.after
+
+    @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Disagreement after the last refit with each log; the same as `gaps_after`."""
+        return self.gaps_after
+
+    def __repr__(self) -> str:
+        from jaxid.results.as_text import discovery_summary
+
+        return discovery_summary(self)
 
     def __str__(self) -> str:
         from jaxid.results.as_text import discovery_table
 
         return discovery_table(self)
 
+    def _repr_html_(self) -> str:
+        from jaxid.results.as_html import discovery_html
+
+        return discovery_html(self)
+
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
-        """Write `discovery.json`, `report.html` and the proposed experiments to a folder.
+        """Write `discovery.json`, `report.html`, `case.toml` and the proposed experiments to a folder.
 
         Raises:
             InputError: If the folder has files that jaxid did not make and `overwrite` is not given.

@@ -1,6 +1,6 @@
 """Measured logs: the columns that a case names, checked and in SI units."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,8 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers import read_columns
+from jaxid.logs.readers.array_files import Columns
+from jaxid.logs.readers.rows import Rows
 from jaxid.logs.timebase import sound_time
 from jaxid.names import HOLDS, OPTIONAL_COLUMNS
 from jaxid.schema import Spot, read_settings
@@ -171,6 +173,7 @@ def read_log(
     *,
     joints: int | None = 1,
     drives: int | None = None,
+    read: Callable[[Path, list[str], Rows | None], Columns] = read_columns,
 ) -> Log:
     """Read a log, and refuse one that no estimator could use.
 
@@ -180,6 +183,7 @@ def read_log(
             time; `hold` and `rows`.
         joints: Expected number of positions; None accepts any.
         drives: Expected number of forces and references; None: at most as many as positions.
+        read: Function that reads named columns, for a source other than a file.
 
     Returns:
         The log.
@@ -191,7 +195,7 @@ def read_log(
     table = log_table(columns)
     names = _names(table)
     _check_distinct(names)
-    data, rows = read_columns(path, [name for group in names.values() for name in group], table.rows)
+    data, rows = read(path, [name for group in names.values() for name in group], table.rows)
     _check_finite(data, rows[0], path)
 
     groups = {key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()}

@@ -1,15 +1,18 @@
-"""The JSON results and the tables that commands print."""
+"""Results as JSON, and the files that commands write."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.files import ready_folder, signal_csv, write_json, write_whole
+from jaxid.files import found_case_file, ready_folder, signal_csv, write_json, write_whole
 from jaxid.model.unknowns import leaf, several_places
+from jaxid.results.found_case import case_text, changed_in_python
+from jaxid.results.parameters import Covariance
 from jaxid.results.proposals import proposal_json
 
 if TYPE_CHECKING:
@@ -21,11 +24,12 @@ if TYPE_CHECKING:
     from jaxid.estimators.estimate import Estimate
     from jaxid.gap import Gap
     from jaxid.model.plant import Plant
+    from jaxid.model.unknowns import Free
     from jaxid.session import Session
 
 
 def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Value, standard deviation, unit and identifiability by name; plant lists as lists."""
+    """Return value, standard deviation, unit and identifiability by name, and plant lists as lists."""
     out: dict[str, Any] = {}
     plant = estimate.machine.plant
     rows = zip(
@@ -47,22 +51,27 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
         if f.index is None:
             out[f.name] = entry
             continue
-        listed = out.setdefault(f.name.partition("[")[0], _known(leaf(plant, f.path), f.unit))
+        listed = out.setdefault(_key(f), _known(np.asarray(leaf(plant, f.path)), f.unit))
         for key in ("value", "std", "identifiable"):
             *row, at = np.atleast_1d(f.index)
             (listed[key][row[0]] if row else listed[key])[at] = entry[key]
     return out
 
 
+def _key(f: Free) -> str:
+    """Return the key of an unknown in results: its name, or that of the plant's list in which it is."""
+    return f.name if f.index is None else str(f.path[0])
+
+
 def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
-    """A list of the plant's before its unknown entries are filled in."""
+    """Return the entry of a plant's list before its unknown elements are filled in."""
     known = np.asarray(values, float)
     std, told = np.full(known.shape, None), np.full(known.shape, True)
     return {"value": known.tolist(), "std": std.tolist(), "unit": unit, "identifiable": told.tolist()}
 
 
-def _one(x: np.ndarray | None) -> Any:
-    """A number where there is one joint, a list where there are several."""
+def one_or_list(x: np.ndarray | None) -> Any:
+    """Return a number for one joint, a list for several."""
     if x is None:
         return None
     x = np.atleast_1d(x)
@@ -72,7 +81,7 @@ def _one(x: np.ndarray | None) -> Any:
 def _worst(gaps: Sequence[Gap], pick: str) -> Any:
     values = [_pick(g, pick) for g in gaps]
     values = [v for v in values if v is not None]
-    return _one(np.max(values, axis=0)) if values else None
+    return one_or_list(np.max(values, axis=0)) if values else None
 
 
 def _pick(gap: Gap, what: str) -> np.ndarray | None:
@@ -82,26 +91,26 @@ def _pick(gap: Gap, what: str) -> np.ndarray | None:
 
 
 def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[str, Any]:
-    """The `gap` object of result.json."""
+    """Return the object `gap` of result.json."""
     fit, others = gaps[0], gaps[1:]
     unit, measured = session.machine.unit_by_joint, np.flatnonzero(session.fit.log.measured)
     out: dict[str, Any] = {
         "unit": unit("force"),
         "band_hz": session.recipe.band_hz(session.fit.log.rate_hz),
-        "fit": _one(fit.force.rms),
+        "fit": one_or_list(fit.force.rms),
         "validation": _worst(others, "force.rms"),
-        "noise_floor": _one(floor),
-        "relative": {"fit": _one(fit.force.relative), "validation": _worst(others, "force.relative")},
+        "noise_floor": one_or_list(floor),
+        "relative": {"fit": one_or_list(fit.force.relative), "validation": _worst(others, "force.relative")},
         "simulation": {
             "unit": unit("position", None if len(measured) > 1 else measured),
-            "fit": _one(_pick(fit, "simulation.rms")),
+            "fit": one_or_list(_pick(fit, "simulation.rms")),
             "validation": _worst(others, "simulation.rms"),
             "relative": {
-                "fit": _one(_pick(fit, "simulation.relative")),
+                "fit": one_or_list(_pick(fit, "simulation.relative")),
                 "validation": _worst(others, "simulation.relative"),
             },
             "command_relative": {
-                "fit": _one(_pick(fit, "simulation.command_relative")),
+                "fit": one_or_list(_pick(fit, "simulation.command_relative")),
                 "validation": _worst(others, "simulation.command_relative"),
             },
         },
@@ -109,18 +118,28 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     if len(others) > 1:
         out["validations"] = {
             g.name: {
-                "force": _one(g.force.rms),
-                "relative": _one(g.force.relative),
-                "simulation": _one(_pick(g, "simulation.rms")),
-                "simulation_relative": _one(_pick(g, "simulation.relative")),
+                "force": one_or_list(g.force.rms),
+                "relative": one_or_list(g.force.relative),
+                "simulation": one_or_list(_pick(g, "simulation.rms")),
+                "simulation_relative": one_or_list(_pick(g, "simulation.relative")),
             }
             for g in others
         }
     return out
 
 
+def versions() -> dict[str, str]:
+    """Return the versions of what the numbers depend on."""
+    return {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")}
+
+
+def covariance_of(estimate: Estimate) -> Covariance:
+    """Return the covariance of an estimate's parameters."""
+    return Covariance(tuple(estimate.names), estimate.precision.covariance)
+
+
 def derived(session: Session, estimate: Estimate) -> list[Derived]:
-    """Natural frequency; friction in its other form where the case states the gravity that it refers to."""
+    """Return the natural frequency, and friction in its other form if the case states gravity."""
     from jaxid.estimators.common.derived import dry_friction, natural_frequency
 
     friction = [] if session.case.plant.gravity is None else dry_friction(estimate)
@@ -128,14 +147,14 @@ def derived(session: Session, estimate: Estimate) -> list[Derived]:
 
 
 def derived_json(session: Session, estimate: Estimate) -> dict[str, Any]:
-    """The `derived` object of results; nothing where there is none."""
-    told = [d for d in derived(session, estimate) if np.isfinite(d.std)]
-    follows = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in told}
-    return {"derived": follows} if follows else {}
+    """Return the object `derived` of results, with its key; empty if nothing is derived."""
+    known = [d for d in derived(session, estimate) if np.isfinite(d.std)]
+    entries = {d.name: {"value": d.value, "std": d.std, "unit": d.unit} for d in known}
+    return {"derived": entries} if entries else {}
 
 
 def identification_json(result: Identification) -> dict[str, Any]:
-    """Content of result.json."""
+    """Return the content of result.json."""
     estimate = result.estimate
     return {
         "method": estimate.method,
@@ -144,16 +163,18 @@ def identification_json(result: Identification) -> dict[str, Any]:
         "samples": estimate.samples,
         "parameters": parameters_json(estimate),
         **derived_json(result.session, estimate),
+        "covariance": covariance_of(estimate).json(),
         "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
         **estimate.details,
         "gap": gap_json(result.session, result.gaps, result.noise_floor),
         "preprocess": recipe_json(result.session),
+        "versions": versions(),
         "notes": notes(result.session, estimate),
     }
 
 
 def recipe_json(session: Session) -> dict[str, Any]:
-    """How the logs were filtered, chosen or stated."""
+    """Return the settings of the filter, chosen or stated."""
     r = session.recipe
     stated = {"median": r.median} if r.median else {}
     if r.derivatives == "parabolic":
@@ -171,20 +192,21 @@ def recipe_json(session: Session) -> dict[str, Any]:
 
 
 def notes(session: Session, estimate: Estimate) -> list[str]:
-    """What a reader should know: warnings on the logs, and how the fit was done."""
+    """Return the warnings on the logs, and remarks on the fit."""
     warnings = [f"{f.where}: {f.what}; {f.hint}" for f in session.findings]
     return [*warnings, *estimate.notes]
 
 
-def effect_json(found: NamedEffect, estimate: Estimate) -> dict[str, Any]:
-    """One entry of `effects` in discovery.json."""
-    own = parameters_json(estimate, found.names)
+def effect_json(effect: NamedEffect, estimate: Estimate) -> dict[str, Any]:
+    """Return one entry of `effects` in discovery.json."""
+    parameters = parameters_json(estimate, effect.names)
+    fields = {f.name: str(f.path[-1]) for f in estimate.machine.parameters.free}
     return {
-        "kind": found.kind,
-        found.place[0]: found.place[1],
-        "parameters": {name.rpartition(".")[2]: entry for name, entry in own.items()},
-        "evidence": found.score.evidence,
-        "alternatives": [_alternative(s, estimate.machine.plant) for s in found.alternatives],
+        "kind": effect.kind,
+        effect.place[0]: effect.place[1],
+        "parameters": {fields[name]: entry for name, entry in parameters.items()},
+        "evidence": effect.score.evidence,
+        "alternatives": [_alternative(s, estimate.machine.plant) for s in effect.alternatives],
     }
 
 
@@ -194,12 +216,12 @@ def _alternative(score: Score, plant: Plant) -> dict[str, Any]:
 
 
 def _place(c: Candidate, plant: Plant) -> dict[str, int]:
-    """Joint or spring of a candidate, where the machine has several."""
+    """Return the joint or spring of a candidate, if the machine has several."""
     return dict([plant.place(c.port)]) if several_places(plant) else {}
 
 
 def where_json(result: Discovery) -> dict[str, Any] | None:
-    """The `where` object of discovery.json."""
+    """Return the object `where` of discovery.json."""
     w = result.where
     if w is None:
         return None
@@ -214,8 +236,8 @@ def where_json(result: Discovery) -> dict[str, Any] | None:
 
 
 def discovery_json(result: Discovery) -> dict[str, Any]:
-    """Content of discovery.json."""
-    own = result.session.machine.parameters.names
+    """Return the content of discovery.json."""
+    declared = {_key(f) for f in result.session.machine.parameters.free}
     before, after = result.gaps_before, result.gaps_after
     on = "validation" if len(after) > 1 else "fit"
     judged = slice(1, None) if len(after) > 1 else slice(0, 1)
@@ -238,7 +260,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
             "band_hz": result.session.recipe.band_hz(result.session.fit.log.rate_hz),
             "before": _worst(before[judged], "force.rms"),
             "after": _worst(after[judged], "force.rms"),
-            "noise_floor": _one(result.noise_floor),
+            "noise_floor": one_or_list(result.noise_floor),
             "on": on,
             "relative": {
                 "before": _worst(before[judged], "force.relative"),
@@ -250,58 +272,56 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
                 "after": _worst(after[judged], "simulation.rms"),
             },
         },
-        "parameters": {
-            k: v
-            for k, v in parameters_json(result.after).items()
-            if any(n == k or n.startswith(f"{k}[") for n in own)
-        },
+        "parameters": {k: v for k, v in parameters_json(result.after).items() if k in declared},
         **derived_json(result.session, result.after),
+        "covariance": covariance_of(result.after).json(),
         "unidentifiable": [{"combination": c} for c in result.after.precision.unidentifiable],
         "fit_gap": gap_json(result.session, after, result.noise_floor),
         "method": result.after.method,
         "preprocess": recipe_json(result.session),
+        "versions": versions(),
         "notes": [*notes(result.session, result.after), *turned_down(result)],
     }
 
 
 def turned_down(result: Discovery, most: int = 3) -> list[str]:
-    """Why effects were taken out again, and why the best of what the last round left were not added."""
+    """Return the reasons for removed effects, and for the best candidates that were not added."""
     if not result.rounds:
         return []
     effects = result.session.machine.plant.effects
     steps = [r.step for r in result.rounds]
-    lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.why]
+    lines = [f"{s.dropped.label} was taken out again: {s.why}" for s in steps if s.dropped and s.why]
     if all(e.break_away_level is None for e in effects) and result.unseen:
-        lines.append(f"break-away friction (static_friction) was not looked for: {result.unseen}")
+        lines.append(f"break-away friction (static_friction) was not searched for: {result.unseen}")
     session = result.session
     loop = session.machine.controller is not None and session.fit.log.reference is not None
     if result.verdict == "unexplained" and loop and session.case.within_prior is None:
-        # Force rows hold no sample at rest, and what depends on whether speed grows is blurred in them.
+        # Force rows hold no sample at rest, and blur effects that depend on whether speed grows.
         lines.append(
-            "what acts at rest, or where speed stands still, may show in the simulated loop: state "
-            "`[within_prior] prior`, how far off the guesses may be, and effects are looked for there"
+            "effects at rest, or at constant speed, may show in the simulated loop: state `[within_prior] "
+            "prior`, the relative error of the guesses, and effects are searched for there"
         )
     last = [s for s in steps if s.added is None and s.dropped is None][-1]
-    left = [s for s in last.scores if s.reason and s.evidence > last.threshold]
-    for score in left[:most]:
+    refused = [s for s in last.scores if s.reason and s.evidence > last.threshold]
+    for score in refused[:most]:
         name, nats = score.candidate.label, score.evidence
         lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
     if not session.machine.plant.designs_experiments and not result.proposals:
         tied = [e.label for e in result.effects if e.alternatives]
-        told = f"no experiment was designed that tells {', '.join(tied)} from rivals"
-        lines += [f"{told}: --experiments does, in minutes"] if tied else []
+        missing = f"no experiment was designed to separate {', '.join(tied)} from rivals"
+        lines += [f"{missing}: --experiments does, in minutes"] if tied else []
     return lines
 
 
 def step_json(r: Any, plant: Plant) -> dict[str, Any]:
-    """One entry of `steps`: what was added (or dropped), where, and the gap after it."""
+    """Return one entry of `steps`: the effect added or dropped, its place, and the gap after it."""
     step = r.step
     changed = step.added.candidate if step.added else step.dropped
     out = {
         "added": step.added.candidate.kind if step.added else None,
         **(_place(changed, plant) if changed else {}),
-        "fit": _one(r.fit),
-        "validation": _one(r.validation),
+        "fit": one_or_list(r.fit),
+        "validation": one_or_list(r.validation),
     }
     if step.dropped is not None:
         out["dropped"] = step.dropped.kind
@@ -318,19 +338,29 @@ def save_identification(result: Identification, folder: Path, *, overwrite: bool
     return folder
 
 
-def discovery_files(result: Discovery) -> list[str]:
-    """Names of what `save_discovery` writes."""
-    return ["discovery.json", "report.html", *[p.file for p in result.proposals if p.separates]]
+def discovery_files(result: Discovery, folder: Path) -> list[str]:
+    """Return the names of the files that `save_discovery` writes to a folder."""
+    experiments = [p.file for p in result.proposals if p.separates]
+    case = result.session.declared
+    corrected = [] if changed_in_python(case) else [found_case_file(case.path, folder)]
+    return ["discovery.json", "report.html", *corrected, *experiments]
 
 
 def save_discovery(result: Discovery, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write discovery.json, report.html and a CSV for every experiment that is proposed."""
+    """Write discovery.json, report.html, the corrected case, and a CSV for every proposed experiment.
+
+    A case that was changed in Python has no file to correct, and none is written.
+    """
     from jaxid.results.report.build import discovery_report
 
-    ready_folder(folder, discovery_files(result), overwrite=overwrite)
+    files = discovery_files(result, folder)
+    ready_folder(folder, files, overwrite=overwrite)
     for proposal in result.proposals:
-        if proposal.separates:
+        if proposal.separates and proposal.values is not None:
             write_whole(folder / proposal.file, signal_csv(proposal.signal, proposal.time, proposal.values))
+    for name in files:
+        if name == found_case_file(result.session.declared.path, folder):
+            write_whole(folder / name, case_text(result, folder))
     write_whole(folder / "report.html", discovery_report(result))
     write_json(folder / "discovery.json", discovery_json(result))
     return folder

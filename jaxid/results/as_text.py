@@ -1,4 +1,4 @@
-"""Results as text, for a terminal or a notebook."""
+"""Results as text, for a terminal: the tables that commands print, and summaries of a few lines."""
 
 from __future__ import annotations
 
@@ -9,53 +9,48 @@ import numpy as np
 
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
+from jaxid.results.parameters import lines_of
 from jaxid.results.report.numbers import with_std
 from jaxid.results.report.words import SLIGHT, place_words, within_prior_words
 
 if TYPE_CHECKING:
+    from jaxid.commands.check import Check
     from jaxid.commands.identify import Identification
     from jaxid.discovery.result import Discovery
     from jaxid.estimators.common.derived import Derived
     from jaxid.estimators.estimate import Estimate
+    from jaxid.gap import Gap
+    from jaxid.results.result import FitResult
+    from jaxid.session import Session
     from jaxid.studies.result import Study
+
+# Stands in tables in place of a standard deviation.
+UNIDENTIFIABLE = "not identifiable from this log"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Columns padded to their widest entry."""
+    """Return rows of text with every column padded to its widest entry."""
     widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)) for r in rows]
     return "\n".join(line.rstrip() for line in lines)
 
 
-def parameter_lines(estimate: Estimate, derived: Sequence[Derived] = ()) -> str:
-    """Value, standard deviation and unit of every parameter, and of what follows from them."""
+def parameter_rows(estimate: Estimate, derived: Sequence[Derived] = ()) -> list[list[str]]:
+    """Return a header, and value, standard deviation and unit of every parameter and derived quantity."""
     rows = [["parameter", "value", "std", "unit"]]
-    for f, value, std, told in zip(
-        estimate.machine.parameters.free,
-        estimate.theta,
-        estimate.std,
-        estimate.identifiable,
-        strict=True,
-    ):
-        shown = with_std(value, std) if told else ("-", "this log cannot tell it")
+    free = estimate.machine.parameters.free
+    for f, value, std, ok in zip(free, estimate.theta, estimate.std, estimate.identifiable, strict=True):
+        shown = with_std(value, std) if ok else ("-", UNIDENTIFIABLE)
         rows.append([f.name, *shown, f.unit])
     rows += [[d.name, *with_std(d.value, d.std), d.unit] for d in derived if np.isfinite(d.std)]
-    return aligned(rows)
+    return rows
 
 
-def _number(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(_number(v) for v in value)
-    return "-" if value is None or not np.isfinite(value) else f"{value:.4g}"
-
-
-def identification_table(result: Identification) -> str:
-    """What `identify` prints."""
-    estimate = result.estimate
-    gap = results.gap_json(result.session, result.gaps, result.noise_floor)
-    head = f"{estimate.method}: {estimate.message}, {estimate.samples} samples"
+def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[list[str]]:
+    """Return a header, and the disagreement of a model with its logs in force and in position."""
+    gap = results.gap_json(session, gaps, floor)
     simulation = gap["simulation"]
-    rows = [
+    return [
         ["gap", "fit", "validation", "unit"],
         ["force", _number(gap["fit"]), _number(gap["validation"]), joined(gap["unit"])],
         ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
@@ -67,25 +62,62 @@ def identification_table(result: Identification) -> str:
             joined(simulation["unit"]),
         ],
     ]
-    told = parameter_lines(estimate, results.derived(result.session, result.estimate))
-    notes = _notes(results.notes(result.session, estimate))
-    own = _minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []
-    together = _told_together(estimate.details.get("directions", []))
-    below = [*_blind(estimate), *within_prior_words(estimate.details), *own]
-    return "\n".join([head, "", told, *together, *below, "", aligned(rows), *notes])
 
 
-def _told_together(directions: Sequence[dict[str, Any]]) -> list[str]:
-    """Combinations that a fit within a prior tells, from the guesses on in units of it."""
+def _number(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_number(v) for v in value)
+    return "-" if value is None or not np.isfinite(value) else f"{value:.4g}"
+
+
+def identification_table(result: Identification) -> str:
+    """Return the text that `identify` prints."""
+    session, estimate = result.session, result.estimate
+    head = f"{estimate.method}: {estimate.message}, {estimate.samples} samples"
+    parameters = aligned(parameter_rows(estimate, results.derived(session, estimate)))
+    below = [
+        *_identifiable_combinations(estimate.details.get("directions", [])),
+        *_unidentifiable(estimate),
+        *within_prior_words(estimate.details),
+        *(_minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []),
+    ]
+    gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
+    return "\n".join([head, "", parameters, *below, "", gap, *_notes(results.notes(session, estimate))])
+
+
+def identification_summary(result: Identification) -> str:
+    """Return an identification in a few lines."""
+    estimate = result.estimate
+    head = f"Identification of {result.session.case.path.name} by {estimate.method}: {estimate.message}"
+    return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
+
+
+def discovery_summary(result: Discovery) -> str:
+    """Return a discovery in a few lines."""
+    effects = ": " + ", ".join(e.label for e in result.effects) if result.effects else ""
+    head = f"Discovery in {result.session.case.path.name}: {result.verdict.replace('_', ' ')}{effects}"
+    return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
+
+
+def _gap_line(result: FitResult) -> str:
+    """Return the force residual on the fitted and the validation logs in one line."""
+    gap = results.gap_json(result.session, result.gaps, result.noise_floor)
+    others = "" if gap["validation"] is None else f", validation {_number(gap['validation'])}"
+    floor = f"noise floor {_number(gap['noise_floor'])} {gap['unit']}"
+    return f"  force gap: fit {_number(gap['fit'])}{others}, {floor}"
+
+
+def _identifiable_combinations(directions: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the combinations that a fit within a prior identifies, from the guesses on in units of it."""
     return [
-        f"told together: {d['value']:+.3f} ± {d['std']:.3f} priors of "
+        f"identifiable combination: {d['value']:+.3f} ± {d['std']:.3f} priors of "
         + ", ".join(f"{w:+.2f} {n}" for n, w in d["combination"].items() if abs(w) > SLIGHT)
         for d in directions
     ]
 
 
 def _minimal(content: dict[str, Any]) -> list[str]:
-    """Coefficients and statistics of a minimal model."""
+    """Return the coefficients and statistics of a minimal model."""
     # With scipy.stats behind it: a second, which no other table needs.
     from jaxid.estimators.minimal.report import minimal_rows
 
@@ -94,28 +126,21 @@ def _minimal(content: dict[str, Any]) -> list[str]:
 
 
 def discovery_table(result: Discovery) -> str:
-    """What `discover` prints."""
+    """Return the text that `discover` prints."""
     content = results.discovery_json(result)
     lines = [f"verdict: {result.verdict}"]
     if content["where"]:
         lines.append(f"where:   {content['where']['text']}")
-    for found in result.effects:
-        others = ", ".join(s.candidate.label for s in found.alternatives)
-        told = f"; this log cannot tell it from {others}" if others else ""
-        lines.append(f"effect:  {found.label} (evidence {found.score.evidence:.0f} nats{told})")
+    for effect in result.effects:
+        others = ", ".join(s.candidate.label for s in effect.alternatives)
+        alternatives = f"; not distinguishable from {others} in this log" if others else ""
+        lines.append(f"effect:  {effect.label} (evidence {effect.score.evidence:.0f} nats{alternatives})")
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
+
+    parameters = aligned(parameter_rows(result.after, results.derived(result.session, result.after)))
+    lines += ["", aligned(step_rows(content)), "", parameters, *_unidentifiable(result.after), ""]
+
     gap = content["gap"]
-    rows = [["step", "force gap, fit", "force gap, validation"]]
-    for step in content["steps"]:
-        where = place_words(step)
-        where = f" ({where})" if where else ""
-        name = f"+ {step['added']}{where}" if step["added"] else "baseline"
-        if "dropped" in step:
-            name = (f"{name}, " if step["added"] else "") + f"- {step['dropped']}"
-            name += "" if step["added"] else where
-        rows.append([name, f"{_number(step['fit'])} {joined(gap['unit'])}", _number(step["validation"])])
-    told = parameter_lines(result.after, results.derived(result.session, result.after))
-    lines += ["", aligned(rows), "", told, *_blind(result.after), ""]
     lines.append(
         f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {joined(gap['unit'])} "
         f"(noise floor {_number(gap['noise_floor'])}); simulated position "
@@ -125,19 +150,37 @@ def discovery_table(result: Discovery) -> str:
     return "\n".join([*lines, *_notes(content["notes"])])
 
 
-def _blind(estimate: Estimate) -> list[str]:
-    """What the log does not tell; a fit within a prior holds it."""
+def step_rows(content: Mapping[str, Any]) -> list[list[str]]:
+    """Return a header, and a row for each step of a search.
+
+    Args:
+        content: Content of discovery.json.
+    """
+    rows = [["step", "force gap, fit", "force gap, validation"]]
+    for step in content["steps"]:
+        place = place_words(step)
+        place = f" ({place})" if place else ""
+        name = f"+ {step['added']}{place}" if step["added"] else "baseline"
+        if "dropped" in step:
+            name = (f"{name}, " if step["added"] else "") + f"- {step['dropped']}"
+            name += "" if step["added"] else place
+        rows.append([name, f"{_number(step['fit'])} {content['gap']['unit']}", _number(step["validation"])])
+    return rows
+
+
+def _unidentifiable(estimate: Estimate) -> list[str]:
+    """Return the combinations that the log does not determine; a fit within a prior holds them."""
     combinations = estimate.precision.unidentifiable
     if "directions" in estimate.details:
-        return [f"left to the guesses: {_sum(c)}" for c in combinations]
-    return _untold(combinations)
+        return [f"held at the guesses: {_sum(c)}" for c in combinations]
+    return _unidentifiable_lines(combinations)
 
 
-def _untold(combinations: Sequence[Mapping[str, float]]) -> list[str]:
-    """Unknowns that are without effect, and combinations that are, a line each."""
+def _unidentifiable_lines(combinations: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return unknowns, and combinations of them, that the log does not determine."""
     alone = [name for c in combinations if len(c) == 1 for name in c]
-    lines = [f"cannot be told: {', '.join(alone)}"] if alone else []
-    return lines + [f"cannot be told apart: {_sum(c)}" for c in combinations if len(c) > 1]
+    lines = [f"not identifiable: {', '.join(alone)}"] if alone else []
+    return lines + [f"not identifiable in combination: {_sum(c)}" for c in combinations if len(c) > 1]
 
 
 def _sum(combination: Mapping[str, float]) -> str:
@@ -148,13 +191,13 @@ def _notes(lines: Sequence[str]) -> list[str]:
     return ["", *[f"note: {line}" for line in lines]] if lines else []
 
 
-def check_table(result: Any) -> str:
-    """What `check` prints."""
+def check_table(result: Check) -> str:
+    """Return the text that `check` prints."""
     content = result.json()
     log, machine = content["log"], result.session.machine
     driven = machine.plant.driven(machine.plant.joints)
     unit = lambda quantity, joints=None: joined(machine.unit_by_joint(quantity, joints))
-    one = results._one
+    one = results.one_or_list
     head = (
         f"{log['samples']} samples at {log['rate_hz']:.6g} Hz, {log['duration_s']:.4g} s; stroke "
         f"{_number(one(log['stroke']))} {unit('position')}, up to "
@@ -171,42 +214,93 @@ def check_table(result: Any) -> str:
         f"filter: {what}, one sample in {recipe['decimation']} kept; noise "
         f"floor {_number(one(content['noise_floor']))} {unit('force')}"
     )
+    rows = check_rows(content)
+    combinations = _unidentifiable_lines([c["combination"] for c in content["unidentifiable"]])
+    table = ["", aligned(rows)] if len(rows) > 1 else []
+    return "\n".join(["the log is sound", head, how, *table, *combinations, *_notes(content["warnings"])])
+
+
+def check_rows(content: Mapping[str, Any]) -> list[list[str]]:
+    """Return a header, and the guess and the smallest standard deviation of each unknown.
+
+    Args:
+        content: Content of check.json.
+    """
     rows = [["unknown", "guess", "std at best", "unit"]]
     for name, p in content["parameters"].items():
-        best = f"{p['expected_std']:.2g}" if p["identifiable"] else "this log cannot tell it"
+        best = f"{p['expected_std']:.2g}" if p["identifiable"] else UNIDENTIFIABLE
         rows.append([name, f"{p['guess']:.4g}", best, p["unit"]])
-    blind = _untold([c["combination"] for c in content["unidentifiable"]])
-    table = ["", aligned(rows)] if len(rows) > 1 else []
-    return "\n".join(["the log is sound", head, how, *table, *blind, *_notes(content["warnings"])])
+    return rows
+
+
+def check_summary(result: Check) -> str:
+    """Return a check in a few lines."""
+    content = result.json()
+    log, session = content["log"], result.session
+    parameters = content["parameters"].values()
+    known = sum(p["identifiable"] for p in parameters)
+    lines = [
+        f"Check of {session.case.path.name}: the log is sound",
+        f"  {log['samples']} samples at {log['rate_hz']:.6g} Hz",
+        f"  {known} of {len(parameters)} unknowns identifiable",
+    ]
+    return "\n".join(lines + [f"  {len(content['warnings'])} warning(s)"] * bool(content["warnings"]))
 
 
 def study_table(result: Study) -> str:
-    """What `study` prints."""
+    """Return the text that `study` prints."""
     from jaxid.studies.settings import SETTINGS, words_of
 
-    part = lambda x: "-" if not np.isfinite(x) else f"{100 * x:.1f} %"
-    keys = ("bias", "spread", "std", "bound")
-    own = [name for name in SETTINGS if name in result.table.dims]
-    rows = [["estimator", *own, "parameter", "bias", "spread", "reported", "bound", "unit",
-             "68 %", "95 %", "failed"]]  # fmt: skip
-    for r in result.summary:
-        numbers = [*[_number(r[k]) for k in keys], r["unit"]]
-        parts = [part(r[k]) for k in ("coverage_68", "coverage_95", "failed")]
-        rows.append([r["estimator"], *[f"{r[k]:g}" for k in own], r["parameter"], *numbers, *parts])
-    runs, settings = result.table.sizes["run"], int(np.prod([result.table.sizes[k] for k in own]))
-    lines = [f"{result.title}: {runs} runs under {settings} setting(s), {result.seconds:.3g} s of work"]
-    lines += ["", aligned(rows)]
+    settings = [name for name in SETTINGS if name in result.table.dims]
+    runs = result.table.sizes["run"]
+    lines = [_study_head(result), "", aligned(study_rows(result))]
+
     if result.tracking:
         sizes = [f"{what} {n}" for what in ("RMS", "peak") for n in ("median", "95 %", "worst")]
-        rows = [[*own, "drive", *sizes, "unit"]]
+        rows = [[*settings, "drive", *sizes, "unit"]]
         for r in result.tracking:
             sizes = [_number(x) for name in ("rms", "peak") for x in r[name].values()]
-            rows.append([*[f"{r[k]:g}" for k in own], str(r["drive"]), *sizes, r["unit"]])
-        lines += ["", "off the reference, last quarter of each run:", aligned(rows)]
+            rows.append([*[f"{r[k]:g}" for k in settings], str(r["drive"]), *sizes, r["unit"]])
+        lines += ["", "tracking error, last quarter of each run:", aligned(rows)]
+
     for k, n in enumerate(result.named):
         lines += ["", "named:"] if k == 0 else []
         lines += [f"  {words_of(n)}: {n['runs']} of {runs}: {n['what']}"]
+
     for k, f in enumerate(result.failures):
         lines += ["", "failed:"] if k == 0 else []
         lines += [f"  {f['estimator']} at {words_of(f)}: {f['runs']} of {runs}: {f['why']}"]
     return "\n".join(lines)
+
+
+def study_rows(result: Study) -> list[list[str]]:
+    """Return a header, and a row for each estimator, setting and parameter of a study."""
+    from jaxid.studies.settings import SETTINGS
+
+    def percent(x: float) -> str:
+        return f"{100 * x:.1f} %" if np.isfinite(x) else "-"
+
+    settings = [name for name in SETTINGS if name in result.table.dims]
+    heads = ["bias", "spread", "reported", "bound", "unit", "68 %", "95 %", "failed"]
+    rows = [["estimator", *settings, "parameter", *heads]]
+    for r in result.summary:
+        sizes = [*[_number(r[k]) for k in ("bias", "spread", "std", "bound")], r["unit"]]
+        parts = [percent(r[k]) for k in ("coverage_68", "coverage_95", "failed")]
+        rows.append([r["estimator"], *[f"{r[k]:g}" for k in settings], r["parameter"], *sizes, *parts])
+    return rows
+
+
+def study_summary(result: Study) -> str:
+    """Return a study in a few lines."""
+    names = ", ".join(str(n) for n in result.table.estimator.values)
+    failed = sum(f["runs"] for f in result.failures)
+    lines = [f"Study of {_study_head(result)}", f"  estimators: {names}"]
+    return "\n".join([*lines, f"  {failed} of {result.table['converged'].size} fits failed"])
+
+
+def _study_head(result: Study) -> str:
+    from jaxid.studies.settings import SETTINGS
+
+    runs = result.table.sizes["run"]
+    settings = int(np.prod([result.table.sizes[k] for k in SETTINGS if k in result.table.dims]))
+    return f"{result.title}: {runs} runs under {settings} setting(s), {result.seconds:.3g} s of work"

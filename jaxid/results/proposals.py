@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def sentence(proposal: Proposal, machine: Machine) -> str:
-    """What to do, and what is to be expected of it, in one line."""
+    """Return an experiment and its expected evidence in one line."""
     p = proposal
     if not p.separates:
         unstated = [n for n in ("stroke", "speed", "force") if n not in p.limits.stated]
@@ -40,12 +40,12 @@ def _nats(value: float) -> str:
 
 
 def proposal_json(proposal: Proposal, machine: Machine) -> dict[str, Any]:
-    """One entry of `experiments` in discovery.json."""
+    """Return one entry of `experiments` in discovery.json."""
     p = proposal
     period = float(p.time[1] - p.time[0])
     return {
         "separates": [p.named, p.rival],
-        **{f"{place}s": [k if what == place else None for what, k in p.places] for place in PLACES},
+        **{f"{place}s": [k if kind == place else None for kind, k in p.places] for place in PLACES},
         "possible": p.separates,
         "text": sentence(p, machine),
         "nats": {"present": p.present, "expected": p.expected, "needed": p.needed},
@@ -69,6 +69,6 @@ def _bounds(b: Limits | Peaks) -> dict[str, Any]:
 
 
 def _one(x: np.ndarray) -> float | list[float]:
-    """A number where there is one joint, a list where there are several."""
+    """Return a number for one joint, a list for several."""
     values = [float(v) for v in np.ravel(x)]
     return values[0] if len(values) == 1 else values

@@ -1,1 +1,1 @@
-"""Monte-Carlo studies: a case simulated and identified over and over."""
+"""Monte-Carlo studies: a case simulated and identified many times."""

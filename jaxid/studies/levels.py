@@ -1,4 +1,4 @@
-"""Under what a study runs: sampling rate, resolution and noise of the sensors, each with each other."""
+"""The levels of a study: all combinations of sampling rate, resolution and noise of the sensors."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Level:
     """One combination of settings.
 
     Args:
-        setting: `noise`, a factor, and of the other settings those that [study] lists.
-        model: The case as it is under them, without the effects that are hidden from the estimators.
-        scene: What is simulated.
-        machine: Of the model, where fits start, before the starts are spread.
+        setting: The factor `noise`, and the other settings that [study] lists, by name.
+        model: The case under these settings, without the effects that are hidden from the estimators.
+        scene: The machine and its input, ready to be simulated.
+        machine: The machine of the model at the start of the fits, before the starts are spread.
     """
 
     setting: dict[str, float]
@@ -33,15 +33,15 @@ class Level:
 
 
 def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...]:
-    """All combinations of what [study] lists.
+    """Return all combinations of the settings that [study] lists.
 
     Args:
         case: The case.
-        model: The same without what is hidden.
-        longer_delays: See `Scene.of`.
+        model: The case without the hidden effects.
+        longer_delays: Factor on the delays that the simulation allows for, see `Scene.of`.
 
     Raises:
-        InputError: If the case cannot be simulated so, or a factor of the noise has nothing to act on.
+        InputError: If the case cannot be simulated so, or states no noise that a factor could multiply.
     """
     setting = case.study
     noises = [float(x) for x in setting.noise]
@@ -58,28 +58,28 @@ def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...
         twice = next((x for x in values if values.count(x) > 1), None)
         if twice is not None:
             raise InputError(
-                f"{twice:g} stands there twice", where=f"{case.where}, [study] {name}", hint="once is enough"
+                f"{twice:g} is given twice", where=f"{case.where}, [study] {name}", hint="give it once"
             )
     if "sample_rate" in others and _follows_rate(case):
         raise InputError(
-            "the file's samples have no time of their own, and would be played faster or slower",
+            "the samples of the file have no time, and would be played faster or slower",
             where=f"{case.where}, [study] sample_rate",
-            hint="give its time or sample_rate beside its kind",
+            hint="add time or sample_rate beside kind",
         )
     levels = []
     for values in itertools.product(*[[float(x) for x in getattr(setting, name)] for name in others]):
-        own = dict(zip(others, values, strict=True))
-        scene = Scene.of(_under(case, own), longer_delays=longer_delays)
-        of_model = _under(model, own)
+        chosen = dict(zip(others, values, strict=True))
+        scene = Scene.of(_under(case, chosen), longer_delays=longer_delays)
+        of_model = _under(model, chosen)
         machine = build_machine(of_model, period=1 / sampling_of(of_model)[0])
         for noise in noises:
-            louder = replace(scene, machine=_noisier(scene.machine, noise))
-            levels.append(Level(own | {"noise": noise}, of_model, louder, _noisier(machine, noise)))
+            noisy = replace(scene, machine=_noisier(scene.machine, noise))
+            levels.append(Level(chosen | {"noise": noise}, of_model, noisy, _noisier(machine, noise)))
     return tuple(levels)
 
 
 def _under(case: Case, setting: dict[str, float]) -> Case:
-    """A case whose log is sampled and resolved otherwise; its loop stays."""
+    """Return a case with another sampling rate and resolution of its log, and the same loop."""
     simulation, sensor, controller = case.simulation, case.sensor, case.controller
     if "sample_rate" in setting:
         if controller is not None and simulation.sample_rate is not None:
@@ -93,13 +93,13 @@ def _under(case: Case, setting: dict[str, float]) -> Case:
 
 
 def _follows_rate(case: Case) -> bool:
-    """Whether what drives the case is a file without a time of its own."""
+    """Return whether a file without a time column drives the case."""
     tables = [t for t in (case.input, case.reference) if t and t.get("kind") == "csv"]
     return any("time" not in t and "sample_rate" not in t for t in tables)
 
 
 def _noisier(machine: Machine, factor: float) -> Machine:
-    """A machine whose sensors have so many times the noise; their resolution stays."""
+    """Return a machine with the noise of its sensors multiplied by a factor, at the same resolution."""
     sensor = machine.sensor
     scaled = {
         n: None if getattr(sensor, n) is None else factor * jnp.asarray(getattr(sensor, n))

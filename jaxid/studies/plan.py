@@ -1,4 +1,4 @@
-"""What a study is to do: which estimators, noise, draws and starts, in which chunks."""
+"""The plan of a study: its estimators, noise levels, draws and starts, in chunks."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from jaxid.numerics.lanes import cores
 from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
 
-# Part of the memory that the chunks in work may take together.
+# Fraction of the memory that the chunks in work may take together.
 _MEMORY = 0.25
-# On a processor's cores: most runs in a chunk of long logs, of more the arrays no longer fit its cache; of
-# short ones, that many samples in all, and most runs in a compiled call. Runs that want different things
-# next then fill each other's gaps.
+# On a processor: largest number of runs in a chunk of long logs, beyond which the arrays exceed its cache;
+# number of samples in a chunk of short logs; and largest number of runs in a compiled call. Runs that need
+# different solves next then fill each other's gaps.
 _LARGEST, _SAMPLES, _LANES = 8, 6400, 16
-# Likewise on an accelerator; and memory of a device that does not state it [bytes].
+# Largest number of runs in a chunk on an accelerator, and memory of a device that does not state it [bytes].
 _RUNS_OF_DEVICE = 4096
 _UNSTATED = 2**32
-# Of the arrays in a chunk; counted up where they change.
+# Version of the arrays in a chunk, counted up if they change.
 _LAYOUT = 2
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
@@ -43,13 +43,13 @@ class Plan:
 
     Args:
         case: The case.
-        levels: Under what it runs.
+        levels: Combinations of settings under which it runs.
         estimators: Names of methods, "discover", or "in_loop".
-        draw: Relative spread of the true values: each is multiplied by exp(draw * N(0, 1)).
-        start_spread: Likewise of the values that a fit starts from.
-        runs: At each level.
-        chunk: Runs that are simulated and solved together.
-        seed: Of everything drawn.
+        draw: Relative spread of the true values, each of which is multiplied by exp(draw * N(0, 1)).
+        start_spread: Relative spread of the values at which a fit starts, drawn in the same way.
+        runs: Number of runs at each level.
+        chunk: Number of runs that are simulated and solved together.
+        seed: Seed of everything that is drawn.
     """
 
     case: Case
@@ -63,18 +63,18 @@ class Plan:
 
     @classmethod
     def of(cls, case: Case, *, runs: int | None = None, seed: int = 0, workers: int | None = None) -> Plan:
-        """The study of a case.
+        """Make the plan of a case's study.
 
         Args:
             case: The case; its [study] may be left out.
-            runs: In place of the case's.
-            seed: Of everything drawn, from 0 to 2^31 - 1.
-            workers: Chunks that are run at once; absent: one a core, or one on an accelerator.
+            runs: Number of runs at each level; None: that of the case.
+            seed: Seed of everything that is drawn, from 0 to 2^31 - 1.
+            workers: Number of chunks that run at once; None: one a core, or one on an accelerator.
 
         Raises:
-            InputError: If the case cannot be simulated, nothing is unknown, a factor of the noise has
-                nothing to act on, what the law found is asked of one that does not identify, or links must
-                be what bodies can be and an estimator cannot keep to it.
+            InputError: If the case cannot be simulated, no parameter is unknown, the case states no noise
+                that a factor could multiply, `in_loop` is asked of a law that does not identify, or links
+                must be physically consistent and an estimator cannot ensure it.
         """
         setting, where = case.study, case.where
         if not 0 <= seed < 2**31:
@@ -84,7 +84,7 @@ class Plan:
         levels = levels_of(case, model, float(np.exp(_FARTHEST * draw)))
         if not levels[0].machine.parameters.free:
             raise InputError(
-                "nothing is unknown", where=where, hint="give at least one parameter as { guess = ... }"
+                "no parameter is unknown", where=where, hint="give at least one parameter as { guess = ... }"
             )
         estimators = setting.estimators
         for method in estimators:
@@ -101,17 +101,17 @@ class Plan:
 
     @property
     def scene(self) -> Scene:
-        """What is simulated, but for the settings."""
+        """The simulated scene of the first level."""
         return self.levels[0].scene
 
     @property
     def machine(self) -> Machine:
-        """Of the model, but for the settings."""
+        """The machine of the model at the first level."""
         return self.levels[0].machine
 
     @property
     def fits(self) -> bool:
-        """Whether anything is fitted to the logs."""
+        """The flag of a study that fits anything to the logs."""
         return set(self.estimators) != {IN_LOOP}
 
     @property
@@ -124,17 +124,17 @@ class Plan:
 
     @property
     def names(self) -> list[str]:
-        """Of the parameters."""
+        """Names of the parameters."""
         return self.machine.parameters.names
 
     @property
     def own(self) -> list[int]:
-        """Where the model's parameters stand among those of what is simulated."""
+        """Positions of the model's parameters among those of the simulated machine."""
         return [self.scene.machine.parameters.names.index(name) for name in self.names]
 
     @property
     def lanes(self) -> int:
-        """Runs in a compiled call: all of a chunk on an accelerator."""
+        """Number of runs in a compiled call; on an accelerator all of a chunk."""
         return self.chunk if _accelerator() else min(self.chunk, _LANES)
 
     @functools.cached_property
@@ -147,9 +147,9 @@ class Plan:
         ]  # fmt: skip
 
     def drawn(self, run: int) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
-        """True values of all that is simulated in a run, where its fit starts, and what draws its noise.
+        """Draw the true values of a run, the start of its fit, and the generator of its noise.
 
-        They depend on the seed and the run's number alone: every level sees the same draws.
+        They depend on the seed and the run's number alone, so that every level has the same draws.
         """
         rng = np.random.default_rng([self.seed, run])
         truth = self.scene.machine.parameters.guess
@@ -164,7 +164,7 @@ class Plan:
 
     @property
     def manifest(self) -> dict:
-        """What must be the same for chunks to belong together."""
+        """All that must be equal for chunks to belong to one study."""
         from importlib.metadata import version
 
         packages = ("jaxid", "jax", "jaxlib", "numpy", "scipy")
@@ -186,13 +186,13 @@ class Plan:
 
 
 def _need_learner(case: Case, scene: Scene) -> None:
-    """Refuse to ask a law what it found that does not identify, or that knows what is to be hidden."""
+    """Refuse `in_loop` for a law that does not identify, or that knows the hidden effects."""
     law, where = scene.machine.controller, f"{case.where}, [study] estimators"
     if law is None or "estimator" not in law.of_machine:
         hint = 'take [controller] kind = "adaptive", or leave in_loop out'
         raise InputError("in_loop: no law identifies in this case", where=where, hint=hint)
     if case.study.hidden:
-        what = "in_loop: the law has the whole case for its model, and nothing is hidden from it"
+        what = "in_loop: the law uses the whole case as its model, so that no effect is hidden from it"
         raise InputError(what, where=where, hint="leave hidden out")
 
 
@@ -203,13 +203,13 @@ def _without(case: Case, hidden: tuple[str, ...]) -> Case:
             raise InputError(
                 f"{kind!r} is not among the effects of this case",
                 where=f"{case.where}, [study] hidden",
-                hint=f"name what is to be hidden from the model: {', '.join(kinds)}",
+                hint=f"name effects of the case: {', '.join(kinds)}",
             )
     return replace(case, effects=tuple(e for e in case.effects if e.cls.kind not in hidden))
 
 
 def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
-    """Runs that are solved together: as many as memory holds for all workers, not more than there are."""
+    """Return the number of runs that are solved together: as many as memory holds for all workers."""
     machine, joints = levels[0].machine, levels[0].model.plant.joints
     samples = max(len(level.scene.signal) for level in levels)
     refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
@@ -221,12 +221,12 @@ def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
 
 
 def _accelerator() -> bool:
-    """Whether there is one: it is filled."""
+    """Return whether JAX has an accelerator, which one chunk then fills."""
     return jax.local_devices()[0].platform != "cpu"
 
 
 def _memory() -> float:
-    """Bytes that arrays may take."""
+    """Return the memory of the device [bytes]."""
     if _accelerator():
         return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", _UNSTATED)
     stated = hasattr(os, "sysconf")
@@ -234,12 +234,12 @@ def _memory() -> float:
 
 
 def at_once() -> int:
-    """Chunks in work at once: one a core; on an accelerator one, which fills it."""
+    """Return the number of chunks in work at once: one a core, or one on an accelerator."""
     return 1 if _accelerator() else cores()
 
 
 def fingerprint(case: Case) -> str:
-    """Of a case as it is in memory, and of every file that it names and that is there."""
+    """Return the digest of a case as it is in memory, and of every existing file that it names."""
     digest = hashlib.sha256(repr(replace(case, path=Path(case.name))).encode())
     for path in named_files(case):
         digest.update(path.read_bytes())
@@ -247,32 +247,32 @@ def fingerprint(case: Case) -> str:
 
 
 def named_files(case: Case) -> list[Path]:
-    """Files that a case names and that are there, in a fixed order."""
-    found: set[Path] = set()
+    """Return the existing files that a case names, in a fixed order."""
+    files: set[Path] = set()
 
-    def look(value: object) -> None:
+    def visit(value: object) -> None:
         if isinstance(value, Mapping):
             for entry in value.values():
-                look(entry)
+                visit(entry)
         elif isinstance(value, (list, tuple)):
             for entry in value:
-                look(entry)
+                visit(entry)
         elif isinstance(value, str):
             path = case.folder / value.partition(":")[0]
             if value and path.is_file():
-                found.add(path)
+                files.add(path)
 
-    look(case.tables)
-    return sorted(found)
+    visit(case.tables)
+    return sorted(files)
 
 
 def digest_of(manifest: dict) -> str:
-    """What every chunk of a study carries, so that no other's is taken for one of it."""
+    """Return the digest by which a chunk is known to belong to a study."""
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def same(one: dict, other: dict) -> str:
-    """What of two manifests differs, in words; empty where they belong together."""
+    """Return the differences of two manifests in words; empty if the studies are the same."""
     words = {"fingerprint": "the case or a file that it names"}
     keys = [k for k in one if json.dumps(one[k]) != json.dumps(other.get(k))]
-    return ", ".join(words.get(k, k) for k in keys)
+    return ", ".join(words[k] if k in words else str(k) for k in keys)

@@ -12,7 +12,8 @@ from typing import Any
 from jaxid.case.case import load_case, read_case
 from jaxid.errors import InputError
 from jaxid.studies.plan import Plan, digest_of, fingerprint, named_files
-from jaxid.studies.runs import Arrays, Runner
+from jaxid.studies.rows import Arrays
+from jaxid.studies.runs import Runner
 
 # Seconds to wait for a scheduler, and for a first worker.
 _PATIENCE = 20
@@ -20,13 +21,13 @@ _PATIENCE = 20
 
 @dataclass(frozen=True)
 class Bundle:
-    """A study as it travels: a case with the files that it names, and what was asked of it.
+    """A study as it is sent to workers: a case with the files that it names, and the options of the plan.
 
     Args:
         case: Name of the case file; of a case that was given as a dict, its tables.
         files: Contents by path, relative to the case's folder.
-        runs, chunk, seed: Of the plan.
-        manifest: What the plan says of itself.
+        runs, chunk, seed: Numbers of the plan.
+        manifest: Manifest of the plan.
     """
 
     case: str | Mapping[str, Any]
@@ -38,10 +39,10 @@ class Bundle:
 
     @classmethod
     def of(cls, plan: Plan) -> Bundle:
-        """Of a plan.
+        """Build the bundle of a plan.
 
         Raises:
-            InputError: If the case is not what its file says, or names a file outside its folder, which a
+            InputError: If the case differs from its file, or names a file outside its folder, which a
                 worker would not find.
         """
         case, files = plan.case, {}
@@ -50,7 +51,7 @@ class Bundle:
             raise InputError(
                 "is not the case that was given",
                 where=case.where,
-                hint="write what was changed in Python to the file: workers read it",
+                hint="write the changes made in Python to the file, which workers read",
             )
         for path in (*([case.path] if case.path else []), *named_files(case)):
             try:
@@ -66,10 +67,10 @@ class Bundle:
         return cls(name, files, plan.runs, plan.chunk, plan.seed, plan.manifest)
 
     def plan(self) -> Plan:
-        """The plan again, where it has arrived.
+        """Rebuild the plan on a worker.
 
         Raises:
-            InputError: If this machine has other versions of what the bits depend on.
+            InputError: If this machine has other versions of the libraries that the numbers depend on.
         """
         with tempfile.TemporaryDirectory(prefix="jaxid-study-") as name:
             folder = Path(name)
@@ -80,21 +81,21 @@ class Bundle:
             case = load_case(folder / case) if isinstance(case, str) else read_case(case, None, folder)
             plan = Plan.of(case, runs=self.runs, seed=self.seed)
             plan = replace(plan, chunk=self.chunk)
-            own, wanted = plan.manifest["versions"], self.manifest["versions"]
-        if own != wanted:
+            present, wanted = plan.manifest["versions"], self.manifest["versions"]
+        if present != wanted:
             raise InputError(
-                f"a worker has {own} where {wanted} belong", hint="install the same on every machine"
+                f"a worker has {present} in place of {wanted}", hint="install the same on every machine"
             )
         return plan
 
 
-# Of this process, by what was asked: a worker loads a case and compiles once.
+# The runners of this process by manifest, so that a worker loads a case and compiles it once.
 _RUNNERS: dict[str, Runner] = {}
 _LOCK = threading.Lock()
 
 
 def run_chunk(bundle: Bundle, number: int) -> Arrays:
-    """One chunk of a bundle, on the worker that this runs on."""
+    """Run one chunk of a bundle on this worker."""
     key = digest_of(bundle.manifest)
     with _LOCK:
         if key not in _RUNNERS:
@@ -106,11 +107,13 @@ class Remote:
     """The workers of a Dask scheduler, while a study lasts.
 
     Args:
-        address: Of the scheduler, such as `tcp://host:8786`.
+        address: Address of the scheduler, such as `tcp://host:8786`.
     """
 
     def __init__(self, address: str) -> None:
         self.address = address
+        # A client of Dask, whose methods answer at once or later by its mode: no type says which.
+        self.client: Any = None
 
     def __enter__(self) -> Remote:
         try:
@@ -119,12 +122,12 @@ class Remote:
             raise InputError(
                 "--scheduler needs Dask's distributed", hint="install jaxid with its extra: jaxid[scheduler]"
             ) from None
-        self.client = None
+        client: Any = None
         try:
-            self.client = Client(self.address, timeout=_PATIENCE, set_as_default=False)
-            self.client.wait_for_workers(1, timeout=_PATIENCE)
+            client = self.client = Client(self.address, timeout=_PATIENCE, set_as_default=False)
+            client.wait_for_workers(1, timeout=_PATIENCE)
         except (OSError, ValueError, TimeoutError) as error:
-            what = "no scheduler answers" if self.client is None else "there is no worker"
+            what = "no scheduler answers" if client is None else "there is no worker"
             self.__exit__()
             raise InputError(
                 f"{what} at {self.address}: {error}", hint="give its address, as it prints it"
@@ -137,25 +140,25 @@ class Remote:
 
     @property
     def threads(self) -> int:
-        """Chunks that run at once."""
+        """Number of chunks that run at once."""
         return max(1, sum(self.client.nthreads().values()))
 
     def run(self, bundle: Bundle, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
-        """Chunks as they come back; what a worker took with it, Dask gives to another.
+        """Yield chunks as they come back; Dask gives those of a lost worker to another.
 
         Raises:
             InputError: If a chunk ended several workers, or the scheduler is lost.
         """
         from distributed import CancelledError, KilledWorker, as_completed
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
 
-        left = {self.client.submit(run_chunk, bundle, k, pure=False): k for k in numbers}
+        pending = {self.client.submit(run_chunk, bundle, k, pure=False): k for k in numbers}
         try:
-            for future in as_completed(list(left), loop=self.client.loop):
-                yield left[future], future.result()
+            for future in as_completed(list(pending), loop=self.client.loop):
+                yield pending[future], future.result()
                 future.release()
         except (KilledWorker, CancelledError, CommClosedError) as error:
             raise InputError(
                 f"the workers at {self.address} are lost: {error}",
-                hint="what is done is kept: see what ended them, then --resume",
+                hint="finished chunks are kept: see the workers' logs, then --resume",
             ) from error

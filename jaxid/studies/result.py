@@ -1,4 +1,4 @@
-"""What a study found: the table of all runs, and what it says of every estimator."""
+"""The result of a study: the table of all runs, and the statistics of every estimator."""
 
 from __future__ import annotations
 
@@ -16,29 +16,32 @@ import xarray as xr
 
 from jaxid.files import ready_folder, write_json, write_whole
 from jaxid.model.units import joined
+from jaxid.studies.rows import COLUMNS, Arrays, variables
 from jaxid.studies.settings import SETTINGS
 
 if TYPE_CHECKING:
+    import pandas
+    from matplotlib.axes import Axes
+
     from jaxid.machine import Machine
     from jaxid.studies.plan import Plan
-    from jaxid.studies.runs import Arrays
 
 FILES = ("study.nc", "summary.json", "report.html")
 # Nominal coverage of the intervals that are counted.
 COVERAGES = (0.68, 0.95)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Study:
-    """What `study` returns.
+    """Result of `study`.
 
     Args:
         table: Every run: `estimate`, `std`, `identifiable` (estimator, noise, run, parameter),
             `converged`, `steps`, `message`, `named` (estimator, noise, run), `truth` and `start` (run,
-            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter); of loops
-            `tracking_rms` and `tracking_peak` (noise, run, drive), of the last quarter of a run. SI. Before
-            noise come `sample_rate` [Hz] and `position_resolution`, where the study varies them.
-        seconds: That all chunks took, added up over the threads; of those resumed, then.
+            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter); for loops
+            `tracking_rms` and `tracking_peak` (noise, run, drive) in the last quarter of a run. SI units.
+            `sample_rate` [Hz] and `position_resolution` come before noise if the study varies them.
+        seconds: Time of all chunks [s], added up over the threads, those of earlier starts included.
         title: Name of the case.
     """
 
@@ -53,9 +56,9 @@ class Study:
 
     @property
     def tracking(self) -> list[dict[str, Any]]:
-        """How well loops follow in the last quarter of a run, by setting and drive; nothing of open loops.
+        """Tracking errors in the last quarter of a run, by setting and drive; empty for open loops.
 
-        Of `rms` and of `peak` the median of the runs, what 95 % of them keep below, and the worst.
+        `rms` and `peak` hold the median of the runs, the value that 95 % of them stay below, and the worst.
         """
         if "tracking_rms" not in self.table:
             return []
@@ -79,9 +82,9 @@ class Study:
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """`why` runs gave no value for all parameters, and how many by that, by estimator and setting.
+        """Reasons (`why`) for which runs lack a value for some parameter, with their number of `runs`.
 
-        Reasons that differ in numbers only count as one, told as the first run has it.
+        Rows are by estimator and setting. Reasons that differ only in numbers count as one.
         """
         out = []
         for estimator, setting, own in cells(self.table):
@@ -101,13 +104,51 @@ class Study:
 
     @property
     def named(self) -> list[dict[str, Any]]:
-        """`what` discover named, or its verdict, and in how many `runs`, by setting."""
+        """Effects that discover named, or its verdict (`what`), with the number of `runs`, by setting."""
         return [
             {"estimator": estimator, **setting, "what": str(what), "runs": runs}
             for estimator, setting, own in cells(self.table)
             for what, runs in Counter(own["named"].values.tolist()).most_common()
             if what
         ]
+
+    def plot(
+        self, kind: str, ax: Axes | None = None, *, parameter: str | None = None, step: int | None = None
+    ) -> Axes:
+        """Draw one plot for one parameter.
+
+        Args:
+            kind: "errors" (RMS error against the setting with most values), "coverage" (of 95 % intervals)
+                or "scatter" (errors in units of their reported deviation).
+            ax: Axes to draw on; None: a new figure, which a notebook shows.
+            parameter: Name of the parameter; None: the first.
+            step: Setting of "scatter", in the order of the table; None: the first.
+
+        Returns:
+            The axes.
+
+        Raises:
+            InputError: If the kind or the parameter is unknown.
+        """
+        from jaxid.results.plotting import Selection, plot_study
+
+        return plot_study(self, kind, ax, Selection(parameter=parameter, step=step))
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return `summary` as a table; needs pandas. All runs are `table.to_dataframe()`."""
+        from jaxid.results.parameters import frame
+
+        return frame(self.summary)
+
+    def __repr__(self) -> str:
+        from jaxid.results.as_text import study_summary
+
+        return study_summary(self)
+
+    def _repr_html_(self) -> str:
+        from jaxid.results.as_html import study_html
+
+        return study_html(self)
 
     def __str__(self) -> str:
         from jaxid.results.as_text import study_table
@@ -140,7 +181,7 @@ def cells(table: xr.Dataset) -> Iterator[tuple[str, dict[str, float], xr.Dataset
 
 
 def conditions(table: xr.Dataset) -> Iterator[tuple[dict[str, float], xr.Dataset]]:
-    """Every setting, and what was found under it."""
+    """Yield every setting with the part of the table under it."""
     dims = [name for name in SETTINGS if name in table.dims]
     for index in itertools.product(*[range(table.sizes[name]) for name in dims]):
         own = table.isel(dict(zip(dims, index, strict=True)))
@@ -148,7 +189,7 @@ def conditions(table: xr.Dataset) -> Iterator[tuple[dict[str, float], xr.Dataset
 
 
 def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
-    """One table of all chunks, in their order."""
+    """Gather the chunks, in their order, in one table."""
     levels = [[c for c, (level, _) in zip(chunks, plan.chunks, strict=True) if level == k]
               for k in range(len(plan.levels))]  # fmt: skip
     settings = plan.settings
@@ -159,18 +200,11 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
         return whole.reshape(len(whole), *sizes, *whole.shape[2:])
 
     run = ("estimator", *settings, "run")
-    each = (*run, "parameter")
     once = {n: np.concatenate([c[n] for c in levels[0]]) for n in ("truth", "start")}
     free = plan.machine.parameters.free
     table = xr.Dataset(
         {
-            "estimate": (each, by_run("estimate")),
-            "std": (each, by_run("std")),
-            "identifiable": (each, by_run("identifiable").astype(np.int8)),
-            "converged": (run, by_run("converged").astype(np.int8)),
-            "steps": (run, by_run("steps").astype(np.int32)),
-            "message": (run, by_run("message").astype(object)),
-            "named": (run, by_run("named").astype(object)),
+            **variables({name: by_run(name) for name in COLUMNS}, run),
             "truth": (("run", "parameter"), once["truth"]),
             "start": (("run", "parameter"), once["start"]),
             "bound": ((*settings, "parameter"), bound.reshape(*sizes, -1)),
@@ -200,23 +234,23 @@ def _tracking_unit(machine: Machine) -> str:
 
 
 def _why(run: xr.Dataset) -> str:
-    """Why a run has no value for all parameters; empty where it has."""
+    """Return the reason for which a run lacks a value for some parameter; empty if it has all."""
     if not run["converged"].item():
         return str(run["message"].item())
-    untold = run.parameter.values[run["identifiable"].values == 0]
-    return f"the log cannot tell {', '.join(map(str, untold))}" if len(untold) else ""
+    missing = run.parameter.values[run["identifiable"].values == 0]
+    return f"not identifiable: {', '.join(map(str, missing))}" if len(missing) else ""
 
 
 def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
-    """Bias, spread and coverage of every estimator, setting and parameter.
+    """Compute bias, spread and coverage of every estimator, setting and parameter.
 
     Returns:
-        Rows with `runs` and `used` (converged, and the parameter told); `failed`, the part that is
-        not; of those used `bias` (mean error), `bias_std` (its own deviation), `spread`
-        (standard deviation of the error), `rmse`, `std` (mean of those reported), `bound`
-        (Cramer-Rao), and `coverage_68`, `coverage_95`: the part of intervals of that nominal coverage
-        that hold the truth. NaN where there is nothing to say it of, as of an estimator that
-        gives no standard deviation.
+        Rows with `runs` and `used` (converged, and the parameter identifiable); `failed`, the fraction of
+        the others; over the runs used `bias` (mean error), `bias_std` (standard deviation of the mean),
+        `spread` (standard deviation of the error), `rmse`, `std` (mean of those reported), `bound`
+        (Cramer-Rao), and `coverage_68`, `coverage_95`: the fraction of intervals of that nominal coverage
+        that hold the truth. NaN if no run has the quantity, such as for an estimator without a
+        standard deviation.
     """
     rows = []
     for estimator, setting, whole in cells(table):

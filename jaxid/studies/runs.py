@@ -20,13 +20,12 @@ from jaxid.session import Session, session_around
 from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics
 from jaxid.studies.plan import Plan
-
-Arrays = dict[str, np.ndarray]
+from jaxid.studies.rows import COLUMNS, Arrays, RunRow, stacked
 
 
 @dataclass(frozen=True)
 class Ways:
-    """How all runs at one level are filtered and integrated: alike, so as to share code."""
+    """Filter and integration of all runs at one level, which share compiled code."""
 
     recipe: Recipe
     numerics: Numerics | None
@@ -45,14 +44,14 @@ class Runner:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def ways(self, level: int) -> Ways:
-        """How runs at a level are filtered and integrated, as the first of them asks."""
+        """Return filter and integration of the runs at a level, chosen at first use."""
         with self._lock:
             if level not in self._ways:
                 self._ways[level] = self._chosen(level)
         return self._ways[level]
 
     def _chosen(self, level: int) -> Ways:
-        """As `identify` would choose on the log of the nominal machine."""
+        """Choose as `identify` does on the log of the nominal machine."""
         at = self.plan.levels[level]
         log = run_alone(at.scene.simulated_log(at.scene.machine, self.plan.drawn(0)[2])).log
         session = session_around(at.model, at.machine, log)
@@ -64,20 +63,20 @@ class Runner:
         return Ways(session.recipe, choose_numerics(machine, log, solver=solver))
 
     def chunk(self, number: int) -> Arrays:
-        """All runs of a chunk, as arrays by estimator and run.
+        """Run a chunk and return arrays by estimator and run.
 
         Returns:
-            `estimate` and `std` (method, run, p), NaN where there is none; `converged` and
+            `estimate` and `std` (method, run, p), NaN if there is none; `converged` and
             `identifiable`; `steps`; `message` and `named` (method, run); `tracking` (method, run, drives,
             2), see `_tracking`; `truth` and `start` (run, p); `seconds` that the chunk took.
         """
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
         ways = self.ways(level) if self.plan.fits else None
-        found = run_batched([self._run(level, k, ways) for k in runs], self.plan.lanes)
-        # Whatever ends a run, in a library too, ends that run only.
-        found = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
-        out = {name: np.stack([row[name] for row in found], axis=1) for name in (*_BY_METHOD, "tracking")}
+        results = run_batched([self._run(level, k, ways) for k in runs], self.plan.lanes)
+        # An exception ends its run only, even one of a library.
+        arrays = [self._all_failed(x) if isinstance(x, Exception) else x for x in results]
+        out = {name: np.stack([row[name] for row in arrays], axis=1) for name in (*COLUMNS, "tracking")}
         drawn = [self.plan.drawn(k) for k in runs]
         out["truth"] = np.stack([truth[self.plan.own] for truth, _, _ in drawn])
         out["start"] = np.stack([start for _, start, _ in drawn])
@@ -88,9 +87,9 @@ class Runner:
         plan, at = self.plan, self.plan.levels[level]
         truth, start, rng = plan.drawn(number)
         machine = at.machine.with_estimate(start)
-        rows = []
+        rows: list[RunRow] = []
         simulated_log = yield from at.scene.simulated_log(at.scene.machine.with_estimate(truth), rng)
-        # What is unknown of a reference is not in the log.
+        # A reference with unknowns is not in the log.
         log = (
             simulated_log.log
             if machine.unknown_reference is None
@@ -98,98 +97,84 @@ class Runner:
         )
         session = None if ways is None else session_around(at.model, machine, log, ways.recipe)
         for method in plan.estimators:
-            options = {"numerics": ways.numerics} if method in SIMULATING else {}
             try:
                 if method == IN_LOOP:
-                    rows.append(_told(plan, simulated_log.trajectory))
+                    rows.append(_row_of_law(plan, simulated_log.trajectory))
                     continue
+                assert ways is not None, "a plan with fits has ways for them"
+                assert session is not None
                 if method == DISCOVER:
                     aligned = replace(ways.recipe, align_hold=True)
                     whole = session_around(at.model, machine, log, aligned)
-                    rows.append(_found(plan, whole))
+                    rows.append(_row_of_search(plan, whole))
                     continue
+                options = {"numerics": ways.numerics} if method in SIMULATING else {}
                 rows.append(_row((yield from steps_of(method, session, **options))))
             except Exception as error:
-                rows.append(_failed(plan, _words(error)))
+                rows.append(RunRow.failed(len(plan.names), _words(error)))
         driven = machine.plant.driven(simulated_log.trajectory.position.shape[1])
         followed = np.asarray(simulated_log.trajectory.position)[:: at.scene.every, list(driven)]
-        return _stacked(rows, _tracking(simulated_log.log.reference, followed))
+        return _run_arrays(rows, _tracking(simulated_log.log.reference, followed))
 
     def _all_failed(self, error: Exception) -> Arrays:
         drives = 0 if self.plan.machine.controller is None else self.plan.machine.gain.size
-        rows = [_failed(self.plan, _words(error)) for _ in self.plan.estimators]
-        return _stacked(rows, np.full((drives, 2), np.nan))
+        rows = [RunRow.failed(len(self.plan.names), _words(error)) for _ in self.plan.estimators]
+        return _run_arrays(rows, np.full((drives, 2), np.nan))
 
 
-_BY_METHOD = ("estimate", "std", "identifiable", "converged", "steps", "message", "named")
+def _row(estimate: Estimate) -> RunRow:
+    identifiable = estimate.identifiable & np.all(np.isfinite(estimate.theta))
+    return RunRow(
+        estimate=np.where(identifiable, estimate.theta, np.nan),
+        std=np.where(identifiable, estimate.std, np.nan),
+        identifiable=identifiable,
+        converged=estimate.converged,
+        steps=estimate.steps,
+        message=estimate.message,
+        named="",
+    )
 
 
-def _row(estimate: Estimate) -> Arrays:
-    told = estimate.identifiable & np.all(np.isfinite(estimate.theta))
-    return {
-        "estimate": np.where(told, estimate.theta, np.nan),
-        "std": np.where(told, estimate.std, np.nan),
-        "identifiable": told,
-        "converged": np.asarray(estimate.converged),
-        "steps": np.asarray(estimate.steps),
-        "message": np.asarray(estimate.message),
-        "named": np.asarray(""),
-    }
-
-
-def _told(plan: Plan, run: Trajectory) -> Arrays:
-    """What a law that identifies had found when the run ended; of its own certainty nothing is kept."""
+def _row_of_law(plan: Plan, run: Trajectory) -> RunRow:
+    """Return the last estimate of a control law that identifies, without standard deviations."""
     theta, closed = np.asarray(run.found.theta)[-1], bool(np.asarray(run.found.closed)[-1])
-    row = _failed(plan, "" if closed else "the law never trusted what it found")
-    told = np.full(len(theta), closed) & np.isfinite(theta)
-    return row | {
-        "estimate": np.where(told, theta, np.nan),
-        "identifiable": told,
-        "converged": np.asarray(closed),
-    }
+    row = RunRow.failed(len(plan.names), "" if closed else "the law never trusted its estimate")
+    identifiable = np.full(len(theta), closed) & np.isfinite(theta)
+    estimate = np.where(identifiable, theta, np.nan)
+    return replace(row, estimate=estimate, identifiable=identifiable, converged=closed)
 
 
-# Part of a run, from its end, over which tracking errors are counted: what a law learns it has learnt.
+# Fraction of a run, at its end, over which tracking errors count; a law that adapts has settled by then.
 _SETTLED = 0.25
 
 
 def _tracking(reference: np.ndarray | None, followed: np.ndarray) -> np.ndarray:
-    """Root mean square and peak of what a loop's drives are off the reference at the end, (drives, 2)."""
+    """Return the root mean square and the peak of the drives' tracking errors at the end, (drives, 2)."""
     if reference is None:
         return np.zeros((0, 2))
     error = (reference - followed)[-max(1, round(_SETTLED * len(followed))) :]
     return np.stack([np.sqrt(np.mean(error**2, axis=0)), np.abs(error).max(axis=0)], axis=1)
 
 
-def _found(plan: Plan, session: Session) -> Arrays:
-    """What `discover` makes of a run: the model's own parameters, and what it names beside them."""
+def _row_of_search(plan: Plan, session: Session) -> RunRow:
+    """Return the declared parameters that `discover` estimates, and the effects that it names."""
     from jaxid.commands.discover import explore
 
-    found = explore(session, refit=False, experiments=False)
-    at = [found.after.names.index(name) for name in plan.names]
-    row = {name: x[at] if np.ndim(x) else x for name, x in _row(found.after).items()}
-    named = " + ".join(sorted(e.label for e in found.effects)) or found.verdict
-    return row | {"named": np.asarray(named)}
+    result = explore(session, refit=False, experiments=False)
+    at, row = [result.after.names.index(name) for name in plan.names], _row(result.after)
+    return replace(
+        row,
+        estimate=row.estimate[at],
+        std=row.std[at],
+        identifiable=row.identifiable[at],
+        named=" + ".join(sorted(e.label for e in result.effects)) or result.verdict,
+    )
 
 
 def _words(error: Exception) -> str:
     return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
 
 
-def _failed(plan: Plan, why: str) -> Arrays:
-    none = np.full(len(plan.names), np.nan)
-    return {
-        "estimate": none,
-        "std": none,
-        "identifiable": np.zeros(len(none), bool),
-        "converged": np.asarray(False),
-        "steps": np.asarray(0),
-        "message": np.asarray(why),
-        "named": np.asarray(""),
-    }
-
-
-def _stacked(rows: list[Arrays], tracking: np.ndarray) -> Arrays:
-    """Of one run, by method; its tracking is the same for all."""
-    out = {name: np.stack([row[name] for row in rows]) for name in _BY_METHOD}
-    return out | {"tracking": np.stack([tracking] * len(rows))}
+def _run_arrays(rows: list[RunRow], tracking: np.ndarray) -> Arrays:
+    """Return the arrays of one run by estimator; its tracking is the same for all."""
+    return stacked(rows) | {"tracking": np.stack([tracking] * len(rows))}

@@ -53,7 +53,7 @@ def test_the_demo_finds_what_was_hidden(tmp_path, capsys):
     for words in ("$ jaxid check ", "$ jaxid identify ", "$ jaxid discover ", "report: "):
         assert f"\n{words}" in f"\n{out}"
     made = {p.name for p in folder.iterdir()}
-    results = {"check.json", "result.json", "discovery.json", "report.html"}
+    results = {"check.json", "result.json", "discovery.json", "report.html", "case_found.toml"}
     assert made == {".jaxid", "case.toml", "log.csv", "validation.csv"} | results
     found = json.loads((folder / "discovery.json").read_text("utf-8"))
     assert found["verdict"] == "found"

@@ -134,14 +134,14 @@ def test_what_the_data_cannot_tell_is_null(folder, capsys):
     for name in twins:
         told = found["parameters"][name]
         assert told == {"value": None, "std": None, "unit": "kg", "identifiable": False}
-        assert re.search(rf"\n{re.escape(name)} +- +this log cannot tell it +kg\n", ran.out)
+        assert re.search(rf"\n{re.escape(name)} +- +not identifiable from this log +kg\n", ran.out)
     near_truth(found["parameters"], (*TRUTH,)[1:], part=0.01)
     (blind,) = found["unidentifiable"]
     weights = [blind["combination"][name] for name in twins]
     assert {*blind["combination"]} == {*twins}
     assert abs(weights[0]) == pytest.approx(0.7071, abs=1e-3)
     assert weights[0] == pytest.approx(-weights[1], abs=1e-3)
-    assert "cannot be told apart: " in ran.out
+    assert "not identifiable in combination: " in ran.out
     judge_gap(found["gap"], validated=False)
     stands_alone((ran.folder / "report.html").read_text("utf-8"))
 
@@ -170,7 +170,7 @@ def test_discover_adds_nothing_where_nothing_is_missing(folder, capsys):
     ran = run(capsys, *argv, folder=folder / "nothing")
     assert (ran.status, ran.err) == (0, "")
     written = [p.name for p in sorted(ran.folder.iterdir())]
-    assert written == [".jaxid", "discovery.json", "report.html"]
+    assert written == [".jaxid", "case.toml", "discovery.json", "report.html"]
     found = ran.json("discovery.json")
     judge_discovery(found, [None])
     assert (found["verdict"], found["where"], found["effects"]) == ("nothing_missing", None, [])

@@ -257,7 +257,7 @@ def test_what_a_law_found_in_its_loop_is_a_row(tmp_path):
     strict = case.read_text().replace("velocity_average = 4", "tolerance = 1e-9\nvelocity_average = 4")
     case.write_text(strict)
     early = jaxid.study(case)
-    assert [f["why"] for f in early.failures] == ["the law never trusted what it found"]
+    assert [f["why"] for f in early.failures] == ["the law never trusted its estimate"]
     assert np.isfinite(early.tracking[0]["rms"]["median"])
 
 
@@ -426,7 +426,7 @@ def test_steps_alone_and_together():
 
 
 FAULTS = {
-    "a level twice": ("noise = [0.5, 1.0]", "noise = [1, 1.0]", "1 stands there twice"),
+    "a level twice": ("noise = [0.5, 1.0]", "noise = [1, 1.0]", "1 is given twice"),
     "no sensor": ("[sensor]\nposition_noise = 3e-5", "", "no noise to multiply"),
     "nothing unknown": ("{ guess = 1.4, true = 2.0 }", "1.4", None),
     "no simulation": ("duration = 2.0\n", "", "no duration"),
@@ -445,7 +445,7 @@ def test_faults_are_one_line(fault, capsys, tmp_path):
     text = (AXIS + STUDY).replace(old, new)
     if message is None:
         text = text.replace("{ guess = 5.0, true = 3.0 }", "3.0")
-        message = "nothing is unknown"
+        message = "no parameter is unknown"
     ran = run(capsys, "study", write_case(tmp_path, text), folder=tmp_path / "out")
     assert ran.status == 2
     assert message in ran.err

@@ -29,7 +29,7 @@ def read_npz(path: Path, names: list[str], rows: Rows | None) -> Columns:
             raise
         hint = "save plain arrays of numbers with numpy.savez"
         raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
-    return _pick(path, known, names, rows)
+    return pick_columns(path, known, names, rows)
 
 
 def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
@@ -47,7 +47,7 @@ def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
         hint = "is it a MATLAB file? save it again with -v7"
         raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
     known = {key: value for key, value in content.items() if not key.startswith("__")}
-    return _pick(path, known, names, rows)
+    return pick_columns(path, known, names, rows)
 
 
 def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
@@ -66,7 +66,7 @@ def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
     except pyarrow.ArrowException as error:
         hint = "is it a Parquet file? export it again"
         raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
-    return _pick(path, known, names, rows)
+    return pick_columns(path, known, names, rows)
 
 
 def _base(name: str, known: Mapping[str, Any] | list[str]) -> str:
@@ -75,11 +75,11 @@ def _base(name: str, known: Mapping[str, Any] | list[str]) -> str:
     return match[1] if match and name not in known else name
 
 
-def _pick(path: Path, known: Mapping[str, Any], names: list[str], rows: Rows | None) -> Columns:
+def pick_columns(path: Path, known: Mapping[str, Any], names: list[str], rows: Rows | None) -> Columns:
     """Take the named columns out of arrays and cut the rows.
 
     Args:
-        path: The file, for messages.
+        path: The file, or another name of the source, for messages.
         known: All variables by name; those that are not requested may be None.
         names: Names of the requested columns.
         rows: First row and end, 0-based and half open; None: all.

@@ -1,4 +1,4 @@
-"""One HTML page that tells what was found, with its plots inside."""
+"""One HTML page with the results of a command, its plots inside."""
 
 from typing import Any
 
@@ -11,9 +11,9 @@ from jaxid.results.report.data import WherePlot as WherePlot
 
 
 def __getattr__(name: str) -> Any:
-    """The page itself, which imports matplotlib, only where it is asked for."""
-    if name in ("render", "write_report"):
-        from jaxid.results.report import page
+    """Load the page, which imports matplotlib, on first use."""
+    if name == "render":
+        from jaxid.results.report.page import render
 
-        return getattr(page, name)
+        return render
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,8 +1,8 @@
-"""Axes as all figures of a report wear them."""
+"""The common style of all axes of a report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,7 +15,7 @@ FONT = 9.0  # pt
 
 
 def time_axes(size: tuple[float, float], rows: int, ratios: tuple[int, int]) -> tuple:
-    """Make one plot over time, or two on one time axis; the second is None where there is one."""
+    """Make one plot over time, or two on one time axis; the second is None if there is one."""
     figure = Figure(figsize=size, layout="constrained")
     if rows == 1:
         figure.set_size_inches(size[0], 0.6 * size[1])
@@ -26,13 +26,13 @@ def time_axes(size: tuple[float, float], rows: int, ratios: tuple[int, int]) -> 
 
 
 def bucket_count(size: tuple[float, float]) -> int:
-    """Say into how many pieces a line is cut before it is thinned."""
-    # chosen: about one bucket a pixel of the drawn width.
+    """Return the number of pieces into which a line is cut before it is thinned."""
+    # Chosen: about one bucket a pixel of the drawn width.
     return max(200, int(80 * size[0]))
 
 
 def time_label(units: Mapping[str, str]) -> str:
-    """Label the time axis."""
+    """Return the label of the time axis."""
     return f"time [{units['time']}]"
 
 
@@ -43,18 +43,15 @@ def span(ax: Axes, view: LogView) -> None:
     ax.set_xlim(start - margin, end + margin)
 
 
-def legend(ax: Axes, names: Sequence[str] | None = None) -> None:
-    """Put the legend above the plot, for the first lines where names are given."""
-    where = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
+def legend(ax: Axes) -> None:
+    """Put the legend above the plot."""
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
     style = {"frameon": False, "fontsize": FONT, "handlelength": 1.6, "columnspacing": 1.2}
-    if names is None:
-        ax.legend(ncols=3, **where, **style)
-    else:
-        ax.legend(ax.get_lines()[: len(names)], names, ncols=3, **where, **style)
+    ax.legend(ncols=3, **place, **style)
 
 
 def dress(ax: Axes, xlabel: str, ylabel: str) -> None:
-    """Label an axes and give it the report's look."""
+    """Label an axes and give it the report's style."""
     ax.set_xlabel(xlabel, fontsize=FONT, color=TEXT)
     ax.set_ylabel(ylabel, fontsize=FONT, color=TEXT)
     ax.tick_params(labelsize=FONT - 0.5, color="#999999", labelcolor=TEXT)
@@ -62,5 +59,7 @@ def dress(ax: Axes, xlabel: str, ylabel: str) -> None:
     ax.spines[["left", "bottom"]].set_color("#999999")
     ax.grid(color="#e6e6e6", lw=0.7)
     ax.set_axisbelow(True)
-    ax.xaxis.set_major_locator(MaxNLocator(6 if ax.figure.get_figwidth() < 8 else 12))
+    figure = ax.get_figure(root=True)
+    narrow = figure is not None and figure.get_figwidth() < 8
+    ax.xaxis.set_major_locator(MaxNLocator(6 if narrow else 12))
     ax.yaxis.set_major_locator(MaxNLocator(5))

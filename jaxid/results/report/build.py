@@ -1,10 +1,9 @@
-"""From the results of identify and discover to a report."""
+"""The reports of `identify` and `discover`, from their results."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def identification_report(result: Identification) -> str:
-    """The report of `identify`, as one page of HTML."""
+    """Return the report of `identify` as one page of HTML."""
     content = results.identification_json(result)
     session = result.session
     rows, below = minimal_rows(content["minimal"]) if "minimal" in content else ((), ())
@@ -45,7 +44,6 @@ def identification_report(result: Identification) -> str:
             title=f"Identification of {session.case.title}",
             command="identify",
             verdict=None,
-            summary_lines=(),
             gap=content["gap"],
             unidentifiable=tuple(content["unidentifiable"]),
             views=_views(session, None, result.gaps, drives="directions" in content),
@@ -60,24 +58,22 @@ def identification_report(result: Identification) -> str:
 
 
 def discovery_report(result: Discovery) -> str:
-    """The report of `discover`, as one page of HTML."""
+    """Return the report of `discover` as one page of HTML."""
     content = results.discovery_json(result)
     session = result.session
-    before = result.gaps_before if result.effects else None
     return render(
         ReportData(
             title=f"What is missing in {session.case.title}",
             command="discover",
             verdict=result.verdict,
-            summary_lines=(),
             gap=content["gap"],
             unidentifiable=tuple(content["unidentifiable"]),
             effects=tuple(content["effects"]),
             where=content["where"],
-            steps=tuple(_step(r) for r in result.rounds),
-            where_plot=_where_plot(result),
+            steps=tuple(search_step(r) for r in result.rounds),
+            where_plot=where_plot(result),
             experiments=tuple(_experiment(p, session) for p in result.proposals),
-            views=_views(session, before, result.gaps_after),
+            views=views(result),
             converged=result.converged,
             **_common(session, result.after, content["notes"]),
         )
@@ -85,14 +81,31 @@ def discovery_report(result: Discovery) -> str:
 
 
 def views(result: Identification | Discovery) -> tuple[LogView, ...]:
-    """The logs of a result as the plots take them, for notebooks."""
-    if hasattr(result, "gaps"):
-        return _views(result.session, None, result.gaps)
-    return _views(result.session, result.gaps_before, result.gaps_after)
+    """Return the logs of a result, by joint, as the plots take them."""
+    return _views(result.session, _gaps_before(result), result.gaps)
+
+
+def view_of(result: Identification | Discovery, run: int, joint: int) -> LogView:
+    """Return one joint of one log of a result.
+
+    Args:
+        result: The result.
+        run: Number of the log, 0 for the fitted one.
+        joint: Joint with an encoder, 0-based.
+    """
+    before = _gaps_before(result)
+    joints = int(np.sum(result.session.fit.log.measured))
+    earlier = None if before is None else before[run]
+    return _view(result.session.runs[run], earlier, result.gaps[run], joint, joints)
+
+
+def _gaps_before(result: Identification | Discovery) -> Sequence[Gap] | None:
+    """Return the gaps of the baseline of a search that changed it; None of any other result."""
+    return getattr(result, "gaps_before", None) if getattr(result, "effects", ()) else None
 
 
 def history_of(estimate: Estimate) -> HistoryView | None:
-    """How a recursive estimate went, for the report and for notebooks; None for any other."""
+    """Return the history of a recursive estimate; None for any other."""
     history = estimate.details.get("recursive", {}).get("history")
     if history is None:
         return None
@@ -111,7 +124,7 @@ def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
         "derived": _derived(session, estimate),
         "units": units_of(session),
         "notes": tuple(notes),
-        "versions": {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")},
+        "versions": results.versions(),
     }
 
 
@@ -145,21 +158,21 @@ def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         strict=True,
     )
     return tuple(
-        ParameterRow(f.name, float(v) if told else None, float(s) if told else None, f.unit, bool(told))
-        for f, v, s, told in rows
+        ParameterRow(f.name, float(v) if ok else None, float(s) if ok else None, f.unit, bool(ok))
+        for f, v, s, ok in rows
     )
 
 
 def _derived(session: Session, estimate: Estimate) -> tuple[ParameterRow, ...]:
-    """What follows from the parameters."""
-    told = [d for d in results.derived(session, estimate) if np.isfinite(d.std)]
-    return tuple(ParameterRow(d.name, d.value, d.std, d.unit) for d in told)
+    """Return the quantities derived from the parameters."""
+    known = [d for d in results.derived(session, estimate) if np.isfinite(d.std)]
+    return tuple(ParameterRow(d.name, d.value, d.std, d.unit) for d in known)
 
 
 def _views(
     session: Session, before: Sequence[Gap] | None, after: Sequence[Gap], drives: bool = False
 ) -> tuple[LogView, ...]:
-    """The logs, by joint; `drives`: with what their loops command."""
+    """Return the logs by joint; with `drives` also the commands of their loops."""
     earlier = before or [None] * len(after)
     joints = np.flatnonzero(session.fit.log.measured).tolist()
     driven = _driven if drives else lambda *of: {}
@@ -175,7 +188,7 @@ def _views(
 
 
 def _driven(session: Session, run: OpenedLog, gap: Gap, joint: int) -> dict[str, np.ndarray]:
-    """Declared force of a joint's drive, logged and simulated; nothing where either is not there."""
+    """Return the declared force of a joint's drive, logged and simulated; empty if either is missing."""
     gain = session.machine.gain
     drive = session.machine.plant.drive_of(joint, gain.size)
     if drive is None or gap.simulation is None or gap.simulation.command is None:
@@ -208,7 +221,8 @@ def _view(run: OpenedLog, before: Gap | None, after: Gap, joint: int, joints: in
     )
 
 
-def _step(r: Round) -> SearchStep:
+def search_step(r: Round) -> SearchStep:
+    """Return one step of a search as it is drawn."""
     step = r.step
     added = step.added.candidate if step.added else None
     return SearchStep(
@@ -228,23 +242,24 @@ def _experiment(proposal: Proposal, session: Session) -> ExperimentView:
     joints = machine.plant.driven(machine.plant.joints)
     loop = proposal.signal == "reference"
     driven = machine.plant.at_drives
-    # A command has no unit of its own where the gain turns it into a force.
-    own = np.all(machine.gain == 1.0)
+    # A command has no known unit if a gain turns it into a force.
+    is_force = np.all(machine.gain == 1.0)
     signal_unit = joined(machine.unit_by_joint("position" if loop else "force", joints))
     ends = (driven(limits.low), driven(limits.high)) if loop else (-limits.force, limits.force)
     return ExperimentView(
         text=sentence(proposal, machine),
         signal=proposal.signal,
-        unit=signal_unit if loop or own else "command",
+        unit=signal_unit if loop or is_force else "command",
         time=proposal.time,
         values=proposal.values if proposal.separates else None,
         limits=np.stack(ends, axis=1),
-        speed=driven(limits.speed) if loop else None,
+        speed=np.asarray(driven(limits.speed)) if loop else None,
     )
 
 
-def _where_plot(result: Discovery) -> WherePlot | None:
-    w = result.where
+def where_plot(result: Identification | Discovery) -> WherePlot | None:
+    """Return the bins of the residual's mean; None if nothing is missing or nothing was searched."""
+    w = getattr(result, "where", None)
     if w is None:
         return None
     unit = {

@@ -1,26 +1,24 @@
-"""Lines with thousands of samples, thinned to what the eye can tell apart."""
+"""Lines with thousands of samples, thinned to the resolution of a drawing."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# chosen: a step longer than this many usual steps is a gap, not jitter.
+# Chosen: a step longer than this many usual steps is a gap, not jitter.
 _GAP = 1.5
 # Beyond this a diverged simulation would only overflow the drawing [any unit].
 _DRAWABLE = 1e30
 
 
-def drawable(values: np.ndarray | None) -> np.ndarray | None:
-    """Replace what cannot be drawn by NaN, which matplotlib leaves out."""
-    if values is None:
-        return None
+def drawable(values: np.ndarray) -> np.ndarray:
+    """Replace values that cannot be drawn by NaN, which matplotlib omits."""
     values = np.asarray(values, dtype=float)
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) < _DRAWABLE, values, np.nan)
 
 
 def segments(time: np.ndarray) -> np.ndarray:
-    """Number the runs of samples between gaps in time, from 0."""
+    """Assign a number to each run of samples between gaps in time, from 0."""
     steps = np.diff(time)
     if steps.size == 0:
         return np.zeros(len(time), dtype=int)
@@ -33,7 +31,7 @@ def envelope(time: np.ndarray, values: np.ndarray, buckets: int) -> tuple[np.nda
     Args:
         time: Increasing instants, (N,); where they jump, the line is broken.
         values: The line, (N,).
-        buckets: How many buckets the whole time is cut into.
+        buckets: Number of buckets into which the whole time is cut.
 
     Returns:
         Instants and values of the thinned line, with NaN in the gaps.
@@ -68,9 +66,9 @@ def binned_mean(
     """Average y over bins of equal width in x.
 
     Args:
-        x: Where, (K,).
-        y: What, (K,).
-        bins: How many bins.
+        x: Abscissa, (K,).
+        y: Values, (K,).
+        bins: Number of bins.
         least: A bin with fewer samples is left out.
         group: Number of the group to which each sample belongs, rising with x, (K,); groups
             are averaged apart and the line is broken between them. None: one group.

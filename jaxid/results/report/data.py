@@ -1,4 +1,4 @@
-"""What a report is made of: plain arrays and numbers, whoever computed them."""
+"""The content of a report as plain arrays and numbers."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import numpy as np
 class LogView:
     """One joint of one log, as it is drawn.
 
-    Two clocks: `time` is the log's own (N samples); `band_time` is what is left after
-    decimation and the removal of rest (K samples), and so has gaps.
+    It has two clocks: `time` is that of the log (N samples). `band_time` is that of the K samples that
+    remain after decimation and the removal of rest, and so has gaps.
 
     Args:
-        name: What the log is called in headings.
+        name: Name of the log in headings.
         time: The log's time [s], (N,).
         position_measured: Measured position, (N,).
         position_simulated_before: Position simulated with the declared model, (N,) or None.
         position_simulated_after: Position simulated with the final model, (N,) or None.
         band_time: Time of the samples that the force balance uses [s], (K,).
-        velocity: Velocity there, (K,).
-        position: Position there, (K,).
-        force_measured: Force at the load there, low-passed, (K,).
+        velocity: Velocity at these samples, (K,).
+        position: Position at these samples, (K,).
+        force_measured: Force at the load at these samples, low-passed, (K,).
         residual_before: Force measured minus force of the declared model, (K,) or None.
-        residual_after: The same with the final model, (K,) or None.
-        joint: Which joint, 0-based.
-        drive_measured: Declared force of its drive as it was logged, (N,), where that is to be compared.
-        drive_simulated: The same as the simulated loop commands it, (N,).
+        residual_after: Force measured minus force of the final model, (K,) or None.
+        joint: Number of the joint, 0-based.
+        drive_measured: Declared force of its drive as logged, (N,), if that is to be compared.
+        drive_simulated: Declared force of its drive as the simulated loop commands it, (N,).
         units: Labels at this joint that differ from those of the page, by quantity.
     """
 
@@ -53,11 +53,11 @@ class LogView:
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """How much one candidate effect would explain.
+    """The evidence of one candidate effect.
 
     Args:
-        kind: The effect's name, with its place where there are several.
-        evidence: Gain in held-out log-likelihood [nats]; not finite where it could not be fitted.
+        kind: Name of the effect, with its place if there are several.
+        evidence: Gain in held-out log-likelihood [nats]; not finite if the fit failed.
         accepted: Whether this is the one that was added.
     """
 
@@ -74,7 +74,7 @@ class SearchStep:
         added: Effect added in this step, or None.
         dropped: Effect taken out again in this step, or None.
         gap_fit: RMS force residual of the model after this step, on the fit log.
-        gap_validation: The same on the validation log, or None.
+        gap_validation: RMS force residual on the validation log, or None.
         candidates: Scores of all effects tried in this step.
         threshold: Evidence that an effect needs to be added [nats].
     """
@@ -89,7 +89,7 @@ class SearchStep:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter; `value` and `std` are None where the data cannot tell it."""
+    """One parameter; `value` and `std` are None if it is not identifiable."""
 
     name: str
     value: float | None
@@ -103,7 +103,7 @@ class WherePlot(NamedTuple):
 
     Args:
         variable: Name of the variable, such as "velocity".
-        unit: Its unit.
+        unit: Unit of the variable.
         x: Middle of each bin, (B,).
         mean: Mean force residual in each bin, (B,).
         low: Lower edge of the mean's confidence band, (B,).
@@ -124,9 +124,9 @@ class HistoryView:
 
     Args:
         time: Instants [s], (K,).
-        names, units: Of the parameters.
+        names, units: Names and units of the parameters.
         value: Estimate so far, (K, p).
-        std: Its standard deviation, (K, p); NaN where nothing but the start told it.
+        std: Standard deviation of the estimate, (K, p); NaN before any data determine it.
         residual: Root mean square of the force residual so far, (K,).
     """
 
@@ -143,12 +143,12 @@ class ExperimentView:
     """A proposed experiment, as it is drawn.
 
     Args:
-        text: What to do and what to expect, or why nothing can be done.
+        text: The experiment and its expected evidence, or the reason why none is proposed.
         signal: "reference" or "input".
-        unit: Its unit, or that of the command.
+        unit: Unit of the signal, or of the command.
         time: Ticks [s], (N,).
-        values: The signal by joint, (N, n); None where no experiment separates.
-        limits: Its range by joint, (n, 2).
+        values: The signal by joint, (N, n); None if no experiment separates the effects.
+        limits: Range of the signal by joint, (n, 2).
         speed: Largest speed by joint, drawn over the speed of a reference; None for an input.
     """
 
@@ -176,7 +176,6 @@ class ReportData:
         case_name: Name of the case.
         log_name: Name of the log that was fitted.
         verdict: "found", "nothing_missing", "unexplained", or None for `identify`.
-        summary_lines: Sentences of the answer; composed from the rest where empty.
         gap: The `gap` object of the JSON result.
         parameters: The case's unknowns after the last fit.
         unidentifiable: `{"combination": {name: weight}}`, one for each.
@@ -189,8 +188,8 @@ class ReportData:
         units: Labels of position, velocity, force and time.
         notes: Remarks, warnings, proposals; one sentence or more each.
         versions: Program names and versions.
-        converged: Whether the solver converged, where that is known.
-        derived: What follows from the parameters.
+        converged: Whether the solver converged; None if that is unknown.
+        derived: Quantities derived from the parameters.
         coefficients: Rows of a minimal model's table, its head first; empty without one.
         statistics: Lines below it.
         within_prior: `directions`, `criterion_percent` and `starts` of the JSON result of a fit within a
@@ -203,7 +202,6 @@ class ReportData:
     case_name: str
     log_name: str
     verdict: str | None
-    summary_lines: tuple[str, ...]
     gap: Mapping
     parameters: tuple[ParameterRow, ...]
     unidentifiable: tuple[Mapping, ...] = ()

@@ -1,4 +1,4 @@
-"""Why a minimal model's log is filtered as it is: force and amplified noise over frequency."""
+"""The filter of a minimal model: force and amplified noise over frequency."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def plot_filtering(
 
     Args:
         spectrum: As `jaxid.estimators.minimal.fit.filtering_of` gives it.
-        recipe: Likewise.
+        recipe: Filter of the log, from the same function.
         rate_hz: Sampling rate of the log.
-        unit: Of the force.
-        size: [in].
+        unit: Label of the force's unit.
+        size: Width and height [in].
     """
     figure = Figure(figsize=size, layout="constrained")
     ax = figure.add_subplot()

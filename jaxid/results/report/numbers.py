@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import TypeGuard
 
 import numpy as np
 
 ABSENT = "–"
 _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-# Units that take a prefix; those not named here (V per rad, labels of the user's) are left alone.
+# Units that take a prefix; others, such as V per rad and labels of the user, stay unchanged.
 _SCALED = {"m", "rad", "m/s", "rad/s", "N", "N m", "V", "A"}
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
-def is_number(value: object) -> bool:
-    """Whether a value is a finite number, and so can be written at all."""
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a value is a finite number."""
     return (
         isinstance(value, (int, float, np.integer, np.floating))
         and not isinstance(value, bool)
@@ -34,7 +35,7 @@ def pretty_unit(unit: str) -> str:
 
 
 def plain(value: object, digits: int = 3) -> str:
-    """Write one number with so many significant digits, an en dash where there is none."""
+    """Write one number with so many significant digits, or an en dash if it is absent."""
     if not is_number(value):
         return ABSENT
     if value == 0:
@@ -66,7 +67,7 @@ def with_std(value: object, std: object) -> tuple[str, str]:
         std: Its standard deviation, in the same unit.
 
     Returns:
-        Both texts; with a common power of ten where the numbers are very large or small.
+        Both texts; with a common power of ten if the numbers are very large or small.
         Without a usable standard deviation the value gets four digits.
     """
     if not is_number(value) or not is_number(std) or std <= 0:
@@ -74,11 +75,11 @@ def with_std(value: object, std: object) -> tuple[str, str]:
     largest = max(abs(float(value)), float(std))
     exponent = math.floor(math.log10(largest))
     shift = exponent if not -4 <= exponent <= 5 else 0
-    value, std = float(value) / 10.0**shift, float(std) / 10.0**shift
+    shifted, deviation = float(value) / 10.0**shift, float(std) / 10.0**shift
     # Rounding 0.0996 to two digits gives 0.10: take the exponent after the rounding.
-    places = 1 - math.floor(math.log10(float(f"{std:.1e}")))
+    places = 1 - math.floor(math.log10(float(f"{deviation:.1e}")))
     tail = f" {_power(shift)}" if shift else ""
-    return _fixed(value, places) + tail, _fixed(std, places) + tail
+    return _fixed(shifted, places) + tail, _fixed(deviation, places) + tail
 
 
 def percent(part: object, whole: object = 1.0, digits: int = 2) -> str:
@@ -96,7 +97,7 @@ def scaled_unit(unit: str, values: Iterable) -> tuple[float, str]:
         values: Numbers or arrays in that unit; None and non-finite ones are passed over.
 
     Returns:
-        What one prefixed unit is in `unit` (0.001 for "mm"), and the prefixed label.
+        The prefixed unit in terms of `unit` (0.001 for "mm"), and the prefixed label.
     """
     peak = 0.0
     for value in values:
@@ -105,7 +106,7 @@ def scaled_unit(unit: str, values: Iterable) -> tuple[float, str]:
             peak = max(peak, float(np.max(array, where=np.isfinite(array), initial=0.0)))
     if unit in _SCALED and peak > 0.0:
         for scale, prefix in _PREFIXES:
-            # chosen: 0.1 m stays in m, 0.09 m becomes 90 mm.
+            # Chosen: 0.1 m stays in m, 0.09 m becomes 90 mm.
             if peak >= 0.1 * scale:
                 return scale, pretty_unit(prefix + unit)
     return 1.0, pretty_unit(unit)

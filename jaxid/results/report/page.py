@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 import re
 from collections.abc import Mapping
 from importlib import resources
-from pathlib import Path
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
@@ -24,32 +22,14 @@ from jaxid.results.report.numbers import is_number, nats, pretty_unit, short
 View = LogView | ExperimentView | HistoryView
 
 _NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
-_RASTER_DPI = 130  # chosen: sharp on a phone, and ten clouds stay below a megabyte
-
-
-def write_report(data: ReportData, path: Path) -> None:
-    """Write the report, whole or not at all.
-
-    Args:
-        data: What it shows.
-        path: The HTML file; its folder must exist. A file that is there is replaced.
-    """
-    path = Path(path)
-    text = render(data)
-    # In the same folder, as only there replacing is one step of the file system.
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+_RASTER_DPI = 130  # Chosen: sharp on a phone, and ten clouds stay below a megabyte
 
 
 def render(data: ReportData) -> str:
     """Make the report's HTML.
 
     Args:
-        data: What it shows.
+        data: Content of the report.
 
     Returns:
         The whole page.
@@ -66,7 +46,7 @@ def render(data: ReportData) -> str:
         unidentifiable=tables.unidentifiable_lines(data.unidentifiable),
         directions=tables.direction_lines(data.within_prior["directions"]) if data.within_prior else [],
         within_prior_words=tables.within_prior_words(data.within_prior or {}),
-        untold=[row.name for row in data.parameters if not row.identifiable],
+        missing=[row.name for row in data.parameters if not row.identifiable],
         steps=tables.step_lines(data),
         force_unit=pretty_unit(str(data.units["force"])),
         rankings=_rankings(data),
@@ -80,7 +60,7 @@ def render(data: ReportData) -> str:
 
 
 def filled(template: str, **entries: object) -> str:
-    """A page of this folder with its entries, and with the style that all of them share."""
+    """Fill a page template of this folder, and add the common style."""
     folder = resources.files("jaxid.results.report")
     environment = Environment(
         autoescape=True,
@@ -173,11 +153,11 @@ def _picture(words: str, draw, view: View, units: Mapping, **options: object) ->
 
 
 def image(figure: Figure, words: str) -> dict:
-    """Turn a figure into what an img element needs.
+    """Turn a figure into the attributes of an img element.
 
     Args:
         figure: The figure.
-        words: What it shows, for those who cannot see it.
+        words: Description of the figure, for readers who cannot see it.
     """
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))

@@ -1,7 +1,8 @@
-"""The figures of a report, one function each; notebooks may call them too.
+"""The figures of a report, one function each.
 
-They return bare `matplotlib.figure.Figure` objects and leave matplotlib's global state alone.
-Colours are Okabe and Ito's, which stay apart for colour-blind readers.
+Functions `plot_*` return `matplotlib.figure.Figure` objects and leave pyplot's state alone; functions
+`draw_*` draw on axes that they are given. The colours are those of Okabe and Ito, which colour-blind
+readers can distinguish.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ _IDLE = "#b4bcc4"
 _DARK = {BEFORE: "#7a3600", AFTER: "#00344f"}
 _MOST_POINTS = 4000
 _FEW = 200
+# Pieces of a line over time on axes of the user's, whose width may change: that of the widest of a report.
+_MANY = bucket_count((11.5, 4.8))
 _JOINTS = (AFTER, "#009e73", "#cc79a7", "#56b4e9")
 
 
 def plot_fit(view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)) -> Figure:
-    """Measured and simulated position over time, with what parts them below.
+    """Draw measured and simulated position over time, with the difference below.
 
     Args:
         view: The log; without simulated positions only the measured one is drawn.
@@ -43,7 +46,7 @@ def plot_fit(view: LogView, units: Mapping[str, str], *, size: tuple[float, floa
 
 
 def plot_drive(view: LogView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)) -> Figure:
-    """Declared force of the drive over time, as logged and as the simulated loop commands it.
+    """Draw the declared force of the drive over time, as logged and as the simulated loop commands it.
 
     Args:
         view: The log; it must have both.
@@ -51,8 +54,10 @@ def plot_drive(view: LogView, units: Mapping[str, str], *, size: tuple[float, fl
         size: Width and height [inch].
 
     Returns:
-        The figure, with what parts them below.
+        The figure, with the difference below.
     """
+    if view.drive_measured is None or view.drive_simulated is None:
+        raise ValueError(f"log {view.name!r} has no force of the drive to compare.")
     simulated = [("simulated", AFTER, drawable(view.drive_simulated))]
     return _compared(view, drawable(view.drive_measured), simulated, "force", units, size)
 
@@ -65,25 +70,77 @@ def _compared(
     units: Mapping[str, str],
     size: tuple[float, float],
 ) -> Figure:
-    """A measured quantity and lines beside it over time, with what parts them below."""
+    """Draw a measured quantity and lines beside it over time, with the differences below."""
     figure, top, below = time_axes(size, 2 if simulated else 1, ratios=(3, 2))
     many = bucket_count(size)
-    factor, unit = scaled_unit(units[what], [measured])
-    top.plot(*envelope(view.time, measured / factor, many), color=MEASURED, lw=3.0)
-    names = ["measured"]
-    small, small_unit = scaled_unit(units[what], [measured - s[2] for s in simulated])
-    for label, color, line in simulated:
-        top.plot(*envelope(view.time, line / factor, many), color=color, lw=1.1)
-        gap = (measured - line) / small
-        below.plot(*envelope(view.time, gap, many), color=color, lw=1.1)
-        names.append(label)
-    span(top, view)
-    dress(top, "" if simulated else time_label(units), f"{what} [{unit}]")
-    if simulated:
-        below.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
-        dress(below, time_label(units), f"measured −\nsimulated [{small_unit}]")
-    legend(top, names)
+    _draw_compared(top, view, measured, simulated, what, units, many)
+    if below is not None:
+        top.set_xlabel("")
+        _draw_difference(below, view, measured, simulated, what, units, many)
     return figure
+
+
+def _draw_compared(
+    ax: Axes,
+    view: LogView,
+    measured: np.ndarray,
+    simulated: Sequence[tuple[str, str, np.ndarray]],
+    what: str,
+    units: Mapping[str, str],
+    many: int,
+) -> None:
+    """Draw a measured quantity and its simulations over time."""
+    factor, unit = scaled_unit(units[what], [measured])
+    ax.plot(*envelope(view.time, measured / factor, many), color=MEASURED, lw=3.0, label="measured")
+    for label, color, line in simulated:
+        ax.plot(*envelope(view.time, line / factor, many), color=color, lw=1.1, label=label)
+    span(ax, view)
+    dress(ax, time_label(units), f"{what} [{unit}]")
+    legend(ax)
+
+
+def _draw_difference(
+    ax: Axes,
+    view: LogView,
+    measured: np.ndarray,
+    simulated: Sequence[tuple[str, str, np.ndarray]],
+    what: str,
+    units: Mapping[str, str],
+    many: int,
+) -> None:
+    """Draw measured minus simulated over time."""
+    small, unit = scaled_unit(units[what], [measured - line for *_, line in simulated])
+    for label, color, line in simulated:
+        gap = (measured - line) / small
+        ax.plot(*envelope(view.time, gap, many), color=color, lw=1.1, label=label)
+    ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
+    dress(ax, time_label(units), f"measured −\nsimulated [{unit}]")
+
+
+def draw_fit(ax: Axes, view: LogView, units: Mapping[str, str]) -> None:
+    """Draw the measured and the simulated position over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; without simulated positions only the measured one is drawn.
+        units: Labels of "position" and "time".
+    """
+    measured, lines = drawable(view.position_measured), _simulated(view)
+    _draw_compared(ax, view, measured, lines, "position", units, _MANY)
+
+
+def draw_difference(ax: Axes, view: LogView, units: Mapping[str, str]) -> None:
+    """Draw measured minus simulated position over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; it must have a simulated position.
+        units: Labels of "position" and "time".
+    """
+    measured, lines = drawable(view.position_measured), _simulated(view)
+    _draw_difference(ax, view, measured, lines, "position", units, _MANY)
+    span(ax, view)
+    legend(ax)
 
 
 def plot_residual_over_time(
@@ -93,7 +150,7 @@ def plot_residual_over_time(
     noise_floor: float | None = None,
     size: tuple[float, float] = (11.5, 4.8),
 ) -> Figure:
-    """Measured force over time, and below it what the model leaves unexplained.
+    """Draw measured force over time, and below it the force residual.
 
     Args:
         view: The log.
@@ -107,25 +164,58 @@ def plot_residual_over_time(
     residuals = _residuals(view)
     figure, top, below = time_axes(size, 2 if residuals else 1, ratios=(2, 3))
     many = bucket_count(size)
+    draw_force(top, view, units, many=many)
+    if below is not None:
+        top.set_xlabel("")
+        draw_residual(below, view, units, noise_floor=noise_floor, many=many)
+    return figure
+
+
+def draw_force(ax: Axes, view: LogView, units: Mapping[str, str], *, many: int = _MANY) -> None:
+    """Draw the measured force over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log.
+        units: Labels of "force" and "time".
+        many: Pieces into which the line is cut before it is thinned.
+    """
     factor, unit = scaled_unit(units["force"], [view.force_measured])
     line = envelope(view.band_time, np.asarray(view.force_measured) / factor, many)
-    top.plot(*line, color=MEASURED, lw=1.0)
-    span(top, view)
-    dress(top, "" if residuals else time_label(units), f"force\nmeasured [{unit}]")
-    if not residuals:
-        return figure
+    ax.plot(*line, color=MEASURED, lw=1.0)
+    span(ax, view)
+    dress(ax, time_label(units), f"force\nmeasured [{unit}]")
+
+
+def draw_residual(
+    ax: Axes,
+    view: LogView,
+    units: Mapping[str, str],
+    *,
+    noise_floor: float | None = None,
+    many: int = _MANY,
+) -> None:
+    """Draw the force residual over time on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; it must have a residual.
+        units: Labels of "force" and "time".
+        noise_floor: RMS that sensor noise alone leaves, drawn as a pair of lines; may be None.
+        many: Pieces into which each line is cut before it is thinned.
+    """
+    residuals = _residuals(view)
     small, small_unit = scaled_unit(units["force"], [r[2] for r in residuals])
     for label, color, residual in residuals:
         line = envelope(view.band_time, residual / small, many)
-        below.plot(*line, color=color, lw=0.9, label=label)
-    if is_number(noise_floor):
-        for sign in (-1.0, 1.0):
-            line = below.axhline(sign * noise_floor / small, color=TEXT, lw=0.9, ls=(0, (4, 3)))
-        line.set_label("± noise floor (RMS)")
-    below.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
-    dress(below, time_label(units), f"force residual [{small_unit}]")
-    legend(below)
-    return figure
+        ax.plot(*line, color=color, lw=0.9, label=label)
+    if noise_floor is not None and is_number(noise_floor):
+        style = {"color": TEXT, "lw": 0.9, "ls": (0, (4, 3))}
+        ax.axhline(-noise_floor / small, **style)
+        ax.axhline(noise_floor / small, **style, label="± noise floor (RMS)")
+    ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
+    dress(ax, time_label(units), f"force residual [{small_unit}]")
+    legend(ax)
 
 
 def plot_residual_against(
@@ -135,12 +225,12 @@ def plot_residual_against(
     variables: Sequence[str] = ("velocity", "position", "time"),
     size: tuple[float, float] | None = None,
 ) -> Figure:
-    """Force residual against other quantities: before above, after below, on one scale.
+    """Draw the force residual against other quantities: before above, after below, on one scale.
 
     Args:
         view: The log.
         units: Labels of "force" and of the variables.
-        variables: Which of "velocity", "position" and "time", one column each.
+        variables: Abscissas among "velocity", "position" and "time", one column each.
         size: Width and height [inch]; by default by the number of panels.
 
     Returns:
@@ -158,15 +248,42 @@ def plot_residual_against(
     axes = figure.subplots(rows, columns, sharey=True, sharex="col", squeeze=False)
     small, unit = scaled_unit(units["force"], [r[2] for r in residuals])
     for column, variable in enumerate(variables):
-        x = view.band_time if variable == "time" else getattr(view, variable)
-        factor, x_unit = scaled_unit(units[variable], [] if variable == "time" else [x])
+        x, factor, x_unit = _abscissa(view, variable, units)
         for row, (label, color, residual) in enumerate(residuals):
             ax = axes[row, column]
-            _cloud(ax, np.asarray(x) / factor, residual / small, color, _groups(variable, x))
+            _cloud(ax, x / factor, residual / small, color, _groups(variable, x))
             name = f"{variable} [{x_unit}]" if row == rows - 1 else ""
             dress(ax, name, f"residual [{unit}]" if column == 0 else "")
             ax.set_title(label, loc="left", fontsize=FONT, color=color, fontweight="bold")
     return figure
+
+
+def draw_residual_against(
+    ax: Axes, view: LogView, units: Mapping[str, str], variable: str = "velocity"
+) -> None:
+    """Draw the force residual against one quantity on one axes: samples as dots, their mean as a line.
+
+    Args:
+        ax: The axes to draw on.
+        view: The log; it must have a residual.
+        units: Labels of "force" and of the variable.
+        variable: One of "velocity", "position" and "time".
+    """
+    residuals = _residuals(view)
+    small, unit = scaled_unit(units["force"], [r[2] for r in residuals])
+    x, factor, x_unit = _abscissa(view, variable, units)
+    for label, color, residual in residuals:
+        _cloud(ax, x / factor, residual / small, color, _groups(variable, x), label)
+    dress(ax, f"{variable} [{x_unit}]", f"force residual [{unit}]")
+    legend(ax)
+
+
+def _abscissa(view: LogView, variable: str, units: Mapping[str, str]) -> tuple[np.ndarray, float, str]:
+    """Return a quantity of a view, the factor of its unit's prefix, and the label of that unit."""
+    if variable == "time":
+        return np.asarray(view.band_time), *scaled_unit(units["time"], [])
+    x = np.asarray(getattr(view, variable))
+    return x, *scaled_unit(units[variable], [x])
 
 
 def ranked(step: SearchStep) -> list[CandidateScore]:
@@ -179,7 +296,7 @@ def ranked(step: SearchStep) -> list[CandidateScore]:
 
 
 def plot_candidates(step: SearchStep) -> Figure:
-    """Evidence of all candidates of one step, best first, against the threshold.
+    """Draw the evidence of all candidates of one step, best first, against the threshold.
 
     Args:
         step: The step; candidates that could not be fitted are listed without a bar.
@@ -187,13 +304,23 @@ def plot_candidates(step: SearchStep) -> Figure:
     Returns:
         The figure.
     """
+    height = 0.95 + 0.235 * max(len(step.candidates), 1)
+    figure = Figure(figsize=(4.9, height), layout="constrained")
+    draw_candidates(figure.add_subplot(), step)
+    return figure
+
+
+def draw_candidates(ax: Axes, step: SearchStep) -> None:
+    """Draw the evidence of all candidates of one step on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        step: The step; candidates that could not be fitted are listed without a bar.
+    """
     candidates = ranked(step)
     scores = np.array([c.evidence if is_number(c.evidence) else 0.0 for c in candidates])
-    height = 0.95 + 0.235 * max(len(candidates), 1)
-    figure = Figure(figsize=(4.9, height), layout="constrained")
-    ax = figure.add_subplot()
     right = max(scores.max(initial=0.0), step.threshold, 1e-9)
-    # A candidate that does great harm must not squeeze the bars that matter.
+    # A candidate with a large loss must not compress the other bars.
     left = max(scores.min(initial=0.0), -0.5 * right)
     rows = np.arange(len(candidates))
     colors = [AFTER if c.accepted else _IDLE for c in candidates]
@@ -215,13 +342,12 @@ def plot_candidates(step: SearchStep) -> Figure:
     dress(ax, "evidence: gain in held-out log-likelihood [nats]", "")
     ax.set_yticks(rows, [c.kind for c in candidates], fontsize=FONT - 0.5)
     ax.grid(axis="y", visible=False)
-    return figure
 
 
 def plot_where(
     plot: WherePlot | tuple, units: Mapping[str, str], region: Sequence[float] | None = None
 ) -> Figure:
-    """The residual's mean over one variable, and where it leaves the model.
+    """Draw the residual's mean over one variable, and the region in which it is significant.
 
     Args:
         plot: The bins.
@@ -231,13 +357,27 @@ def plot_where(
     Returns:
         The figure.
     """
-    plot = WherePlot(*plot)
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    draw_where(figure.add_subplot(), plot, units, region)
+    return figure
+
+
+def draw_where(
+    ax: Axes, plot: WherePlot | tuple, units: Mapping[str, str], region: Sequence[float] | None = None
+) -> None:
+    """Draw the residual's mean over one variable on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        plot: The bins.
+        units: Label of "force".
+        region: The two ends of the stretch where the residual stands out; may be None.
+    """
+    plot = plot if isinstance(plot, WherePlot) else WherePlot(*plot)
     small, unit = scaled_unit(units["force"], [plot.mean, plot.low, plot.high])
     factor, x_unit = scaled_unit(plot.unit, [plot.x])
     x = np.asarray(plot.x) / factor
-    mean, low, high = (drawable(v) / small for v in plot[3:])
-    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
-    ax = figure.add_subplot()
+    mean, low, high = (drawable(v) / small for v in (plot.mean, plot.low, plot.high))
     if region is not None and len(region) == 2 and all(is_number(r) for r in region):
         ends = [r / factor for r in region]
         ax.axvspan(*ends, color="#f0e442", alpha=0.28, lw=0, label="region named")
@@ -246,33 +386,33 @@ def plot_where(
     ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
     dress(ax, f"{plot.variable} [{x_unit}]", f"force residual [{unit}]")
     legend(ax)
-    return figure
 
 
 def plot_experiment(
     view: ExperimentView, units: Mapping[str, str], *, size: tuple[float, float] = (11.5, 4.8)
 ) -> Figure:
-    """A proposed signal over time within its limits; below a reference, its speed.
+    """Draw a proposed signal over time within its limits, and below a reference its speed.
 
     Args:
-        view: The experiment; its values must be there.
+        view: The experiment, with its values.
         units: Labels of "velocity" and "time".
         size: Width and height [inch].
 
     Returns:
         The figure.
     """
-    loop = view.speed is not None
-    figure, top, below = time_axes(size, 2 if loop else 1, ratios=(3, 2))
+    if view.values is None:
+        raise ValueError("the experiment has no values to plot.")
+    figure, top, below = time_axes(size, 1 if view.speed is None else 2, ratios=(3, 2))
     many, joints = bucket_count(size), view.values.shape[1]
     factor, unit = scaled_unit(view.unit, [view.values])
     for k, values in enumerate(view.values.T):
         name = view.signal if joints == 1 else f"{view.signal}, joint {k + 1}"
         top.plot(*envelope(view.time, values / factor, many), lw=1.2, label=name, color=_JOINTS[k % 4])
     _limits(top, view.limits / factor)
-    dress(top, "" if loop else time_label(units), f"{view.signal} [{unit}]")
+    dress(top, "" if view.speed is not None else time_label(units), f"{view.signal} [{unit}]")
     legend(top)
-    if loop:
+    if view.speed is not None:
         speed = np.gradient(view.values, view.time, axis=0)
         factor, unit = scaled_unit(units["velocity"], [speed])
         for k, values in enumerate(speed.T):
@@ -283,43 +423,45 @@ def plot_experiment(
 
 
 def _limits(ax: Axes, limits: np.ndarray) -> None:
-    """Dashed lines at the ends of every joint's range."""
+    """Draw dashed lines at the ends of every joint's range."""
     for k, value in enumerate(np.unique(limits)):
         ax.axhline(value, color=BEFORE, lw=1.0, ls=(0, (4, 3)), label="limits" if k == 0 else None)
 
 
 def _simulated(view: LogView) -> list[tuple[str, str, np.ndarray]]:
-    named = (
-        ("simulated before", BEFORE, drawable(view.position_simulated_before)),
-        ("after", AFTER, drawable(view.position_simulated_after)),
-    )
-    there = [entry for entry in named if entry[2] is not None]
-    return there if len(there) > 1 else [("simulated", *entry[1:]) for entry in there]
+    before, after = view.position_simulated_before, view.position_simulated_after
+    return _present((("simulated before", BEFORE, before), ("after", AFTER, after)), "simulated")
 
 
 def _residuals(view: LogView) -> list[tuple[str, str, np.ndarray]]:
-    named = (
-        ("before", BEFORE, drawable(view.residual_before)),
-        ("after", AFTER, drawable(view.residual_after)),
-    )
-    there = [entry for entry in named if entry[2] is not None]
-    # Alone it is neither before nor after anything.
-    return there if len(there) > 1 else [("residual", *entry[1:]) for entry in there]
+    both = (("before", BEFORE, view.residual_before), ("after", AFTER, view.residual_after))
+    return _present(both, "residual")
+
+
+def _present(
+    lines: Sequence[tuple[str, str, np.ndarray | None]], alone: str
+) -> list[tuple[str, str, np.ndarray]]:
+    """Return the lines that have values; a single one, neither before nor after another, under a name."""
+    present = [(label, color, drawable(line)) for label, color, line in lines if line is not None]
+    return present if len(present) > 1 else [(alone, color, line) for _, color, line in present]
 
 
 def _groups(variable: str, x: np.ndarray) -> np.ndarray | None:
-    """Number the stretches over which a mean may be drawn as one line."""
+    """Assign numbers to the stretches over which a mean may be drawn as one line."""
     if variable == "time":
         return segments(np.asarray(x))
     # Dry friction jumps where the velocity changes its sign.
     return (np.asarray(x) >= 0.0).astype(int) if variable == "velocity" else None
 
 
-def _cloud(ax: Axes, x: np.ndarray, y: np.ndarray, color: str, groups: np.ndarray | None) -> None:
+def _cloud(
+    ax: Axes, x: np.ndarray, y: np.ndarray, color: str, groups: np.ndarray | None, label: str | None = None
+) -> None:
+    """Draw samples as dots, and their mean over bins as a line."""
     some = thinned(len(x), _MOST_POINTS)
-    # As an image: thousands of dots would be megabytes of SVG. A handful is drawn to be seen one by one.
+    # As an image, because thousands of dots would be megabytes of SVG; a few dots are drawn one by one.
     few = len(x) <= _FEW
-    look = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.4}
-    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, **look)
+    size, alpha = (6.0, 0.7) if few else (2.8, 0.4)
+    ax.plot(x[some], y[some], ".", color=color, mew=0, rasterized=not few, ms=size, alpha=alpha)
     ax.axhline(0.0, color=TEXT, lw=0.6)
-    ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8)
+    ax.plot(*binned_mean(x, y, bins=60, group=groups), color=_DARK[color], lw=1.8, label=label)

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 def study_report(result: Study) -> str:
-    """The page.
+    """Return the report of a study as one page of HTML.
 
     Args:
-        result: What it shows.
+        result: The study.
     """
     rows, table = result.summary, result.table
     others = others_of(rows)
@@ -29,13 +29,13 @@ def study_report(result: Study) -> str:
             "Errors",
             "The RMS error of all runs that were used, bias included. "
             + ("" if len(others) > 1 else "Dotted: the mean σ that the estimator reports. ")
-            + "Black: what no unbiased estimate from the readings can go below, the start and "
-            "the command known exactly.",
+            + "Black: the lower bound of any unbiased estimate from the readings, with start and "
+            "command known exactly.",
             image(plot_errors(rows), "RMS error of every estimator, by parameter"),
         ),
         (
             "Do the intervals hold the truth?",
-            "Bars are what this number of runs leaves uncertain (95 %)."
+            "Bars are the uncertainty (95 %) from the number of runs."
             + (f" Of each estimator from left to right: {'; '.join(others)}." if len(others) > 1 else ""),
             image(plot_coverage(rows), "Coverage of 95 % intervals, by parameter"),
         ),
@@ -87,7 +87,7 @@ def _line(row: dict) -> dict:
 
 
 def _answer(result: Study) -> str:
-    """The study in a sentence or two."""
+    """Return the study in one or two sentences."""
     rows = [r for r in result.summary if r["used"]]
     if not rows:
         return "No run gave an estimate."
@@ -95,8 +95,8 @@ def _answer(result: Study) -> str:
     for r in rows:
         held.setdefault(r["estimator"], []).append(r["coverage_95"])
     # Some estimators give no standard deviation.
-    told = {name: np.array(x)[np.isfinite(x)] for name, x in held.items()}
-    parts = [f"{name}: {100 * np.mean(x):.0f} %" for name, x in told.items() if len(x)]
+    finite = {name: np.array(x)[np.isfinite(x)] for name, x in held.items()}
+    parts = [f"{name}: {100 * np.mean(x):.0f} %" for name, x in finite.items() if len(x)]
     failed = sum(f["runs"] for f in result.failures)
     fits = result.table["converged"].size
     lines = [f"{failed} of {fits} fits gave no value for some parameter."]

@@ -17,10 +17,13 @@ from jaxid.results.report.numbers import pretty_unit
 from jaxid.studies.settings import widest, words_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#6b6b6b")
-# One more than colours, so that pairs of both do not soon come again.
+# One more than colours, so that pairs of both repeat late.
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 _COLUMNS = 3
-_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
+Dash = str | tuple[int, tuple[int, ...]]
+# Standard deviations beyond which errors are counted in the outermost bar.
+_REACH = 4.5
+_DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _AXES = {
     "noise": "noise, times the sensor's",
     "sample_rate": "sampling rate [Hz]",
@@ -29,103 +32,137 @@ _AXES = {
 
 
 def plot_errors(rows: Sequence[dict]) -> Figure:
-    """RMS error of every estimator against what is varied most, a panel a parameter, with the bound.
+    """Draw the RMS error of every estimator against the setting with most values, a panel a parameter.
 
-    What else is varied is told by the dashes.
+    Dashes distinguish what else is varied.
 
     Args:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
-    against, others = widest(rows), others_of(rows)
     for name, ax in zip(names, panels, strict=True):
-        own = [r for r in rows if r["parameter"] == name]
-        at = np.array(sorted({r[against] for r in own}))
-        for o, other in enumerate(others):
-            # Of more than there are dashes, the later lines are thinner.
-            dash, width = _DASHES[o % len(_DASHES)], 1.3 / (1 + o // len(_DASHES))
-            here = [r for r in own if words_of(r, without=against) == other]
-            for k, estimator in _estimators(rows, "rmse"):
-                line = {r[against]: r for r in here if r["estimator"] == estimator}
-                style = {**_look(k), "ls": dash, "lw": width}
-                values = np.array([line[x]["rmse"] for x in at])
-                ax.plot(at, values, label=None if o else estimator, **style)
-                if len(others) == 1:
-                    stated = np.array([line[x]["std"] for x in at])
-                    ax.plot(at, stated, lw=0.9, ls=":", color=_look(k)["color"])
-            bound = np.array([next(r["bound"] for r in here if r[against] == x) for x in at])
-            if np.any(np.isfinite(bound)):
-                dash = "--" if len(others) == 1 else dash
-                label = None if o else "Cramér–Rao bound"
-                ax.plot(at, bound, color=TEXT, lw=0.8 * width, ls=dash, label=label)
-        dress(ax, _AXES[against], f"{name}\nRMS error [{pretty_unit(own[0]['unit'])}]")
-        _logarithmic(ax, at)
+        draw_errors(ax, rows, name)
+    others = others_of(rows)
     several = [(other, _DASHES[o % len(_DASHES)]) for o, other in enumerate(others)]
     _legend(figure, panels[0], several if len(others) > 1 else [("reported σ", ":")])
     return figure
 
 
+def draw_errors(ax: Axes, rows: Sequence[dict], name: str) -> None:
+    """Draw the RMS error of every estimator for one parameter on one axes, with the bound.
+
+    Args:
+        ax: The axes to draw on.
+        rows: `Study.summary`.
+        name: Name of the parameter.
+    """
+    against, others = widest(rows), others_of(rows)
+    of_name = [r for r in rows if r["parameter"] == name]
+    at = np.array(sorted({r[against] for r in of_name}))
+    for o, other in enumerate(others):
+        # Of more than there are dashes, the later lines are thinner.
+        dash, width = _DASHES[o % len(_DASHES)], 1.3 / (1 + o // len(_DASHES))
+        here = [r for r in of_name if words_of(r, without=against) == other]
+        for k, estimator in _estimators(rows, "rmse"):
+            line = {r[against]: r for r in here if r["estimator"] == estimator}
+            style = {**_look(k), "ls": dash, "lw": width}
+            values = np.array([line[x]["rmse"] for x in at])
+            ax.plot(at, values, label=None if o else estimator, **style)
+            if len(others) == 1:
+                stated = np.array([line[x]["std"] for x in at])
+                ax.plot(at, stated, lw=0.9, ls=":", color=_look(k)["color"])
+        bound = np.array([next(r["bound"] for r in here if r[against] == x) for x in at])
+        if np.any(np.isfinite(bound)):
+            dash = "--" if len(others) == 1 else dash
+            label = None if o else "Cramér–Rao bound"
+            ax.plot(at, bound, color=TEXT, lw=0.8 * width, ls=dash, label=label)
+    dress(ax, _AXES[against], f"{name}\nRMS error [{pretty_unit(of_name[0]['unit'])}]")
+    _logarithmic(ax, at)
+
+
 def plot_coverage(rows: Sequence[dict]) -> Figure:
-    """Part of the 95 % intervals that hold the truth, with the scatter that the runs leave.
+    """Draw the part of the 95 % intervals that hold the truth, a panel a parameter.
 
     Args:
         rows: `Study.summary`.
     """
     names, panels, figure = _panels(rows)
-    against, others = widest(rows), others_of(rows)
-    sides = list(itertools.product(_estimators(rows, "coverage_95"), range(len(others))))
     for name, ax in zip(names, panels, strict=True):
-        own = [r for r in rows if r["parameter"] == name]
-        places = sorted({r[against] for r in own})
-        for side, ((k, estimator), o) in enumerate(sides):
-            line = {
-                r[against]: r
-                for r in own
-                if r["estimator"] == estimator and words_of(r, without=against) == others[o] and r["used"]
-            }
-            step = min(0.12, 0.8 / len(sides))
-            at = np.array([places.index(x) for x in line]) + step * (side - 0.5 * (len(sides) - 1))
-            held = np.array([r["coverage_95"] for r in line.values()])
-            ends = np.array([_proportion(r["coverage_95"], r["used"]) for r in line.values()]).reshape(-1, 2)
-            style = _look(k)
-            ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=style["color"], lw=1.2)
-            ax.plot(at, 100 * held, ls="", label=None if o else estimator, **style)
-        ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
-        dress(ax, _AXES[against], f"{name}\nin the 95 % interval [%]")
-        ax.set_ylim(0, 103)
-        ax.set_xlim(-0.5, len(places) - 0.5)
-        ax.set_xticks(range(len(places)), [f"{x:g}" for x in places])
+        draw_coverage(ax, rows, name)
     _legend(figure, panels[0])
     return figure
 
 
+def draw_coverage(ax: Axes, rows: Sequence[dict], name: str) -> None:
+    """Draw the coverage of one parameter on one axes, with the scatter of that number of runs.
+
+    Args:
+        ax: The axes to draw on.
+        rows: `Study.summary`.
+        name: Name of the parameter.
+    """
+    against, others = widest(rows), others_of(rows)
+    sides = list(itertools.product(_estimators(rows, "coverage_95"), range(len(others))))
+    of_name = [r for r in rows if r["parameter"] == name]
+    places = sorted({r[against] for r in of_name})
+    for side, ((k, estimator), o) in enumerate(sides):
+        line = {
+            r[against]: r
+            for r in of_name
+            if r["estimator"] == estimator and words_of(r, without=against) == others[o] and r["used"]
+        }
+        step = min(0.12, 0.8 / len(sides))
+        at = np.array([places.index(x) for x in line]) + step * (side - 0.5 * (len(sides) - 1))
+        held = np.array([r["coverage_95"] for r in line.values()])
+        ends = np.array([_proportion(r["coverage_95"], r["used"]) for r in line.values()]).reshape(-1, 2)
+        style = _look(k)
+        ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=style["color"], lw=1.2)
+        ax.plot(at, 100 * held, ls="", label=None if o else estimator, **style)
+    ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
+    dress(ax, _AXES[against], f"{name}\nin the 95 % interval [%]")
+    ax.set_ylim(0, 103)
+    ax.set_xlim(-0.5, len(places) - 0.5)
+    ax.set_xticks(range(len(places)), [f"{x:g}" for x in places])
+
+
 def plot_scatter(table: xr.Dataset) -> Figure:
-    """Errors of all runs under one setting, against the estimators' own deviation.
+    """Draw the errors of all runs under one setting in units of their reported deviation.
 
     Args:
         table: `Study.table` under that setting.
     """
     names = [str(n) for n in table.parameter.values]
     figure, panels = _grid(len(names))
-    reach = np.linspace(-4.5, 4.5, 200)
-    for k, (name, ax) in enumerate(zip(names, panels, strict=True)):
-        own = table.isel(parameter=k)
-        for i, estimator in enumerate(table.estimator.values):
-            one = own.isel(estimator=i)
-            used = one["converged"].values.astype(bool) & np.isfinite(one["std"].values)
-            z = ((one["estimate"] - one["truth"]) / one["std"]).values[used]
-            if len(z):
-                bins = np.linspace(-4.5, 4.5, max(11, min(41, 2 * int(np.sqrt(len(z))) + 1)))
-                style = {"color": _look(i)["color"], "lw": 1.4, "histtype": "step", "density": True}
-                ax.hist(np.clip(z, -4.5, 4.5), bins, label=str(estimator), **style)
-        ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
-        dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
+    for name, ax in zip(names, panels, strict=True):
+        draw_scatter(ax, table, name)
     _legend(figure, panels[0])
     return figure
 
 
+def draw_scatter(ax: Axes, table: xr.Dataset, name: str) -> None:
+    """Draw the errors of one parameter under one setting on one axes.
+
+    Args:
+        ax: The axes to draw on.
+        table: `Study.table` under that setting.
+        name: Name of the parameter.
+    """
+    reach = np.linspace(-_REACH, _REACH, 200)
+    of_name = table.isel(parameter=[str(n) for n in table.parameter.values].index(name))
+    for i, estimator in enumerate(table.estimator.values):
+        one = of_name.isel(estimator=i)
+        used = one["converged"].values.astype(bool) & np.isfinite(one["std"].values)
+        z = ((one["estimate"] - one["truth"]) / one["std"]).values[used]
+        if len(z):
+            ends = np.linspace(-_REACH, _REACH, max(11, min(41, 2 * int(np.sqrt(len(z))) + 1)))
+            style = {"color": _look(i)["color"], "lw": 1.4, "histtype": "step", "density": True}
+            ax.hist(np.clip(z, -_REACH, _REACH), ends.tolist(), label=str(estimator), **style)
+    ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
+    dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
+
+
 def others_of(rows: Sequence[dict]) -> list[str]:
-    """What is varied beside that, in words; one that says nothing where nothing is."""
+    """Return the other settings in words; one empty text if nothing else is varied."""
     return list(dict.fromkeys(words_of(r, without=widest(rows)) for r in rows))
 
 
@@ -146,14 +183,14 @@ def _grid(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def _estimators(rows: Sequence[dict], what: str) -> list[tuple[int, str]]:
-    """Those of which there is any such number, each with its place among all."""
+    """Return the estimators with a finite number, each with its position among all."""
     names = list(dict.fromkeys(r["estimator"] for r in rows))
-    told = {r["estimator"] for r in rows if np.isfinite(r[what])}
-    return [(k, name) for k, name in enumerate(names) if name in told]
+    finite = {r["estimator"] for r in rows if np.isfinite(r[what])}
+    return [(k, name) for k, name in enumerate(names) if name in finite]
 
 
 def _look(k: int) -> dict:
-    """Colour and mark of an estimator."""
+    """Return the colour and mark of an estimator."""
     return {"color": COLOURS[k % len(COLOURS)], "marker": _MARKS[k % len(_MARKS)], "ms": 5}
 
 
@@ -165,19 +202,19 @@ def _logarithmic(ax: Axes, at: np.ndarray) -> None:
     ax.set_xticks(at, [f"{n:g}" for n in at])
 
 
-def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, str]] = ()) -> None:
+def _legend(figure: Figure, ax: Axes, more: Sequence[tuple[str, Dash]] = ()) -> None:
     handles, labels = ax.get_legend_handles_labels()
     for label, dash in more:
         handles.append(ax.plot([], [], color=TEXT, lw=0.9, ls=dash)[0])
         labels.append(label)
-    # As many columns as the longest label lets stand side by side.
+    # The number of columns that fit beside each other with the longest label.
     fits = int(figure.get_figwidth() / (0.6 + 0.075 * max(map(len, labels))))
     columns = max(1, min(4, fits))
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, frameon=False, fontsize=FONT)
 
 
 def _proportion(part: float, of: int) -> tuple[float, float]:
-    """95 % interval of a proportion: Wilson (1927)."""
+    """Return the 95 % interval of a proportion by Wilson (1927)."""
     z = 1.96
     middle = (part + z**2 / (2 * of)) / (1 + z**2 / of)
     half = z / (1 + z**2 / of) * np.sqrt(part * (1 - part) / of + z**2 / (4 * of**2))

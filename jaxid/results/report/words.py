@@ -63,22 +63,23 @@ def verdict_class(data: ReportData) -> str:
 
 
 def answer(data: ReportData) -> str:
-    """Join the summary's lines into one paragraph; compose one where there is none."""
-    lines = [line.strip() for line in data.summary_lines if line.strip()]
-    if not lines:
-        openings = {
-            "found": "The declared model lacks physics that the log shows",
-            "nothing_missing": "What the declared model leaves unexplained is sensor noise",
-            "unexplained": "Model and log disagree, and no known effect explains it",
-        }
-        lines = [openings.get(data.verdict, "The declared model was fitted to the log")]
-        # One line for each quantity, of two joints at most one each: the table below has the other logs.
-        rows = [r for r in _gap_rows(data) if is_number(r.after)]
-        groups: dict[str, list[GapRow]] = {}
-        for row in (r for r in rows if r.log == rows[0].log):
-            groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
-        for quantity, own in groups.items():
-            lines += [_gaps_words(quantity, own)] if len(own) > 2 else [_gap_words(row) for row in own]
+    """Compose the answer as one paragraph: the verdict, and how far the gaps have changed."""
+    openings = {
+        "found": "The declared model lacks physics that the log shows",
+        "nothing_missing": "The residual of the declared model is sensor noise",
+        "unexplained": "Model and log disagree, and no known effect explains it",
+    }
+    lines = [openings.get(data.verdict or "", "The declared model was fitted to the log")]
+
+    # One line for each quantity, of two joints at most one each: the table below has the other logs.
+    rows = [r for r in _gap_rows(data) if is_number(r.after)]
+    groups: dict[str, list[GapRow]] = {}
+    for row in (r for r in rows if r.log == rows[0].log):
+        groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
+    for quantity, of_joints in groups.items():
+        several = len(of_joints) > 2
+        lines += [_gaps_words(quantity, of_joints)] if several else [_gap_words(row) for row in of_joints]
+
     return unbroken(" ".join(line if line[-1] in ".!?:;" else f"{line}." for line in lines))
 
 
@@ -88,7 +89,7 @@ def unbroken(text: str) -> str:
 
 
 def place_words(entry: Mapping) -> str:
-    """Say where an effect acts: "joint 2", "spring 3", or nothing."""
+    """Return the place of an effect, such as "joint 2" or "spring 3", or nothing."""
     for key in PLACES:
         if entry.get(key) is not None:
             return f"{key} {entry[key]}"
@@ -140,7 +141,7 @@ def effect_entries(effects: Sequence[Mapping]) -> list[dict]:
 
 
 def unidentifiable_lines(entries: Sequence[Mapping]) -> list[dict]:
-    """Explain each combination that the log cannot tell, largest weight first."""
+    """Format each combination that is not identifiable, largest weight first."""
     lines = []
     for entry in entries:
         terms = _terms(entry["combination"])
@@ -149,14 +150,14 @@ def unidentifiable_lines(entries: Sequence[Mapping]) -> list[dict]:
 
 
 def _terms(combination: Mapping[str, float], least: float = 0.0) -> list[dict]:
-    """Names and weights of a combination, largest first, without those up to a size."""
+    """Return names and weights of a combination, largest first, without small ones."""
     weights = {k: w for k, w in combination.items() if is_number(w) and abs(w) > least}
     ranked = sorted(weights.items(), key=lambda item: -abs(item[1]))
     return [{"name": n, "weight": ("+" if w > 0 else "") + plain(w, 2)} for n, w in ranked]
 
 
 def direction_lines(directions: Sequence[Mapping]) -> list[dict]:
-    """Format the combinations that a fit within a prior tells."""
+    """Format the combinations that a fit within a prior identifies."""
     lines = []
     for entry in directions:
         value, std = with_std(entry["value"], entry["std"])
@@ -175,7 +176,7 @@ def direction_lines(directions: Sequence[Mapping]) -> list[dict]:
 
 
 def within_prior_words(content: Mapping) -> list[str]:
-    """What a fit within a prior says beside its directions; nothing of any other."""
+    """Return the statistics of a fit within a prior; empty for any other fit."""
     if "criterion_percent" not in content:
         return []
     lines = [f"criterion: {short(content['criterion_percent'], 3)} % of the squared deviation from the mean"]
@@ -183,13 +184,13 @@ def within_prior_words(content: Mapping) -> list[str]:
     if starts:
         shown = f"starts: {starts['same_optimum']} of {starts['count']} end at the same cost"
         if starts["flat"]:
-            shown += f"; {starts['flat']} from which the simulation does not move were led on first"
+            shown += f"; {starts['flat']}, at which the simulation does not move, were moved first"
         lines.append(shown)
     return lines
 
 
 def where_lines(data: ReportData) -> dict | None:
-    """Say in words where the disagreement sits."""
+    """Return the region of the disagreement in words."""
     where = data.where
     if not where:
         return None
@@ -209,7 +210,7 @@ def where_lines(data: ReportData) -> dict | None:
 
 
 def where_region(data: ReportData) -> Sequence[float] | None:
-    """Range of the variable in which the residual is largest; None of a line in its spectrum."""
+    """Return the range in which the residual is largest; None for a line in its spectrum."""
     where = data.where or {}
     return None if is_number(where.get("frequency_hz")) else where.get("region")
 
@@ -234,7 +235,7 @@ def step_lines(data: ReportData) -> list[dict]:
 
 
 def step_words(number: int, step: SearchStep) -> str:
-    """Say what a step changed."""
+    """Return the change of a step in words."""
     changes = [f"{step.added} added"] if step.added else []
     changes += [f"{step.dropped} dropped"] if step.dropped else []
     if changes:
@@ -263,13 +264,13 @@ def _gap_words(row: GapRow) -> str:
 
 
 def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
-    """The same of many joints at once, as ranges."""
+    """Return the gaps of many joints at once, as ranges."""
     numbers = [x for r in rows for x in (r.before, r.after, r.floor) if is_number(x)]
     scale, unit = scaled_unit(rows[0].unit, numbers)
 
     def span(values: list[float | None]) -> str:
-        told = [x / scale for x in values if is_number(x)]
-        ends = dict.fromkeys(plain(x) for x in (min(told), max(told))) if told else ()
+        known = [x / scale for x in values if x is not None and is_number(x)]
+        ends = dict.fromkeys(plain(x) for x in (min(known), max(known))) if known else ()
         return f"{'–'.join(ends)} {unit}".strip() if ends else ""
 
     before, after, floor = (span([getattr(r, k) for r in rows]) for k in ("before", "after", "floor"))
@@ -336,9 +337,13 @@ def _by_joint(**columns: object) -> list[GapRow]:
 def _gap_cells(row: GapRow) -> list[str]:
     numbers = (row.before, row.after, row.floor)
     scale, unit = scaled_unit(row.unit, [n for n in numbers if is_number(n)])
-    texts = [f"{plain(n / scale)} {unit}".strip() if is_number(n) else ABSENT for n in numbers]
-    judged = is_number(row.after) and is_number(row.floor) and row.floor > 0
-    ratio = f"{row.after / row.floor:.2f}" if judged else ABSENT
+    texts = [
+        f"{plain(n / scale)} {unit}".strip() if n is not None and is_number(n) else ABSENT for n in numbers
+    ]
+    after, floor = row.after, row.floor
+    ratio = ABSENT
+    if after is not None and floor is not None and is_number(after) and is_number(floor) and floor > 0:
+        ratio = f"{after / floor:.2f}"
     return [row.quantity, row.log, *texts, ratio, percent(row.relative)]
 
 

@@ -263,7 +263,7 @@ def test_results_hold_the_directions(fitted, tmp_path):
     fitted.save(tmp_path / "out")
     content = json.loads((tmp_path / "out" / "result.json").read_text())
     assert content["criterion_percent"] > 0
-    assert str(fitted).count("told together: ") == len(content["directions"])
+    assert str(fitted).count("identifiable combination: ") == len(content["directions"])
     assert content["directions"][0].keys() >= {"combination", "value", "std"}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "directions of 11 unknowns fitted" in page
@@ -275,7 +275,7 @@ def test_results_hold_the_directions(fitted, tmp_path):
         assert words in str(fitted)
     # Of what was left to them it is not said that it changes nothing.
     assert "Left to the guesses: " in page
-    assert "left to the guesses: " in str(fitted)
+    assert "held at the guesses: " in str(fitted)
     assert "leaves everything that was measured as it is" not in page
     assert "<figcaption>Force of the drive</figcaption>" in page
 

@@ -1,0 +1,91 @@
+"""Logs that are in memory already: tables of pandas, polars or xarray, and arrays by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.logs.log import Log, read_log
+from jaxid.logs.readers.array_files import Columns, pick_columns
+from jaxid.logs.readers.rows import Rows
+
+
+class Table(Protocol):
+    """Named columns: a DataFrame of pandas or polars, an xarray Dataset, or a dictionary of arrays."""
+
+    def __getitem__(self, name: Any, /) -> Any: ...
+
+
+# Every type that a command takes for a log.
+LogLike = Log | str | Path | Table
+
+
+def as_log(
+    log: LogLike, columns: dict[str, Any], *, joints: int | None = 1, drives: int | None = None
+) -> Log:
+    """Return a log, in memory or from a file, with the same checks.
+
+    Args:
+        log: A log, which is returned as it is; a file; or a table, whose columns `columns` names.
+        columns: The `[log]` table of a case, see `jaxid.logs.log.read_log`. The index of a DataFrame counts
+            as a column if it has a name.
+        joints: Number of positions expected; None takes what there is.
+        drives: Number of forces and references expected; None: no more than positions.
+
+    Raises:
+        InputError: If the table is of no known kind, or a key, a column, a value or the time base is unsound.
+    """
+    if isinstance(log, Log):
+        return log
+    if isinstance(log, str | Path):
+        return read_log(log, columns, joints=joints, drives=drives)
+    name, known = _arrays(log)
+
+    def read(source: Path, names: list[str], rows: Rows | None) -> Columns:
+        return pick_columns(source, known, list(dict.fromkeys(names)), rows)
+
+    return read_log(name, columns, joints=joints, drives=drives, read=read)
+
+
+def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:
+    """Return the name of a table in messages, and its columns by name.
+
+    No library is imported, because the library of a given table is loaded already.
+    """
+    library, kind = type(log).__module__.partition(".")[0], type(log).__name__
+    if isinstance(log, Mapping) and library != "xarray":
+        return "arrays", {str(name): values for name, values in log.items()}
+    # The libraries are optional, and their classes are known by name only.
+    table: Any = log
+    if library == "pandas" and kind == "DataFrame":
+        return kind, _of_pandas(table)
+    if library == "polars" and kind in ("DataFrame", "LazyFrame"):
+        table = table.collect() if kind == "LazyFrame" else table
+        return "DataFrame", {name: table[name].to_numpy() for name in table.columns}
+    if library == "xarray" and kind == "Dataset":
+        return kind, {str(name): values.to_numpy() for name, values in table.variables.items()}
+    raise InputError(
+        f"a log cannot be a {type(table).__name__}",
+        hint="give a file, a jaxid.Log, a DataFrame, an xarray Dataset, or a dictionary of arrays",
+    )
+
+
+def _of_pandas(table: Any) -> dict[str, np.ndarray]:
+    """Return the columns of a pandas table, and its index if that has a name."""
+    twice = table.columns[table.columns.duplicated()]
+    if len(twice):
+        raise InputError(f"has two columns {str(twice[0])!r}", where="DataFrame", hint="rename one of them")
+    index = {} if table.index.name is None else {str(table.index.name): table.index}
+    columns = {**index, **{str(name): table[name] for name in table.columns}}
+    return {name: _numbers(values) for name, values in columns.items()}
+
+
+def _numbers(values: Any) -> np.ndarray:
+    """Return a column as an array, missing entries of pandas' nullable numbers as NaN."""
+    if isinstance(values.dtype, np.dtype) or getattr(values.dtype, "kind", "O") not in "fiub":
+        return values.to_numpy()
+    return values.to_numpy(dtype=np.float64, na_value=np.nan)

@@ -1,0 +1,45 @@
+"""Results as small HTML tables, which a notebook shows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jaxid.results import as_json, as_text
+from jaxid.results.parameters import html_table
+
+if TYPE_CHECKING:
+    from jaxid.commands.check import Check
+    from jaxid.commands.identify import Identification
+    from jaxid.discovery.result import Discovery
+    from jaxid.results.result import FitResult
+    from jaxid.studies.result import Study
+
+
+def identification_html(result: Identification) -> str:
+    """Return the parameters and the gap of an identification."""
+    estimate = result.estimate
+    head = f"{estimate.method}: {estimate.message}, {estimate.samples} samples"
+    gap = as_text.gap_rows(result.session, result.gaps, result.noise_floor)
+    return _parameters(result, head) + html_table(gap)
+
+
+def discovery_html(result: Discovery) -> str:
+    """Return the verdict, the parameters and the steps of a discovery."""
+    effects = f": {', '.join(e.label for e in result.effects)}" if result.effects else ""
+    steps = as_text.step_rows(as_json.discovery_json(result))
+    return _parameters(result, f"{result.verdict.replace('_', ' ')}{effects}") + html_table(steps)
+
+
+def check_html(result: Check) -> str:
+    """Return the unknowns of a check with the smallest standard deviation that the log allows."""
+    return html_table(as_text.check_rows(result.json()), as_text.check_summary(result).splitlines()[0])
+
+
+def study_html(result: Study) -> str:
+    """Return the rows of a study."""
+    return html_table(as_text.study_rows(result), as_text.study_summary(result).splitlines()[0])
+
+
+def _parameters(result: FitResult, caption: str) -> str:
+    derived = as_json.derived(result.session, result.estimate)
+    return html_table(as_text.parameter_rows(result.estimate, derived), caption)

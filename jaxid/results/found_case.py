@@ -1,0 +1,356 @@
+"""The case with what a fit or a search found in it, as an object and as a file."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxid.arms.pseudo_inertia import TEN
+from jaxid.case.case import Case, load_case
+from jaxid.case.declared import EffectEntry
+from jaxid.case.values import Value
+from jaxid.effects import EFFECTS
+from jaxid.errors import InputError
+from jaxid.files import write_whole
+from jaxid.model.effect import Effect
+from jaxid.model.unknowns import REFERENCE, several_places
+
+if TYPE_CHECKING:
+    from jaxid.results.result import FitResult
+
+# Digits of a guess: far more than any log determines, and few enough to read.
+_DIGITS = 9
+# Keys whose text is a file name relative to the case, and texts that name a class in such a file.
+_FILES = ("log", "file", "urdf", "mjcf")
+_CLASS = re.compile(r"(.+\.py):\w+$")
+# Where the parameters of a link stand in a table [[plant.links]]: key and entry.
+_LINKS = {
+    **{part: ("first_moment", k) for k, part in enumerate(TEN[1:4])},
+    **{part: ("inertia", k) for k, part in enumerate(TEN[4:])},
+}
+
+Index = int | tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a result has to say to its case.
+
+    Args:
+        plant: New guesses of [plant.parameters] by name and entry.
+        effects: New guesses of [[effects]] by number of the table, name, and place among its places.
+        reference: New guesses of [reference] by key.
+        added: Effects beside those of the case: the object, its place, and its values.
+    """
+
+    plant: dict[str, dict[Index, float]]
+    effects: dict[int, dict[str, dict[int, float]]]
+    reference: dict[str, float]
+    added: tuple[tuple[Effect, tuple[str, int] | None, dict[str, Value]], ...]
+
+
+def found_case(result: FitResult) -> Case:
+    """Return the case with estimates as guesses, and with the effects that a search added."""
+    case, findings = result.session.declared, _findings(result)
+
+    parameters = dict(case.plant.parameters)
+    for name, guesses in findings.plant.items():
+        for index, guess in guesses.items():
+            parameters[name] = _with_guess(parameters[name], index, guess)
+
+    effects = list(case.effects)
+    for number, by_name in findings.effects.items():
+        values = dict(effects[number].parameters)
+        for name, guesses in by_name.items():
+            for at, guess in guesses.items():
+                values[name] = _with_guess(values[name], at, guess)
+        effects[number] = replace(effects[number], parameters=values)
+    for effect, _, values in findings.added:
+        entry = EffectEntry(type(effect), {n: (v,) for n, v in values.items()}, (effect.port,))
+        effects.append(entry)
+
+    unknown = {n: _with_guess(v, None, findings.reference.get(n)) for n, v in case.unknown_reference.items()}
+    reference = case.reference
+    if reference is not None:
+        reference = reference | {name: value.guess for name, value in unknown.items()}
+    return replace(
+        case,
+        plant=replace(case.plant, parameters=parameters),
+        effects=tuple(effects),
+        reference=reference,
+        unknown_reference=unknown,
+    )
+
+
+def _findings(result: FitResult) -> Findings:
+    """Sort the estimates of a result by the entries of its case."""
+    case, machine = result.session.declared, result.estimate.machine
+    # Number of the table and of the place, by number of the effect in the plant.
+    places = [(k, at) for k, entry in enumerate(case.effects) for at in range(len(entry.ports))]
+    plant: dict[str, dict[Index, float]] = {}
+    effects: dict[int, dict[str, dict[int, float]]] = {}
+    reference: dict[str, float] = {}
+    added: dict[int, dict[str, Value]] = {}
+
+    rows = zip(machine.parameters.free, result.estimate.theta, result.estimate.identifiable, strict=True)
+    for f, estimate, identifiable in rows:
+        guess = _rounded(estimate)
+        known = bool(identifiable) and math.isfinite(guess)
+        match f.path:
+            case ("effects", int(number), str(name)) if number >= len(places):
+                # An effect that was added has no other value, however well this one is known.
+                added.setdefault(number, {})[name] = Value(guess, free=True)
+            case ("effects", int(number), str(name)) if known:
+                table, at = places[number]
+                effects.setdefault(table, {}).setdefault(name, {})[at] = guess
+            case (first, str(name)) if first == REFERENCE and known:
+                reference[name] = guess
+            case (str(name),) if known:
+                plant.setdefault(name, {})[f.index] = guess
+
+    return Findings(
+        plant, effects, reference, tuple(_added(machine.plant, k, values) for k, values in added.items())
+    )
+
+
+def _added(plant: Any, number: int, values: dict[str, Value]) -> tuple:
+    effect = plant.effects[number]
+    return effect, plant.place(effect.port) if several_places(plant) else None, values
+
+
+def _rounded(value: float) -> float:
+    return float(f"{float(value):.{_DIGITS}g}")
+
+
+def _with_guess(value: Any, index: Index, guess: float | None) -> Any:
+    """Return a value, or a list of them, with another guess, which stays within its bounds."""
+    if guess is None:
+        return value
+    if index is None:
+        return replace(value, guess=float(np.clip(guess, value.lower, value.upper)))
+    first, rest = index if isinstance(index, tuple) else (index, None)
+    return (*value[:first], _with_guess(value[first], rest, guess), *value[first + 1 :])
+
+
+def case_text(result: FitResult, folder: Path) -> str:
+    """Return the case with what was found as TOML.
+
+    The text of the case file is edited, so that comments and order stay. A case without a file, or whose
+    file writes its effects as one list, is written anew.
+
+    Args:
+        result: The result.
+        folder: Folder from which the file names are to hold.
+
+    Raises:
+        InputError: If the case has been changed in Python since its file was read.
+    """
+    # Loaded here: writing a case is all that needs it.
+    import tomlkit
+
+    case = result.session.declared
+    findings = _findings(result)
+    text = _text(case)
+    tables = tomllib.loads(text)
+    rename = _renamer(case.folder, folder)
+    added = [rename(_table(effect, place, v, case, tables)) for effect, place, v in findings.added]
+
+    wanted = rename(copy.deepcopy(tables))
+    _put_guesses(wanted, case, findings)
+    wanted["effects"] = [*wanted.get("effects", []), *added]
+    wanted = wanted if wanted["effects"] else {k: v for k, v in wanted.items() if k != "effects"}
+
+    document = tomlkit.parse(text)
+    _rename_in(document, rename)
+    _put_guesses(document, case, findings)
+    edited = _appended(tomlkit.dumps(document), added)
+    try:
+        if tomllib.loads(edited) == wanted:
+            return edited
+    except tomllib.TOMLDecodeError:
+        pass
+    return tomlkit.dumps(wanted)
+
+
+def save_found_case(result: FitResult, path: Path, *, overwrite: bool = False) -> Path:
+    """Write the case with what was found; see `FitResult.save_case`."""
+    if path.is_dir() or not path.parent.is_dir():
+        what = "is a folder" if path.is_dir() else "has no such folder"
+        raise InputError(
+            what, where=str(path), hint="name a file in a folder that exists, such as found.toml"
+        )
+    if path.exists() and not overwrite:
+        raise InputError("exists already", where=str(path), hint="choose another name, or overwrite=True")
+    write_whole(path, case_text(result, path.parent))
+    return path
+
+
+def changed_in_python(case: Case) -> bool:
+    """Return whether a case differs from the file, or the tables, that it was read from."""
+    source = _source(case)
+    return source is None or repr(load_case(source)) != repr(case)
+
+
+def _source(case: Case) -> Any:
+    """Return the file or the tables that a case was read from; None if there are none."""
+    if case.path is None:
+        return getattr(case, "tables", None)
+    return case.path if case.path.is_file() else None
+
+
+def _text(case: Case) -> str:
+    """Return the TOML of a case as it was read."""
+    import tomlkit
+
+    if changed_in_python(case):
+        raise InputError(
+            "the case was changed in Python, and differs from its file",
+            where=str(case.path),
+            hint="use case(), or write the changes to the file first",
+        )
+    source = _source(case)
+    return source.read_bytes().decode("utf-8-sig") if isinstance(source, Path) else tomlkit.dumps(source)
+
+
+def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
+    """Put new guesses into the tables of a case, plain ones or those of a document."""
+    for name, guesses in findings.plant.items():
+        _put_plant(tables["plant"], case, name, guesses)
+    for number, by_name in findings.effects.items():
+        for name, guesses in by_name.items():
+            places = len(case.effects[number].ports)
+            _put(tables["effects"][number], name, guesses, places, case.effects[number].parameters[name])
+    for key, guess in findings.reference.items():
+        tables["reference"][key]["guess"] = guess
+
+
+def _put_plant(table: Any, case: Case, name: str, guesses: Mapping[Index, float]) -> None:
+    """Put new guesses of one parameter into [plant]; those of a URDF file have no place there."""
+    values: Any = case.plant.parameters[name]
+    if "links" in table:
+        for index, guess in guesses.items():
+            key, entry = _LINKS.get(name, (name, None))
+            # Of one link's list this is one entry; the others are put by their own names.
+            link = table["links"][index]
+            places = 1 if entry is None else len([part for part in _LINKS.values() if part[0] == key])
+            _put(link, key, {entry or 0: guess}, places, (values[index],) * places)
+    elif "parameters" in table:
+        parameters = table["parameters"]
+        if isinstance(values, Value):
+            _put(parameters, name, {0: guesses[None]}, 1, (values,))
+            return
+        rows: dict[int, dict[int, float]] = {}
+        for index, guess in guesses.items():
+            if isinstance(index, tuple):
+                rows.setdefault(index[0], {})[index[1]] = guess
+        if rows:
+            for row, of_row in rows.items():
+                _put(parameters[name], row, of_row, len(values[row]), values[row])
+        else:
+            _put(
+                parameters,
+                name,
+                {k: g for k, g in guesses.items() if isinstance(k, int)},
+                len(values),
+                values,
+            )
+
+
+def _put(table: Any, key: Any, guesses: Mapping[int, float], places: int, values: Sequence[Any]) -> None:
+    """Put new guesses of a value that stands for several places.
+
+    Args:
+        table: Table or list in which the value stands.
+        key: Its key or number there.
+        guesses: New guess by place.
+        places: Number of places.
+        values: The case's values, one a place.
+    """
+    stated = table[key]
+    clipped = {k: _with_guess(values[k], None, guess).guess for k, guess in guesses.items()}
+    if isinstance(stated, list):
+        for k, guess in clipped.items():
+            if isinstance(stated[k], Mapping):
+                stated[k]["guess"] = guess
+    elif isinstance(stated, Mapping):
+        before = stated["guess"]
+        before = list(before) if isinstance(before, list) else [before] * places
+        after = [float(clipped.get(k, before[k])) for k in range(places)]
+        stated["guess"] = after[0] if places == 1 and not isinstance(stated["guess"], list) else after  # pyright: ignore[reportIndexIssue]  # a dict
+
+
+def _table(
+    effect: Effect, place: tuple[str, int] | None, values: Mapping[str, Value], case: Case, tables: Mapping
+) -> dict[str, Any]:
+    """Return the table [[effects]] of an effect that was added."""
+    known = {} if place is None else {place[0]: place[1]}
+    return {"kind": _kind(type(effect), case, tables), **known} | {
+        name: {"guess": value.guess} for name, value in values.items()
+    }
+
+
+def _kind(cls: type[Effect], case: Case, tables: Mapping) -> str:
+    """Return the text by which a case names an effect: a kind, or a class in a file."""
+    if EFFECTS.get(cls.kind) is cls:
+        return cls.kind
+    named = zip(case.candidates, tables.get("discover", {}).get("candidates", ()), strict=True)
+    declared = zip((e.cls for e in case.effects), (e["kind"] for e in tables.get("effects", ())), strict=True)
+    return next(text for known, text in (*named, *declared) if known is cls)
+
+
+def _appended(text: str, effects: Sequence[Mapping[str, Any]]) -> str:
+    """Return a case's text with tables [[effects]] at its end, each key on a line."""
+    out = text if not text or text.endswith("\n") else f"{text}\n"
+    for k, effect in enumerate(effects):
+        out += "\n# Found by jaxid discover\n" if k == 0 else "\n"
+        out += "[[effects]]\n"
+        for name, value in effect.items():
+            shown = f"{{ guess = {value['guess']!r} }}" if isinstance(value, Mapping) else json.dumps(value)
+            out += f"{name} = {shown}\n"
+    return out
+
+
+def _renamer(old: Path, new: Path) -> Any:
+    """Return a function that rewrites the file names of tables to start from another folder."""
+    same = old.resolve() == new.resolve()
+
+    def moved(name: str) -> str:
+        if same or PurePath(name).is_absolute():
+            return name
+        try:
+            return Path(os.path.relpath((old / name).resolve(), new.resolve())).as_posix()
+        except ValueError:
+            return (old / name).resolve().as_posix()  # another drive
+
+    def rename(value: Any, key: str = "") -> Any:
+        if isinstance(value, Mapping):
+            return {k: rename(v, k) for k, v in value.items()}
+        if isinstance(value, list):
+            return [rename(v, key) for v in value]
+        if isinstance(value, str) and (of_class := _CLASS.match(value)):
+            return moved(of_class[1]) + value[len(of_class[1]) :]
+        return moved(value) if isinstance(value, str) and key in _FILES else value
+
+    return rename
+
+
+def _rename_in(tables: Any, rename: Any, key: str = "") -> None:
+    """Rewrite the file names of a document in place, so that its layout stays."""
+    named = isinstance(tables, Mapping)
+    entries: list[tuple[Any, Any]] = list(tables.items() if named else enumerate(tables))
+    for k, value in entries:
+        name = k if named else key
+        if isinstance(value, Mapping | list):
+            _rename_in(value, rename, name)
+        elif isinstance(value, str) and (new := rename(value, name)) != value:
+            tables[k] = new
