@@ -157,7 +157,7 @@ def test_calibration_finds_scale_mounting_and_bias():
     np.testing.assert_allclose(std[:, 3], noise / np.sqrt(2000), rtol=0.05)
     with pytest.raises(ValueError, match="does not turn"):
         calibrate(raw, np.outer(known[:, 0], [0.0, 0.0, 1.0]))
-    with pytest.raises(ValueError, match="4 samples do not tell"):
+    with pytest.raises(ValueError, match="4 samples do not determine"):
         calibrate(raw[:4], known[:4])
 
 
