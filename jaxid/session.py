@@ -111,7 +111,7 @@ def open_session(
     # The machine of the first log serves them all: only the controller's period depends on the log.
     machine = build_machine(case, period=fit.period)
 
-    def read(log: Log | str | Path, columns: LogTable | None = None, *, whole: bool = False) -> Log:
+    def read(log: LogLike, columns: LogTable | None = None, *, whole: bool = False) -> Log:
         return _followed(case, _read(as_logged, log, columns=columns, whole=whole), machine.plant)
 
     fit = _followed(case, fit, machine.plant)
@@ -156,7 +156,7 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
         InputError: If the log is unsound.
     """
     case, machine = session.declared, session.machine
-    measured = _read(case, log, whole=True)
+    measured = _followed(at_joints(case), _read(case, log, whole=True), machine.plant)
     held = case.within_prior is not None
     _check(at_joints(case), measured, machine, held)
     needed = 0 if held else enough(machine)

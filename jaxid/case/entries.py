@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 
 from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.links import LINKED, check_links, read_links, read_links_of_urdf, read_shafts
@@ -74,7 +74,8 @@ def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
     if cls.couplings:
         keys["coupling"] = coupling_key(cls)
         if "coupling" in table:
-            cls = cls.couplings[keys["coupling"].read(table["coupling"], spot.at("coupling"))]
+            coupling = keys["coupling"].read(table["coupling"], spot.at("coupling"))
+            cls = cast(type[Plant], cls.couplings[coupling])
     joints = _count_joints(table.get("parameters"), cls, spot)
     if "actuated" in cls.__dataclass_fields__:
         keys["actuated"] = actuated_key(joints)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 from jaxid.case.entries import actuated_key, coupling_key, parameter_keys, search_keys
 from jaxid.case.links import LINKED, SHAFT, link_keys
@@ -123,7 +123,11 @@ def _plant(cls: type[Plant]) -> list[dict[str, Any]]:
         return [_kind(cls.kind, _plant_keys(cls), _doc(cls))]
     out = []
     for k, (coupling, variant) in enumerate(cls.couplings.items()):
-        schema = _kind(cls.kind, {**_plant_keys(variant), "coupling": coupling_key(cls)}, _doc(variant))
+        schema = _kind(
+            cls.kind,
+            {**_plant_keys(cast(type[Plant], variant)), "coupling": coupling_key(cls)},
+            _doc(variant),
+        )
         schema["properties"]["coupling"] = {"const": coupling}
         # The first is the default, and need not be named.
         schema["required"] += ["coupling"] if k else []

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxid.case.case import CaseLike
+from jaxid.case.case import Case, CaseLike
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.in_loop.confirm import WHY, hindering
@@ -77,10 +77,16 @@ def discover(
         raise InputError(f"solver {solver!r} is not known", hint=suggest(solver, SOLVERS))
     minimiser_of(minimiser)
     session = open_session(case, log, validate, align_hold=True, method="discover")
-    stated = {"solver": solver, "minimiser": minimiser}
-    stated = session.case.output_error | {k: v for k, v in stated.items() if v is not None}
-    session = replace(session, case=replace(session.case, output_error=stated))
+    session = replace(session, case=_with_numerics(session.case, solver, minimiser))
     return explore(session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress)
+
+
+def _with_numerics(case: Case, solver: str | None, minimiser: str | Minimiser | None) -> Case:
+    """Return the case with a solver and a minimiser in place of those that it states."""
+    given = {"solver": solver, "minimiser": minimiser}
+    given = {name: value for name, value in given.items() if value is not None}
+    within = None if case.within_prior is None else replace(case.within_prior, **given)
+    return replace(case, output_error=replace(case.output_error, **given), within_prior=within)
 
 
 def explore(
@@ -177,7 +183,7 @@ def _break_aways(search: Search) -> list[cand.Candidate]:
     """Return candidates that act at rest only and have one parameter, their level; one for each port."""
     out: dict[int, cand.Candidate] = {}
     for c in search.rest():
-        cls = type(cand.effect_of(search.union, c))
+        cls = type(cand.effect_of(search.superset, c))
         if [*parameters_of(cls)] == [cls.break_away_level]:
             out.setdefault(c.port, c)
     return list(out.values())
@@ -188,7 +194,7 @@ def _with_break_away(
 ) -> tuple[Estimate, NamedEffect, Step]:
     """Return an estimate with break-away friction added at the level that the starts from rest show."""
     machine = estimate.machine
-    cls = type(cand.effect_of(search.union, c))
+    cls = type(cand.effect_of(search.superset, c))
     effect = cls(**{str(cls.break_away_level): b.level}, port=c.port)
     plant, free = free_effect(machine.plant, effect, machine.units)
     theta = np.append(estimate.theta, b.level)
@@ -274,8 +280,8 @@ def _refit(session: Session, start: Estimate) -> Estimate:
         return start
     try:
         stated, log = session.case.output_error, session.fit.log
-        numerics = choose_numerics(session.machine, log, solver=stated.get("solver"))
-        estimate = output_error(session.machine, log, numerics=numerics, minimiser=stated.get("minimiser"))
+        numerics = choose_numerics(session.machine, log, solver=stated.solver)
+        estimate = output_error(session.machine, log, numerics=numerics, minimiser=stated.minimiser)
     except TooStiffError as error:
         return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
     if not estimate.converged or not np.all(np.isfinite(estimate.theta)):

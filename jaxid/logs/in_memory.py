@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.logs.log import Log, read_log
 from jaxid.logs.readers.array_files import Columns, pick_columns
 from jaxid.logs.readers.rows import Rows
+from jaxid.settings import LogTable
 
 
 class Table(Protocol):
@@ -25,7 +26,7 @@ LogLike = Log | str | Path | Table
 
 
 def as_log(
-    log: LogLike, columns: dict[str, Any], *, joints: int | None = 1, drives: int | None = None
+    log: LogLike, columns: LogTable | Mapping[str, Any], *, joints: int | None = 1, drives: int | None = None
 ) -> Log:
     """Return a log, in memory or from a file, with the same checks.
 

@@ -93,7 +93,7 @@ def _pick(gap: Gap, what: str) -> np.ndarray | None:
 def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[str, Any]:
     """Return the object `gap` of result.json."""
     fit, others = gaps[0], gaps[1:]
-    unit, measured = session.machine.unit_by_joint, np.flatnonzero(session.fit.log.measured)
+    unit, measured = session.machine.unit_by_joint, np.flatnonzero(session.fit.log.measured).tolist()
     out: dict[str, Any] = {
         "unit": unit("force"),
         "band_hz": session.recipe.band_hz(session.fit.log.rate_hz),
@@ -242,7 +242,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
     on = "validation" if len(after) > 1 else "fit"
     judged = slice(1, None) if len(after) > 1 else slice(0, 1)
     machine = result.session.machine
-    measured = np.flatnonzero(result.session.fit.log.measured)
+    measured = np.flatnonzero(result.session.fit.log.measured).tolist()
     return {
         "verdict": result.verdict,
         "converged": result.converged,

@@ -88,14 +88,14 @@ def identification_table(result: Identification) -> str:
 def identification_summary(result: Identification) -> str:
     """Return an identification in a few lines."""
     estimate = result.estimate
-    head = f"Identification of {result.session.case.path.name} by {estimate.method}: {estimate.message}"
+    head = f"Identification of {result.session.case.name} by {estimate.method}: {estimate.message}"
     return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
 
 
 def discovery_summary(result: Discovery) -> str:
     """Return a discovery in a few lines."""
     effects = ": " + ", ".join(e.label for e in result.effects) if result.effects else ""
-    head = f"Discovery in {result.session.case.path.name}: {result.verdict.replace('_', ' ')}{effects}"
+    head = f"Discovery in {result.session.case.name}: {result.verdict.replace('_', ' ')}{effects}"
     return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
 
 
@@ -240,7 +240,7 @@ def check_summary(result: Check) -> str:
     parameters = content["parameters"].values()
     known = sum(p["identifiable"] for p in parameters)
     lines = [
-        f"Check of {session.case.path.name}: the log is sound",
+        f"Check of {session.case.name}: the log is sound",
         f"  {log['samples']} samples at {log['rate_hz']:.6g} Hz",
         f"  {known} of {len(parameters)} unknowns identifiable",
     ]

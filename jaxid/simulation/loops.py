@@ -335,7 +335,7 @@ def with_diffrax(
         )
     x0 = State(position, velocity, plant.initial_states(force(times[0])))
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(vector_field),
+        diffrax.ODETerm(vector_field),  # pyright: ignore[reportArgumentType]  # its times are arrays
         solver or diffrax.Tsit5(),
         times[0],
         times[-1],

@@ -59,7 +59,7 @@ class Runner:
             return Ways(session.recipe, None)
         first = inverse_dynamics(session.machine, session.fit.data)
         machine = first.machine if first.all_identified else session.machine
-        solver = at.model.output_error.get("solver")
+        solver = at.model.output_error.solver
         return Ways(session.recipe, choose_numerics(machine, log, solver=solver))
 
     def chunk(self, number: int) -> Arrays:
