@@ -58,7 +58,7 @@ def exact(folder, gap: float):
     log = axes.record(machine, duration=2.0, sensor=sensor)
     spring = f'[[effects]]\nkind = "backlash"\nspring = 1\ngap = {gap}\n' if gap else ""
     (folder / "case.toml").write_text(axes.text(sensor=sensor).replace("[actuator]", spring + "[actuator]"))
-    return log, build_machine(load_case(folder / "case.toml"), true=True, period=1 / axes.RATE)
+    return log, build_machine(load_case(folder / "case.toml"), at_truth=True, period=1 / axes.RATE)
 
 
 @pytest.mark.parametrize("gap", [0.0, 60e-6])
@@ -106,7 +106,7 @@ def test_finds_table_2(folder, case, method):
 
 def test_fits_take_the_steps_that_turning_friction_asks_for(folder):
     session = open_session(folder / "motor.toml", folder / "log.csv")
-    machine, log = build_machine(session.case, true=True, period=1 / axes.RATE), session.fit.log
+    machine, log = build_machine(session.case, at_truth=True, period=1 / axes.RATE), session.fit.log
     chosen = choose_numerics(machine, log)
 
     def position(steps: int) -> np.ndarray:

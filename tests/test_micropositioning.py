@@ -27,7 +27,7 @@ def replayed(case, log: dict, columns: tuple[str, ...], substeps: int):
         force=log["i"][:, None],
         reference=log["ref"][:, None],
     )
-    machine = build_machine(case, true=True, period=1 / stages.RATE)
+    machine = build_machine(case, at_truth=True, period=1 / stages.RATE)
     replay = make_replay(machine, made, Numerics(substeps=substeps))
     replay = dataclasses.replace(replay, velocity=np.zeros(len(columns)))
     return replay(machine.plant)
@@ -76,7 +76,7 @@ def test_a_table_without_an_encoder_starts_where_the_screw_does_not_pull(tmp_pat
         force=made["i"][:, None],
         reference=made["ref"][:, None],
     )
-    machine = build_machine(case, true=True, period=1 / stages.RATE)
+    machine = build_machine(case, at_truth=True, period=1 / stages.RATE)
     replay = make_replay(machine, log, Numerics(substeps=320))
     # What the table's ripple stretches the screw by: its slope of 1 kN/m is no force at rest.
     ripple = stages.TRUTH[1]["cogging[2].amplitude"] / stages.TRUTH[1]["stiffness"]
