@@ -305,8 +305,8 @@ runs = 3
 
 REFUSED = {
     "another study is there": ({}, None, "holds a study already"),
-    "another seed": ({"seed": 4, "resume": True}, None, "another one: seed differ"),
-    "other runs": ({"runs": 3, "seed": 3, "resume": True}, None, "another one: runs differ"),
+    "another seed": ({"seed": 4, "resume": True}, None, "another study: seed differ"),
+    "other runs": ({"runs": 3, "seed": 3, "resume": True}, None, "another study: runs differ"),
     "a changed case": ({"resume": True, "seed": 3}, "draw = 0.1", "the case or a file that it names"),
 }
 
