@@ -107,8 +107,8 @@ def test_every_module_has_its_room_and_every_room_is_there():
     assert there - {"__init__"} == set(ROOMS)
 
 
-def test_the_readme_lists_the_rooms_in_their_order():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_contributing_lists_the_rooms_in_their_order():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     places = [f"jaxid/{r}/" if (PACKAGE / r).is_dir() else f"jaxid/{r}.py" for r in ROOMS]
     assert "".join(f"{p:<28}{what}\n" for p, what in zip(places, ROOMS.values(), strict=True)) in text
 

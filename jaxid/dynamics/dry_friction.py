@@ -66,7 +66,7 @@ def set_valued_step(
         return balance_of(plant, q, qd, qdd, end, t, x.own, none)
 
     def without() -> tuple[State, tuple[Array, Array], Array, Balance]:
-        """The step without friction; position, velocity, mass and levels halfway."""
+        """Step without friction; return it, and position, velocity, mass and levels halfway."""
         free = flow(x)
         # A mass that depends on the position is evaluated halfway, like everything else.
         halfway = 0.5 * (x.q + free.q) if plant.coupled else x.q, 0.5 * (x.qd + free.qd)

@@ -170,7 +170,7 @@ def _sign_floor(f: Free) -> float:
 
 
 def colours(enters: Bool[np.ndarray, "n p"]) -> tuple[int, ...]:
-    """Number the unknowns such that no two with the same number enter the same balance.
+    """Assign numbers to the unknowns such that no two with the same number enter the same balance.
 
     Each takes the first number that is free in all balances that it enters.
     """

@@ -17,7 +17,7 @@ from jaxid.effects import EFFECTS
 from jaxid.plants import PLANTS
 from jaxid.references import REFERENCES
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FILES = sorted(p for d in ("experiments", "benchmarks", "jaxid/demo") for p in (ROOT / d).rglob("*.toml"))
 # Faults that a schema cannot state: of two keys, of the size of the machine, or of numbers that JSON lacks.
 BEYOND = {

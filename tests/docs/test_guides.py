@@ -16,7 +16,7 @@ from jaxid.estimators import METHODS, register_method
 from jaxid.logs.readers import READERS, read_columns, register_reader
 from jaxid.names import USER_METHODS
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "docs" / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 
 
 def example(name: str):

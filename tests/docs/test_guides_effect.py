@@ -13,7 +13,7 @@ from jaxid.case.case import load_case
 from jaxid.commands.discover import discover
 from jaxid.model import Effect, Signals
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "docs" / "examples"
 # By file: its class, and rivals for the search.
 GUIDES = {

@@ -12,7 +12,7 @@ import pytest
 import jaxid
 from jaxid.simulation.loops import Drive, closed_loop, open_loop
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "jax.md"
 
 

@@ -16,7 +16,7 @@ from jaxid.dynamics.rhs import State, acceleration, derivative
 from jaxid.results.as_json import identification_json
 from jaxid.results.as_text import identification_table
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 GUIDE = (DOCS / "adding_a_plant.md").read_text("utf-8")
 EXAMPLES = DOCS / "examples"
 NAMES = ("cart_pole", "dc_motor_pendulum")
