@@ -167,6 +167,11 @@ class Live:
         self._memory = self._law.remembers(memory)
 
     @property
+    def told(self) -> OnlineEstimate | None:
+        """The same as `online_estimate`; the name of version 0.1."""
+        return self.online_estimate
+
+    @property
     def estimate(self) -> RecursiveEstimate:
         """The estimate of a controller that identifies, in the order of `machine.parameters`.
 

@@ -133,6 +133,7 @@ def test_live_identifies_switches_and_tracks(tmp_path):
     switched = run.live.switched
     assert 30 < switched <= 100
     found = errors(list(true_values()), run.live.online_estimate.theta)
+    assert run.live.told is run.live.online_estimate, "the name of version 0.1"
     assert all(found[kind] <= aim for kind, aim in KINDS.items())
     assert late[True] < 1e-4 < 2e-4 < late[False]
     told = follow(case, run.log)

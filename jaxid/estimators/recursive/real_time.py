@@ -199,3 +199,7 @@ class RealTime(eqx.Module):
     def estimate(self, memory: RecursiveMemory) -> RecursiveEstimate:
         """Return estimate and precision from the samples so far."""
         return self.recursion.estimate(memory)
+
+    def told(self, memory: RecursiveMemory) -> RecursiveEstimate:
+        """Return `estimate(memory)`; the name of version 0.1."""
+        return self.estimate(memory)

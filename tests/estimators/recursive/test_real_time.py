@@ -37,6 +37,7 @@ def test_a_sample_at_a_time(live):
     pulled = np.square(0.1 / np.array([50.0, 200.0, 20.0])) * start
     expected = np.linalg.solve(normal, columns.T @ (35.15065 * u[moving, 0]) + pulled)
     told = estimator.estimate(memory)
+    assert np.array_equal(estimator.told(memory).theta, told.theta), "the name of version 0.1"
     assert int(memory.samples) == moving.sum() < len(moving)
     np.testing.assert_allclose(told.theta, expected, rtol=1e-6)
     np.testing.assert_allclose(told.theta, TRUTH, rtol=2e-3)
