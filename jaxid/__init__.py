@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from jaxid.effects import register as _register
     from jaxid.errors import InputError as InputError
     from jaxid.estimators import METHODS as METHODS
+    from jaxid.estimators import register_method as register_method
     from jaxid.estimators.algebraic.online import OnlineEstimate as OnlineEstimate
     from jaxid.estimators.common.levenberg_marquardt import (
         BoundedLevenbergMarquardt as BoundedLevenbergMarquardt,
@@ -51,9 +52,11 @@ if TYPE_CHECKING:
     from jaxid.logs.in_memory import as_log as as_log
     from jaxid.logs.log import Log as Log
     from jaxid.logs.log import read_log as read_log
+    from jaxid.logs.readers import register_reader as register_reader
     from jaxid.machine import Machine as Machine
     from jaxid.model.effect import Action as Action
     from jaxid.model.effect import Effect as Effect
+    from jaxid.model.effect import Scales as Scales
     from jaxid.model.effect import Signals as Signals
     from jaxid.model.parameter import parameter as parameter
     from jaxid.model.plant import Plant as Plant
@@ -159,6 +162,9 @@ _HOMES = {
     "Trajectory": ("jaxid.simulation.loops", "Trajectory"),
     # estimators
     "METHODS": ("jaxid.estimators", "METHODS"),
+    "register_method": ("jaxid.estimators", "register_method"),
+    "register_reader": ("jaxid.logs.readers", "register_reader"),
+    "Scales": ("jaxid.model.effect", "Scales"),
     "base_parameters": ("jaxid.arms.base_parameters", "base_parameters"),
     "BaseParameters": ("jaxid.arms.base_parameters", "BaseParameters"),
     "base_parameters_by_rules": ("jaxid.arms.base_by_rules", "base_parameters_by_rules"),

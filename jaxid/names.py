@@ -49,7 +49,7 @@ MINIMISERS = (
     "optimistix.NonlinearCG",
     "optimistix.NelderMead",
 )
-# Methods of `jaxid.register_method`, which a case and the command line may then name.
+# Methods of `jaxid.register_method`, which Python and [study] estimators of a case may then name.
 USER_METHODS: list[str] = []
 # Course of the command between two samples.
 HOLDS = ("zero_order", "linear", "band_limited")

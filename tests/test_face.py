@@ -9,10 +9,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from rooms import ROOMS
 
 import jaxid
 from jaxid import cli
+from tests.support.rooms import ROOMS
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "jaxid" / "__init__.py"

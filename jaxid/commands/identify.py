@@ -16,7 +16,7 @@ from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimi
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
-from jaxid.names import METHODS, OUTPUTS, SOLVERS
+from jaxid.names import METHODS, OUTPUTS, SOLVERS, USER_METHODS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.results.result import FitResult
 from jaxid.session import Session, open_session
@@ -80,7 +80,7 @@ def identify(
     Args:
         case: The case, its file, or a dict with its tables.
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
-        method: One of `jaxid.names.METHODS`.
+        method: One of `jaxid.names.METHODS`, or a registered one.
         solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between
             samples and dry friction is smoothed; None: fixed steps and exact dry friction. The gap is
             computed with fixed steps either way.
@@ -94,8 +94,7 @@ def identify(
     Raises:
         InputError: If case, log, method, solver, minimiser or `on` are unsound.
     """
-    if method not in METHODS:
-        raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
+    _check_method(method)
     options = {}
     if solver is not None:
         options["solver"] = _checked("solver", solver, tuple(SOLVERS), method)
@@ -136,7 +135,7 @@ def identify_many(
         case: The case, its file, or a dict with its tables; or one for each log, with guesses that may
             differ.
         logs: Logs, or their files.
-        method: One of `jaxid.names.METHODS`.
+        method: One of `jaxid.names.METHODS`, or a registered one.
         lanes: Number of logs in a compiled call.
 
     Returns:
@@ -145,8 +144,7 @@ def identify_many(
     Raises:
         InputError: If a case or the method is unsound, or cases are not as many as logs.
     """
-    if method not in METHODS:
-        raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
+    _check_method(method)
     if isinstance(case, Case | Mapping | str | Path):
         cases = [load_case(case)] * len(logs)
     elif len(case) == len(logs):
@@ -158,6 +156,17 @@ def identify_many(
         return (yield from steps_of(method, open_session(case, log, method=method)))
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
+
+
+def _check_method(method: str) -> None:
+    """Refuse a method that is neither one of jaxid nor registered.
+
+    Raises:
+        InputError: If it is not known.
+    """
+    known = (*METHODS, *USER_METHODS)
+    if method not in known:
+        raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(known)}")
 
 
 def _checked(option: str, value: str, known: Collection[str], method: str) -> str:

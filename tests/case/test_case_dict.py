@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from case_faults import FAULTS
 
 import jaxid
 from jaxid.case.case import load_case
 from jaxid.studies.plan import fingerprint
+from tests.support.case_faults import FAULTS
 
 DEMO = Path(jaxid.__file__).parent / "demo"
 SCENE = {

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from case_faults import FAULTS, GOOD
 
 from jaxid import cli
 from jaxid.case.case import load_case
@@ -16,6 +15,7 @@ from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
 from jaxid.plants import PLANTS
 from jaxid.references import REFERENCES
+from tests.support.case_faults import FAULTS, GOOD
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted(p for d in ("experiments", "benchmarks", "jaxid/demo") for p in (ROOT / d).rglob("*.toml"))

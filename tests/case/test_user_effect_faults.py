@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from case_faults import message, more, write
 
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.session import open_session
+from tests.support.case_faults import message, more, write
 
 HEAD = """
 import math

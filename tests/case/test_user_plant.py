@@ -5,13 +5,13 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from case_faults import GOOD, message, write
-from cli_setup import run
 
 from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.plants import PLANTS
+from tests.support.case_faults import GOOD, message, write
+from tests.support.cli_setup import run
 
 PLANT = """
 import jax

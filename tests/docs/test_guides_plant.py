@@ -8,13 +8,13 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cli_setup import run
 
 import jaxid
 from jaxid.build import build_machine
 from jaxid.dynamics.rhs import State, acceleration, derivative
 from jaxid.results.as_json import identification_json
 from jaxid.results.as_text import identification_table
+from tests.support.cli_setup import run
 
 DOCS = Path(__file__).parents[2] / "docs"
 GUIDE = (DOCS / "adding_a_plant.md").read_text("utf-8")

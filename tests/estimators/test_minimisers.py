@@ -8,10 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-import stages
-import test_directions as directions
-import test_least_squares as curve
-import test_solvers as axis
 
 import jaxid
 from jaxid import cli
@@ -21,6 +17,10 @@ from jaxid.estimators.common.minimisers import MINIMISERS, minimiser_name, minim
 from jaxid.estimators.output_error import output_error
 from jaxid.logs.log import Log
 from jaxid.simulation.replay import Numerics
+from tests.estimators import test_levenberg_marquardt as curve
+from tests.estimators.within_prior import test_within_prior as directions
+from tests.simulation import test_solvers as axis
+from truth.chain import stages
 
 NOISY = curve.DATA + 0.05 * np.random.default_rng(0).standard_normal(curve.TIME.size)
 START = np.array([6.0, 1.0, 1.0, 2.0])

@@ -5,10 +5,10 @@ import pandas
 import polars
 import pytest
 import xarray
-from cli_setup import place, recorded
 
 import jaxid
 from jaxid.logs.in_memory import as_log
+from tests.support.cli_setup import place, recorded
 
 KINDS = {
     "arrays": lambda data: {name: list(values) for name, values in data.items()},

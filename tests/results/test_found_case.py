@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cli_setup import COULOMB, VISCOUS, place, recorded, run, text
 
 import jaxid
+from tests.support.cli_setup import COULOMB, VISCOUS, place, recorded, run, text
 
 COMMENT = "# the drive's own law"
 OWN = """

@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 import xarray
-from cli_setup import COULOMB, TRUTH, VISCOUS, place, recorded, text
 from matplotlib.figure import Figure
 
 import jaxid
+from tests.support.cli_setup import COULOMB, TRUTH, VISCOUS, place, recorded, text
 
 
 @pytest.fixture(scope="module")

@@ -30,12 +30,12 @@ def register_reader(suffix: str, reader: Reader) -> None:
         reader: Function of path, names of columns and rows, see `read_columns`.
 
     Raises:
-        InputError: If the suffix has no dot, or is that of another format.
+        InputError: If the suffix is not one dot and a name, or is that of another format.
     """
     suffix = suffix.lower()
     known = READERS.get(suffix)
-    if not suffix.startswith(".") or len(suffix) < 2:
-        raise InputError(f"suffix {suffix!r} is not the end of a file's name", hint='write it as ".jsonl"')
+    if not suffix.startswith(".") or len(suffix) < 2 or "." in suffix[1:]:
+        raise InputError(f"suffix {suffix!r} is not one dot and a name", hint='write it as ".jsonl"')
     if known is not None and (known.__module__, known.__qualname__) != (
         reader.__module__,
         reader.__qualname__,
