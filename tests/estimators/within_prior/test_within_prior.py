@@ -147,7 +147,7 @@ def test_a_machine_that_sticks_at_the_guesses_is_found_from_elsewhere(tmp_path):
     assert 0.75 * starts["count"] <= starts["same_optimum"] <= starts["count"]
     assert 0.5 * starts["count"] < starts["flat"] < starts["count"]
     words = " ".join(within_prior_words(found[16]))
-    assert f"{starts['flat']} from which the simulation does not" in words
+    assert f"{starts['flat']}, at which the simulation does not move" in words
 
 
 @pytest.mark.slow
