@@ -105,7 +105,7 @@ def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
 
 
 def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot) -> PlantEntry:
-    """[plant] of an arm, which [[plant.links]] or a URDF file describe."""
+    """Read [plant] of an arm, which [[plant.links]] or a URDF file describe."""
     # Weight is a vector there, and acts whichever way the arm stands.
     taken = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
     given = read_table(table, {**taken, **LINKED}, spot)
