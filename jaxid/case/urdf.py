@@ -76,7 +76,7 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
     moving = _chain(root, links, joints, tip, file)
     names, places, bodies, carriers = [], [], [np.zeros(10)], [root]
     weighed = [False]
-    # Links yet to be visited, each with the body that it is part of, and its frame in the body's.
+    # Links that remain to be visited, each with the body that contains it, and its frame in the body's.
     ahead = [(root, 0, np.eye(4))]
     while ahead:
         link, body, frame = ahead.pop()
@@ -241,7 +241,7 @@ def _chain(
     """Return the names of the joints that move: those on the path from the first link to the tip.
 
     Raises:
-        InputError: If there are several ways and no tip says which, or none of the joints can move.
+        InputError: If there are several paths and no tip selects one, or none of the joints can move.
     """
     of_child = {j.child: j for j in joints}
     if tip is not None and tip not in links:

@@ -1,9 +1,9 @@
 """Motions of all joints together, along straight lines of joint space, as fast as bounds allow.
 
 Along a line every joint moves in proportion to one path parameter, which runs from 0 to 1: all start and end
-together. Each bound of that parameter is the tightest that any joint sets: the joint that is slowest by
-velocity, acceleration or jerk is at its bound, and the others are stretched in proportion to their way. That
-is the least time along the line, at least that of the slowest joint alone.
+together. Each bound of that parameter is the tightest of all joints: the joint that is slowest by
+velocity, acceleration or jerk is at its bound, and the others move in proportion to their distances. That
+is the shortest time along the line, at least that of the slowest joint alone.
 """
 
 from __future__ import annotations
