@@ -289,7 +289,7 @@ def _places(
         if name not in every:
             raise InputError(f"parameter {name!r} is not known", hint=suggest(name, every))
     if not names:
-        raise InputError("free names no parameter", hint=f"choose of {', '.join(every)}")
+        raise InputError("free names no parameter", hint=f"choose among {', '.join(every)}")
     return tuple(every[n][0] for n in names), tuple(every[n][1].sign for n in names)
 
 

@@ -93,7 +93,7 @@ def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
     """
     if machine.controller is None:
         raise InputError(
-            f"{what} needs a loop whose simulation makes a force",
+            f"{what} needs a loop, whose simulation gives a force",
             where=log.source,
             hint=f"name the controller in [controller] and the reference's column in [log], {other}",
         )
@@ -419,7 +419,7 @@ def notes_of(
         notes.append(f"fitted on {'position and force' if on == 'both' else 'force'}")
     if numerics.segment:
         seconds = numerics.segment * log.period
-        notes.append(f"restarted from the log every {seconds:.3g} s: it drifts off otherwise")
+        notes.append(f"restarted from the log every {seconds:.3g} s, because it would drift off otherwise")
     if minimiser_of(minimiser) is not None:
         notes.append(f"minimised by {minimiser_name(minimiser)}")
     return tuple(notes)

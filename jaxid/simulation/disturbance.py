@@ -51,8 +51,8 @@ def disturbance_at(
 def _column(name: str, times: np.ndarray, log: Log | None) -> np.ndarray:
     where = f"disturbance = '{name}'"
     if log is None:
-        hint = "give { level, on, off, start } in its place"
-        raise InputError("a column needs a log to stand in", where=where, hint=hint)
+        hint = "give { level, on, off, start } instead"
+        raise InputError("a column needs a log that contains it", where=where, hint=hint)
     values = read_columns(log.source, [name], log.rows)[0][name]
     if not np.isfinite(values).all():
         row = log.rows[0] + int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])

@@ -51,14 +51,14 @@ def needed_steps(machine: Machine, log: Log) -> int:
         raise TooStiffError(
             "the plant's forces have no finite slope where the log begins to move",
             where=log.source,
-            hint="check the guesses, and effects of your own at velocity zero",
+            hint="check the guesses, and user-defined effects at zero velocity",
         )
     if steps > _MOST_STEPS:
         raise TooStiffError(
             f"the plant would need {steps:.2g} integration steps every {period:.3g} s",
             where=log.source,
-            hint="an inertia that is far too small, or a stiffness or damping far too large, does "
-            "that: check the guesses, or declare less",
+            hint="the inertia is far too small, or a stiffness or damping far too large: check the guesses, "
+            "or declare fewer effects",
         )
     return _rounded(max(1, int(np.ceil(steps))))
 

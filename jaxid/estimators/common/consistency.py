@@ -78,7 +78,7 @@ def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
     estimate = yield from steps
     if not estimate.machine.plant.linked:
         return estimate
-    note = "links are what bodies can be; standard deviations are those of the log alone"
+    note = "links are physically consistent; standard deviations are those of the log alone"
     return replace(
         estimate,
         notes=(*estimate.notes, note),
