@@ -174,7 +174,7 @@ class Case:
 
     @property
     def load_column(self) -> bool:
-        """Whether the log has the position of a load behind an elastic coupling."""
+        """True if the log has the position of a load behind an elastic coupling."""
         if self.log is None:
             return True
         named = self.log.position
@@ -199,10 +199,10 @@ class Case:
         return self.log
 
     def fits_within_prior(self, method: str | None) -> bool:
-        """Return whether a method takes the guesses as a prior.
+        """Check that a method takes the guesses as a prior.
 
-        The method `within_prior` does; `discover` (or no method, None) if the case has a prior;
-        `output_error` if the prior is one of its own keys.
+        The method `within_prior` does; `discover` (or no method, None) does if the case has a prior;
+        `output_error` does if the prior is among the keys of [output_error].
         """
         if method == "output_error":
             return self.output_error.prior is not None

@@ -105,8 +105,8 @@ def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
 
 
 def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot) -> PlantEntry:
-    """[plant] of an arm, which [[plant.links]] or a URDF file describe."""
-    # Weight is a vector there, and acts whichever way the arm stands.
+    """Read [plant] of an arm, which [[plant.links]] or a URDF file describe."""
+    # For an arm weight is a vector, and acts in every pose.
     taken = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
     given = read_table(table, {**taken, **LINKED}, spot)
     names: tuple[str, ...] = ()
@@ -219,7 +219,7 @@ def _plant_parameters(
 def _plant_list(
     value: Any, info: ParameterInfo, joints: int, spot: Spot, fixed: bool
 ) -> tuple[Value | tuple[Value, ...], ...]:
-    """Read a list of the plant, with one entry for each joint, or more as the class says.
+    """Read a list of the plant, with one entry for each joint, or more if the class declares so.
 
     If every machine of a kind has the same number of joints (fixed), a fault names the entries.
     """

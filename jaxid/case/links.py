@@ -46,7 +46,7 @@ SHAFT: Keys = {
     "joints": Key(several(whole(1), shortest=2), "joints that it turns with, from 1", True),
     "ratios": Key(several(number()), "turns of the shaft for one of each joint", note="1 each"),
 }
-# Below it the sine of an angle of a URDF file counts as zero: 1.5708 stands there for a right angle.
+# A sine of an angle of a URDF file below this counts as zero: such files state a right angle as 1.5708.
 _ANGLE = 1e-4
 # Choices of the parameters of a URDF file that are unknown.
 UNKNOWN = ("none", "base", "all")

@@ -155,7 +155,7 @@ def controller_keys(kind: str) -> Keys:
 
 
 def validation_keys() -> Keys:
-    """Return the keys of [[validation]]: its own, and any of [log] that differs."""
+    """Return the keys of [[validation]]: its special keys, and any of [log] that differs."""
     of_log = {name: Key(k.read, k.doc, False, k.unit) for name, k in keys_of(LogTable).items()}
     return {
         "name": Key(text, "name in results", True),

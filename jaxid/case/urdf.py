@@ -26,10 +26,10 @@ class Urdf:
 
     Args:
         names: Names of the joints that move, from the base to the tip.
-        geometry: Their frames: the file's, turned such that z is the joint's axis. That of the base is
-            the frame of the file's first link.
+        geometry: Frames of the joints: those of the file, turned such that z is the joint's axis. The base
+            frame is that of the file's first link.
         bodies: Mass, first moments x y z, and inertia tensor xx xy xz yy yz zz about the frame's origin, of
-            what each joint moves up to the next, (n, 10) [kg, kg m, kg m^2].
+            the body between each joint and the next, (n, 10) [kg, kg m, kg m^2].
     """
 
     names: tuple[str, ...]
@@ -76,7 +76,7 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
     moving = _chain(root, links, joints, tip, file)
     names, places, bodies, carriers = [], [], [np.zeros(10)], [root]
     weighed = [False]
-    # Links yet to be visited, each with the body that it is part of, and its frame in the body's.
+    # Links that remain to be visited, each with the body that contains it, and its frame in the body's.
     ahead = [(root, 0, np.eye(4))]
     while ahead:
         link, body, frame = ahead.pop()
@@ -165,7 +165,7 @@ def _named(robot: Element, tag: str, file: str) -> Iterator[tuple[str, Element]]
 
 
 def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _Joint:
-    """One joint.
+    """Read one joint of the file.
 
     Raises:
         InputError: If its type is not one of an arm, or it joins links that do not exist.
@@ -238,10 +238,10 @@ def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
 def _chain(
     root: str, links: dict[str, Element], joints: list[_Joint], tip: str | None, file: str
 ) -> set[str]:
-    """Names of the joints that move: those on the way from the first link to the tip.
+    """Return the names of the joints that move: those on the path from the first link to the tip.
 
     Raises:
-        InputError: If there are several ways and no tip says which, or none of the joints can move.
+        InputError: If there are several paths and no tip selects one, or none of the joints can move.
     """
     of_child = {j.child: j for j in joints}
     if tip is not None and tip not in links:
@@ -276,7 +276,7 @@ def _chain(
 
 
 def _numbers(element: Element, name: str, count: int, where: str) -> np.ndarray:
-    """Numbers of an attribute.
+    """Read the numbers of an attribute.
 
     Raises:
         InputError: If these are not so many finite numbers.
@@ -312,7 +312,7 @@ def _place(origin: Element | None, where: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndarray, " 10"]:
-    """Ten parameters of a link about the origin of its body's frame.
+    """Return the ten parameters of a link about the origin of its body's frame.
 
     Raises:
         InputError: If mass or inertia is missing, or no number.

@@ -23,7 +23,7 @@ from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.numerics.affine import depends
 from jaxid.schema import Spot
 
-# Names that a case gives a meaning of its own in [[effects]].
+# Names that have a special meaning in [[effects]] of a case.
 _RESERVED = ("kind", "port", "shared", *PLACES)
 # Class attributes that name a parameter.
 _NAMING = ("sliding_level", "break_away_level", "stribeck_velocity", "viscous_coefficient", "drive_gain")
@@ -32,7 +32,7 @@ _LONGEST = 160
 
 
 class _Fault(Exception):
-    """A fault of a class: what is wrong, and a hint."""
+    """A fault of a class: the description of the fault, and a hint."""
 
 
 def one_line(error: BaseException, module: ModuleType | Path | None = None) -> str:
@@ -59,12 +59,12 @@ def _line_of(error: BaseException, module: ModuleType | Path | None) -> str:
 
 
 def is_user_class(cls: type) -> bool:
-    """Return whether a class comes from outside of jaxid."""
+    """Check that a class comes from outside of jaxid."""
     return not cls.__module__.startswith("jaxid.")
 
 
 def check_declaration(cls: type[Effect], kind: str, spot: Spot) -> None:
-    """Check what a class states of itself and of its parameters, without calling it.
+    """Check the declarations of a class and of its parameters, without calling it.
 
     Args:
         cls: Class of the effect.
@@ -101,7 +101,7 @@ def _check_info(name: str, info: ParameterInfo, kind: str, spot: Spot) -> None:
 
 
 def check_action(effect: Effect, where: str) -> None:
-    """Check what an effect returns, by tracing it once on symbolic signals.
+    """Check the return values of an effect, by tracing it once on symbolic signals.
 
     Args:
         effect: The effect at some values.
@@ -194,7 +194,7 @@ def _check_rate(effect: Effect, action: Action, signals: Signals, state: Any) ->
 
 
 def _traced(name: str, function: Any, *args: Any, hint: str) -> Any:
-    """Return the shapes of what a method returns; in a fit it is traced too, so that errors are the same."""
+    """Return the shapes of a method's results; a fit traces it too, so that the errors are the same."""
     module = _module(args[0])
     try:
         return eqx.filter_eval_shape(function, *args)

@@ -29,7 +29,7 @@ _LOADED: dict[Path, tuple[int, ModuleType]] = {}
 
 
 def names_a_file(kind: object) -> bool:
-    """Return whether a `kind` names a class in a file rather than one of the package."""
+    """Check that a `kind` names a class in a file rather than one of the package."""
     return ":" in str(kind) or str(kind).endswith(".py")
 
 
@@ -49,7 +49,7 @@ def class_of_file(
         base: Class that it must be derived from.
         example: How `kind` should look, for hints.
         spot: Place of the kind in the case.
-        check: Checks the class before its kind is set; raises where it is faulty.
+        check: Function that checks the class before its kind is set, and raises if it is faulty.
 
     Returns:
         The class, whose `kind` is the text if it states none, and its module.
@@ -78,7 +78,7 @@ def class_of_file(
 
 
 def is_defined_in(thing: object, base: type, module: ModuleType) -> bool:
-    """Return whether something is a class derived from `base` that a module itself defines."""
+    """Check that an object is a class derived from `base` that a module itself defines."""
     return isinstance(thing, type) and issubclass(thing, base) and thing.__module__ == module.__name__
 
 
@@ -134,7 +134,7 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
             kind, f"cannot be imported ({one_line(error, path)})", f"correct {path.name}"
         ) from error
     finally:
-        # What it registers is its case's, not every case's.
+        # The classes that the file registers belong to its case, not to every case.
         EFFECTS.clear()
         EFFECTS.update(effects)
         PLANTS.clear()

@@ -62,7 +62,7 @@ def user_plant(kind: str, folder: Path, spot: Spot) -> type[Plant]:
 
 
 def _check_joints(cls: type[Plant], fault: Callable[[str, str], InputError]) -> None:
-    """Check the declared number of joints, and what is listed by joint."""
+    """Check the declared number of joints, and the lists by joint."""
     if not isinstance(cls.joints, int):
         if all(info.more != 0 for info in parameters_of(cls).values()):
             hint = "state joints = 2, or declare a parameter with more=0 (one entry a joint)"
@@ -79,7 +79,7 @@ def _check_joints(cls: type[Plant], fault: Callable[[str, str], InputError]) -> 
 
 
 def check_user_plant(entry: PlantEntry, kind: str, spot: Spot) -> None:
-    """Evaluate a user's plant at its guesses and a random motion, and refuse what cannot be used.
+    """Evaluate a user's plant at its guesses and a random motion, and refuse it if it cannot be used.
 
     Args:
         entry: The plant as the case declares it.

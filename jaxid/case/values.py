@@ -28,7 +28,7 @@ class Value:
 
     Args:
         guess: Known value, or start of a fit.
-        free: Whether it is to be identified.
+        free: Whether the value is unknown and will be identified.
         lower, upper: Bounds of an unknown value.
         true: Value for simulations; None: `guess`.
     """

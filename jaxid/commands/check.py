@@ -1,4 +1,4 @@
-"""The command `check`: whether a log is sound and excites the unknowns of a case, before any fit."""
+"""The command `check`: tests before any fit that a log is sound and excites the unknowns of a case."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class Check:
         """Write `check.json` to a folder.
 
         Raises:
-            InputError: If the folder holds what jaxid did not make and `overwrite` is not given.
+            InputError: If the folder holds files that jaxid did not make and `overwrite` is not given.
         """
         folder = ready_folder(Path(folder), ["check.json"], overwrite=overwrite)
         write_json(folder / "check.json", self.json())
@@ -156,7 +156,7 @@ def check(case: CaseLike, log: LogLike, *, validate: Sequence[LogLike] = ()) -> 
         validate: More logs to check, beside those of the case.
 
     Raises:
-        InputError: If case or log are unsound.
+        InputError: If the case or the log is invalid.
     """
     session = open_session(case, log, validate)
     machine, data = session.machine, session.fit.data

@@ -57,7 +57,7 @@ class Identification(FitResult):
         """Write `result.json` and `report.html` to a folder.
 
         Raises:
-            InputError: If the folder holds what jaxid did not make and `overwrite` is not given.
+            InputError: If the folder holds files that jaxid did not make and `overwrite` is not given.
         """
         from jaxid.results.as_json import save_identification
 

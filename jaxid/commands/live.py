@@ -53,7 +53,7 @@ class Live:
         switched: First tick at which the controller uses the identified values; None: not yet.
 
     Raises:
-        InputError: If the case has no controller or reference, or asks for what cannot be identified
+        InputError: If the case has no controller or reference, or has unknowns that cannot be identified
             on-line.
     """
 
@@ -168,7 +168,7 @@ class Live:
 
     @property
     def told(self) -> OnlineEstimate | None:
-        """The same as `online_estimate`; the name of version 0.1."""
+        """Alias of `online_estimate`, with the name of version 0.1."""
         return self.online_estimate
 
     @property
@@ -181,7 +181,7 @@ class Live:
         if not self.adapts or self.memory is None:
             what = "no reading yet" if self.adapts else "the controller does not identify"
             raise InputError(what, where="Live", hint="take kind = 'adaptive', and give it readings")
-        # Only laws that adapt have it, which `adapts` says.
+        # Only laws that adapt have this method; `adapts` is true for them.
         return self._controller.estimate(self.memory)  # pyright: ignore[reportAttributeAccessIssue]  # see above
 
     def _identify(self, position: np.ndarray) -> None:
@@ -208,7 +208,7 @@ def follow(case: CaseLike, log: LogLike, *, tolerance: float = 0.05) -> OnlineEs
         tolerance: Relative tolerance of trust, see `jaxid.estimators.algebraic.online.OnlineEstimate`.
 
     Raises:
-        InputError: If the case asks for what cannot be identified on-line.
+        InputError: If the case has unknowns that cannot be identified on-line.
     """
     case = load_case(case)
     if not isinstance(log, Log):
@@ -270,7 +270,7 @@ class _Law:
         others: Sequence[np.ndarray | None],
         memory: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Return the command, the new memory, and whether identified values take part in the command.
+        """Return the command, the new memory, and a flag that identified values take part in the command.
 
         Args:
             k: Number of the tick.

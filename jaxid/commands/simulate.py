@@ -18,7 +18,7 @@ def simulate(case: CaseLike, *, seed: int = 0) -> SimulatedLog:
         seed: Seed of the sensors' noise.
 
     Raises:
-        InputError: If the case does not say what to simulate.
+        InputError: If the case does not state the simulation completely.
     """
     scene = Scene.of(load_case(case))
     return run_alone(scene.simulated_log(scene.machine, np.random.default_rng(seed)))

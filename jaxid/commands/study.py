@@ -62,7 +62,7 @@ def study(
         progress: Function called with the number of runs done, and of all runs.
 
     Raises:
-        InputError: If the case does not say what to simulate, or the folder holds another study.
+        InputError: If the case does not state the simulation completely, or the folder holds another study.
     """
     case = load_case(case)
     where = None if folder is None else Path(folder)
@@ -135,7 +135,7 @@ def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
 
 
 def _begin(folder: Path, plan: Plan) -> None:
-    """Make a folder that of a study; the manifest is written last, so that it marks a whole folder."""
+    """Prepare the folder of a study; the manifest is written last, so that it marks a complete folder."""
     mark_folder(folder)
     (folder / _CHUNKS).mkdir(exist_ok=True)
     for old in (folder / _CHUNKS).iterdir():

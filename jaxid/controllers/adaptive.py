@@ -184,7 +184,7 @@ class Adaptive(FeedForward):
         return enough & jnp.all(estimate.identifiable & (estimate.std * share < self.tolerance))
 
     def _sample(self, tick: Tick, memory: Learning) -> tuple[tuple, Array]:
-        """Return position, velocity, acceleration and command at one instant, and whether they are new."""
+        """Return position, velocity, acceleration and command at one instant, and a flag if they are new."""
         if tick.acceleration is not None:
             # The acceleration belongs to the command of the interval just past.
             sample = (tick.joints, tick.velocity, tick.acceleration, memory.commands[0])

@@ -86,7 +86,7 @@ class Flatness(Controller):
 
     @property
     def reconstructs(self) -> bool:
-        """Whether the law uses a reconstructed velocity."""
+        """True if the law uses a reconstructed velocity."""
         return len(self.poles) == 3
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Any:

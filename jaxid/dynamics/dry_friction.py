@@ -1,4 +1,4 @@
-"""The step under set-valued friction: a joint sticks exactly, and turns where friction does."""
+"""The step under set-valued friction, in which a joint sticks exactly and friction reverses with it."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class _Sliding:
     """The ports on which friction slides, and their motion over a step without it.
 
     Args:
-        ports: Their indices among all ports.
+        ports: Indices of the ports among all ports.
         before: Velocity at the start of the step, (ports,).
         speed: Velocity at its end, (ports,).
         mobility: Change of that per unit reaction, (ports, ports), if ports accelerate each other.

@@ -76,7 +76,7 @@ class HiddenJoints(Plant):
 
 
 def _of_joints(smoothing: Smoothing, joints: tuple[int, ...]) -> Smoothing:
-    """Return the smoothing at some joints, if each has a width of its own."""
+    """Return the smoothing of some joints, with their velocity scales if each joint has one."""
     scale = smoothing.velocity_scale
     return smoothing if scale.ndim == 0 else Smoothing(smoothing.sharpness, scale[np.asarray(joints)])
 

@@ -173,7 +173,7 @@ def _own_decay(plant: Plant, x: State, u: Array, t: Array) -> State:
 
 
 def phi(x: Array) -> list[Array]:
-    """Compute e^x, (e^x - 1)/x and the next three of that family; by series near zero, where they cancel."""
+    """Compute e^x, (e^x - 1)/x and the next three of that family, by series near zero (cancellation)."""
     small = jnp.abs(x) < 0.3
     safe = jnp.where(small, 1.0, x)
     closed = [jnp.expm1(safe) / safe]

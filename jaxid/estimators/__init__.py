@@ -1,8 +1,8 @@
-"""The ladder of estimators, by the names of the command line.
+"""The estimators, by their names on the command line.
 
-To add one: write its file and register it here as steps of a session: a generator of what is to be
-solved, so that studies can solve many together. What a method can be asked for beyond the session
-stands in its keywords.
+To add one, write its file and register it here as a function from a session to a generator of solve
+requests, so that studies can solve many runs together. Options of a method that the session does not have
+are keyword arguments.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _output_error(
     )
     if start is None or all(log.measured):
         return result
-    # Without an encoder on every joint inverse dynamics may end far off, of coarse readings above all.
+    # Without an encoder on every joint inverse dynamics may end far off, especially with coarse readings.
     other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on, minimiser=minimiser)
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
@@ -108,9 +108,10 @@ def _within_prior(
 
 
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
-    """Return another start of a fit within a prior: the estimates of a method, the rest at the guesses.
+    """Return a second start of a fit within a prior: the estimates of the method that the case states.
 
-    Of sums that it cannot tell apart both parts move; what does not enter in proportion stays.
+    If only a sum is identifiable, both of its parts change. Unknowns that do not enter linearly stay at
+    their guesses.
     """
     method, unknown = session.case.need_prior().start, session.machine.parameters
     if method == "guess":
@@ -128,9 +129,10 @@ def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
 def _start(session: Session) -> Steps[np.ndarray | None]:
     """Return the start of output error: the estimates of another method if it identifies all unknowns.
 
-    Else at the guesses (None). Links that are kept to bodies are told well enough: what no log tells of them
-    is that of a body, and moves nothing. Inverse dynamics keeps the bounds, and may end at one; what does not
-    keep them may end where there is nothing to simulate.
+    Otherwise None: the fit starts at the guesses. Parameters of physically consistent links count as
+    identified: their unidentifiable combinations stay at those of a body and do not affect the motion.
+    Inverse dynamics keeps the bounds and may end at one; the estimates of a method that does not keep
+    them may be impossible to simulate.
     """
     parameters = session.machine.parameters
     method = session.case.output_error.start
@@ -190,7 +192,7 @@ def _algebraic(session: Session) -> Steps[Estimate]:
 
 
 def _form(name: str) -> Callable[[Session], Steps[Estimate]]:
-    """Return the steps of a form that solves each joint's equations alone."""
+    """Return the steps function of a form that solves the equations of each joint separately."""
 
     def steps(session: Session) -> Steps[Estimate]:
         from jaxid.estimators.algebraic.one_window import FORMS
@@ -217,10 +219,10 @@ def _minimal_model_printed(session: Session, *, weight: float | None = None) -> 
 _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 
-# Methods that simulate, and can be told how.
+# Methods that simulate, and accept options of the simulation.
 SIMULATING = ("output_error", "within_prior", "instrumental_variable", "didim")
 
-# Methods that can keep links to what bodies can be: they minimise, step by step at least.
+# Methods that can keep links physically consistent: each of them minimises, at least within a step.
 CONSISTENT = (
     "inverse_dynamics",
     "power",
@@ -246,7 +248,7 @@ METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
 
 
 def register_method(name: str, steps: Callable[..., Steps[Estimate]]) -> None:
-    """Register an estimator, so that `identify`, `identify_many` and `study` know it by name.
+    """Register an estimator, so that `identify`, `identify_many` and `study` accept its name.
 
     Args:
         name: Name of the method, in Python and in [study] estimators of a case.
@@ -269,16 +271,16 @@ def register_method(name: str, steps: Callable[..., Steps[Estimate]]) -> None:
 
 
 def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
-    """Fit by one of `METHODS`, one solve at a time.
+    """Return the steps of a fit by one of `METHODS`.
 
     Args:
-        method: Its name.
-        session: Case and logs.
-        options: Of the method.
+        method: Name of the method.
+        session: Case and logs of the fit.
+        options: Keyword arguments of the method.
 
     Raises:
-        InputError: If the reference has unknowns, and the method does not simulate the loop for them; or if
-            links must be what bodies can be, and the method or they cannot.
+        InputError: If the reference has unknowns and the method does not fit them in a simulated loop; or if
+            links must be physically consistent, and the method or the links do not allow it.
     """
     if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
@@ -291,10 +293,10 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
 
 
 def need_consistent(method: str, case: Case) -> None:
-    """Refuse a method that cannot keep links to what bodies can be, where a case asks for it.
+    """Refuse a method that cannot keep links physically consistent if the case requires that.
 
     Raises:
-        InputError: If it is such a method.
+        InputError: If the case sets `physically_consistent` and the method does not support it.
     """
     if not case.identification.physically_consistent:
         return
@@ -310,7 +312,7 @@ def need_known_reference(session: Session, why: str) -> None:
     """Refuse a case whose reference has unknowns.
 
     Raises:
-        InputError: If it has any.
+        InputError: If the reference has any unknown; the message contains `why`.
     """
     if session.machine.unknown_reference is not None:
         raise InputError(

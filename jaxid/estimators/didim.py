@@ -1,15 +1,14 @@
-"""Direct and inverse dynamic identification: forces alone, the motion is that of the simulated loop.
+"""Direct and inverse dynamic identification (DIDIM) from measured forces and the simulated loop's motion.
 
-A good loop moves a wrong model nearly as the machine: its motion follows the reference, and only
-the forces that this takes tell the two apart. Inverse dynamics is then taken along the simulated
+A good loop moves a wrong model nearly like the machine: both motions follow the reference, and only
+the forces differ. Inverse dynamics is therefore evaluated along the simulated
 motion, which has no noise, and compared with the measured force.
 
-The unknowns are where the regressor along that motion is orthogonal to the residual force. Steps
-towards them take the regressor for the slope of the simulated force, as if the motion stayed: a rough
-slope where the loop is loose, but one that finds the way from far off. Late steps and the precision
-take the true slope, the derivative through plant and loop. A joint without a drive is moved by no
-loop, and its balance along a simulated motion says nothing: the true slope then takes the
-regressor's place.
+At the solution the regressor along that motion is orthogonal to the residual force. Early steps
+use the regressor as the slope of the simulated force, as if the motion did not change. This slope is
+rough if the loop is loose, but converges from far off. Late steps and the precision
+use the true slope, the derivative through plant and loop. For a joint without a drive the balance along a
+simulated motion contains no information, so that a machine with such a joint always uses the true slope.
 """
 
 from __future__ import annotations
@@ -40,31 +39,32 @@ from jaxid.simulation.replay import Numerics, Replay
 
 _MOST_STEPS = 30
 _HALVINGS = 8
-# After so many steps by the regressor, those that have not arrived go on by the true slope.
+# Number of first steps with the regressor as slope; later steps use the true slope.
 _ROUGH_STEPS = 8
-# After so many, the samples that count stay: one that comes and goes would keep a fit from settling.
+# Number of first steps that choose the samples that count. Later the choice is fixed, because a sample that
+# enters and leaves would keep the fit from converging.
 _CHOOSING = 4
-# A step is taken unless the mean square rises by more than this: the regressor is not quite the
-# slope of the simulated force, and near the end a good step may raise it a little.
+# A step is accepted unless the mean square grows by more than this factor: the regressor is not exactly the
+# slope of the simulated force, and near the end a good step may increase the mean square a little.
 _WORSE = 1.1
-# Moving samples that a step asks for, by unknown.
+# Least number of moving samples per unknown.
 _FEWEST = 5
 
 
 def didim(machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None) -> Estimate:
     """Fit the unknowns to the measured force along the motion of the simulated loop.
 
-    Of the measured position only the start is used, and what the filter was chosen by; where a joint
-    has no drive, the first guess too, by inverse dynamics.
+    The measured position is used only for the start and for the choice of the filter; if a joint
+    has no drive, also for a first estimate by inverse dynamics.
 
     Args:
         machine: The machine, with its controller.
         log: The log, with its reference.
-        data: The same, prepared; the simulated motion passes the same filters.
-        numerics: How to integrate; absent: as machine and log ask.
+        data: The prepared log; the simulated motion passes the same filters.
+        numerics: Settings of the integration; None: chosen from machine and log.
 
     Returns:
-        The estimate; its covariance takes the residual's colour into account.
+        The estimate; its covariance accounts for a coloured residual.
 
     Raises:
         InputError: If the machine has no controller, or the log no reference.
@@ -76,14 +76,14 @@ def didim(machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | No
 
 
 class _Look(NamedTuple):
-    """What is seen along a simulated motion.
+    """Residual and derivatives along a simulated motion.
 
     Args:
-        e: Residual, (kept, n).
-        regressor: Its Jacobian, the motion held, (kept, n, p).
-        slope: Its Jacobian, the motion moving too; the regressor where that is not finite.
-        rows: Samples that count, (kept, n).
-        size: 2-norm of the measured force there.
+        e: Residual force, (kept, n).
+        regressor: Jacobian of the residual for a constant motion, (kept, n, p).
+        slope: Jacobian of the simulated force through plant and loop; the regressor if that is not finite.
+        rows: Mask of the samples that count, (kept, n).
+        size: 2-norm of the measured force at these samples.
     """
 
     e: np.ndarray
@@ -98,7 +98,7 @@ class _Look(NamedTuple):
 
     @property
     def seen(self) -> np.ndarray:
-        """Slope projected on the regressor, for which the formulas of least squares hold."""
+        """Slope projected on the span of the regressor, for which the formulas of least squares hold."""
         basis = span(self.regressor[self.rows])
         out = np.zeros_like(self.slope)
         out[self.rows] = basis @ (basis.T @ self.slope[self.rows])
@@ -108,7 +108,7 @@ class _Look(NamedTuple):
 def didim_steps(
     machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
 ) -> Steps[Estimate]:
-    """Run `didim`, one solve at a time."""
+    """Run `didim` as a generator of solve requests."""
     if machine.controller is None:
         raise InputError(
             "didim simulates the loop, and the controller is not known",
@@ -164,9 +164,9 @@ def didim_steps(
 def _look(
     rerun: Rerun, plant: Plant, theta: np.ndarray, rows: np.ndarray | None = None
 ) -> Steps[_Look | None]:
-    """Simulate at some values; None where that diverges, or hardly moves.
+    """Simulate at some values of the unknowns; return None if the run diverges or hardly moves.
 
-    `rows` are the samples that count, (kept, n); absent: those of driven joints that move.
+    `rows` is the mask of samples that count, (kept, n); None: all moving samples of driven joints.
     """
     run = yield from rerun.steps(theta, own_command=False)
     if run is None or run.fitted.sum() < _FEWEST * len(theta):
@@ -187,11 +187,11 @@ def _look(
 def _slope(
     replay: Replay, places: tuple, plant: Plant, data: ForceData, theta: Array
 ) -> Float[Array, "kept n p"]:
-    """Return the derivative of the simulated loop's force, by joint, filtered as the logged one."""
+    """Return the derivative of the simulated loop's force by joint, with the filter of the logged force."""
 
     def force(theta: Array) -> Array:
         u = replay.drive.gain * replay(scatter(places, plant, theta)).command
-        # Delays of the plant are in the simulation already; how the command is held is not.
+        # The simulation already contains the delays of the plant, but not the lag of the held command.
         u = signals.delayed(u, jnp.zeros(()), data.period, hold=data.hold)
         return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
 

@@ -50,7 +50,7 @@ class Estimate:
 
     @property
     def std(self) -> Float[np.ndarray, " p"]:
-        """Standard deviations; NaN of parameters that are not identifiable."""
+        """Standard deviations, (p,); NaN for parameters that are not identifiable."""
         return self.precision.std
 
     @property
@@ -60,7 +60,7 @@ class Estimate:
 
     @property
     def all_identified(self) -> bool:
-        """Whether the solver converged and all parameters are identifiable."""
+        """True if the solver converged and all parameters are identifiable."""
         return self.converged and bool(np.all(self.identifiable))
 
     def value(self, name: str) -> float:

@@ -27,9 +27,9 @@ from jaxid.simulation.loops import Drive
 from jaxid.simulation.replay import Replay
 from jaxid.simulation.solvers import AdaptiveStep
 
-# Samples whose slope starts the velocity of a fitted initial state.
+# Number of first samples whose slope is the start of a fitted initial velocity.
 _SLOPE = 10
-# Lower bound of what must be positive, relative to its start.
+# Lower bound of a positive parameter, relative to its start.
 _POSITIVE_FLOOR = 1e-9
 # Relative difference of sampling steps beyond which a time is not equally spaced.
 _UNEQUAL = 1e-6
@@ -90,11 +90,11 @@ def fit(
     solver: str | None = None,
     minimiser: str | Minimiser | None = None,
 ) -> Fit:
-    """Fit parameters of a plant so that its simulated position meets the measured one.
+    """Fit parameters of a plant so that its simulated position matches the measured one.
 
     A pure function of its arrays: vmap it over data, starts or plants, jit it, differentiate `theta` (by the
-    implicit function theorem). It is the output-error fit of `identify` without its choices: the start,
-    the integration and the initial state are the caller's, and the covariance takes the residual as white.
+    implicit function theorem). It is the output-error fit of `identify` without its automatic choices: the
+    caller chooses start, integration and initial state, and the covariance is that for a white residual.
 
     Args:
         plant: The plant; the free parameters start at its values.
@@ -109,13 +109,13 @@ def fit(
         reference: Reference of that loop, (time, m) or (time,).
         gain: Declared force per unit of the command, a number or (m,).
         hold: Course of the command between samples: "zero_order" or "linear".
-        substeps: Integration steps a sample.
+        substeps: Integration steps per sample.
         sticks: Whether dry friction sticks exactly; else its sign is smoothed by the plant's `sharpness`.
         solver: One of `jaxid.simulation.solvers.SOLVERS` in place of fixed steps; smooths dry friction.
         minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix.
 
     Returns:
-        The estimates and what the fit leaves.
+        The estimates, their covariance and the residual.
 
     Raises:
         InputError: If a name, a shape or an option is wrong.
@@ -132,7 +132,7 @@ def fit(
     drive = replace(replay.drive, substeps=substeps, set_valued=sticks and solver is None, solver=step)
     replay = replace(replay, drive=drive)
 
-    # Behind the parameters stand changes of the initial position and velocity.
+    # The unknowns are the parameters, followed by changes of the initial position and velocity.
     n = measured.shape[1]
     nuisance = 0 if initial is not None else 2 * n
     wide = jnp.full(nuisance, jnp.inf)
@@ -169,7 +169,7 @@ def fit(
 
 
 def _covariance(jacobian: Float[Array, "rows p"], cost: Array, samples: Array) -> Float[Array, "p p"]:
-    """Return the covariance of least squares with a white residual; infinite of what has no effect."""
+    """Return the covariance for a white residual; infinite for an unknown without effect."""
     norm = jnp.linalg.norm(jacobian, axis=0)
     scale = jnp.where(norm > 0, norm, 1.0)
     size = scale.size
@@ -191,7 +191,7 @@ def _replay(
     gain: Array | float,
     hold: str,
 ) -> Replay:
-    """Return the run that the data drive; a line through the first samples gives an absent initial state."""
+    """Build the run that the data drive; a line through the first samples gives a missing initial state."""
     n = measured.shape[1]
     given, what = (force, "force") if controller is None else (reference, "reference")
     if given is None:
@@ -233,7 +233,7 @@ def _columns(x: Array) -> Float[Array, "time k"]:
 
 
 def _period(time: Array | float, samples: int) -> float:
-    """Return the sampling period, which compiled code is made for."""
+    """Return the sampling period [s], a constant of the compiled code."""
     if isinstance(time, Tracer):
         raise InputError("time is traced", hint="close over it, or give the sampling period as a number")
     stamps = np.asarray(time, dtype=np.float64)
@@ -289,7 +289,7 @@ def _places(
         if name not in every:
             raise InputError(f"parameter {name!r} is not known", hint=suggest(name, every))
     if not names:
-        raise InputError("free names no parameter", hint=f"choose of {', '.join(every)}")
+        raise InputError("free names no parameter", hint=f"choose among {', '.join(every)}")
     return tuple(every[n][0] for n in names), tuple(every[n][1].sign for n in names)
 
 

@@ -1,9 +1,9 @@
-"""Instrumental variables: the regressor of the measured motion, seen through that of the simulated one.
+"""Instrumental variables: a simulated regressor as instruments for the measured one.
 
-Noise on a measured position is in the regressor too, and in the residual with it, so that least
-squares is biased: towards zero where the noise is large. The same columns along a simulated motion
-go with the true ones and not with the noise, and where the residual is orthogonal to them, the
-unknowns are what they are on average.
+Noise of a measured position is both in the regressor and in the residual, so that least
+squares is biased, towards zero if the noise is large. The same columns along a simulated motion
+are correlated with the true ones and not with the noise. If the residual is orthogonal to them, the
+estimates are consistent.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics
 
-# An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
-# deviation says little of its motion.
+# An open-loop run whose RMS distance from the log exceeds this part of the log's standard deviation
+# gives no useful instruments.
 _LOST = 0.5
 _MOST_STEPS = 30
 _HALVINGS = 8
@@ -39,22 +39,22 @@ def instrumental_variable(
 
     Args:
         machine: The machine. Instruments come from its loop; without a controller, or a reference
-            in the log, from the measured force in open loop. Noise of the force sensor is then in the
-            instruments too: they are free only of that of the position.
-        log: The log.
-        data: The same, prepared; the simulated motion passes the same filters.
-        numerics: How to integrate; absent: as machine and log ask.
+            in the log, from the measured force in open loop. The instruments then contain noise of the
+            force sensor, but none of the position.
+        log: The log with the measured motion and force.
+        data: The prepared log; the simulated motion passes the same filters.
+        numerics: Settings of the integration; None: chosen from machine and log.
 
     Returns:
-        The estimate; its covariance takes the residual's colour into account. It starts from
-        inverse dynamics where that tells all unknowns.
+        The estimate; its covariance accounts for a coloured residual. The fit starts from
+        inverse dynamics if all unknowns are identifiable by it.
 
     Raises:
-        InputError: If the simulation in open loop loses the log.
+        InputError: If the simulation in open loop departs too far from the log.
 
     Source:
-        Janot, Vandanjon & Gautier (2014), IEEE Trans. Control Syst. Technol. 22: IDIM-IV. What
-        enters nonlinearly is linearised anew at every step.
+        Janot, Vandanjon & Gautier (2014), IEEE Trans. Control Syst. Technol. 22: IDIM-IV. Nonlinear
+        unknowns are linearised again at every step.
     """
     return run_alone(instrumental_variable_steps(machine, log, data, numerics=numerics))
 
@@ -62,9 +62,9 @@ def instrumental_variable(
 def instrumental_variable_steps(
     machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
 ) -> Steps[Estimate]:
-    """Run `instrumental_variable`, one solve at a time."""
+    """Run `instrumental_variable` as a generator of solve requests."""
     first = yield from inverse_dynamics_steps(machine, data)
-    # Of bodies what no log tells is that of a body, and moves nothing.
+    # Unidentifiable combinations of physically consistent links are those of a body, and have no effect.
     within = bool(machine.parameters.bodies) and first.converged
     theta = first.theta if first.all_identified or within else machine.parameters.guess
     if log.reference is None:
@@ -75,7 +75,7 @@ def instrumental_variable_steps(
     size = yield SolveRequest(force_size, (plant, arrays))
     found = yield from _search(rerun, plant, arrays, rows, machine.parameters, theta, float(size))
     theta, e, columns, basis = found.theta, found.e, found.columns, found.basis
-    # Seen through the instruments: with it the formulas of least squares are those of instruments.
+    # With the columns projected on the instruments, the formulas of least squares give the IV covariance.
     seen = np.zeros((*rows.shape, len(places)))
     seen[rows] = columns[rows] if basis is None else basis @ (basis.T @ columns[rows])
     precision = force_precision(machine, size, theta, e, seen, rows)
@@ -96,14 +96,14 @@ def instrumental_variable_steps(
 
 @dataclass(frozen=True)
 class _Found:
-    """Where the search ended.
+    """Result of the search for the estimate.
 
     Args:
-        theta: The unknowns.
-        e, columns: Residual and Jacobian there, (kept, n) and (kept, n, p).
-        basis: Of what the instruments span, (rows, r); None where nothing could be simulated.
-        message: What came of it.
-        steps: Taken.
+        theta: Estimates of the unknowns, (p,).
+        e, columns: Residual and Jacobian at the estimates, (kept, n) and (kept, n, p).
+        basis: Orthonormal basis of the instruments' span, (rows, r); None if every simulation failed.
+        message: "converged", or the reason why the search stopped.
+        steps: Number of steps taken.
     """
 
     theta: np.ndarray
@@ -123,7 +123,7 @@ def _search(
     theta: np.ndarray,
     size: float,
 ) -> Steps[_Found]:
-    """Alternate between instruments at the estimate and the estimate by these, until it settles."""
+    """Alternate until convergence between instruments at the estimate and an estimate with them."""
     places = unknown.places
 
     def along(data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
@@ -141,7 +141,7 @@ def _search(
                 hint="name the controller in [controller] and the reference's "
                 "column in [log], or use inverse_dynamics",
             )
-        # Those of the step before still are instruments where the simulation runs away.
+        # If the simulation diverges, the instruments of the step before remain valid.
         if run is not None:
             _, simulated = yield from along(ForceData.of(run, rows), theta)
             basis = span(simulated[rows])
@@ -162,6 +162,6 @@ def _search(
 
 
 def _lost(run: Prepared, log: Log) -> bool:
-    """Return whether a simulated motion has drifted away from the measured one."""
+    """Check that a simulated motion has drifted too far from the measured one."""
     off = np.sqrt(np.mean((run.q - log.filled) ** 2, axis=0))
     return bool(np.any(off > _LOST * np.std(log.filled, axis=0)))

@@ -1,7 +1,7 @@
 """Least squares on the filtered balance: the residual of inverse dynamics, fitted by its Jacobian.
 
-The regressor is the Jacobian of the residual with respect to the unknowns, so that what is linear
-is solved in one step and what is not (a Stribeck velocity, a lag) by a few more on the same code.
+The regressor is the Jacobian of the residual with respect to the unknowns. Linear unknowns therefore take
+one step, and nonlinear ones (a Stribeck velocity, a lag) a few more with the same code.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.force_balance import ForceData, _size, force_residual, sharpened
 
-# Of the solver where the balance is linear in all unknowns: the first step is then the last.
+# Damping of the solver if the balance is linear in all unknowns: a single step then solves it.
 _UNDAMPED = 1e-10
-# Factors on the guess of a shape, from which a fit starts too.
+# Factors on the guess of a shape parameter for additional starts.
 _SHAPES = (0.3, 3.0)
-# Of the dry friction, what may act on joints without an encoder.
+# Shares of the dry friction that additional starts put on joints without an encoder.
 _SHARES = (0.2, 0.5, 0.8)
 
 
@@ -43,7 +43,7 @@ def _solve(
     bounds: tuple[Array, Array],
     damping: float,
 ) -> tuple[Minimum, Array]:
-    """Return the fit, and the size of the force that it explains."""
+    """Return the fit, and the 2-norm of the measured force."""
 
     def residual(theta: Array) -> Array:
         return data.weight * force_residual(scatter(places, plant, theta), data)
@@ -58,18 +58,18 @@ def inverse_dynamics(
     """Fit the unknowns to a prepared log by least squares on the balance of forces.
 
     Args:
-        machine: The machine; its guesses matter only where the balance is nonlinear.
-        data: The log, prepared.
-        reweighted: Weight joints by the spread of their residuals, and samples by a robust (bisquare) weight
-            of theirs, twice over.
-        start: In place of the guesses.
+        machine: The machine; its guesses matter only for unknowns in which the balance is nonlinear.
+        data: The prepared log.
+        reweighted: Whether to fit twice more, with joints weighted by the spread of their residuals and
+            samples by a robust (bisquare) weight.
+        start: Start of the fit in place of the guesses, (p,).
 
     Returns:
-        The estimate; its covariance takes the residual's colour into account.
+        The estimate; its covariance accounts for a coloured residual.
 
     Source:
         Gautier (1986) and Janot, Vandanjon & Gautier (2014) for filtered inverse dynamics; Tukey's
-        bisquare with constant 4.685 for the weights. Gautier (1997), ICRA, for those of the joints.
+        bisquare with constant 4.685 for the weights of samples. Gautier (1997), ICRA, for those of joints.
     """
     return run_alone(inverse_dynamics_steps(machine, data, reweighted=reweighted, start=start))
 
@@ -77,7 +77,7 @@ def inverse_dynamics(
 def inverse_dynamics_steps(
     machine: Machine, data: Prepared, *, reweighted: bool = False, start: np.ndarray | None = None
 ) -> Steps[Estimate]:
-    """Run `inverse_dynamics`, one solve at a time."""
+    """Run `inverse_dynamics` as a generator of solve requests."""
     plant = sharpened(machine.plant, data)
     rows = data.fitted
     arrays = ForceData.of(data, rows)
@@ -90,18 +90,19 @@ def inverse_dynamics_steps(
     for at in _starts(machine, theta):
         fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
-    # What a joint without an encoder sticks at is told by jumps of the others: full of local minima.
+    # Only jumps of the other joints identify dry friction at a joint without an encoder, and the cost has
+    # many local minima.
     for at in [] if whole else _splits(machine, np.asarray(fits[0].theta), data.measured):
         fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
-    # Of those that reach the lowest cost, to rounding, one that converged.
+    # Among the fits that reach the lowest cost, to rounding, prefer one that converged.
     lowest = [f for f, c in zip(fits, costs, strict=True) if c <= min(costs) * (1 + 1e-6)]
     fit = next((f for f in lowest if bool(f.converged)), lowest[0])
     for _ in range(2 if reweighted else 0):
         e = np.asarray(fit.residual).reshape(data.moving.shape)
         was = np.asarray(arrays.weight)
-        # What has no weight left has none again.
+        # A sample with zero weight keeps zero weight.
         e = np.where(was > 0, e / np.where(was > 0, was, 1.0), np.inf)
         arrays = eqx.tree_at(lambda a: a.weight, arrays, _robust(e, rows))
         fit, _ = yield SolveRequest(_solve, (plant, places, arrays, fit.theta, *options))
@@ -123,11 +124,11 @@ def inverse_dynamics_steps(
 
 
 def linear_scale(machine: Machine, whole: bool = True) -> tuple[Transform, float]:
-    """Return a solver's scale on which linear unknowns are fitted as they are, and its damping.
+    """Return a solver's scale on which linear unknowns are not transformed, and its damping.
 
-    As its logarithm, a mass that starts at two thirds of its value takes five evaluations for two.
-    Bounds keep it positive. Where all unknowns are so, no damping is needed. Nothing is so where some
-    of the motion has to be found, `whole` being false.
+    On a logarithmic scale a mass that starts at two thirds of its value takes five evaluations instead of
+    two. Bounds keep it positive. If all unknowns are linear, no damping is needed. No unknown is linear if
+    some joints have no encoder (`whole` is false), because their motion depends on the unknowns.
     """
     linear = linear_unknowns(machine) & whole
     transform = Transform.of(machine.parameters)
@@ -137,12 +138,12 @@ def linear_scale(machine: Machine, whole: bool = True) -> tuple[Transform, float
 
 
 def linear_unknowns(machine: Machine) -> Bool[np.ndarray, " p"]:
-    """Return a mask of the unknowns in which the balance is linear."""
+    """Return the mask of the unknowns in which the balance is linear, (p,)."""
     return np.array([_linear(machine.plant, f) for f in machine.parameters.free], dtype=bool)
 
 
 def _linear(plant: Plant, free: Free) -> bool:
-    """Return whether the residual is linear in an unknown, by the declaration of its owner."""
+    """Check by the declaration of an unknown that the residual is linear in it."""
     info = _info(plant, free)
     if info is None or not carries_force(info):
         return False
@@ -159,7 +160,7 @@ def _info(plant: Plant, free: Free) -> ParameterInfo | None:
 
 
 def _number(free: Free) -> int:
-    """Return which effect of its plant an unknown belongs to."""
+    """Return the index of the effect that has an unknown."""
     number = free.path[1]
     assert isinstance(number, int), "the path of an effect's parameter goes through its number"
     return number
@@ -168,8 +169,8 @@ def _number(free: Free) -> int:
 def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
     """Return the guesses, and the same with each shape (a width, a lag, a period) smaller and larger.
 
-    What enters in proportion is solved in one step from anywhere; a shape that starts far off lets
-    the strength beside it fall to zero, and is then without a slope.
+    Linear unknowns are solved in one step from any start. But if a shape starts far off, the strength of its
+    effect may fall to zero, and the shape then has no slope.
     """
     out = [theta]
     for k, f in enumerate(machine.parameters.free):
@@ -182,7 +183,7 @@ def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
 
 
 def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> list[np.ndarray]:
-    """Return starts that divide dry friction otherwise between joints with and without an encoder."""
+    """Return starts with other shares of dry friction at joints with and without an encoder."""
     effects = machine.plant.effects
     levels = [
         (k, effects[_number(f)].port)
@@ -208,14 +209,14 @@ def force_precision(
     jacobian: np.ndarray,
     rows: np.ndarray,
 ) -> Precision:
-    """Return the precision of a fit in the force domain; `size` is that of `force_size`."""
+    """Return the precision of a fit in the force domain; `size` is the result of `force_size`."""
     guess = machine.parameters.guess
     scale = np.where(guess != 0, guess, 1.0)
     return assess(machine.parameters.names, jacobian, e, rows, float(size), scale)
 
 
 def _robust(e: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return weights of residuals: one over each joint's spread, on their mean, times the bisquare's root."""
+    """Return weights of residuals: RMS spread over each joint's spread, times the root of the bisquare."""
     middle = [np.median(np.abs(x[c])) if c.any() else 0.0 for x, c in zip(e.T, counts.T, strict=True)]
     spread = 1.4826 * np.array(middle)
     spread = np.where(spread > 0, spread, 1.0)

@@ -1,7 +1,7 @@
 """Gradient-based fit of the simulated to the measured position.
 
-In the loop where the controller is known; else open loop over the whole log, or, where an error
-would grow without bound, in segments that restart from the log.
+The simulation runs in closed loop if the controller is known, else in open loop over the whole log. If an
+error would grow without bound, it runs in segments that restart from the log.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from jaxid.simulation.replay import (
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.solvers import RELATIVE
 
-# An open-loop run whose RMS distance from the log exceeds this part of the log's own standard
-# deviation is cut into segments.
+# An open-loop run whose RMS distance from the log exceeds this part of the log's standard deviation is cut
+# into segments.
 _LOST = 0.5
-# The start of an open-loop run is fitted with the rest only where the residual's RMS is within this
-# factor of the position noise. Elsewhere the model's own error would bend the start, which the first
-# samples tell far better.
+# The start of an open-loop run is fitted with the unknowns only if the residual's RMS is within this
+# factor of the position noise. Otherwise the error of the model would bias the start, which the first
+# samples determine far better.
 _NOISE_LIMITED = 3.0
 _CLEARLY = 10.0
-# See `turning_steps`: what a step misses, how much of the noise that may be, and most steps for it.
+# See `turning_steps`: factor of a step's error, its allowed part of the noise, and the most steps.
 _TURNING = 0.04
 _LITTLE = 0.1
 _MOST = 4
-# So many segments then; each long enough to show friction, short enough not to drift away.
+# Number of segments; each is long enough to show friction and short enough not to drift away.
 _SEGMENTS = 40
 
 
@@ -62,7 +62,7 @@ def output_residual(
 ) -> Callable[[Array], Array]:
     """Return measured minus simulated output as a function of the unknowns, (time, k), weighted.
 
-    In open loop the start's position and velocity may be unknowns too, behind the others.
+    The unknowns may end with changes of the position and velocity at the start, (2 n,).
     """
 
     def residual(theta: Array) -> Array:
@@ -80,20 +80,20 @@ def output_residual(
 
 
 def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
-    """Refuse an open loop, whose force is the log's own: it would meet itself.
+    """Refuse an open loop, whose force is the logged one, so that the fit would compare it with itself.
 
     Args:
-        machine: The machine.
-        log: The log.
-        what: Needs the loop.
-        other: Way out, behind that of naming it.
+        machine: The machine that is simulated.
+        log: The log, named in the message.
+        what: Request that needs the loop, for the message.
+        other: Alternative to naming the controller, for the hint.
 
     Raises:
-        InputError: If there is no controller.
+        InputError: If the machine has no controller.
     """
     if machine.controller is None:
         raise InputError(
-            f"{what} needs a loop whose simulation makes a force",
+            f"{what} needs a loop, whose simulation gives a force",
             where=log.source,
             hint=f"name the controller in [controller] and the reference's column in [log], {other}",
         )
@@ -144,9 +144,9 @@ def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndar
     """Return the derivative of the simulated position by the unknowns at their guesses, (time, n, p).
 
     Args:
-        machine: The machine.
-        log: Whose input drives it.
-        numerics: How to integrate.
+        machine: The machine to simulate.
+        log: Log whose input drives the machine.
+        numerics: Settings of the integration.
     """
     replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
     unknown = machine.parameters
@@ -170,24 +170,24 @@ def output_error(
     on: str = "position",
     minimiser: str | Minimiser | None = None,
 ) -> Estimate:
-    """Fit the unknowns so that the simulated position, or force, meets the measured one.
+    """Fit the unknowns so that the simulated position, or force, matches the measured one.
 
     Args:
         machine: The machine; its controller closes the loop.
-        log: The log.
-        start: In place of the guesses, for example from `inverse_dynamics`.
-        numerics: How to integrate; chosen from plant and log where absent.
-        hessian: Take the covariance from the full Hessian in place of Gauss-Newton's.
-        on: One of `jaxid.names.OUTPUTS`. Both: each column over the standard deviation that a fit of position
-            leaves in it. The force is that of a closed loop; an open loop is given its own.
-        minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix; absent:
+        log: The log with the measured output.
+        start: Start of the fit in place of the guesses, for example from `inverse_dynamics`, (p,).
+        numerics: Settings of the integration; None: chosen from plant and log.
+        hessian: Whether the covariance uses the full Hessian in place of Gauss-Newton's.
+        on: One of `jaxid.names.OUTPUTS`. With "both" each column is divided by the standard deviation of its
+            residual in a fit of position. A fit of the force needs a closed loop.
+        minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix; None:
             `jaxid.estimators.common.levenberg_marquardt`.
 
     Returns:
-        The estimate; its covariance takes the residual's colour into account.
+        The estimate; its covariance accounts for a coloured residual.
 
     Raises:
-        InputError: If there is no loop that makes the force to be met, or the minimiser is not known.
+        InputError: If the force is fitted without a closed loop, or the minimiser is not known.
     """
     return run_alone(
         output_error_steps(
@@ -206,7 +206,7 @@ def output_error_steps(
     on: str = "position",
     minimiser: str | Minimiser | None = None,
 ) -> Steps[Estimate]:
-    """Run `output_error`, one solve at a time."""
+    """Run `output_error` as a generator of solve requests."""
     solver = minimiser_of(minimiser)
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
@@ -221,7 +221,7 @@ def output_error_steps(
     active = np.arange(p + nuisance) < p
     problem: tuple[Any, ...] = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
     if machine.unknown_reference is not None:
-        # A machine bent to follow another reference ends nowhere: first what is unknown of that alone.
+        # With a wrong reference the machine's parameters would diverge: fit the reference's unknowns first.
         minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active), solver))
         problem = (*problem[:5], minimum.theta, *problem[6:])
     minimum = yield SolveRequest(_fit, (*problem, active, solver))
@@ -234,7 +234,7 @@ def output_error_steps(
     if looped and not nuisance and not numerics.segment:
         left = np.asarray(minimum.residual).reshape(problem[3].shape)
         if start_shows(left[:, problem[4][0] > 0]):
-            # A log that begins with a jerk from rest: its first readings are no velocity.
+            # The log may begin with a jerk from rest, so that its first readings give no velocity.
             rested = (from_rest(problem[0]), *problem[1:5], minimum.theta, *problem[6:])
             other = yield SolveRequest(_fit, (*rested, active, solver))
             if bool(other.converged) and float(other.cost) < float(minimum.cost):
@@ -281,14 +281,17 @@ def output_error_steps(
 
 
 def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
-    """Return a mask of the unknowns of the reference."""
+    """Return the mask of the unknowns of the reference."""
     own = np.zeros_like(active)
     own[: len(machine.parameters.free)] = [path[0] == REFERENCE for path, _ in machine.parameters.places]
     return own
 
 
 def _with_start(machine: Machine, log: Log, problem: tuple, minimum: Minimum) -> tuple[tuple, np.ndarray]:
-    """Return a fit from a start that suits the fitted plant, with the start unknown if only noise remains."""
+    """Return the problem with the start refitted to the fitted plant, and the mask of its active unknowns.
+
+    The start is active if the residual is no larger than noise.
+    """
     p = len(machine.parameters.free)
     fitted = machine.with_estimate(np.asarray(minimum.theta)[:p])
     replay = with_fitted_start(problem[0], fitted.plant, log)
@@ -324,12 +327,13 @@ def choose_numerics(
 ) -> Numerics:
     """Choose the integration that suits a machine and its log.
 
-    Dry friction sticks exactly: its gradient is exact too, because the force is continuous where
-    sliding starts. Break-away friction breaks that, and is smoothed; so does a solver of diffrax.
+    Dry friction sticks exactly. Its gradient is exact too, because the force is continuous at the onset of
+    sliding. With break-away friction it is not, so that friction is smoothed; likewise with a solver of
+    diffrax.
 
     Args:
-        machine: The machine.
-        log: The log.
+        machine: The machine to simulate.
+        log: The log that drives it.
         segments: Whether an open-loop run may be cut into segments.
         solver: One of `jaxid.names.SOLVERS`; None: fixed steps.
     """
@@ -355,10 +359,10 @@ def choose_numerics(
 
 
 def turning_steps(machine: Machine, log: Log) -> int:
-    """Return the steps a sample that keep the error at reversals of dry friction below the noise.
+    """Return the steps per sample that keep the error at reversals of dry friction below the noise.
 
-    A joint that comes to rest within a step h is off by about 0.04 F / m h^2 afterwards, F its dry
-    friction; a tenth of a reading's noise is little enough for thousands of samples.
+    A joint that comes to rest within a step h is afterwards off by about 0.04 F / m h^2 with F its dry
+    friction; a tenth of a reading's noise is small enough for thousands of samples.
     """
     plant, inertia = machine.plant, machine.plant.own_inertia()
     noise = position_noise(machine, log)
@@ -375,13 +379,13 @@ def turning_steps(machine: Machine, log: Log) -> int:
 
 @eqx.filter_jit
 def _levels(plant: Plant, q: Array, v: Array, u: Array) -> Array:
-    """Return the level of dry friction at rest, break-away included."""
+    """Return the level of dry friction at rest by port, including break-away [N or N m]."""
     levels = plant.balance(q, v, v, u, jnp.zeros(()), plant.initial_states(u))
     return levels.dry + levels.stick
 
 
 def _sharp_steps(machine: Machine, log: Log) -> int:
-    """Return the steps a sample that the smoothed sign needs; with fewer the gradient is garbage."""
+    """Return the steps per sample that the smoothed sign needs; with fewer steps the gradient is wrong."""
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
@@ -404,7 +408,7 @@ def notes_of(
     on: str,
     minimiser: str | Minimiser | None = None,
 ) -> tuple[str, ...]:
-    """State how it was simulated and minimised, for a user."""
+    """Return remarks for the user about simulation and minimisation."""
     where = "in the loop" if machine.controller is not None else "open loop"
     how = "sticks exactly" if numerics.sticks else "is smoothed"
     steps = f"{numerics.substeps} step(s) a sample"
@@ -415,7 +419,7 @@ def notes_of(
         notes.append(f"fitted on {'position and force' if on == 'both' else 'force'}")
     if numerics.segment:
         seconds = numerics.segment * log.period
-        notes.append(f"restarted from the log every {seconds:.3g} s: it drifts off otherwise")
+        notes.append(f"restarted from the log every {seconds:.3g} s, because it would drift off otherwise")
     if minimiser_of(minimiser) is not None:
         notes.append(f"minimised by {minimiser_name(minimiser)}")
     return tuple(notes)

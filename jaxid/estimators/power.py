@@ -1,19 +1,19 @@
 """Energy balances over windows: no acceleration is needed.
 
-The balance of forces times the velocities is a balance of powers. What is inertial in it is the rate
-of the kinetic energy, less half of what the mass changes by; over a window that opens and closes
-smoothly, w, it is integrated by parts:
+The balance of forces times the velocities is a balance of powers. Its inertial part is the rate
+of the kinetic energy, minus half of the power due to the changing mass. Over a window w that opens and
+closes smoothly, it is integrated by parts:
 
     int w qd' M qdd  =  - int w' T  -  int w qd' (dM/dt) qd / 2,      T = qd' M qd / 2,
 
-so that it takes no more than the velocity. M is read off the plant's one balance, as its slope in the
-accelerations, and its rate as the slope of that along the motion. All else, weight and springs
-included, is force times velocity, integrated as it is. At rest nothing does work: a force of friction
-that is anything there is multiplied by zero. Only windows in whose middle a joint with dry friction
-stops or turns are left out.
+so that it needs no derivative beyond the velocity. M is the slope of the plant's balance in the
+accelerations, and dM/dt the slope of M along the motion. All other forces, including weight and springs,
+are multiplied by the velocity and integrated directly. At rest no force does work: the
+undetermined friction force is multiplied by zero. Only windows in whose middle a joint with dry friction
+stops or turns are excluded.
 
-Where no joint's acceleration enters another's balance, each joint has an equation of its own, else
-the machine has one.
+If no joint's acceleration enters another's balance, each joint has its equation; otherwise
+the machine has a single one.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import assess
 from jaxid.simulation.force_balance import ForceData, sharpened
 
-# A hill of speed stands out by this part of the RMS speed.
+# Least prominence of a peak of the speed, relative to the RMS speed.
 _HILL = 0.5
-# Windows, over the mean length of a hill: four on its rise and four on its fall, half overlapping.
+# Length of a window over the mean length of a peak: four on its rise and four on its fall, half overlapping.
 _A_HILL = 0.125
-# Windows are no shorter than so many periods of the band's edge: below, they hold little but noise.
+# Least length of a window in periods of the band's edge: shorter windows contain mostly noise.
 _SHORTEST = 2.0
-# Windows for each unknown, at least.
+# Least number of windows per unknown.
 _FEWEST = 2
 
 
 class PowerData(eqx.Module):
-    """What windows are cut from.
+    """A prepared log and its windows.
 
     Args:
-        data: The log.
-        weight: Of each window's equation, (window, k): zero where nothing moves in it.
-        half: Half the length of a window, in samples.
+        data: Arrays of the prepared log.
+        weight: Weight of each window's equations, (window, k); zero for a window without motion.
+        half: Half the length of a window [samples].
         first: Sample at which the first window opens.
     """
 
@@ -69,17 +69,17 @@ class PowerData(eqx.Module):
 
 
 def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]:
-    """Return the energy missing for balance in every window, over its weight [N or N m].
+    """Return the weighted residual of the energy balance in every window [N or N m].
 
-    A column a joint where the mass is diagonal, else one for the machine.
+    It has one column per joint if the mass is diagonal, else one for the machine.
 
     Source:
-        Gautier (1997), ICRA: Dynamic identification of robots with power model; here each window
-        opens and closes smoothly, which asks for no velocity at its very ends.
+        Gautier (1997), ICRA: Dynamic identification of robots with power model. Here each window
+        opens and closes smoothly, so that the velocity at its ends is not needed.
     """
     kinetic, power = _energies(plant, windows.data)
     half, period = windows.half, windows.data.period
-    # At the middles of samples, so that both halves mirror each other.
+    # The window is evaluated at the middles of samples, so that both halves mirror each other.
     s = (np.arange(half) + 0.5) / half
     up, slope = window(s), window_slope(s) / half
     count = windows.weight.shape[0] + 1
@@ -91,16 +91,16 @@ def power_residual(plant: Plant, windows: PowerData) -> Float[Array, "window k"]
     def over(x: Array, by: np.ndarray) -> Array:
         return jnp.einsum("i,hik->hk", by, halves(x))
 
-    # What closes is the mirror of what opens, with the slope's sign turned.
+    # The closing half is the mirror image of the opening half, with the opposite sign of the slope.
     opened = period * over(power, up) - over(kinetic, slope)
     closed = period * over(power, up[::-1]) + over(kinetic, slope[::-1])
     return windows.weight * (opened[:-1] + closed[1:])
 
 
 def window(s: np.ndarray) -> np.ndarray:
-    """Return a window that is open at 1 and closed at 0 and 2, with no corner in its slope.
+    """Return a smooth window that is one at s = 1 and zero at s = 0 and 2, with a smooth slope.
 
-    Of smoother ones the plain sum over samples is the integral, to fourth order in their distance.
+    It is so smooth that the plain sum over samples is the integral, to fourth order in their distance.
     """
     return np.sin(0.5 * np.pi * s) ** 4
 
@@ -111,14 +111,14 @@ def window_slope(s: np.ndarray) -> np.ndarray:
 
 
 def _energies(plant: Plant, data: ForceData) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
-    """Return the kinetic energy [J], and the power of all else less half the rate of the mass [W].
+    """Return the kinetic energy [J], and the power of all other forces minus v' (dM/dt) v / 2 [W].
 
-    In declared units: over the ratio of the force at the load to the declared one.
+    Both are in declared units: they are divided by the ratio of the force at the load to the declared one.
     """
     joints = data.q.shape[1]
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
-    # Accelerations reach own states only, of effects that look at them.
+    # The accelerations affect only the internal states of effects that use them.
     own = integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
     times = data.start + data.period * jnp.arange(data.q.shape[0])
     apart = plant.diagonal or joints == 1
@@ -165,19 +165,19 @@ def power(machine: Machine, data: Prepared) -> Estimate:
 
     Args:
         machine: The machine.
-        data: The log, prepared: its filtered velocity counts, its accelerations do not.
+        data: The prepared log, of which the filtered velocity is used and not the acceleration.
 
     Returns:
-        The estimate; its covariance takes the residual's colour into account.
+        The estimate; its covariance accounts for a coloured residual.
 
     Raises:
-        InputError: If the log is too short for as many windows as the unknowns ask for.
+        InputError: If the log is too short for the number of windows that the unknowns need.
     """
     return run_alone(power_steps(machine, data))
 
 
 def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
-    """Run `power`, one solve at a time."""
+    """Run `power` as a generator of solve requests."""
     windows, unit = _windows(machine, data)
     plant, parameters = sharpened(machine.plant, data), machine.parameters
     transform, damping = linear_scale(machine)
@@ -223,9 +223,9 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
 def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     """Return the windows over a log, and the RMS force of its drives [N or N m].
 
-    A window's energy is taken over the root of its integrals of w^2 and (w qd)^2: what is left is
-    then a force, whose noise is as large in slow windows as in fast ones. In one equation for all joints
-    each one's speed counts by the noise of its force.
+    The energy of a window is divided by the root of the product of its integrals of w^2 and (w qd)^2. The
+    residual is then a force, whose noise is as large in slow windows as in fast ones. In a single equation
+    for all joints the speed of each joint is weighted by the noise of its force.
     """
     joints, period = data.q.shape[1], data.period
     half, first = _half(data), data.recipe.trim * data.recipe.decimation
@@ -249,7 +249,7 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     squares = np.stack([weigh**2 @ speed[c] ** 2 for c in cut])
     moves = squares > slowest**2 * np.sum(weigh**2)
     passes = np.stack([np.any(halts[c][middle], axis=0) for c in cut])
-    # A motion that is all reversals keeps them: there is no other.
+    # If windows without reversals are too few, those with reversals count too.
     counts = moves & ~passes if np.sum(moves & ~passes) >= fewest else moves
     mean = period * np.sqrt(np.where(counts, squares, 1.0) * np.sum(weigh**2))
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
@@ -257,7 +257,7 @@ def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
 
 
 def _asked(machine: Machine) -> int:
-    """Return the number of unknowns of an equation; of bodies only identifiable sums count."""
+    """Return the number of unknowns; of physically consistent links only identifiable sums count."""
     unknown = machine.parameters
     if not unknown.bodies:
         return len(unknown.free)
@@ -267,7 +267,10 @@ def _asked(machine: Machine) -> int:
 
 
 def _noise_shares(data: Prepared) -> Float[np.ndarray, " n"]:
-    """Return the noise of each joint's force over that of all, from its high band; ones if unavailable."""
+    """Return the noise of each joint's force relative to the RMS of all, (n,); ones if not available.
+
+    The noise is estimated from the high band of the force.
+    """
     noise = signals.high_band_std(data.force)
     if noise.size != data.q.shape[1] or not np.all(noise > 0):
         return np.ones(data.q.shape[1])
@@ -275,11 +278,11 @@ def _noise_shares(data: Prepared) -> Float[np.ndarray, " n"]:
 
 
 def _halts(plant: Plant, data: Prepared) -> Bool[np.ndarray, "time n"]:
-    """Return the samples at which a joint with dry friction rests or turns.
+    """Return the mask of samples at which a joint with dry friction rests or turns, (time, n).
 
-    Friction jumps there, or holds; its velocity, limited to a band, is neither zero nor reverses
-    quite when the machine does, so that energy seems to be lost. A stated recipe keeps what only
-    turns, as it does in inverse dynamics.
+    Friction jumps there, or holds the joint. The band-limited velocity is not exactly zero, and does not
+    reverse exactly when the machine does, so that energy seems to be lost. A stated recipe keeps
+    reversals, as it does in inverse dynamics.
     """
     joints, u = data.q.shape[1], data.force[0]
 
@@ -288,7 +291,7 @@ def _halts(plant: Plant, data: Prepared) -> Bool[np.ndarray, "time n"]:
             data.q[0], data.qd[0], data.qdd[0], u, jnp.zeros(()), plant.initial_states(jnp.asarray(u))
         )
 
-    # Traced: a number that no compiled code sees counts as nothing there.
+    # Traced, because a plain number outside of compiled code counts as no contribution.
     slides = eqx.filter_eval_shape(at_start, plant).slides
     dry = {i for port in slides for i in plant.joints_loaded_by(port, joints)}
     halts = np.abs(data.qd) < np.asarray(data.recipe.rest_velocity)

@@ -1,6 +1,6 @@
 """One statement of the physics: parameters, effects, and the balance of a plant.
 
-A user's own classes import from here: these names stay, wherever their modules are.
+User-defined classes import from here: these names stay, even if their modules move.
 """
 
 from jaxid.model.effect import Action as Action

@@ -30,12 +30,12 @@ class Balance(eqx.Module):
     Args:
         residual: Force that is missing for equilibrium, by coordinate [N or N m].
         dry: Level of dry friction, by port.
-        stick: Level above it at rest, by port.
-        rising: Level above it while speed grows, (2, ports): forwards and backwards.
+        stick: Additional level at rest, by port.
+        rising: Additional level while speed grows, (2, ports): forwards and backwards.
         rates: Time derivatives of the effects' internal states.
         drive: Force at the load of each drive, after all effects in its path [N or N m].
         slides: Ports on which any effect is dry friction.
-        rises: Ports on which it is more while speed grows.
+        rises: Ports on which dry friction is larger while speed grows.
     """
 
     residual: Array
@@ -144,7 +144,7 @@ class _Sums:
         return cls(force, dry, stick, forth, back, scale, [u[j] for j in range(u.size)], drives, [])
 
     def add(self, i: int, action: Action) -> None:
-        """Add what an effect does on port i."""
+        """Add the action of an effect on port i."""
         self.force[i], self.dry[i] = self.force[i] + action.force, self.dry[i] + action.dry
         self.stick[i] = self.stick[i] + action.stick
         if action.rising is not None:
@@ -153,7 +153,7 @@ class _Sums:
 
 
 def _act(plant: Plant, run: list[int], port: _PortSignals, sums: _Sums, t: Array, states: tuple) -> None:
-    """Let a run of effects of one kind act, in one batch, and add what they do."""
+    """Compute the actions of a run of effects of one kind in one batch, and add them to the sums."""
     effects = plant.effects
     spots = [(k, i, sums.drives[k]) for k in run for i in plant.directions(effects[k].port)]
     signals = [

@@ -36,7 +36,7 @@ def group_by_kind(effects: Sequence[Effect], drives: Sequence[int | None]) -> li
 
 
 def _same(one: Effect, two: Effect) -> bool:
-    """Return whether two effects differ only in port and values."""
+    """Check that two effects differ only in port and values."""
     if type(one) is not type(two):
         return False
     for f in fields(one):

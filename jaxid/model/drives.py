@@ -1,4 +1,4 @@
-"""The drives of a plant: which joints they act on, and what is theirs of a quantity by joint."""
+"""The drives of a plant: the joints on which they act, and the conversion of quantities by joint."""
 
 from __future__ import annotations
 

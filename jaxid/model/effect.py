@@ -16,18 +16,18 @@ class Signals(eqx.Module):
     """The signals that an effect may use, in the coordinate of its port.
 
     Args:
-        y: Coordinate [m or rad].
-        yd: Its velocity.
-        ydd: Its acceleration.
-        u: Force of the drive after the effects declared before this one [N or N m]; zero where
-            none drives the port.
+        y: Coordinate of the port [m or rad].
+        yd: Velocity of the port [m/s or rad/s].
+        ydd: Acceleration of the port [m/s^2 or rad/s^2].
+        u: Force of the drive after the effects declared before this one [N or N m]; zero for a
+            port without a drive.
         t: Time from the start of the log [s].
         width: Velocity over which the sign is smoothed.
         dry_scale: Factor on every level of dry friction (drift).
         gravity: Acceleration of gravity along the port; zero on a horizontal axis [m/s^2].
         normal: Force that presses the sliding surfaces together [N].
-        stiffness: Of the plant's own spring, where the port is its elongation [N/m or N m/rad]; else zero.
-        damping: Likewise [N s/m or N m s/rad].
+        stiffness: Stiffness of the plant's spring whose elongation is the port [N/m or N m/rad]; else zero.
+        damping: Damping of this spring [N s/m or N m s/rad]; else zero.
     """
 
     y: Array
@@ -47,11 +47,11 @@ class Action(eqx.Module):
     """All that an effect may do; every entry may be left out.
 
     Args:
-        force: On the port [N or N m]; may depend on the acceleration (added mass).
+        force: Force on the port [N or N m]; may depend on the acceleration (added mass).
         dry: Level of set-valued friction; its force is -dry times a direction in [-1, 1].
         stick: Level above `dry` that must be overcome to leave rest.
         rising: Level above `dry` while speed grows, forwards and backwards.
-        drive: What leaves the actuator path in place of `Signals.u`.
+        drive: Force of the drive after this effect, in place of `Signals.u` [N or N m].
         rate: Time derivative of the effect's internal state; affine in that state.
     """
 
@@ -132,24 +132,24 @@ class Effect(eqx.Module):
         """Return the relative change of every dry-friction level at time t."""
         return 0.0
 
-    # Whether the effect is a force beside the others, in proportion to those of its parameters
-    # that carry a force. False for what sits in the drive or acts on other effects.
+    # Whether the effect is an additional force, in proportion to those of its parameters
+    # that carry a force. False for an effect in the drive or on other effects.
     adds_force: ClassVar[bool] = True
-    # Whether it changes what the drive of its joint delivers.
+    # Whether it changes the force that the drive of its joint delivers.
     in_drive: ClassVar[bool] = False
-    # Whether it is the law of a spring: of a plant with springs, its place is an elongation.
+    # Whether it is the law of a spring; on a plant with springs it acts on an elongation.
     of_spring: ClassVar[bool] = False
-    # Whether only a plant with springs of its own (True), or only one without (False), can have it.
+    # True if only a plant with springs can have it, False if only one without; None: any plant.
     with_springs: ClassVar[bool | None] = None
     # Whether it is the same along every direction: then it may act on a tool, which moves along several.
     any_direction: ClassVar[bool] = False
-    # Whether a search looks for it on stages only: elsewhere what differs by direction is taken for it.
+    # Whether a search tries it on stages only: on other machines it would absorb any difference by direction.
     of_stages: ClassVar[bool] = False
-    # Whether a search looks for it only where [discover] asks: elsewhere a simpler effect is taken for it.
+    # Whether a search tries it only if [discover] requests it; otherwise it would replace a simpler effect.
     on_request: ClassVar[bool] = False
 
-    # Questions that shared code asks of an effect, whatever its kind. The first five name a parameter, or are
-    # None where the effect has no such parameter.
+    # Properties that shared code needs from effects of every kind. The first five name a parameter, or are
+    # None if the effect has no such parameter.
     # Level of dry friction while sliding (Coulomb's, LuGre's).
     sliding_level: ClassVar[str | None] = None
     # Level above sliding friction that must be overcome to leave rest, and that acts at rest only.
@@ -160,29 +160,29 @@ class Effect(eqx.Module):
     viscous_coefficient: ClassVar[str | None] = None
     # Factor from the declared force of the drive to the applied one.
     drive_gain: ClassVar[str | None] = None
-    # Whether it puts a part of the inertia behind a spring of its own, so that the machine resonates.
+    # Whether it puts a part of the inertia behind an additional spring, so that the machine resonates.
     adds_spring: ClassVar[bool] = False
     # Whether it lets a spring of the plant pass no force in a part of its range (a clearance).
     opens_spring: ClassVar[bool] = False
 
     @classmethod
     def delays_command(cls) -> bool:
-        """Return whether the class delays the command: simulated loops then remember past commands."""
+        """Check that the class delays the command: simulated loops then remember past commands."""
         return cls.command_delay is not Effect.command_delay
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        """Values from which a search starts, one dictionary a start.
+        """Return the values from which a search starts, one dictionary per start.
 
-        What enters linearly needs one start of natural size. What enters nonlinearly takes a grid,
-        fine enough that least squares closes the rest.
+        A linear parameter needs one start of natural size. A nonlinear one needs a grid that is
+        fine enough for least squares to converge.
         """
         own = parameters_of(cls).items()
         return [{n: scales.natural(i.dimension) for n, i in own if not i.optional}]
 
     @classmethod
     def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
-        """Bounds within which a search keeps a parameter, beside its sign.
+        """Return the bounds within which a search keeps a parameter, in addition to its sign.
 
         Beyond them the effect would only imitate another (a ripple longer than the stroke is any
         smooth force of position).
@@ -191,12 +191,12 @@ class Effect(eqx.Module):
 
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:
-        """Values at which the effect does next to nothing and its derivatives still exist."""
+        """Return values at which the effect is almost zero and its derivatives still exist."""
         return scaled(cls, cls.starts(scales)[0], 1e-9)
 
 
 def carries_force(info: ParameterInfo) -> bool:
-    """Return whether an added force is in proportion to a parameter."""
+    """Check that an added force is in proportion to a parameter."""
     return info.dimension.startswith(("force", "inertia"))
 
 

@@ -1,7 +1,7 @@
-"""The questions that the package asks of every plant, with the answers of a plain machine.
+"""The interface of every plant, with the defaults of a plain machine.
 
-A plain machine has no springs, no gears and no links in space; its joints are all of one kind. A plant that
-has more takes on a part (`jaxid.model.springs`, `gears`, `links`, `weight`) or overrides single answers.
+A plain machine has no springs, no gears and no links in space; its joints are all of one kind. Other plants
+inherit from a mixin (`jaxid.model.springs`, `gears`, `links`, `weight`) or override single methods.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PLACES = ("joint", "spring", "shaft", "passive", "tool")
 
 
 class PlantInterface(SearchHints):
-    """The answers of a plant without springs, gears and links."""
+    """The interface with the defaults of a plant without springs, gears and links."""
 
     kind: ClassVar[str]
     # Whether the mass matrix is diagonal: no linear system is solved then.
@@ -72,7 +72,7 @@ class PlantInterface(SearchHints):
         return None
 
     def any_motion(self, random: np.random.Generator) -> Float[np.ndarray, "3 n"]:
-        """Draw a possible position, a velocity and an acceleration, to test what the balance depends on.
+        """Draw a possible position, velocity and acceleration, to test the dependencies of the balance.
 
         Raises:
             InputError: If no position in a thousand is possible.

@@ -60,7 +60,7 @@ def parameter(
 
 def as_array(value: Any) -> Any:
     """Convert a number or list to a float64 array; return anything else unchanged."""
-    # Anything that is neither number nor list passes: JAX fills trees with markers of its own.
+    # Anything that is neither number nor list passes, because JAX fills trees with internal markers.
     if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool):
         return jnp.asarray(value, dtype=jnp.float64)
     return value

@@ -23,7 +23,7 @@ from jaxid.model.smoothing import Smoothing
 
 
 class Plant(PlantInterface):
-    """A machine: inertial forces and the effects that act beside them.
+    """A machine: inertial forces and additional effects.
 
     A plant must state its parameters as fields (`jaxid.model.parameter.parameter`), its `kind`, the number of
     `joints` if that is not one, and `inertial`. It may define `ports`. Everything else is inherited.
@@ -31,7 +31,7 @@ class Plant(PlantInterface):
     Args:
         effects: Forces beside the inertia, in the order of the drive.
         smoothing: Width of the smoothed sign of dry friction. It belongs to the numerics: the code that
-            evaluates the balance sets it by `smoothed`; a plant's own file neither declares nor reads it.
+            evaluates the balance sets it by `smoothed`; the file of a plant neither declares nor reads it.
     """
 
     effects: tuple[Effect, ...] = eqx.field(default=(), kw_only=True)
@@ -43,7 +43,7 @@ class Plant(PlantInterface):
 
     @property
     def ports_are_joints(self) -> bool:
-        """Whether there are no other ports: to differentiate `ports` takes half of all compile time."""
+        """True if all ports are joints; else the derivative of `ports` takes half of the compile time."""
         return type(self).ports is PlantInterface.ports
 
     def with_effect(self, effect: Effect) -> Self:

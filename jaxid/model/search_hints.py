@@ -11,7 +11,7 @@ from jaxid.model.effect import Effect
 class SearchHints(Drives):
     """The part of every plant that guides a search. Its answers hold for any plant.
 
-    A plant overrides them to leave out candidates that its motion cannot tell apart, or to name the
+    A plant overrides them to exclude candidates that its motion cannot distinguish, or to name the
     parameter that an effect would duplicate.
     """
 
@@ -22,12 +22,12 @@ class SearchHints(Drives):
 
     @property
     def starts_alone(self) -> bool:
-        """Whether starts from rest show break-away friction: no joint is pushed by more than its drive."""
+        """True if starts from rest show break-away friction, because only its drive pushes each joint."""
         return not self.coupled
 
     @property
     def designs_experiments(self) -> bool:
-        """Whether `discover` designs experiments unasked; for coupled joints that compiles for minutes."""
+        """True if `discover` designs experiments by default; for coupled joints that compiles for minutes."""
         return not self.coupled
 
     @classmethod
@@ -41,7 +41,7 @@ class SearchHints(Drives):
         return 0
 
     def accepts(self, effect: type[Effect], port: int, drives: int) -> bool:
-        """Return whether a search may name such an effect on a port."""
+        """Check that a search may add such an effect on a port."""
         springs = self.springs(self.joints) > 0
         if effect.with_springs not in (None, springs) or (effect.of_stages and not self.stage):
             return False

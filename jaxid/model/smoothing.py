@@ -38,7 +38,7 @@ class Smoothing(eqx.Module):
 def typical_velocity(
     plant: Plant, speeds: Float[np.ndarray, "rows n"], combine: Callable[[np.ndarray], float]
 ) -> np.ndarray:
-    """Return a typical velocity of all joints, or one for each if they do not move alike.
+    """Return a typical velocity of all joints, or one for each if joints have different kinds of motion.
 
     A root mean square over metres and radians together would have no meaning.
 

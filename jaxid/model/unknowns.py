@@ -228,5 +228,5 @@ def label(plant: Plant, kind: str, port: int) -> str:
 
 
 def several_places(plant: Plant) -> bool:
-    """Return whether effects need a place to be distinguished."""
+    """Check that effects need a place to be distinguished."""
     return plant.bodies(plant.joints) + plant.springs(plant.joints) > 1

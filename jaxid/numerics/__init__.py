@@ -1,1 +1,1 @@
-"""Numerical tools that know no machine: smooth functions, filters, precision, batched calls."""
+"""Numerical tools independent of any machine: smooth functions, filters, precision, batched calls."""

@@ -1,4 +1,4 @@
-"""Whether a function is affine in its arguments, read off its trace; and its matrix, if so."""
+"""Check from its trace that a function is affine in its arguments, and compute its matrix."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jax.extend.core import Jaxpr, Literal, jaxpr_as_fun
 
 from jaxid.arrays import Array
 
-# What becomes of the arguments on their way: not seen, affine, or anything else.
+# How a value depends on the arguments: not at all, affinely, or in any other way.
 _CONSTANT, _AFFINE, _OTHER = range(3)
-# Affine in all operands together; in the first alone; in any one of them.
+# Operations that are affine in all operands together; in the first alone; in any single one of them.
 _SUMS = {
     "add",
     "sub",
@@ -38,7 +38,12 @@ _PRODUCTS = {"mul", "dot_general"}
 
 
 class Affine(eqx.Module):
-    """`f(*args)` as offset plus matrices, one for every pair of a leaf that leaves and enters."""
+    """A function `f(*args)` as an offset plus matrices, one for every pair of an output and an input leaf.
+
+    Args:
+        offset: Value at zero arguments, a tree like the result of `f`.
+        matrices: For each output leaf the Jacobians with respect to all input leaves.
+    """
 
     offset: Any
     matrices: Any
@@ -57,15 +62,15 @@ class Affine(eqx.Module):
 
 
 def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
-    """Return a function as a matrix if it is affine; None if it is not, or may not be.
+    """Return a function as an affine map, or None if the trace does not prove that it is affine.
 
     Args:
-        f: Called with `args` and `fixed`; trees of arrays in and out.
+        f: The function, called with `args` and `fixed`; it takes and returns trees of arrays.
         args: Arguments in which it should be affine; only their shapes count.
         fixed: Arguments on which it should not depend at all.
 
     Returns:
-        The map; evaluating it costs as many products as its matrix has entries.
+        The map; its evaluation costs as many products as its matrix has entries.
     """
     zeros = jax.tree.map(jnp.zeros_like, args)
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*zeros, *fixed)
@@ -84,7 +89,7 @@ def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
 
 
 def is_affine(f: Callable, args: tuple, fixed: tuple = ()) -> bool:
-    """Return whether `affine` finds a matrix, without computing it."""
+    """Check that `affine` would return a map, without computing its matrix."""
     zeros = jax.tree.map(jnp.zeros_like, args)
     closed = jax.make_jaxpr(f)(*zeros, *fixed)
     entering = [_AFFINE] * len(jax.tree.leaves(args)) + [_OTHER] * len(jax.tree.leaves(fixed))
@@ -92,7 +97,7 @@ def is_affine(f: Callable, args: tuple, fixed: tuple = ()) -> bool:
 
 
 def depends(f: Callable, args: tuple) -> bool:
-    """Return whether the result of a function depends on its arguments, or may."""
+    """Check that the result of a function depends on its arguments, or may depend on them."""
     closed = jax.make_jaxpr(f)(*jax.tree.map(jnp.zeros_like, args))
     entering = [_OTHER] * len(jax.tree.leaves(args))
     return max(_follow(closed.jaxpr, entering), default=_CONSTANT) != _CONSTANT

@@ -1,4 +1,4 @@
-"""Filters, derivatives and resampling: what turns a log into signals that physics can read."""
+"""Filters, derivatives and resampling of logged signals."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.numerics.fft import fast_length, irfft, rfft
 
-# Periods of the cut-off over which a signal fades out beyond its ends: by then the roll-off's own
-# memory is 10^-4.
+# Periods of the cut-off over which a signal fades out beyond its ends. After as many periods the impulse
+# response of the roll-off has decayed to 10^-4.
 _MEMORY = 30
 
 
@@ -26,7 +26,7 @@ def butterworth_zero_phase(
 ) -> Float[np.ndarray, "time k"]:
     """Filter forwards and backwards by a Butterworth low-pass of the given order.
 
-    Run twice, the filter is 6 dB down at the cut-off and has no phase.
+    Because it runs twice, the filter is 6 dB down at the cut-off and has no phase.
 
     Raises:
         ValueError: If the cut-off does not lie below half the sampling rate.
@@ -47,12 +47,12 @@ def central_difference(x: Float[np.ndarray, "time k"], period: float) -> Float[n
 
 
 def running_median(x: Float[np.ndarray, "time k"], width: int) -> Float[np.ndarray, "time k"]:
-    """Return the median of each sample and its neighbours, `width` in all, which must be odd.
+    """Return the median of each sample and its neighbours, `width` samples in all (an odd number).
 
-    The windows that would reach beyond an end are replaced by Tukey's rule: the median of the
-    sample, of the first full window, and of the line through the first two full windows, as far
-    beyond the sample as that window lies before it. Reflected or repeated samples would bend a
-    ramp, and shrunken windows keep an outlier at the very end.
+    Windows that would reach beyond an end are replaced by Tukey's rule: the median of the sample, of
+    the median of the first full window, and of the line through the medians of the first two full
+    windows, extrapolated as far beyond the sample as that window lies before it. Reflected or repeated
+    samples would bend a ramp, and shrunken windows keep an outlier at the very end.
 
     Raises:
         ValueError: If the width is even, below 3, or not less than the samples.
@@ -71,9 +71,10 @@ def running_median(x: Float[np.ndarray, "time k"], width: int) -> Float[np.ndarr
 
 @cache
 def median_noise(width: int) -> float:
-    """Return the `high_band_std` of white noise of standard deviation one behind a running median.
+    """Return the `high_band_std` of white noise of standard deviation one after a running median.
 
-    Of noise that is larger than the signal's rise from sample to sample; found on Gaussian noise.
+    It is computed from Gaussian samples, and holds for noise that exceeds the signal's rise from sample to
+    sample.
     """
     white = np.random.default_rng(0).standard_normal((1 << 18, 1))
     return float(high_band_std(running_median(white, width))[0])
@@ -82,15 +83,15 @@ def median_noise(width: int) -> float:
 def parabolic_derivatives(
     x: Float[np.ndarray, "time k"], period: float, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and second derivative of the parabola through 2 reach + 1 samples about each one.
+    """Return the first and second derivative of a parabola fitted to 2 reach + 1 samples around each sample.
 
     The parabola is fitted by least squares (Savitzky and Golay); it is not causal and has no phase.
-    At the ends the first and the last one are read off the middle.
+    At the two ends the first and the last full parabola are evaluated away from their middle.
 
     Args:
-        x: Columns.
+        x: Signals by column, (time, k).
         period: Sampling time [s].
-        reach: Samples on each side.
+        reach: Number of samples on each side.
     """
     fit = lambda order: np.asarray(
         scipy.signal.savgol_filter(x, 2 * reach + 1, 2, deriv=order, delta=period, axis=0, mode="interp")
@@ -102,23 +103,23 @@ def parabolic_response(f: np.ndarray, reach: int, order: int) -> np.ndarray:
     """Return the gain of the parabola's derivative of order 1 or 2 over the exact one.
 
     Args:
-        f: Frequencies [cycles a sample].
-        reach: Samples on each side.
-        order: Of the derivative.
+        f: Frequencies [cycles per sample].
+        reach: Number of samples on each side.
+        order: Order of the derivative, 1 or 2.
     """
     steps = np.arange(-reach, reach + 1)
     weights = scipy.signal.savgol_coeffs(2 * reach + 1, 2, deriv=order, use="dot")
     w = 2 * np.pi * np.asarray(f, dtype=float)
     slow = w < 1e-4  # Round-off grows with w^-2; the gain differs from one by w^2.
     exact = np.where(slow, 1.0, w) ** order
-    # Odd weights see the sine, even ones the cosine, whose second derivative is negative.
+    # Odd weights respond to the sine, even weights to the cosine, whose second derivative is negative.
     seen = np.sin(np.outer(w, steps)) if order == 1 else -np.cos(np.outer(w, steps))
     return np.where(slow, 1.0, seen @ weights / exact)
 
 
 @cache
 def parabolic_cutoff(reach: int) -> float:
-    """Return the frequency at which half of the parabola's velocity remains [cycles a sample]."""
+    """Return the frequency at which the gain of the parabola's velocity is one half [cycles per sample]."""
     left = lambda f: float(parabolic_response(np.array([f]), reach, 1)[0]) - 0.5
     root = scipy.optimize.brentq(left, 1e-3 / reach, 1 / (2 * reach + 1))
     return float(root)  # pyright: ignore[reportArgumentType]  # stubs: also the full output
@@ -127,14 +128,20 @@ def parabolic_cutoff(reach: int) -> float:
 def spectral_derivatives(
     x: Float[np.ndarray, "time k"], period: float, cutoff_hz: float, orders: int = 2
 ) -> tuple[np.ndarray, ...]:
-    """Band-limit a signal and differentiate it, twice or so many times, exactly within the band.
+    """Band-limit a signal and differentiate it, exactly within the band.
 
-    Central differences are 10 % short where ten samples make a period; a resonance near a tenth
-    of the sampling rate needs this instead. A cubic through the ends is taken off first, so that
-    the periodic continuation has neither a jump nor a corner, and the roll-off is `roll_off`.
+    Central differences are 10 % too small at ten samples per period; a resonance near a tenth
+    of the sampling rate needs this function instead. A cubic through the ends is subtracted first, so that
+    the periodic continuation has neither a jump nor a corner. The response above the pass band is `roll_off`.
+
+    Args:
+        x: Signals by column, (time, k).
+        period: Sampling time [s].
+        cutoff_hz: Frequency above which nothing passes [Hz].
+        orders: Highest derivative that is wanted.
 
     Returns:
-        The signal, its first, its second and so many derivatives.
+        The band-limited signal and its derivatives of order 1 to `orders`, each (time, k).
     """
     n, span = len(x), (len(x) - 1) * period
     powers = np.linspace(0.0, 1.0, n)[:, None] ** np.arange(4)
@@ -154,9 +161,9 @@ def spectral_derivatives(
 
 
 def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
-    """Return a signal that is zero at both ends, then its odd continuation that fades out, then zeros.
+    """Return a signal, zero at both ends, followed by its odd continuation that fades out, and zeros.
 
-    The length suits a transform: one with a large prime factor takes ten times as long.
+    The length is one of a fast transform; a length with a large prime factor takes ten times as long.
     """
     pad = min(pad, len(x) - 2)
     fade = 0.5 * (1 + np.cos(np.pi * np.arange(1, pad + 1) / (pad + 1)))[:, None]
@@ -166,7 +173,7 @@ def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
 
 
 def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
-    """Return one up to 0.6 of the cut-off, zero beyond it, a half cosine between."""
+    """Return a gain of one up to 0.6 of the cut-off, zero above the cut-off, a half cosine between."""
     return 0.5 * (1 + np.cos(np.pi * np.clip((f / cutoff_hz - 0.6) / 0.4, 0.0, 1.0)))
 
 
@@ -179,21 +186,23 @@ def _end_slope(x: np.ndarray, period: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Decimator:
-    """Low-pass and keep one sample in `factor`: the parallel filter of inverse-dynamics fits.
+    """Low-pass filter and decimation by `factor`: the parallel filter of inverse-dynamics fits.
 
-    Model and measurement pass it alike, so that it biases neither. The filter is the one that is
-    customary for decimation, a Chebyshev low-pass of order eight run forwards and backwards, here
+    Model and measurement pass through the same filter, so that it biases neither. It is the usual filter
+    for decimation, a Chebyshev low-pass of order eight run forwards and backwards. It is
     applied as its squared magnitude in the frequency domain, so that JAX can differentiate, batch
     and compile it.
 
-    With a stated edge it is a Gaussian. A steep filter rings for a tenth of a second after every
-    reversal, where no model of dry friction fits a band-limited velocity; a Gaussian forgets it.
+    With an `edge` it is a Gaussian instead. A steep filter rings for a tenth of a second after every
+    reversal, because no model of dry friction fits a band-limited velocity there; a Gaussian does not ring.
 
     Args:
-        factor: One sample in so many is kept; 1 keeps all and does not filter.
-        trim: Samples left out at each end, after decimation.
-        edge: Where the Gaussian has fallen to a tenth, over half the sampling rate; absent: the
-            Chebyshev filter with its pass band up to 0.8 / factor, none where all are kept.
+        factor: One sample in `factor` is kept; 1 keeps all samples.
+        trim: Samples removed at each end, after decimation.
+        edge: Frequency at which the gain of the Gaussian is a tenth, over half the sampling rate; None:
+            the Chebyshev filter.
+        band: Edge of the Chebyshev filter's pass band, over half the sampling rate; None: 0.8 / factor,
+            and no filter if factor is 1.
     """
 
     factor: int
@@ -202,7 +211,7 @@ class Decimator:
     band: float | None = None
 
     def __call__(self, x: Float[Array, "time k"]) -> Float[Array, "kept k"]:
-        """Return the filter along the first axis, decimate and trim."""
+        """Filter along the first axis, decimate and trim."""
         if self.filters:
             x = self._low_pass(x)
         return x[self.trim : x.shape[0] - self.trim]
@@ -214,7 +223,7 @@ class Decimator:
 
     @property
     def filters(self) -> bool:
-        """Whether anything is filtered."""
+        """True if the samples are filtered at all."""
         return self.factor > 1 or self.edge is not None or self.band is not None
 
     @property
@@ -228,14 +237,14 @@ class Decimator:
 
     @property
     def reach(self) -> int:
-        """Samples of the log over which an event spreads: beyond, 10^-4 of it remains."""
+        """Samples of the log over which the filter spreads an event; beyond them 10^-4 of it remains."""
         if self.edge is None:
             return self.factor - 1 if self.filters else 0
         # Four standard deviations of the Gaussian in time.
         return int(np.ceil(4 * np.sqrt(2 * np.log(10)) / (np.pi * self.edge)))
 
     def band_hz(self, rate_hz: float) -> float:
-        """Return the edge of the pass band."""
+        """Return the edge of the pass band [Hz] at a sampling rate [Hz]."""
         return 0.5 * rate_hz * self.pass_band
 
     def response(self, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -260,16 +269,16 @@ class Decimator:
 
 
 def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every: int = 1) -> Array:
-    """Pass the columns of x through a response over frequency (cycles a sample), without ends.
+    """Pass the columns of x through a frequency response, without transients at the ends.
 
-    Odd extension at both ends keeps value and slope; a half cosine joins them over the rest of
-    the period.
+    An odd extension at both ends keeps value and slope; a half cosine joins the two extensions over the
+    rest of the period.
 
     Args:
-        x: Columns.
-        pad: Samples of the extension.
-        response: Over frequency.
-        every: One sample in so many is wanted, from the first on.
+        x: Signals by column, (time, k).
+        pad: Samples of the extension at each end.
+        response: Function from frequencies [cycles per sample] to the complex gain, (frequency, 1 or k).
+        every: Decimation factor; samples 0, every, 2 every, ... are returned.
     """
     n = x.shape[0]
     lead, pad = min(n - 1, pad + every - 1) // every * every, min(n - 1, pad)
@@ -282,7 +291,7 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
     whole = jnp.concatenate([head, x, tail, bridge])
     spectrum = jnp.fft.rfft(whole, axis=0) * response(np.fft.rfftfreq(every * few))
     if every > 1:
-        # Samples left out fold the spectrum: what is wanted takes a transform of its own length only.
+        # Decimation folds the spectrum, so that the inverse transform needs the decimated length only.
         mirrored = jnp.conj(spectrum[1 : every * few - spectrum.shape[0] + 1][::-1])
         both = jnp.concatenate([spectrum, mirrored]).reshape(every, few, -1)
         spectrum = jnp.sum(both, axis=0)[: few // 2 + 1] / every
@@ -293,20 +302,20 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
 def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: float) -> Float[Array, "time m"]:
     """Return the mean force around each sample of a command that acts `delay` later.
 
-    A command that is held acts from its sample on: seen at the samples it lags by half the time
-    for which it is held. Left out, that half looks like a delay, and a delay like damping.
+    A held command acts from its sample on, so that at the samples its mean lags by half of the hold time.
+    A model without this half would fit it as a delay, and a delay acts like damping.
 
     Args:
         u: Command at the samples, (time, m).
-        delay: Delay [s], one or one a column; the result is differentiable in it.
+        delay: Delay [s], a scalar or (m,); the result is differentiable in it.
         period: Sampling time [s].
-        hold: For how long each command is held [s]; zero where it is not. That is the sampling
+        hold: Time for which each command is held [s]; zero if it is not held. This is the sampling
             time of the controller, which may be shorter than the log's.
     """
 
     def response(f: np.ndarray) -> Array:
-        # Mean of the held command over its hold: its own lag and its own roll-off. Exact in the
-        # band; interpolation between samples is 1 % off at a sixth of the sampling rate.
+        # The mean of the held command over its hold time adds a lag and a roll-off. This is exact in the
+        # band, while interpolation between samples is 1 % off at a sixth of the sampling rate.
         lag = jnp.exp(-2j * jnp.pi * jnp.asarray(f)[:, None] * (delay + 0.5 * hold) / period)
         return lag * np.sinc(f * hold / period)[:, None]
 
@@ -314,16 +323,16 @@ def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: flo
 
 
 def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
-    """Return the standard deviation of white noise that would fill the top of the spectrum as x does.
+    """Return the standard deviation of white noise whose spectrum is as high as that of x at its top.
 
-    The median of the periodogram between 0.6 and 0.95 of Nyquist, over the median of an
-    exponential distribution: lines and a few bad frequencies do not move it.
+    It is the median of the periodogram between 0.6 and 0.95 of the Nyquist frequency, over the median of
+    an exponential distribution: spectral lines and a few bad frequencies do not change it.
     """
     window = _hann(len(x))
     spectrum = rfft(window[:, None] * scipy.signal.detrend(x, axis=0), axis=0)
     f = np.arange(len(spectrum)) / len(x)
     band = spectrum[(f > 0.3) & (f < 0.475)]
-    # `scipy.signal.periodogram` says the same, five times slower: studies ask it of every run, twice.
+    # `scipy.signal.periodogram` gives the same values five times slower; studies call this twice per run.
     power = np.median(band.real**2 + band.imag**2, axis=0) / np.sum(window**2)
     return np.sqrt(power / np.log(2.0))
 

@@ -1,7 +1,7 @@
-"""Estimators as steps: what is to be solved goes out, what was found comes back.
+"""Estimators as generators: they yield the problems to be solved and receive the solutions.
 
-An estimator that is written as a generator of `SolveRequest` can be run alone, or many of them together:
-those that ask for the same solver at the same shapes are stacked and solved in one compiled call.
+An estimator that is written as a generator of `SolveRequest` can run alone or together with others.
+Requests for the same solver at the same shapes are stacked and solved in one compiled call.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class SolveRequest(NamedTuple):
     """A compiled function and its arguments.
 
     Args:
-        function: Takes and returns trees of arrays; what is no array is static.
-        args: Of one run.
+        function: Compiled function that takes and returns trees of arrays; other leaves are static.
+        args: Arguments of the function for one run.
     """
 
     function: Callable
@@ -34,12 +34,12 @@ class SolveRequest(NamedTuple):
 
 
 class Precompile(NamedTuple):
-    """What will be asked for later, with other values: it may be compiled beside what runs until then.
+    """A call to compile ahead of time in a background thread.
 
     Args:
-        function: As it will be called; what it returns or raises now nobody sees.
-        args: Of the kind and of the shapes that it will get.
-        key: What its compiled code depends on: asked for once a process.
+        function: Function that will be called later; its result and its exceptions are discarded now.
+        args: Arguments with the types and shapes of the later call; their values do not matter.
+        key: Hashable key of the compiled code; each key is compiled once per process.
     """
 
     function: Callable
@@ -48,11 +48,11 @@ class Precompile(NamedTuple):
 
 
 class ParallelCalls(NamedTuple):
-    """A compiled function and the arguments of many calls of it, one to a core at a time.
+    """A compiled function and the arguments of many calls, which run in parallel, one per core.
 
     Args:
-        function: As of `SolveRequest`.
-        args: Of each call.
+        function: Compiled function, as in `SolveRequest`.
+        args: Arguments of each call.
     """
 
     function: Callable
@@ -63,11 +63,11 @@ Steps = Generator[SolveRequest | Precompile | ParallelCalls, Any, T]
 
 
 def run_alone(steps: Steps[T], behind: Precompile | None = None) -> T:
-    """Run steps one after the other.
+    """Run the generator of one estimator and return its result.
 
     Args:
-        steps: The steps.
-        behind: What will be asked for after them.
+        steps: Generator of the requests.
+        behind: Call that will follow later; it is compiled in the background from the first solve on.
     """
     answer = None
     while True:
@@ -92,7 +92,7 @@ _PREPARED: set = set()
 
 
 def _prepare(soon: Precompile) -> None:
-    """Call it in a thread of its own: compiling leaves Python's lock alone."""
+    """Call the function once in a background thread; compiling does not hold Python's lock."""
     if soon.key not in _PREPARED:
         _PREPARED.add(soon.key)
         _beside().submit(_called, soon)
@@ -104,16 +104,16 @@ def _beside() -> ThreadPoolExecutor:
 
 
 def _called(soon: Precompile) -> None:
-    # Who asks for it in earnest gets the error.
+    # An exception is ignored here because the later call raises it again.
     with contextlib.suppress(Exception):
         soon.function(*soon.args)
 
 
 def in_threads(function: Callable[..., T], args: Sequence[tuple]) -> list[T]:
-    """Return the results of many calls, one call a core at a time: compiled code releases Python's lock.
+    """Return the results of many calls, run in threads, one per core: compiled code releases Python's lock.
 
-    The first of its kind goes ahead of the others, which would all compile what it does. A call must not ask
-    for the same in its turn.
+    The first call of its kind runs before the others, since otherwise each of them would compile the same
+    code. The function must not call `in_threads` itself.
     """
     leaves, structure = jax.tree.flatten(args[0])
     kind = (function, structure, tuple(x.shape if isinstance(x, _ARRAYS) else type(x) for x in leaves))
@@ -136,18 +136,18 @@ def cores() -> int:
 
 
 def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
-    """Run the steps of several runs side by side, what is alike in one compiled call.
+    """Run the generators of several runs side by side, equal requests in one compiled call.
 
     Args:
-        many: One for each run.
-        lanes: Runs in a compiled call; fewer are filled up, so that one shape serves all, and a
-            run's bits do not depend on how many there are beside it.
+        many: Generators, one for each run.
+        lanes: Runs in one compiled call. A smaller batch is padded, so that one shape serves all, and the
+            bits of a run do not depend on how many others run beside it.
 
     Returns:
-        What each returns, or the exception that ended it.
+        For each run its result, or the exception that ended it.
     """
     ended: dict[int, T | Exception] = {}
-    # What waits to be solved: by what must be alike, the runs and their arrays, in the order of asking.
+    # Requests that wait to be solved: the runs and their arrays by key, in the order of the requests.
     groups: dict[Any, list[tuple[int, list[np.ndarray]]]] = {}
 
     def advance(k: int, answer: Any) -> None:
@@ -158,7 +158,7 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
             key, arrays = _parted(asked)
         except StopIteration as end:
             ended[k] = end.value
-        except Exception as error:  # it ends its own run only
+        except Exception as error:  # it ends this run only
             ended[k] = error
         else:
             groups.setdefault(key, []).append((k, arrays))
@@ -166,7 +166,7 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     for k in range(len(many)):
         advance(k, None)
     while groups:
-        # The largest group first: those left in small ones may grow meanwhile.
+        # The largest group is solved first; the smaller ones may grow meanwhile.
         key = max(groups, key=lambda key: len(groups[key]))
         some, groups[key] = groups[key][:lanes], groups[key][lanes:]
         if not groups[key]:
@@ -177,7 +177,7 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
 
 
 def _parted(asked: SolveRequest) -> tuple[Any, list[np.ndarray]]:
-    """Return the key that runs solved together share, and the arrays of this one."""
+    """Return the key that is common to runs solved together, and the arrays of this run."""
     leaves, structure = jax.tree.flatten(asked.args)
     arrays = [np.asarray(x) for x in leaves if isinstance(x, _ARRAYS)]
     static = tuple(_Hole if isinstance(x, _ARRAYS) else x for x in leaves)
@@ -186,7 +186,7 @@ def _parted(asked: SolveRequest) -> tuple[Any, list[np.ndarray]]:
 
 
 class _Hole:
-    """Stands where an array belongs."""
+    """Placeholder for an array among static leaves."""
 
 
 _ARRAYS = (np.ndarray, np.generic, jax.Array)
@@ -194,7 +194,7 @@ _ARRAYS = (np.ndarray, np.generic, jax.Array)
 
 def _solved(key: Any, runs: list[list[np.ndarray]], lanes: int) -> list[Any]:
     filled = [*runs, *[runs[-1]] * (lanes - len(runs))]
-    # Stacked by numpy: one transfer each, where JAX would dispatch an operation a run.
+    # Numpy stacks them, which needs one transfer each; JAX would dispatch one operation per run.
     stacked = [np.stack(x) for x in zip(*filled, strict=True)]
     found = jax.tree.map(np.asarray, _batched(*key[:3], stacked))
     leaves, structure = jax.tree.flatten(found)

@@ -1,4 +1,4 @@
-"""How well a log tells its parameters: covariance under coloured noise, and what it cannot tell."""
+"""Precision of estimated parameters: covariance under coloured noise, and unidentifiable directions."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from jaxtyping import Bool, Float
 from jaxid.arrays import Array
 from jaxid.numerics.fft import fast_length, irfft, rfft
 
-# A combination of parameters counts as untold where its standard deviation, seen as force or
-# position, exceeds this part of the measured signal itself.
+# A combination of parameters counts as unidentifiable if its standard deviation, expressed as force or
+# position, exceeds this part of the measured signal.
 _UNTOLD = 0.5
-# Relative to the largest, below this an eigenvalue of the scaled information is rounding.
+# An eigenvalue of the scaled information below this part of the largest one is rounding.
 _ROUNDING = 1e-12
-# Entries of a combination below this are left out when it is named.
+# Entries of a combination below this are omitted from its description.
 _NEGLIGIBLE = 0.1
-# Samples over which a residual may hang together: beyond, its covariance may wrap round.
+# Samples over which a residual may be correlated; beyond them its covariance may wrap around.
 _REMEMBERED = 4096
-# Samples over which innovations of two residuals may hang together.
+# Samples over which the innovations of two residuals may be correlated.
 _COMMON = 40
 
 
@@ -34,8 +34,8 @@ class NoiseModel:
     """Autoregressive model of a residual: e[k] = sum a[i] e[k-i] + innovation.
 
     Args:
-        coefficients: a, (order,).
-        innovation: Standard deviation of the innovation.
+        coefficients: Coefficients a of the model, (order,).
+        innovation: Standard deviation of the innovation, in the unit of the residual.
     """
 
     coefficients: Float[np.ndarray, " order"]
@@ -45,12 +45,12 @@ class NoiseModel:
     def fit(
         cls, e: Float[np.ndarray, " time"], counts: Bool[np.ndarray, " time"], largest: int = 40
     ) -> NoiseModel:
-        """Fit by Yule and Walker to the samples that count, the order by Akaike's criterion.
+        """Fit a model by the Yule-Walker equations, with the order by Akaike's criterion.
 
         Args:
-            e: Residual; entries that do not count are ignored.
-            counts: Which samples count; lags across gaps are estimated from pairs that both do.
-            largest: Highest order tried.
+            e: Residual, (time,); entries that do not count are ignored.
+            counts: Mask of the samples that count, (time,); lags across gaps use pairs that both count.
+            largest: Highest order that is tried.
         """
         e = np.where(counts, e, 0.0)
         samples = max(int(counts.sum()), 1)
@@ -60,7 +60,7 @@ class NoiseModel:
         r = _lagged(e, largest) / pairs
         if r[0] <= 0:
             return cls(np.zeros(0), 0.0)
-        # Taper: long lags are few pairs, and an untapered estimate need not be a covariance.
+        # Taper, because long lags have few pairs and an untapered estimate need not be a covariance.
         r = r * (1 - np.arange(largest + 1) / (largest + 1) * 1e-3)
         best, best_score = cls(np.zeros(0), float(np.sqrt(r[0]))), samples * np.log(r[0])
         a, variance = np.zeros(0), r[0]
@@ -81,22 +81,22 @@ class NoiseModel:
 
         Args:
             power: One-sided density at equal steps from zero to half the sampling rate [1/Hz].
-            rate_hz: Sampling rate.
-            order: Of the model.
+            rate_hz: Sampling rate [Hz].
+            order: Order of the model.
         """
         r = np.fft.irfft(power)[: order + 1] * rate_hz / 2
         a = scipy.linalg.solve_toeplitz(r[:-1], r[1:])
         return cls(a, float(np.sqrt(r[0] - a @ r[1:])))
 
     def whiten(self, x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, "time k"]:
-        """Return the innovation of each column, over its standard deviation."""
+        """Return the innovation of each column divided by its standard deviation."""
         out = x.copy()
         for i, a in enumerate(self.coefficients, start=1):
             out[i:] -= a * x[:-i]
         return out / self.innovation
 
     def whitened_counts(self, counts: Bool[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
-        """Return the samples whose whole past, as far as the model reaches, counts."""
+        """Return the mask of samples that count together with all past samples that the model uses."""
         out = counts.copy()
         for i in range(1, len(self.coefficients) + 1):
             out[i:] &= counts[:-i]
@@ -109,7 +109,7 @@ class NoiseModel:
         return self.innovation**2 / np.abs(np.fft.rfft(a, size)) ** 2
 
     def sample(self, rng: np.random.Generator, size: int, runs: int) -> np.ndarray:
-        """Return the draw residuals of this colour, (runs, size)."""
+        """Draw residuals with the spectrum of this model, (runs, size)."""
         burn = 20 * (len(self.coefficients) + 5)
         white = self.innovation * rng.standard_normal((runs, size + burn))
         a = np.concatenate([np.ones(1), -self.coefficients])
@@ -123,7 +123,7 @@ def _lagged(x: np.ndarray, largest: int) -> np.ndarray:
 
 
 def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[np.ndarray, "p p"]:
-    """Return J' R J with R the covariance of the residual: its colour seen through the regressor."""
+    """Return J' R J with J the Jacobian and R the covariance of the residual."""
     size = fast_length(len(jacobian) + min(len(jacobian), _REMEMBERED))
     weight = noise.density(size)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
@@ -139,8 +139,8 @@ def cross_sandwich(
 ) -> Float[np.ndarray, "p p"]:
     """Return J1' R12 J2 with R12 the covariance between two residuals.
 
-    Each is whitened by its own model; what their innovations have in common is a short covariance,
-    tapered, between the two models.
+    Each residual is whitened by its model. The covariance of the two innovations is short and tapered; it
+    is filtered by the two models.
     """
     time = len(jacobians[0])
     size = fast_length(time + min(time, _REMEMBERED))
@@ -158,14 +158,14 @@ def cross_sandwich(
 
 @dataclass(frozen=True)
 class Precision:
-    """What a Jacobian and a residual say of the parameters.
+    """Precision of the parameters from a Jacobian and a residual.
 
     Args:
-        covariance: (p, p), of the parameters that can be told; rows of the others are NaN.
-        identifiable: (p,).
-        unidentifiable: Combinations that cannot be told, each a dictionary from name to weight
+        covariance: Covariance of the identifiable parameters, (p, p); rows of the others are NaN.
+        identifiable: Mask of the identifiable parameters, (p,).
+        unidentifiable: Unidentifiable combinations, each a dictionary from name to weight
             in the scaled parameters.
-        information: Eigenvalues of the scaled information, relative to the largest.
+        information: Eigenvalues of the scaled information matrix, relative to the largest, (p,).
     """
 
     covariance: Float[np.ndarray, "p p"]
@@ -175,17 +175,17 @@ class Precision:
 
     @property
     def std(self) -> Float[np.ndarray, " p"]:
-        """Standard deviations; NaN where not identifiable."""
+        """Standard deviations, (p,); NaN for parameters that are not identifiable."""
         return np.sqrt(np.diag(self.covariance))
 
     def first(self, names: list[str]) -> Precision:
-        """Return the precision of the first parameters, of these names: the rest were nuisances."""
+        """Return the precision of the first parameters, which have these names, without the nuisances."""
         p = len(names)
         told = [c for c in self.unidentifiable if any(n in names for n in c)]
         return Precision(self.covariance[:p, :p], self.identifiable[:p], told, self.information)
 
     def beside(self, std: float) -> Precision:
-        """Return the precision with one parameter more, known from elsewhere to a standard deviation."""
+        """Return the precision with one more parameter, whose standard deviation is known independently."""
         p = len(self.covariance)
         covariance = np.zeros((p + 1, p + 1))
         covariance[:p, :p], covariance[p, p] = self.covariance, std**2
@@ -204,21 +204,21 @@ def assess(
     hessian: Float[np.ndarray, "p p"] | None = None,
     crossed: bool = False,
 ) -> Precision:
-    """Return the covariance of a least-squares fit under coloured noise, and its blind directions.
+    """Return the precision of a least-squares fit under coloured noise, with its unidentifiable directions.
 
     Args:
-        names: Of the parameters.
-        jacobian: Of the residual.
-        residual: At the fit.
-        counts: Which samples count.
+        names: Names of the p parameters.
+        jacobian: Jacobian of the residual, (time, n, p).
+        residual: Residual at the fit, (time, n).
+        counts: Mask of the samples that count, (time, n).
         signal: 2-norm of the measured signal that the residual belongs to.
-        scale: Natural size of each parameter, where its column vanishes.
-        hessian: In place of J'J, for the full-Hessian form.
-        crossed: Whether the columns of the residual have noise in common, as a reading and the command
-            that a loop makes of it; else they count as independent.
+        scale: Natural size of each parameter, (p,), which decides whether its column counts as zero.
+        hessian: Matrix used in place of J'J, for the full-Hessian form, (p, p).
+        crossed: Whether the columns of the residual have common noise, such as a reading and the command
+            that a loop computes from it; otherwise they count as independent.
 
     Returns:
-        The precision. The residual's colour is an autoregressive model, by column of the residual.
+        The precision. Each column of the residual gets an autoregressive noise model.
     """
     if not names:
         return Precision(np.zeros((0, 0)), np.zeros(0, bool), [], np.zeros(0))
@@ -233,7 +233,7 @@ def assess(
     meat = np.zeros_like(normal)
     noises = [NoiseModel.fit(e, c) for e, c in zip(residual.T, counts.T, strict=True)]
     for i, noise in enumerate(noises):
-        # Of a chain of many masses a balance holds few of the unknowns.
+        # In a chain of many masses each balance contains few of the unknowns.
         own = np.flatnonzero(np.any(rows[:, i] != 0, axis=0))
         meat[np.ix_(own, own)] += sandwich(rows[:, i, own] / norm[own], noise)
     for i, j in itertools.combinations(range(len(noises)) if crossed else (), 2):
@@ -256,7 +256,7 @@ def assess(
 
 
 def held(directions: Float[np.ndarray, "p k"]) -> Bool[np.ndarray, " p"]:
-    """Return a mask of the unknowns that unidentifiable orthonormal directions make unidentifiable."""
+    """Return the mask of unknowns that occur in unidentifiable orthonormal directions, (p,)."""
     return np.linalg.norm(directions, axis=1) > _NEGLIGIBLE
 
 
@@ -264,7 +264,7 @@ def named_directions(names: Sequence[str], directions: Float[np.ndarray, "p k"])
     """Return unidentifiable orthonormal directions as combinations of the unknowns by name."""
     untold = _sparse(directions)
     weight = np.abs(untold)
-    # Many small weights hold an unknown as one large one does: each is named at least once.
+    # An unknown may occur only with many small weights; it is still named at least once.
     named = weight > _NEGLIGIBLE
     named |= held(directions)[:, None] & (weight >= weight.max(axis=1, keepdims=True, initial=0.0))
     return [
@@ -274,9 +274,9 @@ def named_directions(names: Sequence[str], directions: Float[np.ndarray, "p k"])
 
 
 def _sparse(vectors: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
-    """Return a basis of the same space in which each vector alone contains some unknown.
+    """Return a basis of the same space in which each vector contains an unknown that no other contains.
 
-    Eigenvectors of one eigenvalue are mixed at will: of an arm's two dozen each would name every link.
+    Eigenvectors of one eigenvalue are arbitrary mixtures: for an arm each of two dozen would name every link.
     """
     if vectors.shape[1] < 2:
         return vectors
@@ -288,7 +288,7 @@ def _sparse(vectors: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
 
 
 def _signed(v: np.ndarray) -> np.ndarray:
-    """Return the direction with its first named entry positive: eigenvectors come with either sign."""
+    """Return the direction with its first named entry positive; the sign of an eigenvector is arbitrary."""
     first = v[np.argmax(np.abs(v) > _NEGLIGIBLE)]
     return v if first > 0 else -v
 
@@ -296,7 +296,7 @@ def _signed(v: np.ndarray) -> np.ndarray:
 def full_hessian(
     residual: Callable[[Float[Array, " p"]], Float[Array, "..."]], theta: Float[Array, " p"]
 ) -> Float[Array, "p p"]:
-    """Return the hessian of half the sum of squares, curvature of the residual included."""
+    """Return the Hessian of half the sum of squares, with the curvature of the residual."""
 
     def gradient(theta: Array) -> Array:
         e, push = jax.linearize(residual, theta)

@@ -1,7 +1,7 @@
 """Smoothed sign, absolute value, clip and dead zone: the only place where corners are rounded.
 
-Each takes the width over which the corner is rounded, in the units of its argument. As the width
-goes to zero each tends to its sharp namesake.
+Each function takes the width over which the corner is rounded, in the units of its argument. As the
+width goes to zero, each function tends to its sharp namesake.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _TINY = 1e-9
 
 def sign(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the smoothed sign, tanh(x / width)."""
-    # The reciprocal of a constant width is taken out of a loop, a division is not.
+    # The compiler moves the reciprocal of a constant width out of a loop, but not a division.
     return jnp.tanh(x * (1.0 / width))
 
 
@@ -29,7 +29,7 @@ def absolute(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array,
 def at_rest(x: Float[Array, "..."], width: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the smoothed indicator of x = 0: one at zero, 0.02 two widths away.
 
-    Used for what acts at rest only (break-away friction); its product with the smoothed sign
+    It is used for forces that act only at rest (break-away friction). Its product with the smoothed sign
     peaks at `REST_PEAK`, so callers that need a peak of one divide by it.
     """
     return jnp.exp(-((x / width) ** 2))
@@ -57,7 +57,7 @@ def ramp(
     x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
 ) -> Float[Array, "..."]:
     """Return the smoothed clip of x to 0 below and limit above, rounded over `width`, which may be zero."""
-    # Far above a limit that is next to nothing the two corners would cancel to a difference of infinities.
+    # For x far above a tiny limit the two corners would give a difference of infinities.
     rounded = width > _TINY * jnp.abs(x)
     safe = jnp.where(rounded, width, 1.0)
     soft = safe * (jax.nn.softplus(x / safe) - jax.nn.softplus((x - limit) / safe))
@@ -67,7 +67,7 @@ def ramp(
 def sharp_clip(x: Float[Array, "..."], limit: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the clip of x to plus or minus limit, not smoothed.
 
-    `jnp.clip` halves its derivative at ties, which costs two divisions in every loop.
+    It replaces `jnp.clip`, whose derivative is halved at ties, which costs two divisions in every loop.
     """
     return jnp.where(x > limit, limit, jnp.where(x < -limit, -limit, x))
 

@@ -33,7 +33,7 @@ def bezier_curve(
 
 
 def rest_to_rest(start: float, end: float) -> Float[np.ndarray, " points"]:
-    """Control points of a move from rest to rest."""
+    """Return the control points of a move from rest to rest."""
     return np.repeat([start, end], [_AT_START, _AT_END])
 
 
@@ -48,7 +48,7 @@ def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
     duration = values["duration"] or rest
     z = (grid.time - values["start_time"]) / duration
     if values["repeat"]:
-        # To and fro: the way back is the same curve, run backwards.
+        # The return move is the same curve, backwards in time.
         z = np.where(z > 0, 1.0 - np.abs(1.0 - np.mod(z, 2.0)), 0.0)
     return bezier_curve(points, np.clip(z, 0.0, 1.0))
 

@@ -1,4 +1,4 @@
-"""References that stand in a file."""
+"""References that are read from a CSV file."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
 
 
 def _resample(time: np.ndarray, position: np.ndarray, grid: Grid) -> np.ndarray:
-    """Straight lines between the rows; past the last row it holds."""
+    """Interpolate linearly between the rows, and hold the last row."""
     return np.interp(grid.time, time, position)
 
 

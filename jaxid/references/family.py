@@ -38,7 +38,7 @@ def number_list(shortest: int = 1) -> Reader:
 
 
 def is_number_list(value: Any) -> bool:
-    """Return whether a value is one list of numbers, rather than a list of such lists by joint."""
+    """Check that a value is one list of numbers, rather than a list of such lists by joint."""
     return not (is_list(value) and len(value) > 0 and all(is_list(entry) for entry in value))
 
 
@@ -59,7 +59,7 @@ about_zero = Reader(
 
 
 def is_about_zero(value: Any) -> bool:
-    """Return whether a value is one range about zero, rather than a list of them by joint."""
+    """Check that a value is one range about zero, rather than a list of them by joint."""
     listed = is_list(value) and len(value) > 0
     pair = listed and len(value) == 2 and all(_is_number(entry) for entry in value) and min(value) < 0
     return not listed or pair
@@ -126,9 +126,9 @@ class Family:
     """One kind of reference.
 
     Attributes:
-        kind: Its name in a case.
+        kind: Name of the family in a case.
         doc: One line for the user.
-        keys: Every parameter allowed, by name.
+        keys: All allowed parameters by name.
         sample: Function from the values of one joint to its positions at the grid's instants; with
             `together`, from the values of all joints to their positions, (samples, joints).
         unknown: Parameters that may be unknown, and are then fitted by `output_error`.
@@ -179,7 +179,7 @@ class Family:
 
     @property
     def schema(self) -> dict[str, Any]:
-        """JSON Schema of a table of this kind: a value, a list by joint, or an unknown."""
+        """Return the JSON Schema of a table of this kind: a value, a list by joint, or an unknown."""
         unknown = {"type": "object", "required": ["guess"]}
         out = schema_of(self.keys, self.doc)
         for name, entry in out["properties"].items():

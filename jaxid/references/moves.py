@@ -1,4 +1,4 @@
-"""Moves from rest to rest, strung together: trapezoids of velocity and S-curves."""
+"""Sequences of moves from rest to rest: trapezoids of velocity and S-curves."""
 
 import math
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ class Move:
     Times and distance may be JAX's, for positions that can be differentiated in them.
 
     Attributes:
-        distance: Way, with its sign [position].
-        ramp_time: From rest to the peak speed [s].
-        cruise_time: At the peak speed [s].
+        distance: Distance of the move, with its sign [position].
+        ramp_time: Time from rest to the peak speed [s].
+        cruise_time: Time at the peak speed [s].
     """
 
     distance: float
@@ -37,9 +37,9 @@ class Move:
         return 2.0 * self.ramp_time + self.cruise_time
 
     def position(self, time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-        """Way covered [position] at instants from the start of the move [s]; rest outside."""
+        """Return the distance covered [position] at instants from the start of the move [s]; rest outside."""
         xp = time.__array_namespace__()
-        # A move nowhere takes no time.
+        # A move over zero distance takes no time.
         peak = self.distance / xp.maximum(self.ramp_time + self.cruise_time, _NO_TIME)
         clipped = xp.clip(time, 0.0, self.duration)
         # Later than half time the move is itself, reversed in time and direction.
@@ -53,10 +53,10 @@ def plan_move(distance: float, speed: float, acceleration: float, jerk: float = 
     """Find the fastest move from rest to rest within limits that are the same in both directions.
 
     Args:
-        distance: Way, with its sign [position].
-        speed: Limit [position/s].
-        acceleration: Limit [position/s^2].
-        jerk: Limit [position/s^3]; infinite for a trapezoid of velocity.
+        distance: Distance of the move, with its sign [position].
+        speed: Limit of the speed [position/s].
+        acceleration: Limit of the acceleration [position/s^2].
+        jerk: Limit of the jerk [position/s^3]; infinite for a trapezoid of velocity.
     """
     if math.isinf(jerk):
         return plan_trapezoid(distance, speed, acceleration)
@@ -65,7 +65,7 @@ def plan_move(distance: float, speed: float, acceleration: float, jerk: float = 
 
 
 def plan_trapezoid(distance: float, speed: Any, acceleration: Any, xp: Any = np) -> Move:
-    """`plan_move` without a limit of jerk; limits may be JAX's, and `xp` is jax.numpy then."""
+    """Plan a move without a limit of jerk; the limits may be JAX arrays if `xp` is jax.numpy."""
     way = abs(distance)
     ramp_time = xp.minimum(speed / acceleration, xp.sqrt(way / acceleration))
     return Move(distance, ramp_time, xp.maximum(way / speed - ramp_time, 0.0))
@@ -102,7 +102,7 @@ def string_moves(
         now, here, turn = now + move.duration + values["dwell"], target, turn + 1
         if turn % len(targets) == 0:
             if now == round_start:
-                break  # Nowhere to go: it stands at its only target.
+                break  # The joint is already at its only target.
             if now - round_start < 2.0 / grid.rate_hz:
                 hint = "move further, more slowly, or raise the sampling rate"
                 raise grid.fault("a round of the targets takes less than two samples", hint)
@@ -116,7 +116,7 @@ def _trapezoid(values: dict[str, Any], grid: Grid) -> np.ndarray:
 
 
 def _followed(values: Mapping[str, Any], time: Any) -> Any:
-    """As `_trapezoid` with its targets visited once: a sum of moves, differentiable in its times."""
+    """Sample a trapezoid that visits its targets once: a sum of moves, differentiable in its times."""
     xp, now, here = time.__array_namespace__(), values["onset"], values["start"]
     position = xp.full(time.shape, here)
     for target in values["targets"]:

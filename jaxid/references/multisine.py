@@ -10,7 +10,7 @@ from jaxid.schema import Key, choice, flag, number, whole
 
 
 def _lines(values: dict[str, Any], samples: int, grid: Grid) -> np.ndarray:
-    """Harmonics of the period that lie in the band."""
+    """Return the harmonics of the period that lie in the band."""
     if len(values["band_hz"]) != 2:
         raise grid.fault("band_hz must hold two frequencies", "band_hz = [lowest, highest]")
     low, high = values["band_hz"]

@@ -30,9 +30,9 @@ class SCurve:
     """Seven segments of constant jerk, zero in the second, fourth and sixth.
 
     Attributes:
-        distance: Way, with its sign [position].
+        distance: Distance of the motion, with its sign [position].
         durations: Durations of the segments [s]; zero if a limit is not reached, (7,).
-        jerks: In the segments [position/s^3], (7,).
+        jerks: Jerks in the segments [position/s^3], (7,).
     """
 
     distance: float
@@ -45,7 +45,7 @@ class SCurve:
         return float(self.durations.sum())
 
     def position(self, time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-        """Way covered [position] at instants from the start of the motion [s]; rest outside."""
+        """Return the distance covered [position] at instants from the motion's start [s]; rest outside."""
         ends = np.cumsum(self.durations)
         state, states = np.zeros(3), []
         for h, jerk in zip(self.durations, self.jerks, strict=True):
@@ -65,14 +65,14 @@ class SCurve:
 def plan_s_curve(distance: float, bounds: MotionBounds) -> SCurve:
     """Find the fastest motion from rest to rest.
 
-    Velocity rises to a peak and falls back to zero. Rise and fall each take three segments, of which the
-    middle one has no length where the peak is reached before the limit of acceleration; without one of
-    constant velocity the peak is the one of which both together cover the way. That is in closed form where
-    both or neither reach their limits of acceleration, and the bracketed root of a polynomial of fourth
-    order where one does.
+    Velocity rises to a peak and falls back to zero. Rise and fall each take three segments. The
+    middle one has no length if the peak is reached before the limit of acceleration. Without a segment of
+    constant velocity, rise and fall together cover the distance, which determines the peak. It has a closed
+    form if both or neither reach their limits of acceleration; if only one does, it is the bracketed root of
+    a polynomial of fourth order.
 
     Args:
-        distance: Way, not negative [position].
+        distance: Distance of the motion, not negative [position].
         bounds: Bounds of a forward motion; a backward motion is its mirror image.
 
     Source:
@@ -93,21 +93,21 @@ def plan_s_curve(distance: float, bounds: MotionBounds) -> SCurve:
 
 
 def _segments(peak: float, limit: float, rise: float, fall: float) -> tuple[float, float, float]:
-    """Durations from rest to a peak velocity: acceleration grows, holds, falls."""
+    """Return the durations from rest to a peak velocity: acceleration grows, holds, falls."""
     both = 1 / rise + 1 / fall
     held = min(limit, np.sqrt(2 * peak / both))
     return held / rise, max(peak / held - held * both / 2, 0.0), held / fall
 
 
 def _way(peak: float, limit: float, rise: float, fall: float) -> float:
-    """Way from rest to a peak velocity."""
+    """Return the distance from rest to a peak velocity."""
     t1, t2, t3 = _segments(peak, limit, rise, fall)
     a = rise * t1
     return a * (t1**2 / 6 + t1 * t2 / 2 + t2**2 / 2 + (t1 / 2 + t2) * t3 + t3**2 / 3)
 
 
 def _peak(distance: float, bounds: MotionBounds) -> float:
-    """Velocity whose rise and fall cover the way, whatever the limit of velocity."""
+    """Return the peak velocity whose rise and fall cover the distance, without a limit of velocity."""
     _, gain, loss, rise, fall = bounds
     both, mean = 1 / rise + 1 / fall, 1 / (6 * rise) + 1 / (3 * fall)
     # Neither reaches its limit: each covers a^3 both mean.

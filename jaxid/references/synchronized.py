@@ -1,9 +1,9 @@
 """Motions of all joints together, along straight lines of joint space, as fast as bounds allow.
 
 Along a line every joint moves in proportion to one path parameter, which runs from 0 to 1: all start and end
-together. Each bound of that parameter is the tightest that any joint sets: the joint that is slowest by
-velocity, acceleration or jerk is at its bound, and the others are stretched in proportion to their way. That
-is the least time along the line, at least that of the slowest joint alone.
+together. Each bound of that parameter is the tightest of all joints: the joint that is slowest by
+velocity, acceleration or jerk is at its bound, and the others move in proportion to their distances. That
+is the shortest time along the line, at least that of the slowest joint alone.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def _sample(joints: list[dict[str, Any]], grid: Grid) -> Float[np.ndarray, "samp
                 raise grid.fault("a motion takes less than two samples", hint)
             now, here, still = now + curve.duration, target, 0
         elif values["dwell"] == 0:
-            # A round of nowhere to go would last for ever.
+            # A round of targets without any distance would never end.
             still += 1
             if values["points"] is not None and still >= len(values["points"]):
                 break
@@ -70,7 +70,7 @@ def _sample(joints: list[dict[str, Any]], grid: Grid) -> Float[np.ndarray, "samp
 
 
 def _targets(values: dict[str, Any], grid: Grid) -> Iterator[np.ndarray]:
-    """Points of joint space, in turn."""
+    """Yield points of joint space, one after the other."""
     points, polygon = values["points"], values["polygon"]
     if (points is None) == (polygon is None):
         what = "neither points nor polygon" if points is None else "both points and polygon"
@@ -85,7 +85,7 @@ def _targets(values: dict[str, Any], grid: Grid) -> Iterator[np.ndarray]:
 
 
 def _drawn(polygon: np.ndarray, seed: int, grid: Grid) -> Iterator[np.ndarray]:
-    """Points of uniform density within a convex polygon (polytope, of more than two joints), without end."""
+    """Yield random points, uniform in a convex polygon (a polytope for more than two joints), without end."""
     corners = _simplices(polygon, grid)
     sizes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
     edges, rng = np.cumsum(sizes) / sizes.sum(), np.random.default_rng(seed)

@@ -129,7 +129,7 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what the numbers depend on."""
+    """Return the versions of the packages on which the numbers depend."""
     return {name: version(name) for name in ("jaxid", "jax", "diffrax", "numpy")}
 
 
@@ -252,7 +252,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "steps": [
             step_json(r, result.session.machine.plant)
             for k, r in enumerate(result.rounds)
-            # The baseline, and what changed it; the last round mostly adds nothing.
+            # The baseline, and the rounds that changed it; the last round mostly adds nothing.
             if k == 0 or r.step.added or r.step.dropped
         ],
         "gap": {

@@ -1,4 +1,4 @@
-"""The case with what a fit or a search found in it, as an object and as a file."""
+"""The case with the results of a fit or a search, as an object and as a file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _DIGITS = 9
 # Keys whose text is a file name relative to the case, and texts that name a class in such a file.
 _FILES = ("log", "file", "urdf", "mjcf")
 _CLASS = re.compile(r"(.+\.py):\w+$")
-# Where the parameters of a link stand in a table [[plant.links]]: key and entry.
+# Key and entry of each parameter of a link in a table [[plant.links]].
 _LINKS = {
     **{part: ("first_moment", k) for k, part in enumerate(TEN[1:4])},
     **{part: ("inertia", k) for k, part in enumerate(TEN[4:])},
@@ -44,7 +44,7 @@ Index = int | tuple[int, int] | None
 
 @dataclass(frozen=True)
 class Findings:
-    """What a result has to say to its case.
+    """The changes of a case that follow from a result.
 
     Args:
         plant: New guesses of [plant.parameters] by name and entry.
@@ -143,7 +143,7 @@ def _with_guess(value: Any, index: Index, guess: float | None) -> Any:
 
 
 def case_text(result: FitResult, folder: Path) -> str:
-    """Return the case with what was found as TOML.
+    """Return the case with the results as TOML.
 
     The text of the case file is edited, so that comments and order stay. A case without a file, or whose
     file writes its effects as one list, is written anew.
@@ -155,7 +155,7 @@ def case_text(result: FitResult, folder: Path) -> str:
     Raises:
         InputError: If the case has been changed in Python since its file was read.
     """
-    # Loaded here: writing a case is all that needs it.
+    # Imported here, because only the writing of a case needs it.
     import tomlkit
 
     case = result.session.declared
@@ -183,7 +183,7 @@ def case_text(result: FitResult, folder: Path) -> str:
 
 
 def save_found_case(result: FitResult, path: Path, *, overwrite: bool = False) -> Path:
-    """Write the case with what was found; see `FitResult.save_case`."""
+    """Write the case with the results; see `FitResult.save_case`."""
     if path.is_dir() or not path.parent.is_dir():
         what = "is a folder" if path.is_dir() else "has no such folder"
         raise InputError(
@@ -196,7 +196,7 @@ def save_found_case(result: FitResult, path: Path, *, overwrite: bool = False) -
 
 
 def changed_in_python(case: Case) -> bool:
-    """Return whether a case differs from the file, or the tables, that it was read from."""
+    """Check that a case differs from the file, or the tables, from which it was read."""
     source = _source(case)
     return source is None or repr(load_case(source)) != repr(case)
 
@@ -240,7 +240,7 @@ def _put_plant(table: Any, case: Case, name: str, guesses: Mapping[Index, float]
     if "links" in table:
         for index, guess in guesses.items():
             key, entry = _LINKS.get(name, (name, None))
-            # Of one link's list this is one entry; the others are put by their own names.
+            # This is one entry of a link's list; the other entries are written under their names.
             link = table["links"][index]
             places = 1 if entry is None else len([part for part in _LINKS.values() if part[0] == key])
             _put(link, key, {entry or 0: guess}, places, (values[index],) * places)

@@ -26,8 +26,8 @@ class Parameter:
 
     Args:
         name: Name in results, such as "inertia" or "coulomb_friction[2].level".
-        value: Estimate in `unit`; NaN where the log does not determine it.
-        std: Standard deviation in `unit`; NaN likewise.
+        value: Estimate in `unit`; NaN if the log does not determine it.
+        std: Standard deviation in `unit`; NaN if the log does not determine the parameter.
         unit: Label of the unit.
         identifiable: Whether the log determines the parameter.
         guess: Value at which the fit started; None for an effect that a search added.
@@ -50,7 +50,7 @@ class ParameterTable(Mapping[str, Parameter]):
     """The parameters of a result by name, in the order of the estimate.
 
     Args:
-        parameters: The entries in their order; each has a name of its own.
+        parameters: The entries in their order; each has a unique name.
     """
 
     def __init__(self, parameters: Sequence[Parameter]):
@@ -62,7 +62,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
         Args:
             estimate: The estimate.
-            start: Unknowns of the case, at the values where the fit started.
+            start: Unknowns of the case, with the values at which the fit started.
         """
         guesses = {f.name: f.guess for f in start.free}
         free = estimate.machine.parameters.free
@@ -136,7 +136,7 @@ class Covariance:
 
     @property
     def correlation(self) -> Float[np.ndarray, "p p"]:
-        """Correlation coefficients, from -1 to 1; NaN where the covariance is, or a deviation is zero."""
+        """Correlation coefficients, from -1 to 1; NaN if the covariance is NaN, or a deviation is zero."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return self.matrix / np.outer(self.std, self.std)
 
@@ -163,7 +163,7 @@ class Residuals:
     Args:
         name: Name of the log in results.
         time: Time of the log's samples [s], (N,).
-        position: Measured minus simulated position, (N, n); NaN for a joint without an encoder; None where
+        position: Measured minus simulated position, (N, n); NaN for a joint without an encoder; None if
             the simulation diverges.
         force_time: Time of the samples that the force balance uses [s], (K,); they are some of `time`.
         force: Measured force minus force by inverse dynamics behind the recipe's filter, (K, n); NaN at rest.

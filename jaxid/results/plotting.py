@@ -34,7 +34,7 @@ _INTERVAL = 1.96
 
 @dataclass(frozen=True)
 class Selection:
-    """What a plot is to show of a result.
+    """Options of a plot of a result.
 
     Args:
         log: Name or number of the log, the fitted one being "fit" or 0.
@@ -81,7 +81,7 @@ def _drawn(kinds: Mapping[str, Callable], result: object, kind: str, ax: Axes | 
     if ax is not None:
         kinds[kind](ax, result, at)
         return ax
-    # Only here: a figure of the user's needs none of pyplot's state.
+    # Imported only here, because a figure that the user gives does not need pyplot.
     from matplotlib import pyplot
 
     figure, ax = pyplot.subplots(figsize=_SIZE, layout="constrained")
@@ -216,7 +216,7 @@ def _candidates(ax: Axes, result: Fitted, at: Selection) -> None:
 
 
 def _named(name: str | None, names: Sequence[str]) -> str:
-    """Return a name that is among those known, the first where none is given."""
+    """Return a name after a check that it is known; the first one if none is given."""
     if name is not None and name not in names:
         raise InputError(f"parameter {name!r} is not known", hint=suggest(name, names))
     return names[0] if name is None else name

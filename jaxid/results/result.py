@@ -1,4 +1,4 @@
-"""What the results of `identify` and `discover` have in common: parameters, residuals, plots and tables."""
+"""The common base of the results of `identify` and `discover`: parameters, residuals, plots and tables."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class FitResult:
         return self.parameters.to_pandas()
 
     def case(self) -> Case:
-        """Return the case with what was found: estimates as guesses, and the effects that a search added.
+        """Return the case with the results: estimates as guesses, and the effects that a search added.
 
         A known value stays known. An unknown that the log does not determine keeps its guess.
         """
@@ -126,7 +126,7 @@ class FitResult:
         return found_case(self)
 
     def save_case(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the case with what was found as TOML, with all else of the case as it was, comments too.
+        """Write the case with the results as TOML; all else stays as in the case file, with its comments.
 
         File names in it are rewritten to hold from the new folder.
 

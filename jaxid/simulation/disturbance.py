@@ -10,9 +10,9 @@ from jaxid.logs.log import Log
 from jaxid.logs.readers import read_columns
 from jaxid.settings import Disturbance
 
-# A disturbance switches at start + k (on + off); the tick at that very instant still sees the
-# old value, and a time stamp that is off by its rounding must not change that. In parts of
-# on + off: half a microsecond at a usual 0.5 s, far below any tick, above the jitter of logs.
+# A disturbance switches at start + k (on + off). The tick at that instant still has the old value, and a
+# rounding error of its time stamp must not change that. The tolerance is relative to on + off: half a
+# microsecond at a usual 0.5 s, far below any tick and above the jitter of logs.
 _SWITCH = 1e-6
 
 
@@ -23,19 +23,19 @@ def disturbance_at(
 ) -> Float[np.ndarray, "ticks _"]:
     """Sample the disturbance that is added to the command in a loop.
 
-    A square wave is on for start < t <= start + on, and so on every on + off: the tick at the
-    very instant of switching still sees the old value, however its time stamp is rounded.
+    A square wave is on for start < t <= start + on, and repeats with the period on + off. The tick at the
+    instant of switching still has the old value, however its time stamp is rounded.
 
     Args:
         disturbance: A square wave, the name of a column, or None for zero.
-        times: The ticks [s], on the clock of the log.
-        log: Whose file has the column; its values are held between its samples.
+        times: Times of the ticks on the clock of the log [s].
+        log: Log whose file has the column; the values are held between its samples.
 
     Returns:
         The disturbance at each tick, in units of the command.
 
     Raises:
-        InputError: If there is no such column, or no log to have it.
+        InputError: If there is no such column, or no log is given.
     """
     times = np.asarray(times, dtype=np.float64)
     if disturbance is None:
@@ -51,13 +51,13 @@ def disturbance_at(
 def _column(name: str, times: np.ndarray, log: Log | None) -> np.ndarray:
     where = f"disturbance = '{name}'"
     if log is None:
-        hint = "give { level, on, off, start } in its place"
-        raise InputError("a column needs a log to stand in", where=where, hint=hint)
+        hint = "give { level, on, off, start } instead"
+        raise InputError("a column needs a log that contains it", where=where, hint=hint)
     values = read_columns(log.source, [name], log.rows)[0][name]
     if not np.isfinite(values).all():
         row = log.rows[0] + int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         hint = "correct that row, or cut it out with rows"
         raise InputError(f"row {row} is not a number", where=f"{log.source}, {where}", hint=hint)
-    # A tick belongs to the sample at its own instant, however that is rounded.
+    # A tick at the time of a sample belongs to this sample, however its time is rounded.
     held = np.searchsorted(log.time, times + 1e-3 * log.period, side="right") - 1
     return values[np.clip(held, 0, len(values) - 1)]

@@ -22,12 +22,12 @@ def need_finite_effects(plant: Plant, data: Prepared, source: str) -> None:
     """Refuse a user-defined effect whose force, or a derivative of it, is not finite along a log.
 
     Args:
-        plant: The plant at its guesses.
-        data: The log, prepared; its moving samples are used.
+        plant: Plant with the guesses as its parameters.
+        data: The prepared log; its moving samples are used.
         source: Name of the log, for the message.
 
     Raises:
-        InputError: If there is such an effect.
+        InputError: If an effect gives a force or a derivative that is not finite.
     """
     user_defined = [e for e in plant.effects if not type(e).__module__.startswith("jaxid.")]
     moving = data.kept[data.moving.any(axis=1)]

@@ -22,9 +22,14 @@ class ForceData(eqx.Module):
     """Arrays of a prepared log, as compiled code takes them.
 
     Args:
-        q, qd, qdd, force: At the log's rate.
-        weight: Of each kept sample, (kept, n); zero where it does not count.
+        q, qd, qdd, force: Prepared motion and declared force at the log's rate, (time, n) and (time, m).
+        weight: Weight of each kept sample, (kept, n); zero for a sample that does not count.
         start: Time of the first sample, from the start of the log [s].
+        period: Sampling time of the log [s].
+        hold: Time for which a command is held [s]; zero if it is not held.
+        decimator: Filter that the balance passes through.
+        measured: Whether each joint has an encoder.
+        steps: Integration steps per sample for the motion of joints without an encoder.
     """
 
     q: Float[Array, "time n"]
@@ -59,7 +64,7 @@ class ForceData(eqx.Module):
 
 
 def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
-    """Return the inverse dynamics minus declared force, filtered alike and decimated [N or N m]."""
+    """Return inverse dynamics minus declared force, passed through one filter and decimated [N or N m]."""
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     motion = whole_motion(plant, data, u)
@@ -67,7 +72,7 @@ def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
 
 
 def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array, Array]:
-    """Return position, velocity and acceleration of all joints, encoder or not, (time, n)."""
+    """Return position, velocity and acceleration of all joints, with and without encoder, (time, n)."""
     times = data.start + data.period * jnp.arange(data.q.shape[0])
     return complete_motion(plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps)
 
@@ -80,10 +85,10 @@ def force_and_columns(
 
     Args:
         plant: The plant.
-        places: Of the unknowns.
-        data: The log.
-        theta: The unknowns.
-        directions: In which the derivatives are taken, (unknowns, c). Absent: each unknown has its own.
+        places: Places of the unknowns in the plant.
+        data: Arrays of the prepared log.
+        theta: Values of the unknowns, (p,).
+        directions: Directions of the derivatives, (p, c); None: one derivative for each unknown.
     """
 
     def residual(step: Array) -> tuple[Array, Array]:
@@ -97,7 +102,7 @@ def force_and_columns(
 
 
 def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
-    """Return the declared force by joint through the same filter [N or N m]; zero where none is driven."""
+    """Return the filtered declared force by joint [N or N m]; zero for a joint without a drive."""
     u = signals.delayed(data.force, jnp.zeros(()), data.period, hold=data.hold)
     return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
 
@@ -105,8 +110,8 @@ def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
 def sharpened(plant: Plant, data: Prepared) -> Plant:
     """Return the plant with a sign as sharp as its log allows.
 
-    The width is a third of the rest velocity: samples nearer to zero are left out, so that the
-    smoothing biases nothing.
+    The width is a third of the rest velocity. Slower samples do not count, so that the smoothing does not
+    bias the fit.
     """
     rest_velocity = np.asarray(data.recipe.rest_velocity)[None]
     return plant.smoothed(np.asarray(1 / 3), typical_velocity(plant, rest_velocity, np.min))

@@ -1,9 +1,9 @@
-"""From plant, loop and input to a trajectory: a fixed-step scan, and diffrax.
+"""Simulation of a plant in open or closed loop by a scan over samples, or with diffrax.
 
-The scan over the samples serves sampled loops and fits; between samples it takes fixed steps or a
-solver of diffrax. `with_diffrax` serves a force that is any function of time, on the same right-hand
-side. A command that is held is held outside the integration step: a continuous controller is a
-different model from a sampled one.
+The scan over the samples is for sampled loops and fits; between samples it takes fixed steps or a
+solver of diffrax. `with_diffrax` takes a force that is any function of time, with the same right-hand
+side. The hold of a command is applied outside the integration step, because a continuous controller is
+a different model from a sampled one.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
     import diffrax
 
 # Largest product of step and fastest decay for which the fourth-order step keeps both trajectory
-# and gradient (2.78 is where it turns unstable; past 1 the gradient error grows beyond 1 %).
+# and gradient (it becomes unstable at 2.78; beyond 1 the gradient error exceeds 1 %).
 _LARGEST_STEP = 1.0
 
 
 class Trajectory(eqx.Module):
-    """What a simulation returns, one row a sample.
+    """Trajectory of a simulation, one row per sample.
 
     Args:
-        position: (time, n) [m or rad].
-        velocity: (time, n).
+        position: Simulated position, (time, n) [m or rad].
+        velocity: Simulated velocity, (time, n) [m/s or rad/s].
         command: Logged command, (time, m), before the declared gain.
         reading: Position as the sensor reports it, (time, n).
-        found: What a law that identifies had found, see `Controller.learned`; else None.
+        found: Estimates of a law that identifies, see `Controller.learned`; None for other laws.
     """
 
     position: Float[Array, "time n"]
@@ -52,16 +52,16 @@ class Trajectory(eqx.Module):
 
 
 class Drive(eqx.Module):
-    """How a sampled force acts: declared gain, hold and delay.
+    """The drive between command and force: declared gain, hold, delay and integration steps.
 
     Args:
         gain: Declared force per unit of command, (m,).
         period: Time between samples of the command [s].
-        hold: "zero_order", "linear" or "band_limited".
-        substeps: Integration steps a sample.
+        hold: Course of the command between samples: "zero_order", "linear" or "band_limited".
+        substeps: Integration steps per sample.
         set_valued: Whether dry friction sticks exactly (replay) or is smoothed (gradients).
         longest_delay: Samples of past command kept for delays in a closed loop.
-        solver: Takes the place of fixed steps where given; dry friction is then smoothed.
+        solver: Solver that replaces the fixed steps; dry friction is then smoothed. None: fixed steps.
     """
 
     gain: Array
@@ -77,13 +77,13 @@ class Drive(eqx.Module):
     ) -> Callable[[State, tuple[Array, ...], Array], State]:
         """Return a function that advances a state by one sample, given the force at its ends, and the time.
 
-        To be called outside the loop over the samples: where the plant's forces are affine, its
-        flow is one matrix, worked out here once.
+        Call it outside the loop over the samples: if the plant's forces are affine, its flow is one matrix,
+        which is computed here once.
 
         Args:
-            plant: The plant.
-            x, ends: A state and the force at the ends of a sample, for their shapes; one force
-                where it is held.
+            plant: The plant to simulate.
+            x, ends: A state and the force at the ends of a sample, for their shapes; a held force
+                is given once.
         """
         if self.solver is not None:
             whole, solver = jnp.asarray(self.period), self.solver
@@ -125,17 +125,17 @@ def open_loop(
     """Simulate a plant under a logged command.
 
     Args:
-        plant: The plant.
-        drive: How the command acts.
+        plant: The plant to simulate.
+        drive: Gain, hold and integration of the command.
         command: Logged command, (time, m).
-        position, velocity: At the first sample.
-        sensor: What reads the position; absent: exact.
+        position, velocity: State at the first sample, (n,) each.
+        sensor: Sensor of the position; None: exact readings.
         reset: Samples at which a segment starts (time,) bool, and the positions and velocities
             to restart from, (time, n); for multiple shooting.
         start: Time of the first sample, from the start of the log [s].
-        own: Own states of the effects there; absent: as if the drive had long been at its force.
-        past: Logged command before the first sample, for what a delay still holds back; absent:
-            as at the first sample.
+        own: Internal states of the effects at the first sample; None: the steady states at its force.
+        past: Logged command before the first sample, which a delay needs, (earlier, m); None: equal to
+            the first sample.
     """
     earlier = 0 if past is None else past.shape[0]
     known = command if past is None else jnp.concatenate([past, command])
@@ -163,8 +163,8 @@ def open_loop(
 def interval_forces(plant: Plant, drive: Drive, command: Float[Array, "time m"]) -> tuple[Array, Array]:
     """Return the declared force at the start and the end of every interval, delay applied.
 
-    A delay that is no whole number of samples is averaged over the interval: taken literally, a
-    held command has zero gradient in it.
+    A fractional delay is averaged over the interval. An exact treatment would give a held command a zero
+    gradient with respect to the delay.
     """
     force = drive.gain * command
     n, drives = force.shape
@@ -196,18 +196,18 @@ def closed_loop(
     """Simulate a plant in its sampled loop.
 
     Args:
-        plant: The plant.
-        drive: How the command acts; `drive.period` is the controller's.
-        controller: The law.
-        reference: Of the joints that are driven, at every tick, (ticks, m).
-        disturbance: Added to the command at every tick, before its limit.
-        position, velocity: At the first tick.
-        sensor: What the controller reads; absent: exact.
-        noise: Standard normal numbers for the sensor's noise, of the positions and, where there are more
-            columns, of the measured commands and the inertial sensors; absent: none.
+        plant: The plant to simulate.
+        drive: Gain, hold and integration of the command; `drive.period` is the controller's.
+        controller: The sampled control law.
+        reference: Reference of the driven joints at every tick, (ticks, m).
+        disturbance: Disturbance added to the command at every tick before its limit, (ticks, m or 1).
+        position, velocity: State at the first tick, (n,) each.
+        sensor: Sensor that the controller reads; None: exact readings.
+        noise: Standard normal numbers for the noise of the positions and, if there are more
+            columns, of the measured commands and the inertial sensors; None: no noise.
 
     Returns:
-        One row a tick.
+        The trajectory, one row per tick.
     """
     sensor, n = Sensor() if sensor is None else sensor, position.size
     driven = plant.driven(position.size)
@@ -281,13 +281,13 @@ def initial_state(
     velocity: Float[Array, " n"] | None = None,
     force: Float[Array, " m"] | None = None,
 ) -> State:
-    """Return the state of a plant from its motion, the effects' internal states those of a constant force.
+    """Return the state of a plant at a motion, with the effects' internal states of a constant force.
 
     Args:
-        plant: The plant.
-        position: Coordinates, (n,) [m or rad].
-        velocity: Their rates, (n,); absent: at rest.
-        force: Declared force under which the drives have long been, (m,) [N or N m]; absent: zero.
+        plant: The plant whose state is built.
+        position: Coordinates of the joints, (n,) [m or rad].
+        velocity: Velocities of the joints, (n,) [m/s or rad/s]; None: at rest.
+        force: Constant declared force that gives the internal states, (m,) [N or N m]; None: zero.
     """
     position = jnp.asarray(position, dtype=jnp.float64)
     velocity = jnp.zeros_like(position) if velocity is None else jnp.asarray(velocity, dtype=jnp.float64)
@@ -312,15 +312,15 @@ def with_diffrax(
     """Simulate with any diffrax solver on the same right-hand side (smoothed friction).
 
     Args:
-        plant: The plant.
+        plant: The plant to simulate.
         force: Declared force as a function of time, (m,).
-        times: Where the motion is wanted [s].
-        position, velocity: At times[0].
-        solver: Default Tsit5.
-        controller: Step-size control; default PID at 1e-8, or constant where `step_length` is given.
-        step_length: Fixed step [s].
-        adjoint: How diffrax differentiates; default its own.
-        max_steps: Longest run.
+        times: Times at which the motion is returned [s].
+        position, velocity: State at times[0], (n,) each.
+        solver: Solver of diffrax; by default Tsit5.
+        controller: Step-size control; by default PID at 1e-8, or constant if `step_length` is given.
+        step_length: Length of a fixed step [s].
+        adjoint: Method by which diffrax differentiates; by default RecursiveCheckpointAdjoint.
+        max_steps: Largest number of integration steps.
 
     Returns:
         Positions and velocities, (time, n).
@@ -352,14 +352,14 @@ def with_diffrax(
 
 
 def needed_substeps(plant: Plant, drive: Drive, q: Array, v: Array, u: Array) -> int:
-    """Return the integration steps a sample that the smoothed sign needs along a motion.
+    """Return the integration steps per sample that the smoothed sign needs along a motion.
 
-    Past that, the trajectory still looks plausible while its gradient is garbage: level times
-    step over (mass times width) must not exceed about one.
+    The level times the step over (mass times width) must not exceed about one. With longer steps the
+    trajectory is still plausible, but its gradient is wrong.
 
     Args:
-        plant: The plant.
-        drive: Its period counts.
+        plant: The plant with its smoothed sign.
+        drive: The drive; only its period is used.
         q, v, u: Motion and declared force at some samples, (time, n) and (time, m).
     """
     times = jnp.zeros(q.shape[0])
@@ -369,7 +369,7 @@ def needed_substeps(plant: Plant, drive: Drive, q: Array, v: Array, u: Array) ->
         slope = jax.jacfwd(lambda v: acceleration(plant, State(q, v, own), u, t))(v)
         return jnp.abs(slope).max()
 
-    # A motion that passes through rest between two samples meets the corner all the same.
+    # The velocity may also change its sign between two samples: then zero velocity is evaluated too.
     passes = v * jnp.concatenate([v[1:], v[-1:]]) < 0
     v = jnp.concatenate([v, jnp.where(passes, 0.0, v)])
     q, u, times = (jnp.concatenate([a, a]) for a in (q, u, times))

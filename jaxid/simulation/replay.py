@@ -1,4 +1,4 @@
-"""A machine run over the input of a log: in its loop where the controller is known, else open."""
+"""Simulation of a machine with the input of a log: in closed loop if its controller is known, else open."""
 
 from __future__ import annotations
 
@@ -29,22 +29,23 @@ from jaxid.simulation.step_size import needed_steps
 
 # Ticks of past command that a delay in a loop may reach back.
 _LONGEST_DELAY = 12
-# Samples within which an error of a loop's start shows, and by how much more than the rest they are off then.
+# Number of first samples in which an error of a loop's start appears, and the factor by which their mean
+# square residual then exceeds that of the others.
 _FIRST, _FAR_MORE = 100, 5.0
-# A band-limited command is refined so often, then joined by lines.
+# Factor by which a band-limited command is upsampled before its samples are joined by lines.
 _REFINE = 8
 
 
 @dataclass(frozen=True)
 class Numerics:
-    """How a replay integrates.
+    """Settings of the integration in a replay.
 
     Args:
-        set_valued: Dry friction sticks exactly; else it is smoothed.
+        set_valued: Whether dry friction sticks exactly; otherwise it is smoothed.
         substeps: Integration steps between samples of the command.
-        longest_delay: Samples of past command kept, for delays in a loop.
+        longest_delay: Samples of past command kept for delays in a loop.
         segment: Samples after which an open-loop run restarts from the log; None: never.
-        solver: One of `jaxid.names.SOLVERS`, which takes the place of the fixed steps and
+        solver: One of `jaxid.names.SOLVERS`, which replaces the fixed steps and
             smooths dry friction; None: fixed steps.
     """
 
@@ -56,7 +57,7 @@ class Numerics:
 
     @property
     def sticks(self) -> bool:
-        """Whether dry friction sticks exactly."""
+        """True if dry friction sticks exactly."""
         return self.set_valued and self.solver is None
 
 
@@ -64,15 +65,16 @@ class Replay(eqx.Module):
     """Inputs of a log, ready to drive a plant; call it with the plant.
 
     Args:
-        drive: How the command acts.
-        controller: The law; None: open loop.
-        sensor: What the controller reads.
-        reference, disturbance: By drive, at every tick (closed loop); an `UnknownReference` has unknowns.
-        command: Logged command (open loop), refined where it is band-limited.
-        position, velocity: At the start.
+        drive: Gain, hold and integration of the command.
+        controller: The control law; None: open loop.
+        sensor: Sensor that the controller reads.
+        reference, disturbance: Values by drive at every tick (closed loop). An `UnknownReference` has
+            unknowns.
+        command: Logged command (open loop), upsampled if it is band-limited.
+        position, velocity: State at the start, (n,) each.
         restart: Flags, positions and velocities of segments (open loop).
-        every: The log holds one tick in so many.
-        follow: How positions at the start go along with those of joints that have an encoder, (n, k).
+        every: Number of ticks per sample of the log.
+        follow: Matrix from positions of joints with an encoder to positions of all at rest, (n, k).
     """
 
     drive: Drive
@@ -91,8 +93,8 @@ class Replay(eqx.Module):
         """Return the trajectory at the samples of the log.
 
         Args:
-            plant: The plant.
-            nudge: Added to position and velocity at the start, (2 n,).
+            plant: The plant to simulate.
+            nudge: Change of position and velocity at the start, (2 n,).
         """
         q, v = self.position, self.velocity
         if nudge is not None:
@@ -117,11 +119,11 @@ class Replay(eqx.Module):
         return jax.tree.map(lambda a: a[:: self.every], run)
 
     def started(self, start: Float[Array, " k"]) -> Replay:
-        """Return the same run, joints with an encoder moved by so much and the others at rest with them."""
+        """Return the run with a changed start: joints with an encoder move by `start`, the others follow."""
         return replace(self, position=self.position + self.follow @ start)
 
     def following(self, places: tuple, theta: Float[Array, " p"]) -> Replay:
-        """Return the same run with the unknowns of its reference at theta."""
+        """Return the run with the values theta for the unknowns of its reference."""
         if not isinstance(self.reference, UnknownReference):
             return self
         return replace(self, reference=self.reference.with_unknowns(places, theta))
@@ -132,12 +134,12 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
 
     Args:
         machine: The machine; with a controller the loop is closed.
-        log: The log; in a loop it needs a reference.
-        numerics: How to integrate; default exact sticking, steps as fine as the plant asks.
+        log: The log; for a closed loop it needs a reference.
+        numerics: Settings of the integration; by default exact sticking and the steps that the plant needs.
 
     Raises:
-        InputError: If the loop is to be closed and the log has no reference, or its rate does not
-            fit the controller's.
+        InputError: If the loop is closed and the log has no reference, or its sampling time is not
+            a multiple of the controller's.
     """
     numerics = numerics or Numerics(substeps=needed_steps(machine, log))
     position, follow = resting(machine.plant, log.filled[0], machine.gain.size, log.measured)
@@ -170,8 +172,8 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     elif every == 1:
         reference, times = log.reference, log.time
     else:
-        # Akima's cubic passes a ramp of speed exactly and does not ring at a step. A line between samples
-        # ten ticks apart is off by a hundredth of a millimetre at 0.8 m/s^2, and bends an inertia by 10 %.
+        # Akima's cubic reproduces a ramp of speed exactly and does not ring at a step. A line between samples
+        # ten ticks apart is wrong by a hundredth of a millimetre at 0.8 m/s^2, and an inertia then by 10 %.
         curve = scipy.interpolate.Akima1DInterpolator(log.time, log.reference, axis=0)
         reference, times = curve(np.minimum(ticks, log.time[-1])), ticks
     disturbance = disturbance_at(machine.disturbance, times, log)
@@ -206,36 +208,36 @@ def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: 
 
 
 def from_rest(replay: Replay) -> Replay:
-    """Return the same run, with zero velocity at its start."""
+    """Return the run with zero velocity at its start."""
     return eqx.tree_at(lambda r: r.velocity, replay, np.zeros_like(replay.velocity))
 
 
 def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
-    """Return whether the residual of a run's first samples is far larger than that of the others.
+    """Check that the residual of a run's first samples is far larger than that of the others.
 
     Args:
-        off: Measured less simulated; NaN where there is no reading.
+        off: Measured minus simulated position, (time, k); NaN for a missing reading.
     """
     squares = np.nanmean(np.square(off), axis=1)
     return bool(np.mean(squares[:_FIRST]) > _FAR_MORE * np.mean(squares[_FIRST:]))
 
 
 def with_sensor(replay: Replay, sensor: Sensor) -> Replay:
-    """Return the same run, its controller reading by another sensor."""
+    """Return the run with another sensor for its controller."""
     return eqx.tree_at(lambda r: r.sensor, replay, sensor, is_leaf=lambda x: isinstance(x, Sensor))
 
 
 def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100) -> Replay:
     """Return an open-loop run whose initial position and velocity fit the first samples of its log.
 
-    A slope through noisy samples is a poor velocity, worse where an oscillation is sampled ten
-    times a period; the plant itself knows how the first samples hang together.
+    A slope through noisy samples is a poor velocity, especially if an oscillation has only ten samples per
+    period; the model of the plant relates the first samples to each other.
 
     Args:
-        replay: The run.
-        plant: The plant.
-        log: The log.
-        samples: How many count.
+        replay: The run to start; a closed loop is returned unchanged.
+        plant: The plant that is simulated.
+        log: The log with the measured positions.
+        samples: Number of first samples in the fit.
     """
     if replay.controller is not None or replay.restart is not None:
         return replay
@@ -261,7 +263,7 @@ def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, 
         step = jnp.linalg.lstsq(jacobian / scale, residual(nudge))[0] / scale
         return nudge - step
 
-    # Three steps: the start enters almost linearly over so short a run.
+    # Three steps suffice: over so short a run the position is almost linear in the start.
     return jax.lax.fori_loop(0, 3, improve, jnp.zeros(2 * replay.position.size))
 
 
@@ -294,7 +296,7 @@ def _open(
 
 
 def _refined(command: np.ndarray) -> np.ndarray:
-    """Return the band-limited interpolation, of an odd extension so that the ends do not ring."""
+    """Return the band-limited interpolation; an odd extension avoids ringing at the ends."""
     n = len(command)
     pad = min(n - 1, 200)
     whole = np.concatenate(
@@ -305,7 +307,7 @@ def _refined(command: np.ndarray) -> np.ndarray:
 
 
 def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
-    """Return the restart every `length` samples from the measured position and its local slope."""
+    """Return the restarts, one every `length` samples, from the measured position and its local slope."""
     n = (log.samples - 1) * every + 1
     flags = np.zeros(n, bool)
     q, v = np.zeros((n, log.filled.shape[1])), np.zeros((n, log.filled.shape[1]))
@@ -316,8 +318,8 @@ def _segments(log: Log, length: int, every: int) -> tuple[Array, Array, Array]:
     return flags, q, v
 
 
-# Reaches of the parabola that gives a velocity [samples], and how far, in standard deviations, a wider
-# one may stray from what a narrower one says.
+# Reaches of the parabola that gives a velocity [samples], and the largest difference, in standard
+# deviations, between the velocities of a wider and a narrower one.
 _REACHES = (2, 3, 5, 7, 10)
 _STRAY = 2.0
 
@@ -327,17 +329,17 @@ def local_line(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the position and velocity at sample k, by joint, from parabolas through its neighbours.
 
-    As wide as noise asks and the motion allows: a machine that starts with a jerk is nowhere near a
-    parabola for twenty samples. The widest one counts that agrees with all narrower ones.
+    The widest parabola counts that agrees with all narrower ones. A wide one averages the noise, but a
+    machine that starts with a jerk does not follow a parabola for twenty samples.
 
     Args:
-        log: The log.
-        k: The sample.
-        noise: Standard deviation of a reading, by joint; absent: read off the log.
+        log: The log with the positions.
+        k: Number of the sample.
+        noise: Standard deviation of a reading by joint, (n,); None: estimated from the log.
     """
     noise = signals.high_band_std(log.filled) if noise is None else noise
     position, velocity, size = _parabola(log, k, _REACHES[0])
-    # Wide enough that rounding alone, in a log without noise, is no disagreement.
+    # The second term tolerates rounding in a log without noise.
     spread = _STRAY * size * noise + 1e-12 * np.abs(velocity)
     low, high = velocity - spread, velocity + spread
     going = np.ones(position.shape, bool)
@@ -351,7 +353,7 @@ def local_line(
 
 
 def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the value and slope at sample k, and the standard deviation of the slope for readings of one."""
+    """Return value and slope at sample k, and the slope's standard deviation for noise of deviation one."""
     lo = int(np.clip(k - reach, 0, max(log.samples - 2 * reach - 1, 0)))
     x = log.filled[lo : lo + 2 * reach + 1]
     t = log.period * (np.arange(lo, lo + len(x)) - k)
@@ -361,7 +363,7 @@ def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, flo
 
 
 def start_velocity(log: Log) -> np.ndarray:
-    """Return the velocity at the first sample."""
+    """Return the velocity at the first sample, (n,) [m/s or rad/s]."""
     return local_line(log, 0)[1]
 
 
@@ -369,12 +371,12 @@ def exact_numerics(machine: Machine, log: Log, steps: int | None = None) -> Nume
     """Return the integration for a run that is not differentiated: dry friction sticks exactly.
 
     Args:
-        machine: The machine.
-        log: The log.
-        steps: Between samples of the command; absent: as many as the machine asks for.
+        machine: The machine to simulate.
+        log: The log that drives it.
+        steps: Integration steps between samples of the command; None: as many as the machine needs.
 
     Raises:
-        TooStiffError: If the machine asks for more steps than any sound one.
+        TooStiffError: If the machine needs more steps than any plausible one.
     """
     delayed = any(e.delays_command() for e in machine.plant.effects)
     looped = machine.controller is not None

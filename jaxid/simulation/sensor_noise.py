@@ -1,4 +1,4 @@
-"""Noise of readings, as stated or as a log shows it."""
+"""Noise of position readings, as stated or as estimated from a log."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from jaxid.numerics import filters as signals
 
 
 def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
-    """Return the standard deviation of a reading of each joint, as stated, else off the log's high band.
+    """Return the standard deviation of a reading of each joint, (n,) [m or rad].
 
-    Zero where a joint has no encoder.
+    It is the stated one, or else an estimate from the high band of the log. A joint without an encoder has
+    zero.
     """
     stated = machine.sensor.position_std
     if stated is None:

@@ -1,8 +1,8 @@
 """Solvers of diffrax, by name, from one sample of the command to the next.
 
-The command jumps at its samples, and in a loop it is not known before its tick: each interval is
-solved by itself, so that no step straddles a jump, whatever the hold. Steps are as fine as the
-error asks for, which near a reversal is many and elsewhere one.
+The command jumps at its samples, and in a loop it is not known before its tick. Each interval is
+therefore solved separately, so that no step contains a jump, whatever the hold. The error control takes
+many steps near a reversal and otherwise one.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from jaxid.errors import InputError, suggest
 from jaxid.model.plant import Plant
 from jaxid.names import SOLVERS
 
-# Error of a step, relative to the state; near zero, to a tenth of the motion's size.
+# Allowed error of a step relative to the state; near zero, relative to a tenth of the motion's size.
 RELATIVE = 1e-8
 _NEAR_ZERO = 0.1
-# Most steps from one sample to the next; a motion that asks for more has diverged.
+# Largest number of steps from one sample to the next; a motion that needs more has diverged.
 _MOST_STEPS = 4096
 
 
@@ -30,8 +30,8 @@ class AdaptiveStep(eqx.Module):
     """A diffrax solver under step-size control, differentiable forward.
 
     Args:
-        name: One of `SOLVERS`.
-        absolute: Error allowed of a state near zero, in the unit of each state.
+        name: Name of the solver, one of `SOLVERS`.
+        absolute: Allowed error of a state near zero, in the unit of each state.
     """
 
     name: str = eqx.field(static=True)
@@ -39,7 +39,11 @@ class AdaptiveStep(eqx.Module):
 
     @classmethod
     def sized(cls, name: str, *sizes: float) -> AdaptiveStep:
-        """Return the solver of that name for a motion of such position and velocity.
+        """Return a solver by name for a motion of given size.
+
+        Args:
+            name: Name of the solver, one of `SOLVERS`.
+            sizes: Typical sizes of position and velocity; the smallest sets the absolute error.
 
         Raises:
             InputError: If there is no such solver.
@@ -49,16 +53,16 @@ class AdaptiveStep(eqx.Module):
         return cls(name, jnp.asarray(_NEAR_ZERO * RELATIVE * min(sizes), dtype=jnp.float64))
 
     def __call__(self, plant: Plant, x: State, ends: tuple[Array, ...], t: Array, h: Array) -> State:
-        """State at t + h.
+        """Return the state at t + h.
 
         Args:
             plant: The plant; its dry friction is smoothed.
-            x: State at t.
-            ends: Declared force at the ends of the interval, delay applied; once where it is held.
+            x: State at the time t.
+            ends: Declared force at the ends of the interval, delay applied; a held force is given once.
             t, h: Time and length of the interval [s].
 
         Returns:
-            The state; not a number where the solver failed, so that a fit turns back.
+            The state; NaN if the solver failed, so that a fit rejects the step.
         """
         import diffrax
 

@@ -1,4 +1,4 @@
-"""How finely a machine must be integrated: its fastest rate, what is too stiff, and what no sample shows."""
+"""Step size of the integration, from the fastest rate of a machine, and limits on its stiffness."""
 
 from __future__ import annotations
 
@@ -17,30 +17,31 @@ from jaxid.machine import Machine
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
 
-# Fastest rate of the linearised plant times step that a fourth-order step follows to 1e-5.
+# Largest product of step and fastest rate that a fourth-order step follows to 1e-5.
 _FINE = 0.2
-# Any number of steps up to this; beyond, so many numbers from one to its double.
+# Up to _EACH steps any number is used; beyond, only _AN_OCTAVE numbers per doubling.
 _EACH, _AN_OCTAVE = 8, 4
-# More integration steps a sample than that no machine asks for: a fit or a guess has run away.
+# No plausible machine needs more integration steps per sample; a fit has diverged, or a guess is far off.
 _MOST_STEPS = 2000
-# Damping ratio of a spring that rings faster than a log samples, and steps in parts of those that its ring
-# asks for. Friction that falls with speed makes such a ring chatter: slopes along 2000 samples of a stage
-# grow to 1e14 times what a fit leaves, with a ratio of 0.05 too; with this one they stay below 100 times.
-# Nothing then hangs on the ring's phase. Half a radian a step does where a load's position is compared. For
-# the motor's current alone a radian does: with 31 steps a sample that stage's is as near to that of 248 as
-# with 62; with 16 it grows without bounds on a spring much stiffer.
+# Damping ratio of a spring that rings faster than a log samples, and the part of the steps that its ringing
+# would need. Friction that falls with speed excites such a ring: slopes along 2000 samples of a stage grow
+# to 1e14 times the residual of a fit, also with a ratio of 0.05; with this ratio they stay below 100 times.
+# The result then does not depend on the phase of the ring. Half a radian per step suffices if a load's
+# position is compared. For the motor's current alone one radian suffices: with 31 steps per sample the
+# current of that stage is as near to the one with 248 steps as with 62; with 16 steps it grows without
+# bounds if the spring is much stiffer.
 _CALM, _COARSER, _COARSEST = 0.3, 0.4, 0.2
 
 
 class TooStiffError(InputError):
-    """A machine so stiff, or so light, that simulating it would not end."""
+    """Error for a machine so stiff, or so light, that its simulation would not end."""
 
 
 def needed_steps(machine: Machine, log: Log) -> int:
-    """Return the integration steps a sample that the smooth part of the plant needs along a log.
+    """Return the integration steps per sample that the smooth part of the plant needs along a log.
 
     Raises:
-        TooStiffError: If that is more than any sound machine asks for.
+        TooStiffError: If that is more than any plausible machine needs.
     """
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
@@ -50,20 +51,20 @@ def needed_steps(machine: Machine, log: Log) -> int:
         raise TooStiffError(
             "the plant's forces have no finite slope where the log begins to move",
             where=log.source,
-            hint="check the guesses, and effects of your own at velocity zero",
+            hint="check the guesses, and user-defined effects at zero velocity",
         )
     if steps > _MOST_STEPS:
         raise TooStiffError(
             f"the plant would need {steps:.2g} integration steps every {period:.3g} s",
             where=log.source,
-            hint="an inertia that is far too small, or a stiffness or damping far too large, does "
-            "that: check the guesses, or declare less",
+            hint="the inertia is far too small, or a stiffness or damping far too large: check the guesses, "
+            "or declare fewer effects",
         )
     return _rounded(max(1, int(np.ceil(steps))))
 
 
 def _rounded(steps: int) -> int:
-    """Round up to one of few numbers, a fifth more at most: each other number compiles all code anew."""
+    """Round up by at most a fifth to one of few numbers, because each new number compiles all code again."""
     if steps <= _EACH:
         return steps
     octave = np.ceil(_AN_OCTAVE * np.log2(steps / _EACH)) / _AN_OCTAVE
@@ -90,16 +91,16 @@ def _fastest(plant: Plant, q: Array, u: Array) -> Array:
 
 
 def _slope(matrix: Array) -> Array:
-    """Return the largest entry of a matrix of slopes, each pair of joints taken together.
+    """Return the largest geometric mean of a slope and its transposed one.
 
-    Joints may be in different units, and one light beside the other: k R / J alone is no rate of a motor
-    behind a screw, only with k R / M is it one.
+    Joints may have different units and very different masses: for a motor with a screw k R / J alone is not
+    the square of a rate, but its geometric mean with k R / M is.
     """
     return jnp.sqrt(jnp.abs(matrix * matrix.T)).max()
 
 
 def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
-    """Return the fastest rate of the effects that are oscillators, which steps cannot take exactly."""
+    """Return the fastest rate [1/s] of effects with an oscillator, which the steps do not solve exactly."""
     worst = jnp.zeros(())
     for i, z in enumerate(x.own):
         if z is None or z.ndim == 0:
@@ -116,17 +117,17 @@ def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
 
 
 def with_numerical_damping(plant: Plant, q: Float[Array, " n"], period: float) -> Plant:
-    """Return the plant with damping beside springs that ring faster than samples can show.
+    """Return the plant with damping on springs that ring above the Nyquist frequency.
 
     Args:
-        plant: The plant.
-        q: A position.
-        period: Between samples [s].
+        plant: The plant with its springs.
+        q: Position at which stiffness and damping are evaluated, (n,).
+        period: Sampling time [s].
 
     Returns:
-        The same plant where there is no such spring, or enough damping; else with `viscous_friction` on its
-        elongation, behind all other effects. Critical is 2 (k m)^(1/2), m the mass that rings on the spring,
-        both its ends free.
+        The plant itself if it has no such spring, or enough damping; else the plant with `viscous_friction`
+        on the elongation of the spring, after all other effects. Critical damping is 2 (k m)^(1/2) with m
+        the mass that rings on the spring if both its ends are free.
     """
     mass = plant.own_inertia()
     if mass is None or not plant.springs(plant.joints):
@@ -143,5 +144,5 @@ def with_numerical_damping(plant: Plant, q: Float[Array, " n"], period: float) -
 
 
 def steps_with_numerical_damping(steps: int, on: str) -> int:
-    """Return the steps that suffice once ringing is damped; `on` is the compared output."""
+    """Return the steps per sample that suffice for damped ringing; `on` is the compared output."""
     return max(1, int(np.ceil((_COARSEST if on == "force" else _COARSER) * steps)))

@@ -1,1 +1,1 @@
-"""Parts that several estimators share: least-squares solver, bounds, consistency, reruns."""
+"""Common parts of several estimators: least-squares solver, bounds, consistency, reruns."""

@@ -1,4 +1,4 @@
-"""Links whose ten parameters some body can have, as an option of every fit that minimises."""
+"""Physically consistent links, whose ten parameters are those of a real body, as an option of fits."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from jaxid.model.unknowns import Body, Free
 from jaxid.numerics.lanes import Steps
 from jaxid.session import Session
 
-# Masses, and how far a body extends, stay within this factor of the guess: where the best of all bodies has
-# no extent in some direction, its logarithm would run away.
+# Masses, and the extents of a body, stay within this factor of the guess: if the optimal body has no extent
+# in some direction, the logarithm of this extent would diverge.
 _RANGE = 1e3
 
 
 def need_bodies(session: Session) -> Session:
     """Return the session with the unknown links of its arm restricted to parameters of real bodies.
 
-    Of other machines inertias are positive anyway.
+    Other machines are returned unchanged; their inertias are positive anyway.
 
     Raises:
         InputError: If a link is known in part, bounded by min or max, or its guess is no body.
@@ -66,7 +66,7 @@ def _body(link: int, indices: dict[str, int], unknown: Sequence[Free], where: st
         hint = "start from mass, first_moment and inertia of a body: a rod, a ball"
         raise InputError(what, where=where, hint=hint)
     lower, upper = np.full(10, -np.inf), np.full(10, np.inf)
-    # Half the logarithm of the mass, and those of the spread.
+    # These coordinates are half the logarithm of the mass, and the logarithms of the extents.
     for coordinates, factor in (([0], 0.5), ([4, 5, 6], 1.0)):
         lower[coordinates] = x[coordinates] - factor * np.log(_RANGE)
         upper[coordinates] = x[coordinates] + factor * np.log(_RANGE)
@@ -78,7 +78,7 @@ def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
     estimate = yield from steps
     if not estimate.machine.plant.linked:
         return estimate
-    note = "links are what bodies can be; standard deviations are those of the log alone"
+    note = "links are physically consistent; standard deviations are those of the log alone"
     return replace(
         estimate,
         notes=(*estimate.notes, note),
@@ -87,7 +87,7 @@ def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
 
 
 def links_of(plant: Plant) -> list[dict[str, object]]:
-    """Return the each link's parameters, and the least eigenvalue of its pseudo-inertia over the largest."""
+    """Return each link's parameters, and the smallest eigenvalue of its pseudo-inertia over the largest."""
     ten = bodies_of(plant)
     values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten))))
     return [
@@ -97,5 +97,5 @@ def links_of(plant: Plant) -> list[dict[str, object]]:
 
 
 def bodies_of(plant: Plant) -> Float[np.ndarray, "n 10"]:
-    """Return the ten parameters of every link."""
+    """Return the ten inertial parameters of every link, (n, 10)."""
     return np.stack([np.asarray(getattr(plant, name)) for name in TEN], axis=-1)

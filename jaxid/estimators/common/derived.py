@@ -1,4 +1,4 @@
-"""What follows from an estimate, with its sigma: friction in its other form, natural frequency."""
+"""Quantities derived from an estimate, with standard deviations: friction coefficients, frequencies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import effect_name
 
-# The other way to state a level of friction.
+# Parameter of a friction that states its level as a coefficient.
 _COEFFICIENT = "friction_coefficient"
 
 
@@ -24,10 +24,10 @@ class Derived:
     """A quantity that is a function of the unknowns.
 
     Args:
-        name: As in results.
-        value: At the estimate.
-        std: By the delta method; NaN where an unknown in it cannot be told.
-        unit: Label.
+        name: Name in the results.
+        value: Value at the estimate.
+        std: Standard deviation by the delta method; NaN if an unknown in it is not identifiable.
+        unit: Label of the unit.
     """
 
     name: str
@@ -37,9 +37,9 @@ class Derived:
 
 
 def dry_friction(estimate: Estimate) -> list[Derived]:
-    """Return the level of each Coulomb friction given by its coefficient, and the reverse.
+    """Return the level of each dry friction that is given by its coefficient, and the reverse.
 
-    The normal force is the plant's own, m g: a weight, by which a coefficient has its meaning.
+    The normal force is that of the plant, its weight m g, because the coefficient is defined by it.
     """
     machine, out = estimate.machine, []
     plant = machine.plant
@@ -47,7 +47,7 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
     for k, effect in enumerate(plant.effects):
         name = effect_name(_before(plant, k), effect)
         level = effect.sliding_level
-        # Only a law that may be stated either way has the other way to be derived.
+        # Skip friction laws that have no coefficient as an alternative to the level.
         if level is None or not hasattr(effect, _COEFFICIENT):
             continue
         if not float(plant.port_normal(q)[effect.port]) > 0:
@@ -74,7 +74,7 @@ def dry_friction(estimate: Estimate) -> list[Derived]:
 
 
 def natural_frequency(estimate: Estimate) -> list[Derived]:
-    """Return the natural frequency of an axis with an elastic coupling, its joints free [Hz]."""
+    """Return the highest natural frequency [Hz] of a plant with a spring, with its joints free."""
     plant, parameters = estimate.machine.plant, estimate.machine.parameters
     rigid = plant.load is None and not any(e.adds_spring for e in plant.effects)
     if rigid or any(e.opens_spring for e in plant.effects):
@@ -88,5 +88,5 @@ def natural_frequency(estimate: Estimate) -> list[Derived]:
 
 
 def _before(plant: Plant, k: int) -> Plant:
-    """Return the plant with its first k effects, which number the next one."""
+    """Return the plant with its first k effects, which determine the number in the next one's name."""
     return eqx.tree_at(lambda p: p.effects, plant, plant.effects[:k])

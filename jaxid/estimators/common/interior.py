@@ -1,4 +1,4 @@
-"""Least squares among bodies, where the residual is affine: a convex problem, solved from inside."""
+"""Least squares with physically consistent bodies and an affine residual, by an interior-point method."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jaxtyping import Float
 from jaxid.arms.pseudo_inertia import pseudo_inertia
 from jaxid.arrays import Array
 
-# Weights of the barrier, each with two Newton steps; the last over the first.
+# Number of weights of the barrier, each with two Newton steps, and ratio of the last to the first.
 _WEIGHTS, _LAST = 112, 1e-14
-# Of Newton's step at the end, in the barrier's own measure: beyond, it has left the path.
+# Largest decrement of the last Newton step, in units of the weight, for a point near the central path.
 _ON_PATH = 0.25
 
 
@@ -25,22 +25,22 @@ def inner_start(
     bodies: tuple[tuple[int, ...], ...],
     solve: Callable[[Array, Array], Array],
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-    """Minimise the squares of columns @ theta + rest among bodies, from any body.
+    """Minimise the sum of squares of columns @ theta + rest over bodies with positive pseudo-inertia P.
 
-    Minus the logarithms of the determinants of the pseudo-inertias, over those at the start, times a weight
-    that falls, keep what is sought inside. Newton's steps, damped by their own length, never leave it. The
-    divergence whose part that is, tr(P0^-1 P) - log det(P0^-1 P), is least at the start: of what the columns
-    do not tell the bodies nearest to it are taken. Without the trace, masses that no column tells would run
-    away, and the steps would follow them and leave the path.
+    A barrier, minus the logarithms of the determinants of P, times a decreasing weight, keeps the bodies
+    feasible. Damped Newton steps never leave the feasible set. With the trace the barrier is the divergence
+    tr(P0^-1 P) - log det(P0^-1 P) from the start P0, which is smallest at the start: unidentifiable
+    directions end at the bodies nearest to it. Without the trace, unidentifiable masses would diverge, and
+    the steps would leave the central path.
 
     Args:
-        columns, rest: The residual.
-        theta: Values that are bodies where they must be.
-        bodies: Places of the ten parameters of each.
-        solve: Of a symmetric positive definite system, (p, p) and (p, k).
+        columns, rest: Matrix (rows, p) and constant (rows,) of the affine residual.
+        theta: Start, (p,), with positive definite pseudo-inertias.
+        bodies: Places of the ten parameters of each body.
+        solve: Solver of a symmetric positive definite system with arguments (p, p) and (p, k).
 
     Returns:
-        The values, and half a sum of squares below which no bodies fall; minus infinity where none is sure.
+        The minimum, and a lower bound of half the sum of squares; minus infinity if the bound is not certain.
 
     Source:
         Boyd & Vandenberghe (2004), Convex Optimization, chapters 9.6 and 11, for path and damping; Lee,
@@ -51,7 +51,7 @@ def inner_start(
     unit = pseudo_inertia(jnp.eye(10))
     inverses = [solve(pseudo_inertia(theta[at]), jnp.eye(4)) for at in places]
     home = [jnp.einsum("ij,aji->a", inverse, unit) for inverse in inverses]
-    # What is in no body may stand anywhere, and has no barrier: a trace keeps the matrix definite.
+    # Unknowns that belong to no body have no barrier; a small diagonal term keeps the matrix definite.
     loose = 1e-13 * jnp.diag(normal)
 
     def advance(k: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -67,7 +67,7 @@ def inner_start(
                 .at[np.ix_(at, at)]
                 .add(weight * jnp.einsum("aij,bji->ab", turned, turned))
             )
-        # What is without effect, and in no body, stays where it is.
+        # An unknown that has no effect and belongs to no body keeps its value.
         size = jnp.diag(hessian)
         without = size <= 0
         scale = jnp.where(without, 0.0, 1.0 / jnp.sqrt(jnp.where(without, 1.0, size)))
@@ -75,7 +75,7 @@ def inner_start(
         step = -scale * solve(scaled, (scale * gradient)[:, None])[:, 0]
         fall = -gradient @ step
         ahead = theta + step / (1.0 + jnp.sqrt(jnp.maximum(fall, 0.0) / weight))
-        # Rounding may spoil a step where the weight is small: what is there is good enough then.
+        # With a small weight, rounding may spoil a step; the current point is then accurate enough.
         return jnp.where(jnp.all(jnp.isfinite(ahead)) & (fall > 0), ahead, theta), fall / weight
 
     def cost(theta: Array) -> Array:
@@ -84,7 +84,8 @@ def inner_start(
 
     first = cost(theta) + 1e-300
     theta, decrement = jax.lax.fori_loop(0, 2 * _WEIGHTS, advance, (theta, jnp.asarray(jnp.inf)))
-    # On the path it is the order of the barrier times the weight; near it, less than twice that.
+    # The gap to the minimum is the order of the barrier times the weight on the path, and less than twice
+    # that near it.
     order, weight = 4 * len(bodies), first * _LAST ** ((_WEIGHTS - 1) / _WEIGHTS)
     floor = cost(theta) - 2 * order * weight
     return theta, jnp.where(jnp.abs(decrement) < _ON_PATH, floor, -jnp.inf)

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt within bounds, compiled whole; and the scales it works on."""
+"""Levenberg-Marquardt within bounds as one compiled function, and the scale of its unknowns."""
 
 from __future__ import annotations
 
@@ -19,42 +19,43 @@ from jaxid.arrays import Array
 from jaxid.estimators.common.interior import inner_start
 from jaxid.model.unknowns import Parameters
 
-# At the start, relative to the diagonal of the normal matrix.
+# Damping at the start, relative to the diagonal of the normal matrix.
 DAMPING = 1e-4
-# A fit has converged where the cost can fall by no more than this part of itself: with 10^4
-# samples that is 10^-4 of a standard deviation.
+# A fit has converged if the cost can fall by no more than this part of itself: with 10^4 samples that is
+# 10^-4 of a standard deviation.
 _TOLERANCE = 1e-12
-# It has also converged where a step that should lower the cost by no more than this, with 10^4 samples
-# a hundredth of a standard deviation, does not: sticking and rounding make the last digits of a cost rough.
-# Only a step that is damped by less than this says so: a short one promises little anywhere.
+# It has also converged if a step fails to lower the cost and its predicted fall is at most _FLAT, with 10^4
+# samples a hundredth of a standard deviation: sticking and rounding make the last digits of a cost rough.
+# Only a step with a damping below _WHOLE counts, because the predicted fall of a short step is always small.
 _FLAT = 1e-8
 _WHOLE = 1e-2
-# Bodies take more evaluations, and have converged earlier: their unidentifiable coordinates move far along
-# curves.
+# Fits of bodies may take more evaluations and have a looser tolerance: their unidentifiable coordinates move
+# far along curves.
 _BODY_STEPS = 500
 _BODY_TOLERANCE = 1e-9
-# And where it is above what it is known not to fall below by no more than this over the residual's entries: a
-# hundredth of a standard deviation too.
+# It has also converged if the cost exceeds a known lower bound by no more than this part of itself, divided
+# by the number of residuals: also a hundredth of a standard deviation.
 _SURE = 1e-4
-# And where no step within this damping lowers the cost, although one should by less than a tenth.
+# It has also converged if a step fails to lower the cost with a damping above _STUCK and a predicted fall of
+# at most _ROUGH, with 10^4 samples a tenth of a standard deviation.
 _ROUGH = 1e-6
 _STUCK = 1e3
-# An unknown whose size moves the residual by less than this part of the first one is without effect: its
-# column holds rounding, and dividing by it sends the unknown to 1e15.
+# An unknown whose size changes the residual by less than this part of the first residual has no effect: its
+# column contains rounding, and a division by it would send the unknown to 1e15.
 _NOTHING = 1e-12
 
 
 class Transform(eqx.Module):
-    """Physical values to the scale of the solver and back: one object, one inverse.
+    """Map from physical values to the scale of the solver and back.
 
-    What must be positive is fitted as its logarithm (in the force domain only what the balance is not in
-    proportion to); the ten parameters of a body as its `log_cholesky`; the rest as it is. Scaling to order
-    one is the solver's (it scales by the columns of the Jacobian).
+    Positive unknowns are fitted as their logarithms (in the force domain only those in which the balance is
+    nonlinear), the ten parameters of a body as its `log_cholesky`, and other unknowns without a transform.
+    The solver itself scales the unknowns to order one, by the columns of the Jacobian.
 
     Args:
-        log: Which are fitted as their logarithms, (p,).
+        log: Mask of the unknowns that are fitted as their logarithms, (p,).
         lower, upper: Bounds on the coordinates of the bodies, (bodies, 10).
-        bodies: Places of their parameters.
+        bodies: Places of the ten parameters of each body.
         affine: Whether the residual is known to be affine in the physical values.
     """
 
@@ -73,19 +74,19 @@ class Transform(eqx.Module):
         return cls(log, lower, upper, tuple(b.places for b in bodies))
 
     def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Return physical values on the solver's scale."""
+        """Transform physical values to the solver's scale."""
         return self._with_bodies(
             jnp.where(self.log, jnp.log(jnp.where(self.log, theta, 1.0)), theta), log_cholesky, theta
         )
 
     def outward(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Return physical values from those on the solver's scale."""
+        """Transform values on the solver's scale to physical values."""
         return self._with_bodies(
             jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x), of_log_cholesky, x
         )
 
     def bounds(self, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> tuple[Array, Array]:
-        """Return bounds on the physical values on the solver's scale; bodies have separate ones."""
+        """Transform bounds on the physical values to the solver's scale; bodies have separate bounds."""
         plain = Transform(self.log)
         out = []
         for bound, coordinates in ((lower, self.lower), (upper, self.upper)):
@@ -96,7 +97,7 @@ class Transform(eqx.Module):
         return out[0], out[1]
 
     def physical(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
-        """Return a Jacobian by physical values from one by the solver's, at some physical values."""
+        """Convert a Jacobian by the solver's values to one by the physical values theta."""
         out = jnp.asarray(jacobian / self.slope(theta))
         for places in map(np.array, self.bodies):
             out = out.at[:, places].set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
@@ -108,22 +109,22 @@ class Transform(eqx.Module):
         return out
 
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Return d physical / d solver, for Jacobians, of unknowns that are part of no body."""
+        """Return the derivative of physical by solver values, (p,), for unknowns that belong to no body."""
         return jnp.where(self.log, theta, 1.0)
 
 
 class Minimum(eqx.Module):
-    """What the solver returns.
+    """Result of the solver.
 
     Args:
-        theta: Physical values.
+        theta: Physical values at the minimum, (p,).
         cost: Half the sum of squares.
-        steps: Evaluations of residual and Jacobian.
-        converged: Whether the cost could fall no further.
-        residual: At theta, flat; empty where not kept.
-        jacobian: Of the residual in the physical values; empty where not kept.
-        failure: Why a solver of optimistix did not converge, see `jaxid.estimators.common.minimise`; None of
-            jaxid's solver.
+        steps: Number of evaluations of residual and Jacobian.
+        converged: Whether the cost cannot fall further.
+        residual: Residual at theta, flat; empty if it is not kept.
+        jacobian: Jacobian of the residual by the physical values, (rows, p); empty if it is not kept.
+        failure: Index of the reason why a solver of optimistix did not converge, see
+            `jaxid.estimators.common.minimise`; None for jaxid's solver.
     """
 
     theta: Float[Array, " p"]
@@ -136,13 +137,13 @@ class Minimum(eqx.Module):
 
 
 class Progress(eqx.Module):
-    """The state of a descent on the solver's scale: cut short anywhere, it goes on to the same bits.
+    """The state of a descent on the solver's scale; an interrupted descent continues to the same bits.
 
     Args:
         trial: Point to evaluate next.
-        predicted: Predicted fall of the cost there.
-        x, cost, gradient, normal: Best point, and the quadratic model of the cost there.
-        kept: Residual and Jacobian there; empty where not kept.
+        predicted: Predicted fall of the cost at the trial point.
+        x, cost, gradient, normal: Best point, and the quadratic model of the cost at that point.
+        kept: Residual and Jacobian at the best point; empty if they are not kept.
         damping, growth: Damping of the next step, and its factor after a refused one.
         scale: Sizes of the unknowns at the start.
         nothing: 2-norm of a change of the residual that counts as none.
@@ -168,9 +169,9 @@ class Progress(eqx.Module):
 
     @classmethod
     def at(cls, x: Array, scale: Array, size: int, damping: Array | float = DAMPING) -> Progress:
-        """Return the state at a start; `size` is that of the residual kept, zero for none.
+        """Return the state at a start; `size` is the length of the kept residual, zero to keep none.
 
-        Of numpy's arrays where x is one: to make jax's outside of compiled code takes longer.
+        The arrays are numpy's if x is one, because JAX's take longer to create outside of compiled code.
         """
         p, xp = x.size, np if isinstance(x, np.ndarray) else jnp
         return cls(
@@ -216,23 +217,23 @@ def levenberg_marquardt(
 ) -> Minimum:
     """Minimise half the sum of squares of `residual` within bounds.
 
-    Forward-mode Jacobian, Marquardt's scaling, Nielsen's damping; steps are projected on the
-    bounds and unknowns that press against one rest. Compiles whole, with a single copy of the
-    residual's Jacobian in it (a second copy doubles the compile time): vmap it over starts or data.
+    It uses the forward-mode Jacobian, Marquardt's scaling and Nielsen's damping. Steps are projected on the
+    bounds, and unknowns that press against a bound rest. The compiled function contains a single copy of the
+    residual's Jacobian, since a second copy doubles the compile time; vmap it over starts or data.
 
     Args:
         residual: Residual as a function of the physical unknowns; entries that do not count are zero.
         theta: Physical values at the start.
         transform: Scale of the solver.
         lower, upper: Bounds on the physical values.
-        active: Mask of the unknowns that may move; absent: all.
-        max_steps: Most evaluations; absent: 60, or with bodies 500.
-        keep: Return residual and Jacobian; without, batches need less memory.
+        active: Mask of the unknowns that may move, (p,); None: all.
+        max_steps: Largest number of evaluations; None: 60, or 500 with bodies.
+        keep: Whether to return residual and Jacobian; batches without them need less memory.
         damping: Damping at the start, relative to the diagonal; a linear problem needs none.
         tolerance: The fit has converged if the cost can fall by no more than this part of itself.
 
     Returns:
-        The minimum; `converged` is false where the steps ran out or the residual is not finite.
+        The minimum; `converged` is false if the steps ran out or the residual is not finite.
 
     Source:
         Marquardt (1963); damping after Nielsen (1999), IMM-REP-1999-05.
@@ -248,7 +249,7 @@ def levenberg_marquardt(
             kept,
             jnp.zeros((kept.size, 0)),
         )
-    # Traced once, for its shape and for its Jacobian.
+    # With jit the residual is traced once for both its shape and its Jacobian.
     residual, floor = jax.jit(residual), -jnp.inf
     if transform.affine:
         columns = jax.jacfwd(residual)(theta).reshape(-1, theta.size)
@@ -267,7 +268,7 @@ def levenberg_marquardt(
     solution = optx.least_squares(
         lambda x, args: on_scale(x), solver, x0, options=options, max_steps=max_steps, throw=False
     )
-    # The value is that of the state; implicit differentiation goes through the value alone.
+    # The value equals that of the state, but only the value carries the implicit derivatives.
     return replace(solution.state, x=solution.value).minimum(transform)
 
 
@@ -280,15 +281,15 @@ def descend(
     tolerance: Array | float = _TOLERANCE,
     floor: Array | float = -np.inf,
 ) -> Progress:
-    """Go on with a descent; see `levenberg_marquardt`, but on the solver's scale.
+    """Continue a descent; it works like `levenberg_marquardt`, but on the solver's scale.
 
     Args:
         residual: Residual as a function of the solver's unknowns.
         progress: State of the descent.
         bounds: Lower and upper bounds on the solver's unknowns.
-        max_steps: Evaluations at which to stop, those so far among them.
+        max_steps: Total number of evaluations, including earlier ones, at which to stop.
         active, tolerance: Options of `levenberg_marquardt`.
-        floor: Lower bound of the cost: near enough to it, the descent has converged too.
+        floor: Lower bound of the cost; a descent close to it has also converged.
     """
     solver = BoundedLevenbergMarquardt(rtol=tolerance)
     options = {"lower": bounds[0], "upper": bounds[1], "active": active, "floor": floor}
@@ -303,8 +304,8 @@ def descend(
 class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt within bounds, as a solver of `optimistix.least_squares`.
 
-    Marquardt's scaling, Nielsen's damping; steps are projected on the bounds, and unknowns that press against
-    a bound rest. Each step evaluates the residual and its forward-mode Jacobian once.
+    It uses Marquardt's scaling and Nielsen's damping. Steps are projected on the bounds, and unknowns that
+    press against a bound rest. Each step evaluates the residual and its forward-mode Jacobian once.
 
     Supports the following `options` of `optimistix.least_squares`, each optional:
 
@@ -318,7 +319,7 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         rtol: The solve ends if half the sum of squares can fall by no more than this part of itself.
         atol: The solve also ends if that can fall by no more than this.
         damping: Damping of the first step, relative to the diagonal of the normal matrix.
-        keep: Whether the state holds residual and Jacobian at the best point; without, batches are smaller.
+        keep: Whether the state holds residual and Jacobian at the best point, which needs more memory.
         norm: Required by optimistix and not used: the cost alone decides.
 
     Source:
@@ -399,7 +400,7 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 def _bounds_of(options: dict[str, Any], y: PyTree) -> tuple[Array | float, Array | float]:
-    """Return the bounds of a solve, flat; infinite where none are given."""
+    """Return the bounds of a solve, flat; infinite if none are given."""
     lower, upper = options.get("lower"), options.get("upper")
     return (
         -np.inf if lower is None else ravel_pytree(lower)[0],
@@ -418,7 +419,7 @@ def _advanced(
     atol: Array | float,
     floor: Array | float,
 ) -> Progress:
-    """Take or refuse the trial, given residual and Jacobian there, and choose the next."""
+    """Accept or reject the trial point from its residual and Jacobian, and choose the next one."""
     (lower, upper), keep = bounds, p.kept[0].size > 0
     cost = 0.5 * e @ e
     first = p.steps == 0
@@ -432,17 +433,17 @@ def _advanced(
         (p.x, p.cost, p.gradient, p.normal, p.kept, p.aux),
     )
     nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
-    # Asked at every step: a velocity of which a level of zero leaves no trace has one as soon as that moves.
+    # Checked at every step: a velocity has no effect while its friction level is zero, and one later.
     moves = moves & (p.scale * jnp.sqrt(jnp.diag(normal)) > nothing)
     pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     aim = x + _step(gradient, normal, damping, moves & ~pressed)
     trial = jnp.clip(aim, lower, upper)
-    # Of the step that is taken: a bound cuts it short.
+    # The prediction is for the actual step, which a bound may shorten.
     change = trial - x
     predicted = -change @ gradient - 0.5 * change @ normal @ change
-    # A step cut short by a bound says little of what is left: its unknown rests from now on.
+    # A step that a bound shortened does not show convergence: its unknown only rests from now on.
     small = (predicted <= rtol * cost + atol) & jnp.all(trial == aim)
-    # A step that a bound bent may promise less than nothing.
+    # The predicted fall of a step that a bound changed may be negative.
     flat = (p.damping < _WHOLE) & (p.predicted > 0) & (p.predicted <= _FLAT * p.cost)
     rough = ~better & (flat | ((damping > _STUCK) & (p.predicted <= _ROUGH * p.cost)))
     stuck = rough | (~better & (damping > 1e12))
@@ -470,17 +471,17 @@ def _step(gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
     normal = jnp.where(jnp.outer(jnp.asarray(free), jnp.asarray(free)), normal / jnp.outer(scale, scale), 0.0)
-    # A trace of damping keeps unidentifiable directions at rest.
+    # A small damping keeps unidentifiable directions at rest.
     matrix = normal + jnp.diag(jnp.where(free, damping + 1e-13, 1.0))
     gradient = jnp.where(free, gradient / scale, 0.0)
     return -eliminated(matrix, gradient[:, None])[:, 0] / scale
 
 
 def eliminated(matrix: Float[Array, "p p"], b: Float[Array, "p k"]) -> Float[Array, "p k"]:
-    """Solve by Gauss and Jordan's elimination, without pivoting: the symmetric part is positive definite.
+    """Solve by Gauss-Jordan elimination without pivoting, for a positive definite symmetric part.
 
-    Not LAPACK's: a batch of its factorisations waits for threads of the pool on which it runs, and two
-    batches at once, as studies have them, then wait for each other for ever (jaxlib 0.10.2).
+    It replaces LAPACK: a batch of LAPACK's factorisations waits for threads of the pool on which it runs,
+    and two batches at once, as in studies, then wait for each other for ever (jaxlib 0.10.2).
     """
 
     def eliminate(k: Array, rows: Array) -> Array:

@@ -24,7 +24,7 @@ from jaxid.estimators.common.levenberg_marquardt import (
 if TYPE_CHECKING:
     from jaxid.estimators.common.minimisers import Minimiser
 
-# Most steps: solvers with a Jacobian need tens, those without need hundreds.
+# Largest numbers of steps: solvers with a Jacobian need tens, those without need hundreds.
 _STEPS, _MANY_STEPS = 256, 4096
 # Weight of a pull towards the start, on a scale on which residual and unknowns are of order one: it makes
 # every linear system of a solver regular. Estimates move by less than 1e-4 standard deviations, even if the
@@ -66,12 +66,13 @@ def minimise(
         theta: Physical values at the start.
         transform: Scale of the solver.
         lower, upper: Bounds on the physical values.
-        active: Unknowns that may move, a mask; absent: all.
-        minimiser: A solver of optimistix, see `minimise_on_scale`; absent: `levenberg_marquardt`.
+        active: Mask of the unknowns that may move, (p,); None: all.
+        minimiser: A solver of optimistix, see `minimise_on_scale`; None: `levenberg_marquardt`.
         keep: Whether the result holds residual and Jacobian.
 
     Returns:
-        The minimum; `converged` if the cost cannot fall noticeably from there, whatever ended the minimiser.
+        The minimum; `converged` is true if the cost cannot fall noticeably further, also if the minimiser
+        reported a failure.
     """
     if minimiser is None or theta.size == 0:
         return levenberg_marquardt(residual, theta, transform, lower, upper, active, keep=keep)
@@ -111,8 +112,8 @@ def minimise_on_scale(
         keep: Whether the result holds residual and Jacobian.
 
     Returns:
-        The end, with the minimiser's number of steps, and a place in `FAILURES`. `done` is true at a minimum,
-        also where the minimiser ran out of steps.
+        The end, with the minimiser's number of steps, and an index in `FAILURES`. `done` is true at a
+        minimum, also if the minimiser ran out of steps.
 
     Source:
         The bounds' transforms are those of Minuit: James and Roos (1975), Comput. Phys. Commun. 10, 343-367.
@@ -152,7 +153,7 @@ def minimise_on_scale(
 
 
 def _reason(result: optx.RESULTS) -> Array:
-    """Return the place in `FAILURES` of what a minimiser reports that has not ended at a minimum."""
+    """Return the index in `FAILURES` for the report of a minimiser that has not ended at a minimum."""
     reason = jnp.where(result == optx.RESULTS.successful, _NO_MINIMUM, _LINEAR)
     for reported, place in (
         (optx.RESULTS.nonlinear_max_steps_reached, _MOST_STEPS),
@@ -169,7 +170,7 @@ def _unbounded(
     """Return the maps to and from coordinates that have no bounds, each of order one."""
     below, above = jnp.isfinite(lower), jnp.isfinite(upper)
     both, either = below & above, below ^ above
-    # Values that are not used stay finite: their derivatives would not be numbers.
+    # Unused values must be finite too, because their derivatives would otherwise be NaN.
     wall = jnp.where(below, lower, jnp.where(above, upper, 0.0))
     sign = jnp.where(below, 1.0, -1.0)
     middle = jnp.where(both, 0.5 * (jnp.where(both, lower, 0.0) + jnp.where(both, upper, 0.0)), 0.0)
@@ -199,6 +200,6 @@ def _snapped(x: Array, size: Array, bounds: tuple[Array, Array]) -> Array:
 
 
 def failure_text(minimum: Minimum, name: str) -> str:
-    """Return why a minimiser of that name did not converge."""
+    """Return the reason why a minimiser did not converge, with its name."""
     place = 0 if minimum.failure is None else int(np.asarray(minimum.failure))
     return f"{name}: {FAILURES[place].format(steps=int(minimum.steps))}"

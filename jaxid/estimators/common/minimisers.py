@@ -1,6 +1,6 @@
-"""Names of the minimisers that a fit can take: jaxid's own one, and solvers of optimistix.
+"""Names of the minimisers of a fit: jaxid's Levenberg-Marquardt, and solvers of optimistix.
 
-Nothing here imports JAX before a minimiser is asked for.
+The module does not import JAX before a minimiser of optimistix is requested.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def minimiser_name(given: str | Minimiser | None) -> str:
 
 @functools.cache
 def _named(name: str) -> Minimiser:
-    """Return one instance a name: compiled code depends on it, and runs of a study share it."""
+    """Return the single instance for a name: compiled code depends on it, and runs of a study share it."""
     import optimistix as optx
 
     return getattr(optx, name.removeprefix("optimistix."))(rtol=_RTOL, atol=_ATOL)

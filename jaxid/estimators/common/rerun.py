@@ -1,4 +1,4 @@
-"""A log run once more by simulation, and filtered as it was: a motion without the sensors' noise."""
+"""Simulation of a log with the same filters: a motion without the noise of the sensors."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from jaxid.model.unknowns import Parameters, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.simulation.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
 
-# A simulated position this many times larger than the measured one has run away.
+# A simulated position this many times larger than the measured one has diverged.
 _RUNAWAY = 1e3
-# Directions in which columns differ by less than this part tell nothing.
+# Singular values of the scaled columns below this part of the largest count as zero.
 _ROUNDING = 1e-6
-# Of a standard deviation, were the residual white: a fit that moves by less has converged.
+# A fit has converged if a step is smaller than this part of a standard deviation for a white residual.
 _SMALL = 1e-2
 
 
@@ -31,9 +31,9 @@ class Rerun:
     """A log, ready to be simulated with any values of the unknowns.
 
     Args:
-        machine: The machine; in its loop where it has a controller, else driven by the measured force.
-        log: The log.
-        data: The same, prepared: its recipe filters the simulated motion too.
+        machine: The machine; simulated in closed loop if it has a controller, else with the measured force.
+        log: The log to simulate.
+        data: The prepared log; its recipe filters the simulated motion too.
         replay: Inputs of the simulation.
     """
 
@@ -44,39 +44,39 @@ class Rerun:
 
     @classmethod
     def of(cls, machine: Machine, log: Log, data: Prepared, numerics: Numerics | None = None) -> Rerun:
-        """Prepare a log.
+        """Prepare the simulation of a log.
 
         Args:
-            machine: The machine, at values that the steps of integration should suit.
-            log: The log.
-            data: The same, prepared.
-            numerics: How to integrate; nothing is differentiated, so that dry friction always
-                sticks exactly. Absent: as machine and log ask.
+            machine: The machine, with values from which the integration steps are chosen.
+            log: The log to simulate.
+            data: The prepared log.
+            numerics: Settings of the integration; dry friction always
+                sticks exactly, because nothing is differentiated. None: chosen from machine and log.
 
         Raises:
-            InputError: If the loop is to be closed and the log has no reference.
+            InputError: If the machine has a controller and the log has no reference.
         """
         numerics = numerics or exact_numerics(machine, log)
         numerics = replace(numerics, set_valued=True, segment=None, solver=None)
-        # A rounded reading would put a noise of its own into the simulated loop.
+        # Rounded readings would add noise to the simulated loop.
         exact = replace(machine, sensor=replace(machine.sensor, position_resolution=None))
         replay = with_fitted_start(make_replay(exact, log, numerics), machine.plant, log)
         return cls(machine, log, data, replay)
 
     @property
     def looped(self) -> bool:
-        """Whether the loop is closed."""
+        """True if the simulation is in closed loop."""
         return self.replay.controller is not None
 
     def steps(self, theta: np.ndarray, *, own_command: bool) -> Steps[Prepared | None]:
-        """Simulate, and prepare what comes out as the log was.
+        """Simulate, and prepare the simulated motion like the log.
 
         Args:
-            theta: The unknowns.
-            own_command: Whether the force is that of the simulated loop; else the measured one.
+            theta: Values of the unknowns, (p,).
+            own_command: Whether the force is that of the simulated loop; otherwise the measured one.
 
         Returns:
-            The simulated motion with its force; None where the simulation diverges.
+            The simulated motion with its force; None if the simulation diverges.
         """
         places = self.machine.parameters.places
         position, command = yield SolveRequest(_simulated, (self.replay, places, self.machine.plant, theta))
@@ -86,10 +86,10 @@ class Rerun:
             return None
         own = own_command and self.looped
         force = np.asarray(command) if own else self.log.force
-        # What has no encoder has none here: its motion is found as that of the log is.
+        # Joints without an encoder have no readings here either: their motion is completed as for the log.
         position = np.where(self.log.measured, position, np.nan)
         run = replace(self.log, position=position, force=force)
-        # The log's own force has passed its median before.
+        # The logged force has already passed the running median.
         run = self.data.recipe.cleaned(run) if own else run
         return replace(
             prepare(run, self.machine.gain, self.data.recipe), hold=self.data.hold, steps=self.data.steps
@@ -109,19 +109,19 @@ def best_step(
     e: Float[np.ndarray, " rows"],
     theta: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """Return Gauss-Newton's step within bounds, or to the best bodies if links are bodies.
+    """Return Gauss-Newton's step within bounds, or to the optimal bodies if links must be consistent.
 
-    Between two bodies there are only bodies: any part of the step keeps to them too.
+    The set of bodies is convex, so that any fraction of the step is feasible too.
 
     Args:
-        parameters: The unknowns; what the columns do not tell of bodies stays near their guess.
-        columns: Jacobian of the residual.
-        e: Residual.
-        theta: The unknowns.
+        parameters: The unknowns; unidentifiable directions of bodies stay near their guess.
+        columns: Jacobian of the residual, (rows, p).
+        e: Residual at theta, (rows,).
+        theta: Current values of the unknowns, (p,).
     """
     if not parameters.bodies:
         return bounded_step(columns, e, theta, parameters.bounds)
-    # As many rows as unknowns hold all that a sum of squares does.
+    # The triangular factor gives the same sum of squares with about as many rows as unknowns.
     triangle = np.asarray(np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r"))
     minimum = _best_bodies(triangle, Transform.of(parameters), parameters.guess, parameters.bounds)
     return np.asarray(minimum.theta) - theta
@@ -140,15 +140,16 @@ def bounded_step(
     theta: Float[np.ndarray, " p"],
     bounds: tuple[np.ndarray, np.ndarray],
 ) -> Float[np.ndarray, " p"]:
-    """Return Gauss-Newton's step within bounds: an unknown that would pass one stops there, the rest adapt.
+    """Return Gauss-Newton's step within bounds.
 
-    Directions that the columns do not tell stay where they are.
+    An unknown that would pass a bound stops there, and the others adapt. Unidentifiable directions do not
+    move.
 
     Args:
-        columns: Jacobian of the residual.
-        e: Residual.
-        theta: The unknowns.
-        bounds: Lower and upper.
+        columns: Jacobian of the residual, (rows, p).
+        e: Residual at theta, (rows,).
+        theta: Current values of the unknowns, (p,).
+        bounds: Lower and upper bounds, (p,) each.
     """
     lower, upper = bounds
     norm = np.linalg.norm(columns, axis=0)
@@ -166,19 +167,19 @@ def bounded_step(
 
 
 def settled(change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], size: float) -> bool:
-    """Return whether a step changes the residual by less than a hundredth of a standard deviation would.
+    """Check that a step changes the residual by less than a hundredth of a standard deviation would.
 
     Args:
-        change: Of the residual.
-        e: Residual.
-        size: 2-norm of the force; below 10^-10 of it all is rounding.
+        change: Change of the residual by the step, (rows,).
+        e: Residual before the step, (rows,).
+        size: 2-norm of the force; a change below 10^-10 of it is rounding.
     """
     small = _SMALL * np.linalg.norm(e) / np.sqrt(max(e.size, 1))
     return bool(np.linalg.norm(change) <= max(small, 1e-10 * size))
 
 
 def span(columns: Float[np.ndarray, "rows p"]) -> Float[np.ndarray, "rows r"]:
-    """Return an orthonormal basis of the span of some columns."""
+    """Return an orthonormal basis of the span of some columns, (rows, r)."""
     norm = np.linalg.norm(columns, axis=0)
     u, s, _ = np.linalg.svd(columns / np.where(norm > 0, norm, 1.0), full_matrices=False)
     return u[:, s > _ROUNDING * s[0]]

@@ -100,7 +100,7 @@ def view_of(result: Identification | Discovery, run: int, joint: int) -> LogView
 
 
 def _gaps_before(result: Identification | Discovery) -> Sequence[Gap] | None:
-    """Return the gaps of the baseline of a search that changed it; None of any other result."""
+    """Return the gaps of the baseline of a search that changed it; None for any other result."""
     return getattr(result, "gaps_before", None) if getattr(result, "effects", ()) else None
 
 

@@ -29,7 +29,7 @@ def envelope(time: np.ndarray, values: np.ndarray, buckets: int) -> tuple[np.nda
     """Thin a line to its smallest and largest sample in each of many short buckets.
 
     Args:
-        time: Increasing instants, (N,); where they jump, the line is broken.
+        time: Increasing instants, (N,); the line is broken at gaps.
         values: The line, (N,).
         buckets: Number of buckets into which the whole time is cut.
 
@@ -45,7 +45,7 @@ def envelope(time: np.ndarray, values: np.ndarray, buckets: int) -> tuple[np.nda
         # The last instant falls on the edge and shares the last bucket.
         span = time[-1] - time[0]
         bucket = np.minimum((time - time[0]) / span * buckets, buckets - 1).astype(int)
-        # With more runs than buckets, single runs are too short to be seen.
+        # With more runs than buckets, single runs are too short to be visible.
         key = bucket + segment * buckets if segment[-1] <= buckets else bucket
         order = np.lexsort((values, key))
         first = np.flatnonzero(np.diff(key[order], prepend=-1))

@@ -58,7 +58,7 @@ class CandidateScore:
     Args:
         kind: Name of the effect, with its place if there are several.
         evidence: Gain in held-out log-likelihood [nats]; not finite if the fit failed.
-        accepted: Whether this is the one that was added.
+        accepted: Whether the search added this candidate.
     """
 
     kind: str
@@ -183,7 +183,7 @@ class ReportData:
         where: The `where` object of the JSON result, or None.
         steps: The search, step by step.
         where_plot: The residual over the variable that `where` names, or None.
-        experiments: Proposals that would tell effects apart which the log cannot.
+        experiments: Proposed experiments that would distinguish effects that the log cannot.
         views: The logs to draw: first the fitted one, then the validations.
         units: Labels of position, velocity, force and time.
         notes: Remarks, warnings, proposals; one sentence or more each.
@@ -193,8 +193,8 @@ class ReportData:
         coefficients: Rows of a minimal model's table, its head first; empty without one.
         statistics: Lines below it.
         within_prior: `directions`, `criterion_percent` and `starts` of the JSON result of a fit within a
-            prior; None of any other.
-        history: Of a recursive estimate, or None.
+            prior; None for any other.
+        history: History of a recursive estimate; None for any other.
     """
 
     title: str

@@ -16,7 +16,7 @@ _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Return whether a value is a finite number."""
+    """Check that a value is a finite number."""
     return (
         isinstance(value, (int, float, np.integer, np.floating))
         and not isinstance(value, bool)

@@ -22,7 +22,7 @@ MEASURED = "#8a8a8a"
 BEFORE = "#d55e00"
 AFTER = "#0072b2"
 _IDLE = "#b4bcc4"
-# Darker shades for the means, which stand on a cloud of their own colour.
+# Darker shades for the means, which are drawn on a cloud of the same colour.
 _DARK = {BEFORE: "#7a3600", AFTER: "#00344f"}
 _MOST_POINTS = 4000
 _FEW = 200
@@ -450,7 +450,7 @@ def _groups(variable: str, x: np.ndarray) -> np.ndarray | None:
     """Assign numbers to the stretches over which a mean may be drawn as one line."""
     if variable == "time":
         return segments(np.asarray(x))
-    # Dry friction jumps where the velocity changes its sign.
+    # Dry friction jumps when the velocity changes its sign.
     return (np.asarray(x) >= 0.0).astype(int) if variable == "velocity" else None
 
 

@@ -34,7 +34,7 @@ _AXES = {
 def plot_errors(rows: Sequence[dict]) -> Figure:
     """Draw the RMS error of every estimator against the setting with most values, a panel a parameter.
 
-    Dashes distinguish what else is varied.
+    Dashes distinguish the other settings that vary.
 
     Args:
         rows: `Study.summary`.

@@ -1,4 +1,4 @@
-"""The words and tables of a report: what the JSON results hold, laid out for reading."""
+"""The words and tables of a report, made from the JSON results."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from jaxid.results.report.numbers import (
 )
 
 _MOST_INTERVALS = 12
-# Weights up to this are left out of a combination that is told.
+# Weights up to this are omitted from the text of a combination.
 SLIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class GapRow:
-    """One line of the gap table, still as numbers; None where there is none."""
+    """One line of the gap table as numbers; None for a missing value."""
 
     quantity: str
     log: str
@@ -39,7 +39,7 @@ class GapRow:
 
 
 def verdict_words(data: ReportData) -> str:
-    """Say the verdict in plain words, such as "found: coulomb_friction"."""
+    """Return the verdict in plain words, such as "found: coulomb_friction"."""
     if data.verdict == "found":
         return "found: " + ", then ".join(_named(e, data.effects) for e in data.effects)
     if data.verdict is not None:
@@ -244,7 +244,7 @@ def step_words(number: int, step: SearchStep) -> str:
 
 
 def _named(effect: Mapping, effects: Sequence[Mapping]) -> str:
-    # On a machine of one joint the place says nothing.
+    # On a machine with one joint the place is not needed.
     places = {place_words(e) for e in effects}
     place = place_words(effect)
     return f"{effect['kind']} ({place})" if places - {"", "joint 1"} and place else effect["kind"]
@@ -322,7 +322,7 @@ def _other_log(data: ReportData, log: str, force: Mapping) -> list[GapRow]:
 
 
 def _by_joint(**columns: object) -> list[GapRow]:
-    """Make one line, or one for each joint where the numbers are lists."""
+    """Make one line, or one for each joint if the numbers are lists."""
     lengths = [len(v) for v in columns.values() if isinstance(v, (list, tuple))]
     if not lengths:
         return [GapRow(**{**columns, "unit": columns["unit"] or ""})]
