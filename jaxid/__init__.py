@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from jaxid.model.effect import Signals as Signals
     from jaxid.model.parameter import parameter as parameter
     from jaxid.model.plant import Plant as Plant
+    from jaxid.model.smoothing import Smoothing as Smoothing
     from jaxid.plants import PLANTS as PLANTS
     from jaxid.references import REFERENCES as REFERENCES
     from jaxid.references import make_reference as make_reference
@@ -164,6 +165,7 @@ _HOMES = {
     "METHODS": ("jaxid.estimators", "METHODS"),
     "register_method": ("jaxid.estimators", "register_method"),
     "register_reader": ("jaxid.logs.readers", "register_reader"),
+    "Smoothing": ("jaxid.model.smoothing", "Smoothing"),
     "Scales": ("jaxid.model.effect", "Scales"),
     "base_parameters": ("jaxid.arms.base_parameters", "base_parameters"),
     "BaseParameters": ("jaxid.arms.base_parameters", "BaseParameters"),

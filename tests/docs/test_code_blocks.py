@@ -28,6 +28,8 @@ COMMAND = re.compile(r"^(?:\$ )?(?:\S*/bin/)?jaxid [a-z]")
 MODULE = re.compile(r"python -m ((?:experiments|benchmarks|truth)[\w.]*)")
 SCRIPT = re.compile(r"python (?:experiments|benchmarks|tests)/\S+")
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
+# A block that begins so is a part of a file of docs/examples, which other tests run.
+EXCERPT = re.compile(r"^# (\w+\.py)\n")
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,13 @@ def test_python_blocks_run(page, tmp_path):
     script = ""
     for block in (b for b in blocks_of(page) if b.language == "python"):
         assert block.text.strip(), f"{page}:{block.line}: empty"
-        if block.runs:
+        excerpt = EXCERPT.match(block.text)
+        if excerpt:
+            shown = block.text[excerpt.end() :].strip("\n")
+            assert shown in (ROOT / "docs" / "examples" / excerpt[1]).read_text("utf-8"), (
+                f"{page}:{block.line}"
+            )
+        elif block.runs:
             script += "\n" * (block.line - 1 - script.count("\n")) + block.text
         else:
             compile(block.text, name(page), "exec")
@@ -133,10 +141,12 @@ def test_commands_are_those_of_the_command_line(page, commands):
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_scripts_and_links_lead_to_files(page):
+    # A call such as classes["kind"](value=1) in a block looks like a link.
     text = page.read_text("utf-8")
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
     for module in MODULE.findall(text):
         assert (ROOT / module.replace(".", "/")).with_suffix(".py").is_file(), module
     assert not SCRIPT.findall(text), "scripts run as modules: python -m"
-    for target in LINK.findall(text):
+    for target in LINK.findall(prose):
         if "://" not in target:
             assert (page.parent / target).exists(), target

@@ -18,7 +18,7 @@ def recorded(setup: Setup, **changes) -> dict[str, np.ndarray | str | None]:
     run = setup.run(**changes)
     reference = run["reference"] if setup.loop.kind != "open_loop" else None
     return {
-        "t": run["t"],
+        "time": run["t"],
         "position": run["position"],
         "force": run["force"],
         "reference": reference,
