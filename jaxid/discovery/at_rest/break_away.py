@@ -170,7 +170,7 @@ class _Trial:
         drive = Drive(jnp.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
         plant = machine.plant
         for joint in self.joints:
-            plant = plant.with_effect(StaticFriction(level=0.0, port=joint))
+            plant = plant.with_effect(StaticFriction(level=0.0, port=joint))  # pyright: ignore[reportArgumentType] (set later)
         prior = _prior(self.estimate)
         places, theta = machine.parameters.places, jnp.asarray(self.estimate.theta)
 
