@@ -16,7 +16,8 @@ from jaxid.session import open_session
 # A force in time at a known frequency: nothing that is registered does that.
 OWN = """
 import jax.numpy as jnp
-from jaxid.model.plant import Action, Effect, parameter
+from jaxid.model.effect import Action, Effect
+from jaxid.model.parameter import parameter
 
 
 class Hum(Effect):
