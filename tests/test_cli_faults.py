@@ -36,7 +36,10 @@ def files(tmp_path, sound):
         ("simulate a -o folder.csv", "folder.csv: is a folder"),
         ("identify a b --method output", "choose one of output_error, within_prior, inverse_dynamics"),
         ("identify a b --solver tsit6", "solver 'tsit6' is not known; did you mean 'tsit5'?"),
-        ("identify a b --solver tsit5 --method algebraic", "goes only with output_error; leave out"),
+        (
+            "identify a b --solver tsit5 --method algebraic",
+            "goes only with output_error and within_prior; leave out",
+        ),
         ("check a b -o file", "file: is a file, not a folder; choose another -o"),
         ("check a b -o file/deeper/still", "file: is a file, not a folder; choose another -o"),
     ],

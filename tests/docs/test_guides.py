@@ -102,7 +102,7 @@ def test_names_that_cannot_be_registered():
             register_method(name, steps)
     with pytest.raises(InputError, match="another format"):
         register_reader(".csv", lambda path, names, rows: ({}, (0, 0)))
-    with pytest.raises(InputError, match="not the end of a file's name"):
+    with pytest.raises(InputError, match="not one dot and a name"):
         register_reader("jsonl", lambda path, names, rows: ({}, (0, 0)))
 
 

@@ -143,7 +143,7 @@ def test_a_loop_is_fitted_too_and_lists_have_entries(page):
     ("change", "told"),
     [
         ({"free": ("inertias",)}, "parameter 'inertias' is not known"),
-        ({"free": lambda p: p.sharpness}, "no parameter"),
+        ({"free": lambda p: p.smoothing.sharpness}, "no parameter"),
         ({"free": ()}, "free names no parameter"),
         ({"time": np.arange(5.0)}, "time has 5 samples and position 301"),
         ({"time": np.sqrt(np.arange(301.0))}, "equal steps"),

@@ -129,7 +129,7 @@ def test_text_in_an_array_file(tmp_path):
 @pytest.mark.parametrize(("text", "kind"), [("nan", "NaN"), ("-inf", "infinite")])
 def test_not_finite(csv_file, text, kind):
     edit(edit(csv_file, 9, f"0.009,1,{text}"), 12, f"0.012,1,{text}")
-    refuse(csv_file, match=rf"column 'u': 2 row\(s\).*first is row 9 \({kind}\); cut")
+    refuse(csv_file, match=rf"column 'u': 2 row\(s\).*first is row 9 \({kind}\); exclude")
 
 
 def test_unequal_lengths(tmp_path):

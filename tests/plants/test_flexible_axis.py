@@ -189,7 +189,7 @@ def test_check_says_nothing_of_a_joint_without_encoder(folder, tmp_path):
 
 
 FAULTS = {
-    "load twice": ('position = "q"', 'position = ["q", "q_load"]', ["load_position", "leave it out"]),
+    "load twice": ('position = "q"', 'position = ["q", "q_load"]', ["load_position", "remove load_position"]),
     "no such spring": (
         "[actuator]",
         '[[effects]]\nkind = "backlash"\nspring = 2\ngap = 1e-5\n[actuator]',

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.settings import SensorTable
 from tests.support.cli_setup import COULOMB, VISCOUS, place, recorded, run, text
 
 COMMENT = "# the drive's own law"
@@ -89,7 +90,7 @@ def test_an_existing_file_is_kept(folder, found):
 
 def test_a_case_changed_in_python_is_an_object_only(folder):
     case = jaxid.load_case(folder / "case.toml")
-    changed = replace(case, sensor={"position_noise": 1e-6})
+    changed = replace(case, sensor=SensorTable(position_noise=1e-6))
     result = jaxid.identify(changed, folder / "log.csv", method="inverse_dynamics")
     assert result.case().sensor == changed.sensor
     with pytest.raises(jaxid.InputError, match="changed in Python"):

@@ -43,7 +43,7 @@ def test_its_gap_is_in_the_force_only(light):
 def test_no_start_from_rest_is_run(light):
     estimate = inverse_dynamics(light.machine, light.fit.data)
     estimate = type(estimate)(**{**vars(estimate), "machine": light.machine})
-    assert break_away(estimate, light.runs) == ["the model found is too stiff to be simulated"]
+    assert break_away(estimate, light.runs) == ["the resulting model is too stiff to be simulated"]
 
 
 def test_identify_says_so_and_writes_nothing(capsys, tmp_path):
