@@ -77,6 +77,7 @@ def replay(reference: np.ndarray, numerics: Numerics) -> Replay:
         jnp.zeros(1),
         None,
         1,
+        jnp.eye(1),
     )
 
 
@@ -153,5 +154,6 @@ def fit(run: Replay, base: Axis, theta: np.ndarray, measured: np.ndarray) -> Min
         BOUNDS,
         "position",
         active,
+        None,
     )
     return jax.block_until_ready(minimum)
