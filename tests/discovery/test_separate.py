@@ -161,7 +161,10 @@ def test_limits_that_cannot_be(text, told, tmp_path):
 def test_limits_may_be_given_by_joint(tmp_path):
     setup, declared = setups.curved(0.1)
     text = case_text(setup, declared) + "[limits]\nstroke = [[0.0, 0.3]]\nspeed = [0.1]\n"
-    assert load_case(write_case(tmp_path, text)).limits == {"stroke": ((0.0, 0.3),), "speed": (0.1,)}
+    limits = load_case(write_case(tmp_path, text)).limits
+    assert limits.stroke == ((0.0, 0.3),)
+    assert limits.speed == (0.1,)
+    assert limits.force is None
 
 
 @pytest.mark.slow
