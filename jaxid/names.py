@@ -6,6 +6,7 @@ It imports nothing, so that the command line can list them without loading JAX.
 # Estimators, in the order in which help texts list them; `jaxid.estimators.METHODS` has one entry for each.
 METHODS = (
     "output_error",
+    "prediction_error",
     "within_prior",
     "inverse_dynamics",
     "algebraic",

@@ -107,6 +107,16 @@ def _within_prior(
     )
 
 
+def _prediction_error(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
+    from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
+    from jaxid.estimators.prediction_error import prediction_error_steps
+
+    machine, run = session.machine, session.fit
+    first = yield from inverse_dynamics_steps(machine, run.data)
+    start = first.theta if np.all(np.isfinite(first.theta)) else None
+    return (yield from prediction_error_steps(machine, run.log, start=start, numerics=numerics))
+
+
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
     """Return a second start of a fit within a prior: the estimates of the method that the case states.
 
@@ -234,6 +244,7 @@ CONSISTENT = (
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
+    "prediction_error": _prediction_error,
     "within_prior": _within_prior,
     "inverse_dynamics": _inverse_dynamics,
     "algebraic": _algebraic,

@@ -87,7 +87,7 @@ def inverse_dynamics_steps(
     places, (transform, damping) = parameters.places, linear_scale(machine, whole)
     options = (transform, parameters.bounds, damping)
     fits, size = [], np.zeros(())
-    for at in _starts(machine, theta):
+    for at in [theta, *shape_starts(machine, theta)]:
         fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
         fits.append(fit)
     # Only jumps of the other joints identify dry friction at a joint without an encoder, and the cost has
@@ -166,13 +166,13 @@ def _number(free: Free) -> int:
     return number
 
 
-def _starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
-    """Return the guesses, and the same with each shape (a width, a lag, a period) smaller and larger.
+def shape_starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
+    """Return a start with each shape (a width, a lag, a period) smaller, and one with it larger.
 
     Linear unknowns are solved in one step from any start. But if a shape starts far off, the strength of its
     effect may fall to zero, and the shape then has no slope.
     """
-    out = [theta]
+    out: list[np.ndarray] = []
     for k, f in enumerate(machine.parameters.free):
         if f.path[0] != "effects":
             continue

@@ -1,0 +1,147 @@
+"""Fisher's scoring for Gaussian likelihoods whose means and variances depend on the unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float
+
+from jaxid.arrays import Array
+
+# The fit has converged if the log-likelihood can rise by no more than this [nats]: about a hundredth of a
+# standard deviation.
+_TOLERANCE = 1e-5
+# Damping at the start, and the largest one, relative to the diagonal of the information.
+_DAMPING, _STUCK = 1e-3, 1e12
+
+
+class Scored(eqx.Module):
+    """Result of the scoring, on the scale of the solver.
+
+    Args:
+        x: Unknowns, (p,).
+        cost: Negative log-likelihood [nats].
+        z: Residuals over their standard deviations, (time, k); zero for an entry that does not count.
+        mean: Derivative of the residual over its standard deviation, (time, k, p).
+        log_variance: Derivative of the logarithm of the variance, (time, k, p).
+        gradient: Gradient of the cost, (p,).
+        damping: Damping of the last step.
+        steps: Number of evaluations.
+        done: Whether the likelihood can rise no further.
+    """
+
+    x: Array
+    cost: Array
+    z: Array
+    mean: Array
+    log_variance: Array
+    gradient: Array
+    damping: Array
+    steps: Array
+    done: Array
+
+    @property
+    def converged(self) -> Array:
+        """True if the likelihood is finite and can rise no further."""
+        return self.done & jnp.isfinite(self.cost) & (self.damping < _STUCK)
+
+
+class _Trial(eqx.Module):
+    best: Scored
+    normal: Array
+    trial: Array
+    predicted: Array
+    growth: Array
+
+
+def maximise_likelihood(
+    outputs: Callable[[Float[Array, " p"]], tuple[Float[Array, "time k"], Float[Array, "time k"]]],
+    counts: Bool[Array, "time k"],
+    x: Float[Array, " p"],
+    lower: Float[Array, " p"],
+    upper: Float[Array, " p"],
+    max_steps: Array | int,
+) -> Scored:
+    """Maximise a Gaussian likelihood within bounds by Fisher's scoring with Marquardt's damping.
+
+    Args:
+        outputs: Residuals and their variances as functions of the unknowns.
+        counts: Mask of the residuals that count.
+        x: Unknowns at the start, of order one on a linear scale or logarithms.
+        lower, upper: Bounds.
+        max_steps: Largest number of evaluations.
+
+    Source:
+        Ljung (1999), System Identification, section 7.4, for the likelihood of innovations; damping after Nielsen
+        (1999), IMM-REP-1999-05.
+    """
+    x = jnp.clip(x, lower, upper)
+    p = x.size
+
+    def pair(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        e, variance = outputs(x)
+        return (e, jnp.log(variance)), (e, variance)
+
+    def evaluate(x: Array) -> tuple[Array, Array, Array, tuple[Array, Array, Array]]:
+        """Return cost, gradient, information, and the arrays of `Scored`."""
+        (slope, log_slope), (e, variance) = jax.jacfwd(pair, has_aux=True)(x)
+        root = jnp.sqrt(variance)
+        z = jnp.where(counts, e / root, 0.0)
+        mean = jnp.where(counts[..., None], slope / root[..., None], 0.0)
+        spread = jnp.where(counts[..., None], log_slope, 0.0)
+
+        cost = 0.5 * jnp.sum(z**2 + jnp.where(counts, jnp.log(variance), 0.0))
+        gradient = jnp.einsum("tk,tkp->p", z, mean) + 0.5 * jnp.einsum("tk,tkp->p", 1 - z**2, spread)
+
+        rows, logs = mean.reshape(-1, p), spread.reshape(-1, p)
+        # Far from the optimum the observed information on a variance exceeds the expected one.
+        weight = jnp.maximum(jnp.square(z).ravel(), 1.0)[:, None]
+        return cost, gradient, rows.T @ rows + 0.5 * logs.T @ (weight * logs), (z, mean, spread)
+
+    def advance(s: _Trial) -> _Trial:
+        cost, gradient, normal, arrays = evaluate(s.trial)
+        was = s.best
+        better, first = cost < was.cost, ~jnp.isfinite(was.cost)
+        gain = (was.cost - cost) / jnp.maximum(s.predicted, 1e-300)
+        little = better & ~first & (was.cost - cost < _TOLERANCE)
+
+        old = (was.x, was.cost, was.gradient, s.normal, (was.z, was.mean, was.log_variance))
+        new = (s.trial, cost, gradient, normal, arrays)
+        x, cost, gradient, normal, arrays = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        shrink = jnp.where(first, 1.0, jnp.where(gain < 0.5, 0.5, 0.1))
+        damping = jnp.where(better, was.damping * shrink, was.damping * s.growth)
+        growth = jnp.where(better, 2.0, 2 * s.growth)
+
+        # An unknown that presses against a bound rests.
+        rests = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+        size = jnp.sqrt(jnp.maximum(jnp.diag(normal), 1e-300))
+        scaled = jnp.where(rests[:, None] | rests[None, :], 0.0, normal / jnp.outer(size, size))
+        scaled = scaled + jnp.diag(jnp.where(rests, 1.0, damping + 1e-14))
+        whole = -jnp.linalg.solve(scaled, jnp.where(rests, 0.0, gradient) / size) / size
+        trial = jnp.clip(x + whole, lower, upper)
+        predicted = -(gradient @ whole + 0.5 * whole @ normal @ whole)
+        cut = jnp.any(trial != x + whole)
+
+        done = (little & (s.predicted < _TOLERANCE)) | (~cut & (predicted < 0.1 * _TOLERANCE))
+        done |= (damping > _STUCK) | ((was.steps > 10) & ~jnp.isfinite(cost))
+        best = Scored(x, cost, *arrays, gradient, damping, was.steps + 1, done)
+        return _Trial(best, normal, trial, predicted, growth)
+
+    empty = jnp.zeros((*counts.shape, p))
+    start = Scored(
+        x=x,
+        cost=jnp.asarray(jnp.inf),
+        z=jnp.zeros(counts.shape),
+        mean=empty,
+        log_variance=empty,
+        gradient=jnp.zeros(p),
+        damping=jnp.asarray(_DAMPING),
+        steps=jnp.asarray(0),
+        done=jnp.asarray(False),
+    )
+    first = _Trial(start, jnp.eye(p), x, jnp.asarray(0.0), jnp.asarray(2.0))
+    end = jax.lax.while_loop(lambda s: ~s.best.done & (s.best.steps < max_steps), advance, first)
+    return end.best

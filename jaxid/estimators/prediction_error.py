@@ -1,0 +1,208 @@
+"""Prediction error: maximum likelihood of the innovations of a Kalman filter on the plant's step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Float
+
+from jaxid.arrays import Array
+from jaxid.estimators.common.levenberg_marquardt import Transform
+from jaxid.estimators.common.scoring import Scored, maximise_likelihood
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.inverse_dynamics import shape_starts
+from jaxid.logs.log import Log
+from jaxid.machine import Machine
+from jaxid.model.plant import Plant
+from jaxid.model.unknowns import scatter
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.precision import assess
+from jaxid.simulation.kalman import KalmanFilter, make_filter
+from jaxid.simulation.law import noise_free_command
+from jaxid.simulation.replay import Numerics, exact_numerics
+from jaxid.simulation.sensor_noise import position_noise
+
+# Evaluations of a fit, and those that show which start is the best one.
+_STEPS, _SCREENING = 80, 12
+# Noise of the force at the start, as a part of the force; a large one makes a wrong model possible.
+_FORCE_NOISE = 0.1
+# Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow curved
+# valley: a fit at a higher noise leads close to its floor. The last one is far below any drive's.
+_FLOORS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+# Largest noise of the force, as a part of it; noise of a reading, as a multiple of its first estimate.
+_MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
+# Lags of the test of whiteness, and the probability at which it rejects.
+_LAGS, _REJECTS = 20, 1e-3
+
+
+@eqx.filter_jit
+def _fit(
+    kalman: KalmanFilter,
+    places: tuple,
+    plant: Plant,
+    counts: Array,
+    transform: Transform,
+    bounds: tuple[Array, Array],
+    high: Array,
+    low: Array,
+    theta: Array,
+    noise: Array,
+    max_steps: Array,
+) -> tuple[Array, Scored]:
+    """Return the physical values of the unknowns, and the fit with derivatives by them."""
+    p, m = theta.size, kalman.command.shape[1]
+
+    def outputs(x: Array) -> tuple[Array, Array]:
+        fitted = scatter(places, plant, transform.outward(x[:p]))
+        return kalman(fitted, jnp.exp(x[p : p + m]), jnp.exp(x[p + m :]))
+
+    limits = transform.bounds(*(jnp.asarray(b) for b in bounds))
+    lower, upper = (jnp.concatenate([a, b]) for a, b in zip(limits, (low, high), strict=True))
+    start = jnp.concatenate([transform.inward(theta), noise])
+    scored = maximise_likelihood(outputs, counts, start, lower, upper, max_steps)
+
+    found = transform.outward(scored.x[:p])
+    flat = scored.mean[..., :p].reshape(-1, p)
+    physical = transform.physical(flat, found).reshape(*counts.shape, p)
+    return found, eqx.tree_at(lambda s: s.mean, scored, physical)
+
+
+def prediction_error(
+    machine: Machine, log: Log, *, start: np.ndarray | None = None, numerics: Numerics | None = None
+) -> Estimate:
+    """Fit the unknowns, the noise of the force and the noise of the readings by maximum likelihood.
+
+    An extended Kalman filter on the plant's step, driven by the logged command, predicts each reading from
+    those before it. In open loop and in a loop the estimate is the same function of the log, because the
+    command is measured. If the declared law explains the logged command but for white noise of its reading, the
+    command of the law is used.
+
+    Args:
+        machine: The machine. Its sensor gives the first values of the noise.
+        log: The log.
+        start: A start of the fit beside the guesses, for example from `inverse_dynamics`, (p,).
+        numerics: Settings of the integration; None: exact sticking and the steps that the plant needs.
+
+    Returns:
+        The estimate. Its covariance is that of the likelihood, widened if the innovations are coloured.
+
+    Source:
+        Ljung (1999), System Identification, chapter 7; Astrom (1980), Automatica 16, for the innovations form.
+    """
+    return run_alone(prediction_error_steps(machine, log, start=start, numerics=numerics))
+
+
+def prediction_error_steps(
+    machine: Machine, log: Log, *, start: np.ndarray | None = None, numerics: Numerics | None = None
+) -> Steps[Estimate]:
+    """Run `prediction_error` as a generator of solve requests."""
+    numerics = numerics or exact_numerics(machine, log)
+    parameters, measured = machine.parameters, list(log.measured)
+    applied = noise_free_command(machine, log)
+    used = log if applied is None else replace(log, force=applied)
+    kalman = make_filter(machine, used, numerics)
+    counts = np.asarray(kalman.used)[:: kalman.every][:, measured]
+
+    force = np.maximum(np.std(log.force, axis=0), 1e-300)
+    stroke = np.maximum(np.ptp(log.filled, axis=0), 1e-300)
+    reading = np.maximum(position_noise(machine, log), 1e-9 * stroke)[measured]
+    noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
+    high = np.log(np.concatenate([_MOST * force, _READING_RANGE[1] * reading]))
+    floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
+    transform, bounds = Transform.of(parameters), parameters.bounds
+    problem = (kalman, parameters.places, machine.plant, counts, transform, bounds, high)
+
+    starts = [parameters.guess, *shape_starts(machine, parameters.guess)]
+    if start is not None:
+        starts.insert(0, np.clip(start, *parameters.bounds))
+    theta, steps = starts[0], 0
+    if len(starts) > 1:
+        trials = []
+        for at in starts:
+            trials.append((yield SolveRequest(_fit, (*problem, floors[0], at, noise, np.asarray(_SCREENING)))))
+        costs = [np.nan_to_num(float(s.cost), nan=np.inf) for _, s in trials]
+        theta, scored = trials[int(np.argmin(costs))]
+        noise, steps = scored.x[len(theta) :], _SCREENING * len(starts)
+
+    for floor in floors:
+        theta, scored = yield SolveRequest(_fit, (*problem, floor, theta, noise, np.asarray(_STEPS)))
+        noise, steps = scored.x[len(theta) :], steps + int(scored.steps)
+        above = np.asarray(noise)[: len(force)] > floor[: len(force)] + 1e-3
+        if np.all(above) or not np.isfinite(float(scored.cost)):
+            break
+    return _estimate(machine, log, np.asarray(theta), scored, counts, applied is not None, steps)
+
+
+def _estimate(
+    machine: Machine, log: Log, theta: np.ndarray, scored: Scored, counts: np.ndarray, by_law: bool, steps: int
+) -> Estimate:
+    """Return the estimate of a fit, with its precision, its noise and a test of its innovations.
+
+    Args:
+        machine, log: The machine at its guesses, and its log.
+        theta: Estimates, (p,).
+        scored: The fit.
+        counts: Mask of the innovations that count, (time, k).
+        by_law: Whether the command was computed by the declared law.
+        steps: Evaluations of all fits.
+    """
+    names, drives = machine.parameters.names, log.force.shape[1]
+    z, jacobian = np.asarray(scored.z), np.asarray(scored.mean)
+
+    # An unknown is identifiable if its standard deviation changes the innovations less than the largest
+    # effect of any unknown does.
+    scale = np.where(theta != 0, theta, 1.0)
+    effect = np.linalg.norm((jacobian * scale).reshape(-1, len(theta)), axis=0)
+    precision = assess(names, jacobian, z, counts, float(np.max(effect, initial=0.0)), scale)
+
+    noise = np.exp(np.asarray(scored.x)[len(theta) :])
+    p_values = [whiteness(e[c]) for e, c in zip(z.T, counts.T, strict=True)]
+    notes = ["noise of the force and of the readings was estimated with the unknowns"]
+    if by_law:
+        notes.append(
+            "the command was computed by the declared law from the logged readings: the logged one is the same "
+            "but for white noise of its reading"
+        )
+    if min(p_values) < _REJECTS:
+        notes.append(
+            "the innovations are not white: the model or the noise is incomplete, and the standard "
+            "deviations are those of the coloured innovations"
+        )
+    converged = bool(scored.converged) and bool(np.all(np.isfinite(theta)))
+    return Estimate(
+        method="prediction_error",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=converged,
+        message="converged" if converged else f"no convergence within {steps} steps",
+        residual=np.where(counts, z, np.nan),
+        samples=int(counts.sum()),
+        steps=steps,
+        notes=tuple(notes),
+        details={
+            "noise": {"force": noise[:drives], "position": noise[drives:]},
+            "log_likelihood": -float(scored.cost),
+            "whiteness": {"lags": _LAGS, "p": p_values},
+        },
+    )
+
+
+def whiteness(z: Float[np.ndarray, " time"], lags: int = _LAGS) -> float:
+    """Return the probability that white noise has autocorrelations as large as these.
+
+    Source:
+        Ljung & Box (1978), Biometrika 65, statistic of the first `lags` autocorrelations.
+    """
+    samples, z = len(z), z - z.mean()
+    lags = min(lags, samples // 5)
+    power = z @ z
+    if lags < 1 or power <= 0:
+        return 1.0
+    r = np.array([z[k:] @ z[:-k] for k in range(1, lags + 1)]) / power
+    statistic = samples * (samples + 2) * np.sum(r**2 / (samples - np.arange(1, lags + 1)))
+    return float(scipy.stats.chi2.sf(statistic, lags))

@@ -1,0 +1,167 @@
+"""Extended Kalman filter on the plant's step: innovations of a log, and their variances.
+
+The measured command drives the plant, so that a log from a loop and one without a controller are the same
+case. Noise of the force is process noise, and noise of the encoders is measurement noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Bool, Float
+
+from jaxid.arrays import Array
+from jaxid.dynamics.rhs import State
+from jaxid.logs.log import Log
+from jaxid.machine import Machine
+from jaxid.model.plant import Plant
+from jaxid.simulation.loops import Drive, interval_forces
+from jaxid.simulation.replay import Numerics, make_replay
+from jaxid.simulation.sensor_noise import position_noise
+
+# Noise of this many counts makes each rounding error independent of the one before.
+_DITHERS = 0.5
+# Samples over which the speed is averaged that tells how far a reading is from the one before, and the
+# largest number of samples at rest between two readings that count.
+_SMOOTH, _REST = 21, 500
+
+
+class KalmanFilter(eqx.Module):
+    """Inputs of a log for an extended Kalman filter; call it with a plant and the noise.
+
+    Args:
+        drive: Gain, hold and integration of the command.
+        command: Logged command at every tick, (ticks, m).
+        position: Readings at every tick, (ticks, n); between the samples of the log any number.
+        used: Mask of the readings that correct the state, (ticks, n).
+        start: Position and velocity before the first reading, (2 n,).
+        spread: Standard deviations of `start`, (2 n,).
+        measured: Joints with an encoder.
+        every: Number of ticks per sample of the log.
+    """
+
+    drive: Drive
+    command: Float[Array, "ticks m"]
+    position: Float[Array, "ticks n"]
+    used: Bool[Array, "ticks n"]
+    start: Float[Array, " 2n"]
+    spread: Float[Array, " 2n"]
+    measured: tuple[int, ...] = eqx.field(static=True)
+    every: int = eqx.field(static=True)
+
+    def __call__(
+        self, plant: Plant, force_noise: Float[Array, " m"], reading_noise: Float[Array, " k"]
+    ) -> tuple[Float[Array, "time k"], Float[Array, "time k"]]:
+        """Return the innovations and their variances at the samples, for the k joints with an encoder.
+
+        Args:
+            plant: The plant.
+            force_noise: Standard deviation of the command's error, constant between two ticks, (m,).
+            reading_noise: Standard deviation of a reading, (k,) [m or rad].
+
+        Source:
+            Anderson & Moore (1979), Optimal Filtering, section 8.2; readings are taken one after the other,
+            so that no matrix is inverted.
+        """
+        drive, n = self.drive, self.position.shape[1]
+        before, after = interval_forces(plant, drive, self.command)
+        held = drive.hold == "zero_order"
+
+        x0 = State(self.start[:n], self.start[n:], plant.initial_states(before[0]))
+        x, unravel = ravel_pytree(x0)
+        size, m = x.size, before.shape[1]
+        moving = jnp.arange(2 * n)
+        p = jnp.zeros((size, size)).at[moving, moving].set(self.spread**2)
+
+        advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
+        force_variance, reading_variance = (drive.gain * force_noise) ** 2, reading_noise**2
+
+        def tick(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+            x, p = carry
+            u0, u1, t, reading, used = now
+
+            innovations, variances = [], []
+            for i, j in enumerate(self.measured):
+                e, s = reading[j] - x[j], p[j, j] + reading_variance[i]
+                gain = jnp.where(used[j], p[:, j] / s, 0.0)
+                x, p = x + gain * e, p - s * gain[:, None] * gain[None, :]
+                innovations.append(e)
+                variances.append(s)
+
+            def step(z: Array) -> tuple[Array, Array]:
+                ends = (u0 + z[size:],) if held else (u0 + z[size:], u1 + z[size:])
+                new = ravel_pytree(advance(unravel(z[:size]), ends, t))[0]
+                return new, new
+
+            jacobian, x = jax.jacfwd(step, has_aux=True)(jnp.concatenate([x, jnp.zeros(m)]))
+            a, b = jacobian[:, :size], jacobian[:, size:]
+            p = a @ p @ a.T + (b * force_variance) @ b.T
+            return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
+
+        times = drive.period * jnp.arange(self.command.shape[0])
+        inputs = (before, after, times, self.position, self.used)
+        out = jax.lax.scan(tick, (x, p), inputs)[1]
+        return out[0][:: self.every], out[1][:: self.every]
+
+
+def make_filter(machine: Machine, log: Log, numerics: Numerics) -> KalmanFilter:
+    """Prepare a log for the Kalman filter of its machine.
+
+    Args:
+        machine: The machine; its controller is not used.
+        log: The log; its force is the command that drives the filter.
+        numerics: Settings of the integration.
+    """
+    # The command is the logged one: no law is needed.
+    replay = make_replay(replace(machine, controller=None), log, numerics)
+    assert replay.command is not None, "make_replay gives an open loop its command"
+    every, ticks = replay.every, len(replay.command)
+
+    used, position = np.zeros((ticks, log.position.shape[1]), bool), np.zeros((ticks, log.position.shape[1]))
+    used[::every], position[::every] = readings_used(machine, log), log.filled
+
+    noise, stroke = position_noise(machine, log), np.maximum(np.ptp(log.filled, axis=0), 1e-300)
+    speed = np.sqrt(np.mean(np.diff(log.filled, axis=0) ** 2, axis=0)) / log.period
+    # A joint without an encoder may be anywhere within the stroke of the others.
+    unsure = np.where(log.measured, np.maximum(3 * noise, 1e-6 * stroke), 0.1 * np.max(stroke))
+    speed = np.where(log.measured, speed, np.max(speed))
+    return KalmanFilter(
+        drive=replay.drive,
+        command=replay.command,
+        position=position,
+        used=used,
+        start=np.concatenate([replay.position, replay.velocity]),
+        spread=np.concatenate([unsure, speed]),
+        measured=tuple(np.flatnonzero(log.measured).tolist()),
+        every=every,
+    )
+
+
+def readings_used(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
+    """Return the mask of the readings whose rounding error is independent of the others, (time, n).
+
+    Rounding is noise of a twelfth of the squared step only if the position moves by a step, or is dithered,
+    from one reading to the next. On slower motion readings are left out, so many that one is taken a step.
+    """
+    n = log.position.shape[1]
+    stated, resolution = machine.sensor.position_noise, machine.sensor.position_resolution
+    step = np.zeros(n) if resolution is None else np.broadcast_to(np.asarray(resolution), n)
+    noise = position_noise(machine, log) if stated is None else np.broadcast_to(np.asarray(stated), n)
+
+    used = np.zeros(log.position.shape, bool)
+    for j in np.flatnonzero(log.measured):
+        if noise[j] >= _DITHERS * step[j]:
+            used[:, j] = True
+            continue
+        # The speed is smoothed: a choice by the readings themselves would prefer one side of a count.
+        width = min(_SMOOTH, (log.samples - 1) // 2 * 2 + 1)
+        padded = np.pad(log.position[:, j], width // 2, mode="edge")
+        smooth = np.convolve(padded, np.ones(width) / width, "valid")
+        travel = np.clip(np.abs(np.gradient(smooth)) / step[j], 1 / _REST, 1.0)
+        used[:, j] = np.diff(np.floor(np.cumsum(travel) + 0.5), prepend=0.0) > 0
+    return used
