@@ -114,7 +114,15 @@ def _prediction_error(session: Session, *, numerics: Numerics | None = None) -> 
     machine, run = session.machine, session.fit
     first = yield from inverse_dynamics_steps(machine, run.data)
     start = first.theta if np.all(np.isfinite(first.theta)) else None
-    return (yield from prediction_error_steps(machine, run.log, start=start, numerics=numerics))
+    return (
+        yield from prediction_error_steps(
+            machine,
+            run.log,
+            start=start,
+            numerics=numerics,
+            rest_velocity=np.asarray(run.data.recipe.rest_velocity),
+        )
+    )
 
 
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:

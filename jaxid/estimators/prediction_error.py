@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -21,8 +22,8 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.precision import assess
-from jaxid.simulation.kalman import KalmanFilter, make_filter
-from jaxid.simulation.law import noise_free_command
+from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples
+from jaxid.simulation.law import noise_free_command, reading_noise
 from jaxid.simulation.replay import Numerics, exact_numerics
 from jaxid.simulation.sensor_noise import position_noise
 
@@ -35,8 +36,55 @@ _FORCE_NOISE = 0.1
 _FLOORS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 # Largest noise of the force, as a part of it; noise of a reading, as a multiple of its first estimate.
 _MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
+# Pairs of simulated noise for the correction of the bias by noise of the command's reading.
+_PAIRS = 4
 # Lags of the test of whiteness, and the probability at which it rejects.
 _LAGS, _REJECTS = 20, 1e-3
+
+
+@eqx.filter_jit
+def _score(
+    kalman: KalmanFilter,
+    places: tuple,
+    plant: Plant,
+    counts: Array,
+    transform: Transform,
+    bounds: tuple[Array, Array],
+    high: Array,
+    low: Array,
+    theta: Array,
+    noise: Array,
+) -> tuple[Array, Array]:
+    """Return gradient and information at a point, on the scale of the solver."""
+    outputs, start, lower, upper = _on_scale(
+        kalman, places, plant, transform, bounds, high, low, theta, noise
+    )
+    at = maximise_likelihood(outputs, counts, start, lower, upper, 1)
+    rows, logs = (a.reshape(-1, start.size) for a in (at.mean, at.log_variance))
+    return at.gradient, rows.T @ rows + 0.5 * logs.T @ logs
+
+
+def _on_scale(
+    kalman: KalmanFilter,
+    places: tuple,
+    plant: Plant,
+    transform: Transform,
+    bounds: tuple[Array, Array],
+    high: Array,
+    low: Array,
+    theta: Array,
+    noise: Array,
+) -> tuple[Callable[[Array], tuple[Array, Array]], Array, Array, Array]:
+    """Return innovations and variances on the scale of the solver, the start, and the bounds."""
+    p, m = theta.size, kalman.command.shape[1]
+
+    def outputs(x: Array) -> tuple[Array, Array]:
+        fitted = scatter(places, plant, transform.outward(x[:p]))
+        return kalman(fitted, jnp.exp(x[p : p + m]), jnp.exp(x[p + m :]))
+
+    limits = transform.bounds(*(jnp.asarray(b) for b in bounds))
+    lower, upper = (jnp.concatenate([a, b]) for a, b in zip(limits, (low, high), strict=True))
+    return outputs, jnp.concatenate([transform.inward(theta), noise]), lower, upper
 
 
 @eqx.filter_jit
@@ -54,15 +102,10 @@ def _fit(
     max_steps: Array,
 ) -> tuple[Array, Scored]:
     """Return the physical values of the unknowns, and the fit with derivatives by them."""
-    p, m = theta.size, kalman.command.shape[1]
-
-    def outputs(x: Array) -> tuple[Array, Array]:
-        fitted = scatter(places, plant, transform.outward(x[:p]))
-        return kalman(fitted, jnp.exp(x[p : p + m]), jnp.exp(x[p + m :]))
-
-    limits = transform.bounds(*(jnp.asarray(b) for b in bounds))
-    lower, upper = (jnp.concatenate([a, b]) for a, b in zip(limits, (low, high), strict=True))
-    start = jnp.concatenate([transform.inward(theta), noise])
+    p = theta.size
+    outputs, start, lower, upper = _on_scale(
+        kalman, places, plant, transform, bounds, high, low, theta, noise
+    )
     scored = maximise_likelihood(outputs, counts, start, lower, upper, max_steps)
 
     found = transform.outward(scored.x[:p])
@@ -72,7 +115,12 @@ def _fit(
 
 
 def prediction_error(
-    machine: Machine, log: Log, *, start: np.ndarray | None = None, numerics: Numerics | None = None
+    machine: Machine,
+    log: Log,
+    *,
+    start: np.ndarray | None = None,
+    numerics: Numerics | None = None,
+    rest_velocity: np.ndarray | None = None,
 ) -> Estimate:
     """Fit the unknowns, the noise of the force and the noise of the readings by maximum likelihood.
 
@@ -97,15 +145,24 @@ def prediction_error(
 
 
 def prediction_error_steps(
-    machine: Machine, log: Log, *, start: np.ndarray | None = None, numerics: Numerics | None = None
+    machine: Machine,
+    log: Log,
+    *,
+    start: np.ndarray | None = None,
+    numerics: Numerics | None = None,
+    rest_velocity: np.ndarray | None = None,
 ) -> Steps[Estimate]:
     """Run `prediction_error` as a generator of solve requests."""
     numerics = numerics or exact_numerics(machine, log)
     parameters, measured = machine.parameters, list(log.measured)
     applied = noise_free_command(machine, log)
-    used = log if applied is None else replace(log, force=applied)
-    kalman = make_filter(machine, used, numerics)
-    counts = np.asarray(kalman.used)[:: kalman.every][:, measured]
+    driven = log if applied is None else replace(log, force=applied)
+    slow = None
+    if rest_velocity is not None and slides(machine, log):
+        slow = slow_samples(log, rest_velocity)
+    kalman = make_filter(machine, driven, numerics, slow)
+    counts = np.asarray(kalman.used)[:: kalman.every]
+    counts = (counts if slow is None else counts & ~slow)[:, measured]
 
     force = np.maximum(np.std(log.force, axis=0), 1e-300)
     stroke = np.maximum(np.ptp(log.filled, axis=0), 1e-300)
@@ -123,7 +180,9 @@ def prediction_error_steps(
     if len(starts) > 1:
         trials = []
         for at in starts:
-            trials.append((yield SolveRequest(_fit, (*problem, floors[0], at, noise, np.asarray(_SCREENING)))))
+            trials.append(
+                (yield SolveRequest(_fit, (*problem, floors[0], at, noise, np.asarray(_SCREENING))))
+            )
         costs = [np.nan_to_num(float(s.cost), nan=np.inf) for _, s in trials]
         theta, scored = trials[int(np.argmin(costs))]
         noise, steps = scored.x[len(theta) :], _SCREENING * len(starts)
@@ -134,11 +193,71 @@ def prediction_error_steps(
         above = np.asarray(noise)[: len(force)] > floor[: len(force)] + 1e-3
         if np.all(above) or not np.isfinite(float(scored.cost)):
             break
+    read = np.zeros(len(force))
+    if applied is None:
+        x, read = yield from _corrected_steps(log, problem, scored, theta, floor)
+        theta = np.clip(transform.outward(x), *bounds)
     return _estimate(machine, log, np.asarray(theta), scored, counts, applied is not None, steps)
 
 
+def _corrected_steps(
+    log: Log, problem: tuple, scored: Scored, theta: Array, floor: np.ndarray
+) -> Steps[tuple[np.ndarray, float]]:
+    """Remove the bias by noise with which the command was read; return the estimates and the noise.
+
+    The filter takes the logged command for the applied one plus an error that is independent of the log. Noise of
+    the reading is not: like noise of a regressor it makes the force count too little. As much noise again,
+    simulated, has the same effect once more: the shift of the optimum, by one step of the scoring, is
+    subtracted. Pairs of opposite noise cancel in first order.
+
+    Args:
+        log: The log.
+        problem: Arguments of `_fit`.
+        scored: The fit.
+        theta: Its estimates, (p,).
+        floor: Lower bounds of the logarithms of the noise.
+
+    Source:
+        Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
+    """
+    kalman, p, drives = problem[0], len(theta), log.force.shape[1]
+    x = np.asarray(scored.x)
+    read = np.minimum(reading_noise(log), np.exp(x[p : p + drives]))
+    noise = x[p:].copy()
+    noise[:drives] += 0.5 * np.log1p((read / np.exp(noise[:drives])) ** 2)
+
+    def at(command: np.ndarray) -> SolveRequest:
+        shifted = (eqx.tree_at(lambda k: k.command, kalman, command), *problem[1:])
+        return SolveRequest(_score, (*shifted, floor, theta, noise))
+
+    command, every = np.asarray(kalman.command), kalman.every
+    information = np.asarray((yield at(command))[1])
+    rng, gradients = np.random.default_rng(0), []
+    for _ in range(_PAIRS):
+        more = read * rng.standard_normal((len(command[::every]), drives))
+        more = np.repeat(more, every, axis=0)[: len(command)]
+        for sign in (1.0, -1.0):
+            gradients.append(np.asarray((yield at(command + sign * more))[0]))
+    shift = -np.linalg.lstsq(information, np.mean(gradients, axis=0), rcond=1e-13)[0]
+    return x[:p] - shift[:p], read
+
+
+def slides(machine: Machine, log: Log) -> bool:
+    """Check that dry friction acts somewhere."""
+    plant, n = machine.plant, log.position.shape[1]
+    zero, u = jnp.zeros(n), jnp.zeros(log.force.shape[1])
+    balance = plant.balance(jnp.asarray(log.filled[0]), zero, zero, u, jnp.zeros(()), plant.initial_states(u))
+    return bool(balance.slides)
+
+
 def _estimate(
-    machine: Machine, log: Log, theta: np.ndarray, scored: Scored, counts: np.ndarray, by_law: bool, steps: int
+    machine: Machine,
+    log: Log,
+    theta: np.ndarray,
+    scored: Scored,
+    counts: np.ndarray,
+    by_law: bool,
+    steps: int,
 ) -> Estimate:
     """Return the estimate of a fit, with its precision, its noise and a test of its innovations.
 

@@ -29,6 +29,8 @@ _DITHERS = 0.5
 # Samples over which the speed is averaged that tells how far a reading is from the one before, and the
 # largest number of samples at rest between two readings that count.
 _SMOOTH, _REST = 21, 500
+# Samples beside one at rest that count as slow too.
+_AROUND = 3
 
 
 class KalmanFilter(eqx.Module):
@@ -39,6 +41,7 @@ class KalmanFilter(eqx.Module):
         command: Logged command at every tick, (ticks, m).
         position: Readings at every tick, (ticks, n); between the samples of the log any number.
         used: Mask of the readings that correct the state, (ticks, n).
+        kicks: Standard deviation of a change of velocity beside those by the forces, at every tick, (ticks, n).
         start: Position and velocity before the first reading, (2 n,).
         spread: Standard deviations of `start`, (2 n,).
         measured: Joints with an encoder.
@@ -49,6 +52,7 @@ class KalmanFilter(eqx.Module):
     command: Float[Array, "ticks m"]
     position: Float[Array, "ticks n"]
     used: Bool[Array, "ticks n"]
+    kicks: Float[Array, "ticks n"]
     start: Float[Array, " 2n"]
     spread: Float[Array, " 2n"]
     measured: tuple[int, ...] = eqx.field(static=True)
@@ -75,7 +79,7 @@ class KalmanFilter(eqx.Module):
         x0 = State(self.start[:n], self.start[n:], plant.initial_states(before[0]))
         x, unravel = ravel_pytree(x0)
         size, m = x.size, before.shape[1]
-        moving = jnp.arange(2 * n)
+        moving, speeds = jnp.arange(2 * n), n + jnp.arange(n)
         p = jnp.zeros((size, size)).at[moving, moving].set(self.spread**2)
 
         advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
@@ -83,7 +87,7 @@ class KalmanFilter(eqx.Module):
 
         def tick(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
             x, p = carry
-            u0, u1, t, reading, used = now
+            u0, u1, t, reading, used, kicks = now
 
             innovations, variances = [], []
             for i, j in enumerate(self.measured):
@@ -101,29 +105,37 @@ class KalmanFilter(eqx.Module):
             jacobian, x = jax.jacfwd(step, has_aux=True)(jnp.concatenate([x, jnp.zeros(m)]))
             a, b = jacobian[:, :size], jacobian[:, size:]
             p = a @ p @ a.T + (b * force_variance) @ b.T
+            p = p.at[speeds, speeds].add(kicks**2)
             return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
 
         times = drive.period * jnp.arange(self.command.shape[0])
-        inputs = (before, after, times, self.position, self.used)
+        inputs = (before, after, times, self.position, self.used, self.kicks)
         out = jax.lax.scan(tick, (x, p), inputs)[1]
         return out[0][:: self.every], out[1][:: self.every]
 
 
-def make_filter(machine: Machine, log: Log, numerics: Numerics) -> KalmanFilter:
+def make_filter(
+    machine: Machine, log: Log, numerics: Numerics, slow: np.ndarray | None = None
+) -> KalmanFilter:
     """Prepare a log for the Kalman filter of its machine.
 
     Args:
         machine: The machine; its controller is not used.
         log: The log; its force is the command that drives the filter.
         numerics: Settings of the integration.
+        slow: Mask of the samples at which the model is not to predict the velocity, see `slow_samples`, (time, n);
+            None: it always does.
     """
     # The command is the logged one: no law is needed.
     replay = make_replay(replace(machine, controller=None), log, numerics)
     assert replay.command is not None, "make_replay gives an open loop its command"
-    every, ticks = replay.every, len(replay.command)
+    every, ticks, n = replay.every, len(replay.command), log.position.shape[1]
+    slow = np.zeros(log.position.shape, bool) if slow is None else slow
 
-    used, position = np.zeros((ticks, log.position.shape[1]), bool), np.zeros((ticks, log.position.shape[1]))
-    used[::every], position[::every] = readings_used(machine, log), log.filled
+    used, position, kicks = np.zeros((ticks, n), bool), np.zeros((ticks, n)), np.zeros((ticks, n))
+    used[::every], position[::every] = readings_used(machine, log) | (slow & log.measured), log.filled
+    fastest = np.max(np.abs(np.diff(smooth_steps(log), axis=0)), axis=0, initial=0.0) / log.period
+    kicks[::every] = slow * fastest
 
     noise, stroke = position_noise(machine, log), np.maximum(np.ptp(log.filled, axis=0), 1e-300)
     speed = np.sqrt(np.mean(np.diff(log.filled, axis=0) ** 2, axis=0)) / log.period
@@ -135,11 +147,40 @@ def make_filter(machine: Machine, log: Log, numerics: Numerics) -> KalmanFilter:
         command=replay.command,
         position=position,
         used=used,
+        kicks=kicks,
         start=np.concatenate([replay.position, replay.velocity]),
         spread=np.concatenate([unsure, speed]),
         measured=tuple(np.flatnonzero(log.measured).tolist()),
         every=every,
     )
+
+
+def smooth_steps(log: Log) -> Float[np.ndarray, "time n"]:
+    """Return the change of position from sample to sample, smoothed, (time, n) [m or rad]."""
+    width = min(_SMOOTH, (log.samples - 1) // 2 * 2 + 1)
+    padded = np.pad(log.filled, ((width // 2, width // 2), (0, 0)), mode="edge")
+    sums = np.cumsum(np.concatenate([np.zeros((1, log.filled.shape[1])), padded]), axis=0)
+    return np.gradient((sums[width:] - sums[:-width]) / width, axis=0)
+
+
+def slow_samples(log: Log, rest_velocity: Float[np.ndarray, " n"]) -> Bool[np.ndarray, "time n"]:
+    """Return the mask of the samples at and around rest, (time, n).
+
+    At rest and at reversals a filter is degenerate: under noise of the force it is not known when a joint
+    sticks, and neither a slope nor a variance of the step shows that.
+
+    Args:
+        log: The log.
+        rest_velocity: Speed below which a sample counts as at rest, (n,) [m/s or rad/s].
+    """
+    steps = smooth_steps(log)
+    turned = np.diff(np.sign(steps), axis=0, prepend=np.sign(steps[:1])) != 0
+    slow = (np.abs(steps) < np.asarray(rest_velocity) * log.period) | turned
+    wide = slow.copy()
+    for k in range(1, _AROUND + 1):
+        wide[k:] |= slow[:-k]
+        wide[:-k] |= slow[k:]
+    return wide
 
 
 def readings_used(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
@@ -153,15 +194,12 @@ def readings_used(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
     step = np.zeros(n) if resolution is None else np.broadcast_to(np.asarray(resolution), n)
     noise = position_noise(machine, log) if stated is None else np.broadcast_to(np.asarray(stated), n)
 
-    used = np.zeros(log.position.shape, bool)
+    # The speed is smoothed: a choice by the readings themselves would prefer one side of a count.
+    steps, used = np.abs(smooth_steps(log)), np.zeros(log.position.shape, bool)
     for j in np.flatnonzero(log.measured):
         if noise[j] >= _DITHERS * step[j]:
             used[:, j] = True
             continue
-        # The speed is smoothed: a choice by the readings themselves would prefer one side of a count.
-        width = min(_SMOOTH, (log.samples - 1) // 2 * 2 + 1)
-        padded = np.pad(log.position[:, j], width // 2, mode="edge")
-        smooth = np.convolve(padded, np.ones(width) / width, "valid")
-        travel = np.clip(np.abs(np.gradient(smooth)) / step[j], 1 / _REST, 1.0)
+        travel = np.clip(steps[:, j] / step[j], 1 / _REST, 1.0)
         used[:, j] = np.diff(np.floor(np.cumsum(travel) + 0.5), prepend=0.0) > 0
     return used

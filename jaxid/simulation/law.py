@@ -12,6 +12,7 @@ from jaxid.arrays import Array
 from jaxid.controllers import Controller, Tick
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.numerics.filters import high_band_std
 from jaxid.simulation.replay import make_replay
 
 # First ticks at which the memory of the law is not known.
@@ -19,6 +20,8 @@ _SETTLING = 20
 # Largest autocorrelation of the difference between the logged command and that of the law, at lags 1 to 5, at
 # which it counts as noise of the reading; and the largest such noise, as a part of the command.
 _WHITE, _LAGS, _NOISE = 0.1, 5, 0.5
+# Readings to which a law may answer at a tick.
+_TAPS = 8
 
 
 @eqx.filter_jit
@@ -90,3 +93,23 @@ def noise_free_command(machine: Machine, log: Log) -> Float[np.ndarray, "time m"
     if np.max(np.abs(correlation)) > _WHITE:
         return None
     return np.concatenate([log.force[:_SETTLING], command[_SETTLING:]])
+
+
+def reading_noise(log: Log) -> Float[np.ndarray, " m"]:
+    """Estimate the noise with which the command was read, (m,), in units of the log.
+
+    A sampled law answers to the readings of a few ticks, so that the logged command is rough even if it is
+    logged exactly. What no such law explains, at the top of the spectrum, is noise of its reading.
+    """
+    columns = [log.filled] if log.reference is None else [log.filled, log.reference]
+    signals = np.concatenate(columns, axis=1)
+    rows = np.concatenate([signals[_TAPS - k : len(signals) - k] for k in range(_TAPS)], axis=1)
+    force = log.force[_TAPS:]
+    if len(force) < 4 * rows.shape[1]:
+        return high_band_std(log.force)
+    # Differences, because moves and integrals are slow.
+    rows, steps = np.diff(rows, axis=0), np.diff(force, axis=0)
+    rows = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    weights = np.linalg.lstsq(rows, steps, rcond=1e-9)[0]
+    left = np.cumsum(np.concatenate([force[:1], steps - rows @ weights]), axis=0)
+    return np.minimum(high_band_std(left), high_band_std(log.force))
