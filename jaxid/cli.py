@@ -174,7 +174,11 @@ def _check(commands: argparse._SubParsersAction) -> None:
 def _identify(commands: argparse._SubParsersAction) -> None:
     parser = _add(commands, "identify", "identify the unknowns of a case from a log", _run_identify)
     _logs(parser)
-    parser.add_argument("--method", metavar="M", default="output_error", help=", ".join(METHODS))
+    parser.add_argument(
+        "--method",
+        metavar="M",
+        help=f"{', '.join(METHODS)}; absent: chosen from case and log, and the reason is printed",
+    )
     parser.add_argument(
         "--on",
         metavar="OUTPUT",
@@ -316,7 +320,7 @@ def _run_check(args: argparse.Namespace) -> int:
 
 
 def _run_identify(args: argparse.Namespace) -> int:
-    if args.method not in METHODS:
+    if args.method is not None and args.method not in METHODS:
         raise InputError(f"method {args.method!r} is not known", hint=f"choose one of {', '.join(METHODS)}")
     _need_numerics(args)
     if args.on is not None and args.on not in OUTPUTS:

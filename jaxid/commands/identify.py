@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import steps_of
+from jaxid.estimators.choice import choose_method, with_choice
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap, gaps, noise_floor
@@ -68,7 +70,7 @@ def identify(
     case: CaseLike,
     log: LogLike,
     *,
-    method: str = "output_error",
+    method: str | None = None,
     solver: str | None = None,
     minimiser: str | Minimiser | None = None,
     on: str | None = None,
@@ -80,7 +82,8 @@ def identify(
     Args:
         case: The case, its file, or a dict with its tables.
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
-        method: One of `jaxid.names.METHODS`, or a registered one.
+        method: One of `jaxid.names.METHODS`, or a registered one; None: chosen from case and log, with the
+            reason in `result.json` under `settings`.
         solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between
             samples and dry friction is smoothed; None: fixed steps and exact dry friction. The gap is
             computed with fixed steps either way.
@@ -94,8 +97,9 @@ def identify(
     Raises:
         InputError: If case, log, method, solver, minimiser or `on` are unsound.
     """
-    _check_method(method)
-    options = {}
+    if method is not None:
+        _check_method(method)
+    options: dict[str, Any] = {}
     if solver is not None:
         options["solver"] = _checked("solver", solver, tuple(SOLVERS), method)
     if minimiser is not None:
@@ -111,8 +115,14 @@ def identify(
             where=session.case.where,
             hint="give at least one parameter as { guess = ... }",
         )
+    choice = None
+    if method is None:
+        choice = choose_method(session, next(iter(options), None))
+        method = choice.method
     progress(f"fitting by {method}")
     estimate = run_alone(steps_of(method, session, **options), _gaps_of(session))
+    if choice is not None:
+        estimate = with_choice(estimate, choice)
     progress("simulating")
     return Identification(
         session,
@@ -126,7 +136,7 @@ def identify_many(
     case: CaseLike | Sequence[CaseLike],
     logs: Sequence[LogLike],
     *,
-    method: str = "output_error",
+    method: str | None = None,
     lanes: int = 16,
 ) -> list[Estimate | Exception]:
     """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
@@ -135,7 +145,7 @@ def identify_many(
         case: The case, its file, or a dict with its tables; or one for each log, with guesses that may
             differ.
         logs: Logs, or their files.
-        method: One of `jaxid.names.METHODS`, or a registered one.
+        method: One of `jaxid.names.METHODS`, or a registered one; None: chosen for each case and log.
         lanes: Number of logs in a compiled call.
 
     Returns:
@@ -144,7 +154,8 @@ def identify_many(
     Raises:
         InputError: If a case or the method is unsound, or cases are not as many as logs.
     """
-    _check_method(method)
+    if method is not None:
+        _check_method(method)
     if isinstance(case, Case | Mapping | str | Path):
         cases = [load_case(case)] * len(logs)
     elif len(case) == len(logs):
@@ -153,7 +164,10 @@ def identify_many(
         raise InputError(f"{len(case)} cases for {len(logs)} logs", hint="give one case, or one for each log")
 
     def steps(case: Case, log: LogLike) -> Steps[Estimate]:
-        return (yield from steps_of(method, open_session(case, log, method=method)))
+        session = open_session(case, log, method=method)
+        choice = choose_method(session) if method is None else None
+        estimate = yield from steps_of(method or choose_method(session).method, session)
+        return estimate if choice is None else with_choice(estimate, choice)
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
@@ -169,16 +183,16 @@ def _check_method(method: str) -> None:
         raise InputError(f"method {method!r} is not known", hint=f"choose one of {', '.join(known)}")
 
 
-def _checked(option: str, value: str, known: Collection[str], method: str) -> str:
+def _checked(option: str, value: str, known: Collection[str], method: str | None) -> str:
     _need_output_error(option, value, method)
     if value not in known:
         raise InputError(f"{option} {value!r} is not known", hint=suggest(value, known))
     return value
 
 
-def _need_output_error(option: str, value: str, method: str) -> None:
+def _need_output_error(option: str, value: str, method: str | None) -> None:
     methods = ("output_error", "within_prior")
-    if method not in methods:
+    if method is not None and method not in methods:
         raise InputError(
             f"{option} {value!r} goes only with {' and '.join(methods)}",
             hint=f"leave out {option}, or method {method!r}",

@@ -21,7 +21,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.precision import assess
+from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples
 from jaxid.simulation.law import noise_free_command, reading_noise
 from jaxid.simulation.replay import Numerics, exact_numerics
@@ -31,13 +31,20 @@ from jaxid.simulation.sensor_noise import position_noise
 _STEPS, _SCREENING = 80, 12
 # Noise of the force at the start, as a part of the force; a large one makes a wrong model possible.
 _FORCE_NOISE = 0.1
-# Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow curved
-# valley: a fit at a higher noise leads close to its floor. The last one is far below any drive's.
-_FLOORS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+# Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow
+# curved valley: a fit at a higher noise leads close to its floor. The last one is below any drive's noise,
+# and above the error of the steps at reversals.
+_FLOORS = (1e-2, 1e-3, 1e-4)
 # Largest noise of the force, as a part of it; noise of a reading, as a multiple of its first estimate.
 _MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
+# Noise of the force, as a part of it, below which sticking is certain.
+_QUIET = 1e-3
 # Pairs of simulated noise for the correction of the bias by noise of the command's reading.
 _PAIRS = 4
+# Eigenvalue of the scaled information, relative to the largest, below which a direction is not corrected.
+_BLIND = 1e-10
+# Blocks whose scores give the least variance of the estimates.
+_BLOCKS = 40
 # Lags of the test of whiteness, and the probability at which it rejects.
 _LAGS, _REJECTS = 20, 1e-3
 
@@ -126,22 +133,26 @@ def prediction_error(
 
     An extended Kalman filter on the plant's step, driven by the logged command, predicts each reading from
     those before it. In open loop and in a loop the estimate is the same function of the log, because the
-    command is measured. If the declared law explains the logged command but for white noise of its reading, the
-    command of the law is used.
+    command is measured. If the declared law explains the logged command but for white noise of its reading,
+    the command of the law is used.
 
     Args:
         machine: The machine. Its sensor gives the first values of the noise.
         log: The log.
         start: A start of the fit beside the guesses, for example from `inverse_dynamics`, (p,).
         numerics: Settings of the integration; None: exact sticking and the steps that the plant needs.
+        rest_velocity: Speed below which a sample of a machine with dry friction does not count, unless the
+            force is free of noise, (n,) [m/s or rad/s]; None: all samples count.
 
     Returns:
         The estimate. Its covariance is that of the likelihood, widened if the innovations are coloured.
 
     Source:
-        Ljung (1999), System Identification, chapter 7; Astrom (1980), Automatica 16, for the innovations form.
+        Ljung (1999), System Identification, chapter 7; Astrom (1980), Automatica 16, for the innovations.
     """
-    return run_alone(prediction_error_steps(machine, log, start=start, numerics=numerics))
+    return run_alone(
+        prediction_error_steps(machine, log, start=start, numerics=numerics, rest_velocity=rest_velocity)
+    )
 
 
 def prediction_error_steps(
@@ -177,8 +188,8 @@ def prediction_error_steps(
     if start is not None:
         starts.insert(0, np.clip(start, *parameters.bounds))
     theta, steps = starts[0], 0
+    trials = []
     if len(starts) > 1:
-        trials = []
         for at in starts:
             trials.append(
                 (yield SolveRequest(_fit, (*problem, floors[0], at, noise, np.asarray(_SCREENING))))
@@ -187,28 +198,39 @@ def prediction_error_steps(
         theta, scored = trials[int(np.argmin(costs))]
         noise, steps = scored.x[len(theta) :], _SCREENING * len(starts)
 
+    scored, floor = None, floors[0]
     for floor in floors:
         theta, scored = yield SolveRequest(_fit, (*problem, floor, theta, noise, np.asarray(_STEPS)))
         noise, steps = scored.x[len(theta) :], steps + int(scored.steps)
         above = np.asarray(noise)[: len(force)] > floor[: len(force)] + 1e-3
         if np.all(above) or not np.isfinite(float(scored.cost)):
             break
+    assert scored is not None, "there is at least one floor"
+
+    # Without noise of the force it is known when a joint sticks, and samples at rest count too.
+    if slow is not None and applied is not None and np.all(np.exp(noise[: len(force)]) < _QUIET * force):
+        kalman = make_filter(machine, driven, numerics)
+        counts = np.asarray(kalman.used)[:: kalman.every][:, measured]
+        problem = (kalman, parameters.places, machine.plant, counts, transform, bounds, high)
+        theta, scored = yield SolveRequest(_fit, (*problem, floor, theta, noise, np.asarray(_STEPS)))
+        steps += int(scored.steps)
+
     read = np.zeros(len(force))
     if applied is None:
         x, read = yield from _corrected_steps(log, problem, scored, theta, floor)
         theta = np.clip(transform.outward(x), *bounds)
-    return _estimate(machine, log, np.asarray(theta), scored, counts, applied is not None, steps)
+    return _estimate(machine, log, np.asarray(theta), scored, counts, applied is not None, read, steps)
 
 
 def _corrected_steps(
     log: Log, problem: tuple, scored: Scored, theta: Array, floor: np.ndarray
-) -> Steps[tuple[np.ndarray, float]]:
+) -> Steps[tuple[np.ndarray, np.ndarray]]:
     """Remove the bias by noise with which the command was read; return the estimates and the noise.
 
-    The filter takes the logged command for the applied one plus an error that is independent of the log. Noise of
-    the reading is not: like noise of a regressor it makes the force count too little. As much noise again,
-    simulated, has the same effect once more: the shift of the optimum, by one step of the scoring, is
-    subtracted. Pairs of opposite noise cancel in first order.
+    The filter takes the logged command for the applied one plus an error that is independent of the log.
+    Noise of the reading is not independent: like noise of a regressor it makes the force count too little. As
+    much noise again, simulated, has the same effect once more: the shift of the optimum, by one step of the
+    scoring, is subtracted. Pairs of opposite noise cancel in first order.
 
     Args:
         log: The log.
@@ -238,7 +260,9 @@ def _corrected_steps(
         more = np.repeat(more, every, axis=0)[: len(command)]
         for sign in (1.0, -1.0):
             gradients.append(np.asarray((yield at(command + sign * more))[0]))
-    shift = -np.linalg.lstsq(information, np.mean(gradients, axis=0), rcond=1e-13)[0]
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information / np.outer(size, size), rcond=_BLIND, hermitian=True)
+    shift = -inverse @ (np.mean(gradients, axis=0) / size) / size
     return x[:p] - shift[:p], read
 
 
@@ -257,6 +281,7 @@ def _estimate(
     scored: Scored,
     counts: np.ndarray,
     by_law: bool,
+    read: np.ndarray,
     steps: int,
 ) -> Estimate:
     """Return the estimate of a fit, with its precision, its noise and a test of its innovations.
@@ -267,6 +292,7 @@ def _estimate(
         scored: The fit.
         counts: Mask of the innovations that count, (time, k).
         by_law: Whether the command was computed by the declared law.
+        read: Noise with which the command was read, (m,).
         steps: Evaluations of all fits.
     """
     names, drives = machine.parameters.names, log.force.shape[1]
@@ -277,14 +303,15 @@ def _estimate(
     scale = np.where(theta != 0, theta, 1.0)
     effect = np.linalg.norm((jacobian * scale).reshape(-1, len(theta)), axis=0)
     precision = assess(names, jacobian, z, counts, float(np.max(effect, initial=0.0)), scale)
+    precision = widened(precision, np.einsum("tk,tkp->tp", z, jacobian), jacobian)
 
     noise = np.exp(np.asarray(scored.x)[len(theta) :])
     p_values = [whiteness(e[c]) for e, c in zip(z.T, counts.T, strict=True)]
     notes = ["noise of the force and of the readings was estimated with the unknowns"]
     if by_law:
         notes.append(
-            "the command was computed by the declared law from the logged readings: the logged one is the same "
-            "but for white noise of its reading"
+            "the command was computed by the declared law from the logged readings: the logged one is the "
+            "same but for white noise of its reading"
         )
     if min(p_values) < _REJECTS:
         notes.append(
@@ -304,11 +331,43 @@ def _estimate(
         steps=steps,
         notes=tuple(notes),
         details={
-            "noise": {"force": noise[:drives], "position": noise[drives:]},
+            "noise": {"force": noise[:drives], "force_reading": read, "position": noise[drives:]},
             "log_likelihood": -float(scored.cost),
             "whiteness": {"lags": _LAGS, "p": p_values},
         },
     )
+
+
+def widened(
+    precision: Precision, scores: Float[np.ndarray, "time p"], jacobian: Float[np.ndarray, "time k p"]
+) -> Precision:
+    """Return the precision with standard deviations at least as large as the scores of long blocks imply.
+
+    Rounding of a steady motion, and an incomplete model, leave errors that last longer than any innovation
+    model remembers. The sum of the scores over a block has their whole variance.
+
+    Args:
+        precision: Precision by the model of the innovations.
+        scores: Derivative of the log-likelihood of each sample, (time, p).
+        jacobian: Derivative of the innovations over their standard deviations, (time, k, p).
+
+    Source:
+        White (1982), Econometrica 50; blocks for dependent samples after Kunsch (1989), Annals of
+        Statistics 17.
+    """
+    keep = precision.identifiable
+    if not keep.any() or len(scores) < 2 * _BLOCKS:
+        return precision
+    rows = jacobian[..., keep].reshape(-1, keep.sum())
+    size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    inverse = np.linalg.pinv((rows / size).T @ (rows / size), rcond=1e-12, hermitian=True)
+    sums = np.array([part.sum(axis=0) for part in np.array_split(scores[:, keep] / size, _BLOCKS)])
+    blocked = inverse @ (sums.T @ sums) @ inverse / np.outer(size, size)
+    factor = np.ones(len(keep))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.sqrt(np.diag(blocked)) / precision.std[keep]
+    factor[keep] = np.where(np.isfinite(ratio), np.maximum(ratio, 1.0), 1.0)
+    return replace(precision, covariance=precision.covariance * np.outer(factor, factor))
 
 
 def whiteness(z: Float[np.ndarray, " time"], lags: int = _LAGS) -> float:

@@ -26,8 +26,8 @@ from jaxid.simulation.sensor_noise import position_noise
 
 # Noise of this many counts makes each rounding error independent of the one before.
 _DITHERS = 0.5
-# Samples over which the speed is averaged that tells how far a reading is from the one before, and the
-# largest number of samples at rest between two readings that count.
+# Samples over which a speed is averaged, and the largest number of samples at rest between two readings
+# that count.
 _SMOOTH, _REST = 21, 500
 # Samples beside one at rest that count as slow too.
 _AROUND = 3
@@ -41,7 +41,7 @@ class KalmanFilter(eqx.Module):
         command: Logged command at every tick, (ticks, m).
         position: Readings at every tick, (ticks, n); between the samples of the log any number.
         used: Mask of the readings that correct the state, (ticks, n).
-        kicks: Standard deviation of a change of velocity beside those by the forces, at every tick, (ticks, n).
+        kicks: Standard deviation of a change of velocity that no force causes, at every tick, (ticks, n).
         start: Position and velocity before the first reading, (2 n,).
         spread: Standard deviations of `start`, (2 n,).
         measured: Joints with an encoder.
@@ -99,7 +99,7 @@ class KalmanFilter(eqx.Module):
 
             def step(z: Array) -> tuple[Array, Array]:
                 ends = (u0 + z[size:],) if held else (u0 + z[size:], u1 + z[size:])
-                new = ravel_pytree(advance(unravel(z[:size]), ends, t))[0]
+                new = ravel_pytree(advance(unravel(jnp.asarray(z[:size])), ends, t))[0]
                 return new, new
 
             jacobian, x = jax.jacfwd(step, has_aux=True)(jnp.concatenate([x, jnp.zeros(m)]))
@@ -123,8 +123,8 @@ def make_filter(
         machine: The machine; its controller is not used.
         log: The log; its force is the command that drives the filter.
         numerics: Settings of the integration.
-        slow: Mask of the samples at which the model is not to predict the velocity, see `slow_samples`, (time, n);
-            None: it always does.
+        slow: Mask of the samples at which the model is not to predict the velocity, see `slow_samples`,
+            (time, n); None: it always does.
     """
     # The command is the logged one: no law is needed.
     replay = make_replay(replace(machine, controller=None), log, numerics)

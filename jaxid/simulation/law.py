@@ -20,6 +20,8 @@ _SETTLING = 20
 # Largest autocorrelation of the difference between the logged command and that of the law, at lags 1 to 5, at
 # which it counts as noise of the reading; and the largest such noise, as a part of the command.
 _WHITE, _LAGS, _NOISE = 0.1, 5, 0.5
+# A difference below this part of the command is rounding.
+_EXACT = 1e-6
 # Readings to which a law may answer at a tick.
 _TAPS = 8
 
@@ -53,7 +55,7 @@ def command_along(machine: Machine, log: Log) -> Float[np.ndarray, "time m"] | N
         log: The log, one row per tick of the controller.
 
     Returns:
-        The command in units of the log; None if the law cannot be computed from the log: there is no controller
+        The command in units of the log; None if the law cannot be computed: there is no controller
         or no reference, the log is slower than the loop, or a joint has no encoder.
     """
     controller = machine.controller
@@ -87,6 +89,8 @@ def noise_free_command(machine: Machine, log: Log) -> Float[np.ndarray, "time m"
     size, noise = np.std(log.force, axis=0), np.sqrt(np.mean(off**2, axis=0))
     if np.any(noise > _NOISE * size):
         return None
+    if np.all(noise <= _EXACT * size):
+        return command
     # The mean counts too: an integral that began elsewhere, or a disturbance, is no noise.
     power = np.maximum(np.sum(off**2, axis=0), 1e-300)
     correlation = [np.sum(off[k:] * off[:-k], axis=0) / power for k in range(1, _LAGS + 1)]

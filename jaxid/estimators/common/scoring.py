@@ -75,8 +75,8 @@ def maximise_likelihood(
         max_steps: Largest number of evaluations.
 
     Source:
-        Ljung (1999), System Identification, section 7.4, for the likelihood of innovations; damping after Nielsen
-        (1999), IMM-REP-1999-05.
+        Ljung (1999), System Identification, section 7.4, for the likelihood of innovations; damping after
+        Nielsen (1999), IMM-REP-1999-05.
     """
     x = jnp.clip(x, lower, upper)
     p = x.size
@@ -127,7 +127,18 @@ def maximise_likelihood(
 
         done = (little & (s.predicted < _TOLERANCE)) | (~cut & (predicted < 0.1 * _TOLERANCE))
         done |= (damping > _STUCK) | ((was.steps > 10) & ~jnp.isfinite(cost))
-        best = Scored(x, cost, *arrays, gradient, damping, was.steps + 1, done)
+        z, mean, spread = arrays
+        best = Scored(
+            x=x,
+            cost=cost,
+            z=z,
+            mean=mean,
+            log_variance=spread,
+            gradient=gradient,
+            damping=damping,
+            steps=was.steps + 1,
+            done=done,
+        )
         return _Trial(best, normal, trial, predicted, growth)
 
     empty = jnp.zeros((*counts.shape, p))

@@ -1,0 +1,83 @@
+"""Choice of the estimator that suits a case and its log, with the reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from jaxid.estimators.estimate import Estimate
+
+if TYPE_CHECKING:
+    from jaxid.session import Session
+
+# Samples beyond which a filter over the whole log takes too long for a default.
+_LONG = 400_000
+
+
+class Choice(NamedTuple):
+    """A method, and the reason in words.
+
+    Args:
+        method: Name of the method.
+        reason: Clause that follows "because".
+    """
+
+    method: str
+    reason: str
+
+    def json(self) -> dict[str, Any]:
+        """Return the entry of `settings` in result.json."""
+        return {"value": self.method, "reason": self.reason}
+
+
+def choose_method(session: Session, asked: str | None = None) -> Choice:
+    """Choose the method for a session whose method is not stated.
+
+    `docs/methods.md` has the measured intervals of each method on which the choice rests.
+
+    Args:
+        session: Case and logs.
+        asked: An option of `output_error` that the user gave, such as "solver"; None: none.
+    """
+    case, machine, log = session.case, session.machine, session.fit.log
+    plant, controller = machine.plant, machine.controller
+
+    if asked is not None:
+        return Choice("output_error", f"{asked} is an option of it")
+    if "output_error" in case.tables and case.within_prior is None:
+        return Choice("output_error", "the case has a table [output_error]")
+    if case.fits_within_prior(None):
+        return Choice(case.prior_method, "the case states a prior")
+    if machine.unknown_reference is not None:
+        return Choice("output_error", "the reference has unknowns, which only a simulated loop shows")
+    if case.identification.physically_consistent:
+        return Choice("output_error", "links are to be physically consistent")
+
+    looped = controller is not None and log.reference is not None
+    breaks_away = any(e.break_away_level is not None for e in plant.effects)
+    if breaks_away and looped:
+        return Choice("output_error", "only a simulated loop shows when a joint breaks away")
+    if controller is not None and looped and log.period > 1.5 * controller.period:
+        return Choice(
+            "output_error", "the log is slower than the loop, whose command changes between samples"
+        )
+    if plant.coupled and len(log.measured) > 1:
+        return Choice("inverse_dynamics", "a filter along the log of an arm takes long")
+    if log.samples > _LONG:
+        return Choice("inverse_dynamics", f"a filter along {log.samples} samples takes long")
+
+    how = "open loop and feedback are one case" if controller is None else "the log holds the command"
+    if not np.all(log.measured):
+        how = "a joint has no encoder"
+    return Choice("prediction_error", f"{how}, and the noise of force and position is estimated from the log")
+
+
+def with_choice(estimate: Estimate, choice: Choice) -> Estimate:
+    """Return the estimate with the choice of its method among notes and settings."""
+    note = f"{choice.method} was chosen because {choice.reason}"
+    settings = {**estimate.details.get("settings", {}), "method": choice.json()}
+    return replace(
+        estimate, notes=(note, *estimate.notes), details={**estimate.details, "settings": settings}
+    )

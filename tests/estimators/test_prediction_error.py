@@ -1,0 +1,171 @@
+"""The likelihood of innovations, on logs of the exact axis, whose physics shares no code with the filter."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.estimators.choice import choose_method
+from jaxid.estimators.common.scoring import maximise_likelihood
+from jaxid.estimators.prediction_error import whiteness
+from jaxid.session import open_session
+from jaxid.simulation.law import noise_free_command, reading_noise
+from truth.axis.cases import case_text
+from truth.axis.machines import EMPS_ACCELERATION, EMPS_LOOP, Setup, emps_like, moves
+from truth.axis.stepper import Sensor
+
+TRUE = np.array([95.1, 203.5, 20.39])
+LOGS = 8
+
+
+def setup(seed: int, **sensor: float) -> Setup:
+    """Build two seconds of an EMPS axis: a slow, a fast and a middle move, drawn by a few percent."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(2000) / 1000.0
+    speeds = np.array([0.05, 0.3, 0.13]) * rng.uniform(0.9, 1.1, 3)
+    reference = moves(t, [0.0, 0.02, 0.12], speeds, 2 * EMPS_ACCELERATION, rest=0.02)
+    given = {"position_resolution": 1e-7, "position_noise": 1e-6, "force_noise": 0.1, **sensor}
+    loop = dataclasses.replace(EMPS_LOOP, reference=reference)
+    base = emps_like()
+    return Setup(base.machine, loop, Sensor(**given), rate=1000.0, duration=2.0, seed=seed)
+
+
+def opened(folder, seed: int, *, closed: bool, sensor: bool = True, **values: float):
+    """Return the case's file and its log as columns; the guesses are off by a factor of 1.5."""
+    made = setup(seed, **values)
+    run = made.run()
+    path = folder / f"{seed}{closed}{sensor}.toml"
+    path.write_text(case_text(made, list(made.machine.effects.items()), closed=closed, sensor=sensor))
+    return path, {"t": run["t"], "q": run["position"], "u": run["force"], "ref": run["reference"]}
+
+
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory):
+    """The estimates of eight logs without and with the controller."""
+    folder = tmp_path_factory.mktemp("innovations")
+    out = {}
+    for closed in (False, True):
+        files = [opened(folder, seed, closed=closed) for seed in range(1, LOGS + 1)]
+        cases, logs = zip(*files, strict=True)
+        out[closed] = jaxid.identify_many(cases, logs, method="prediction_error", lanes=LOGS)
+    return out
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_deviations_are_those_of_the_standard_deviations(fits, closed):
+    z = np.array([(fit.theta - TRUE) / fit.std for fit in fits[closed]])
+    assert all(fit.converged for fit in fits[closed])
+    # The largest of 24 normal numbers is below 3.5 in 99 %. Their RMS is about one; those of one log are
+    # correlated.
+    assert np.abs(z).max() < 3.5
+    assert 0.5 < np.sqrt(np.mean(z**2)) < 1.5
+
+
+def test_the_noise_is_estimated(fits):
+    noise = [fit.details["noise"] for fit in fits[False]]
+    assert np.median([n["force"] for n in noise]) == pytest.approx(0.1, rel=0.15)
+    assert np.median([n["force_reading"] for n in noise]) == pytest.approx(0.1, rel=0.1)
+    assert np.median([n["position"] for n in noise]) == pytest.approx(1e-6, rel=0.05)
+
+
+def test_a_declared_law_removes_the_noise_of_the_reading(fits):
+    for alone, looped in zip(*fits.values(), strict=True):
+        assert np.all(looped.std < 0.3 * alone.std)
+        assert looped.details["noise"]["force"] < 0.03  # 0.1 with that of the reading
+        assert any("declared law" in note for note in looped.notes)
+        assert not any("declared law" in note for note in alone.notes)
+
+
+def test_innovations_of_a_complete_model_are_white_and_of_another_not(fits, tmp_path):
+    assert all(min(fit.details["whiteness"]["p"]) > 1e-3 for fit in fits[False])
+    path, log = opened(tmp_path, 1, closed=False)
+    text = path.read_text()
+    at = text.index('[[effects]]\nkind = "coulomb')
+    path.write_text(text[:at] + text[text.index("[actuator]") :])
+    bare = jaxid.identify(path, log, method="prediction_error").estimate
+    assert min(bare.details["whiteness"]["p"]) < 1e-6
+    assert any("not white" in note for note in bare.notes)
+
+
+def test_noise_of_the_command_does_not_bias_the_inertia(tmp_path):
+    # Noise of 0.6 of a command of 1.2 (RMS): the filter alone is off by a tenth.
+    files = [opened(tmp_path, seed, closed=False, force_noise=0.6) for seed in range(1, LOGS + 1)]
+    cases, logs = zip(*files, strict=True)
+    fits = jaxid.identify_many(cases, logs, method="prediction_error", lanes=LOGS)
+    z = np.array([(fit.theta - TRUE) / fit.std for fit in fits])[:, 0]
+    assert abs(z.mean()) < 3 / np.sqrt(LOGS)
+
+
+def test_noise_of_a_reading_is_told_from_the_answers_of_a_law(tmp_path):
+    path, log = opened(tmp_path, 3, closed=True, force_noise=0.0)
+    session = open_session(path, log)
+    rough = session.fit.log
+    assert reading_noise(rough)[0] < 1e-6
+    assert noise_free_command(session.machine, rough) is not None
+    read = dataclasses.replace(
+        rough, force=rough.force + 0.05 * np.random.default_rng(0).standard_normal(rough.force.shape)
+    )
+    assert reading_noise(read)[0] == pytest.approx(0.05, rel=0.1)
+    # A law with another gain does not explain the command.
+    kp = dataclasses.replace(session.machine.controller, kp=1.1 * session.machine.controller.kp)
+    other = dataclasses.replace(session.machine, controller=kp)
+    assert noise_free_command(other, read) is None
+
+
+@pytest.mark.parametrize(
+    ("closed", "change", "method"),
+    [
+        (False, "", "prediction_error"),
+        (True, "", "prediction_error"),
+        (True, "[output_error]\non = 'force'\n", "output_error"),
+        (True, "[within_prior]\nprior = 0.5\n", "within_prior"),
+        (True, "[[effects]]\nkind = 'static_friction'\nlevel = { guess = 5.0 }\n", "output_error"),
+    ],
+)
+def test_the_method_is_chosen_with_a_reason(tmp_path, closed, change, method):
+    path, log = opened(tmp_path, 1, closed=closed)
+    path.write_text(path.read_text() + change)
+    choice = choose_method(open_session(path, log))
+    assert choice.method == method
+    assert choice.reason
+
+
+def test_the_choice_stands_in_the_result(tmp_path):
+    path, log = opened(tmp_path, 1, closed=True)
+    found = jaxid.identify(path, log)
+    assert found.estimate.method == "prediction_error"
+    assert found.estimate.details["settings"]["method"]["value"] == "prediction_error"
+    assert "was chosen because" in str(found)
+    assert jaxid.identify(path, log, on="force").estimate.method == "output_error"
+
+
+def test_scoring_finds_mean_and_variance():
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 1, 4000)[:, None]
+    y = 2.0 + 3.0 * t + 0.7 * rng.standard_normal(t.shape)
+
+    def outputs(x):
+        return y - x[0] - x[1] * t, jnp.exp(2 * x[2]) * jnp.ones_like(t)
+
+    wide = jnp.full(3, 1e3)
+    fit = maximise_likelihood(outputs, jnp.ones(t.shape, bool), jnp.array([0.0, 0.0, 3.0]), -wide, wide, 60)
+    rows = np.concatenate([np.ones_like(t), t], axis=1)
+    best = np.linalg.lstsq(rows, y, rcond=None)[0][:, 0]
+    spread = np.sqrt(np.mean((y[:, 0] - rows @ best) ** 2))
+    assert bool(fit.converged)
+    np.testing.assert_allclose(fit.x, [*best, np.log(spread)], atol=1e-4)
+    cost = lambda x: jnp.sum(0.5 * outputs(x)[0] ** 2 / outputs(x)[1] + 0.5 * jnp.log(outputs(x)[1]))
+    at = jnp.array([1.0, 2.0, 0.5])
+    one = maximise_likelihood(outputs, jnp.ones(t.shape, bool), at, -wide, wide, 1)
+    np.testing.assert_allclose(one.gradient, jax.grad(cost)(at), rtol=1e-9)
+
+
+def test_whiteness_is_uniform_for_white_noise_and_small_for_coloured():
+    rng = np.random.default_rng(1)
+    p = np.array([whiteness(rng.standard_normal(500)) for _ in range(400)])
+    assert 0.02 < np.mean(p < 0.05) < 0.09
+    coloured = np.convolve(rng.standard_normal(500), [1.0, 0.5])
+    assert whiteness(coloured) < 1e-6
