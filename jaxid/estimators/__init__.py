@@ -113,7 +113,7 @@ def _prediction_error(session: Session, *, numerics: Numerics | None = None) -> 
 
     machine, run = session.machine, session.fit
     first = yield from inverse_dynamics_steps(machine, run.data)
-    start = first.theta if np.all(np.isfinite(first.theta)) else None
+    start = first.theta if first.all_identified else None
     return (
         yield from prediction_error_steps(
             machine,

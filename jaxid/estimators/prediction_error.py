@@ -12,6 +12,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.common.scoring import Scored, maximise_likelihood
 from jaxid.estimators.estimate import Estimate
@@ -147,6 +148,9 @@ def prediction_error(
     Returns:
         The estimate. Its covariance is that of the likelihood, widened if the innovations are coloured.
 
+    Raises:
+        InputError: If too few readings count.
+
     Source:
         Ljung (1999), System Identification, chapter 7; Astrom (1980), Automatica 16, for the innovations.
     """
@@ -174,6 +178,13 @@ def prediction_error_steps(
     kalman = make_filter(machine, driven, numerics, slow)
     counts = np.asarray(kalman.used)[:: kalman.every]
     counts = (counts if slow is None else counts & ~slow)[:, measured]
+    if counts.sum() < 5 * len(parameters.free):
+        slowest = 0.0 if rest_velocity is None else np.min(rest_velocity)
+        raise InputError(
+            f"only {int(counts.sum())} readings are of a motion faster than {slowest:.3g}",
+            where=log.source,
+            hint="take a log with more motion, lower [preprocess] rest_velocity, or use another method",
+        )
 
     force = np.maximum(np.std(log.force, axis=0), 1e-300)
     stroke = np.maximum(np.ptp(log.filled, axis=0), 1e-300)
@@ -184,7 +195,9 @@ def prediction_error_steps(
     transform, bounds = Transform.of(parameters), parameters.bounds
     problem = (kalman, parameters.places, machine.plant, counts, transform, bounds, high)
 
-    starts = [parameters.guess, *shape_starts(machine, parameters.guess)]
+    # Beside another method's start the guesses matter for shapes only, whose likelihood has several maxima.
+    shapes = shape_starts(machine, parameters.guess)
+    starts = [parameters.guess, *shapes] if shapes or start is None else []
     if start is not None:
         starts.insert(0, np.clip(start, *parameters.bounds))
     theta, steps = starts[0], 0
