@@ -21,11 +21,13 @@ from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_known_reference
+from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics, output_error
-from jaxid.gap import Gap, gaps, noise_floor
+from jaxid.estimators.prediction_error import prediction_error
+from jaxid.gap import Gap, force_gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
@@ -274,8 +276,10 @@ def _final_machine(
 
 
 def _refit(session: Session, start: Estimate) -> Estimate:
-    """Refit by output error from the force-domain fit; keep the latter if the simulation cannot follow."""
+    """Refit from the force-domain fit by the method that suits; keep the former if the fit fails."""
     blind = not bool(np.all(start.identifiable))
+    if not blind and choose_method(session).method == "prediction_error":
+        return _refit_innovations(session, start)
     if blind or session.fit.log.reference is None and session.machine.controller is not None:
         return start
     try:
@@ -292,6 +296,21 @@ def _refit(session: Session, start: Estimate) -> Estimate:
     nearer = old.simulation is None or _length(new) < _length(old)
     if new.simulation is None or worse or not nearer:
         note = "output error did not reduce the simulation gap; the parameters are those of inverse dynamics"
+        return replace(start, notes=(*start.notes, note))
+    return estimate
+
+
+def _refit_innovations(session: Session, start: Estimate) -> Estimate:
+    """Refit by prediction error from the force-domain fit; keep the latter if the force gap grows."""
+    machine, run = session.machine, session.fit
+    rest = np.asarray(run.data.recipe.rest_velocity)
+    estimate = prediction_error(machine, run.log, start=start.theta, alone=True, rest_velocity=rest)
+    if not estimate.converged:
+        note = f"prediction error: {estimate.message}; the parameters are those of inverse dynamics"
+        return replace(start, notes=(*start.notes, note))
+    old, new = (force_gap(e.machine, run.data).rms for e in (start, estimate))
+    if np.any(new > _WORSE * old):
+        note = "prediction error did not reduce the force gap; the parameters are those of inverse dynamics"
         return replace(start, notes=(*start.notes, note))
     return estimate
 

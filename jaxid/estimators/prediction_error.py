@@ -129,6 +129,7 @@ def prediction_error(
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     rest_velocity: np.ndarray | None = None,
+    alone: bool = False,
 ) -> Estimate:
     """Fit the unknowns, the noise of the force and the noise of the readings by maximum likelihood.
 
@@ -144,6 +145,7 @@ def prediction_error(
         numerics: Settings of the integration; None: exact sticking and the steps that the plant needs.
         rest_velocity: Speed below which a sample of a machine with dry friction does not count, unless the
             force is free of noise, (n,) [m/s or rad/s]; None: all samples count.
+        alone: Whether `start` is the only start, because it is known to be near the optimum.
 
     Returns:
         The estimate. Its covariance is that of the likelihood, widened if the innovations are coloured.
@@ -155,7 +157,9 @@ def prediction_error(
         Ljung (1999), System Identification, chapter 7; Astrom (1980), Automatica 16, for the innovations.
     """
     return run_alone(
-        prediction_error_steps(machine, log, start=start, numerics=numerics, rest_velocity=rest_velocity)
+        prediction_error_steps(
+            machine, log, start=start, numerics=numerics, rest_velocity=rest_velocity, alone=alone
+        )
     )
 
 
@@ -166,6 +170,7 @@ def prediction_error_steps(
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     rest_velocity: np.ndarray | None = None,
+    alone: bool = False,
 ) -> Steps[Estimate]:
     """Run `prediction_error` as a generator of solve requests."""
     numerics = numerics or exact_numerics(machine, log)
@@ -196,7 +201,7 @@ def prediction_error_steps(
     problem = (kalman, parameters.places, machine.plant, counts, transform, bounds, high)
 
     # Beside another method's start the guesses matter for shapes only, whose likelihood has several maxima.
-    shapes = shape_starts(machine, parameters.guess)
+    shapes = [] if alone else shape_starts(machine, parameters.guess)
     starts = [parameters.guess, *shapes] if shapes or start is None else []
     if start is not None:
         starts.insert(0, np.clip(start, *parameters.bounds))
