@@ -12,7 +12,7 @@ from typing import NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
-from jaxid.names import METHODS, MINIMISERS, OUTPUTS, SOLVERS
+from jaxid.names import METHODS, MINIMISERS, OUTPUTS, SOLVERS, WHEN
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _demo(commands)
     for name, purpose, run in (
+        ("methods", "list the methods of identify, and when to take which", _run_methods),
         ("plants", "list the plants with their parameters and units", _run_plants),
         ("effects", "list the effects with their parameters and units", _run_effects),
     ):
@@ -177,7 +178,8 @@ def _identify(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--method",
         metavar="M",
-        help=f"{', '.join(METHODS)}; absent: chosen from case and log, and the reason is printed",
+        help=f"{', '.join(METHODS)}; absent: chosen from case and log, and the "
+        "reason is printed; `jaxid methods` says when to take which",
     )
     parser.add_argument(
         "--on",
@@ -254,6 +256,12 @@ def _ready(args: argparse.Namespace, *files: str) -> None:
         from jaxid.files import check_folder
 
         check_folder(Path(args.o), files, overwrite=args.force)
+
+
+def _run_methods(args: argparse.Namespace) -> int:
+    width = max(len(name) for name in METHODS)
+    print("\n".join(f"{name.ljust(width)}  {WHEN[name]}" for name in METHODS))
+    return 0
 
 
 def _run_plants(args: argparse.Namespace) -> int:

@@ -21,6 +21,24 @@ METHODS = (
     "minimal_model",
     "minimal_model_printed",
 )
+# When to take each method, for `jaxid methods`.
+WHEN = {
+    "output_error": "a simulated loop whose log is slower than it; break-away; an unknown reference",
+    "prediction_error": "most logs: open loop or feedback, sensors stated or not; the default where it applies",
+    "within_prior": "a short log and guesses of known precision",
+    "inverse_dynamics": "arms, very long logs, a first estimate; needs a well chosen filter",
+    "algebraic": "an online estimate by integrals, without derivatives",
+    "instrumental_variable": "a loop with a noisy encoder, as a check of inverse dynamics",
+    "didim": "a known loop with a poor encoder: force is fitted, the position only simulated",
+    "power": "energy balances, without accelerations",
+    "recursive": "parameters that change with time",
+    "algebraic_single_time": "`algebraic` with one window: one equation per unknown",
+    "algebraic_ratio": "`algebraic` with one window: ratios of integrals",
+    "algebraic_sign_changed": "`algebraic` with one window, friction of a motion that reverses",
+    "algebraic_sign_unchanged": "`algebraic` with one window, friction of a motion that does not reverse",
+    "minimal_model": "a flexible joint of which only motor or load is measured",
+    "minimal_model_printed": "`minimal_model` with the coefficients as published",
+}
 # Further entries of [study] estimators: the search, and the estimate of an adaptive controller.
 DISCOVER, IN_LOOP = "discover", "in_loop"
 # Signals of a simulated loop that output error compares with the log.

@@ -65,6 +65,13 @@ def test_plants_and_effects_with_parameters_and_units(capsys):
     assert ["period", ">", "0", "m", "rad"] in [row[:5] for row in lines]
 
 
+def test_every_method_has_a_line_that_says_when_to_take_it(capsys):
+    assert cli.main(["methods"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert tuple(line.split()[0] for line in lines) == names.METHODS
+    assert all(len(line.split()) > 4 for line in lines)
+
+
 def test_help_lists_every_method_output_and_solver(capsys):
     with pytest.raises(SystemExit):
         cli.main(["identify", "--help"])

@@ -64,11 +64,34 @@ def _output_error(
     result = yield from output_error_steps(
         session.machine, log, start=start, numerics=numerics, on=on, minimiser=minimiser
     )
+    result = replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
     if start is None or all(log.measured):
         return result
     # Without an encoder on every joint inverse dynamics may end far off, especially with coarse readings.
     other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on, minimiser=minimiser)
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
+
+
+def _doubts_of_output_error(session: Session) -> list[str]:
+    """Return why the standard deviations of output error may be too small on a log, a sentence each."""
+    from jaxid.simulation.law import reading_noise
+
+    machine, log = session.machine, session.fit.log
+    if machine.controller is None:
+        noise = reading_noise(log)
+        if np.any(noise > 1e-3 * np.std(log.force, axis=0)):
+            return [
+                "an open-loop simulation takes the logged force as exact, but it holds noise of about "
+                f"{', '.join(f'{x:.2g}' for x in noise)}: the standard deviations are too small, use "
+                "prediction_error"
+            ]
+        return []
+    if machine.sensor.mean.position_resolution is not None:
+        return [
+            "the loop is simulated with an encoder that rounds, which makes the cost rough: the fit may end "
+            "several standard deviations off, use prediction_error"
+        ]
+    return []
 
 
 def _within_prior(
