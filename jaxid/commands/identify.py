@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.case.user_faults import named_faults
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import steps_of
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
@@ -64,6 +65,7 @@ class Identification(FitResult):
         return save_identification(self, Path(folder), overwrite=overwrite)
 
 
+@named_faults()
 def identify(
     case: CaseLike,
     log: LogLike,
@@ -122,6 +124,7 @@ def identify(
     )
 
 
+@named_faults()
 def identify_many(
     case: CaseLike | Sequence[CaseLike],
     logs: Sequence[LogLike],

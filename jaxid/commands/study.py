@@ -16,9 +16,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxid.case.case import CaseLike, load_case
+from jaxid.case.user_faults import named_faults
 from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
-from jaxid.files import check_folder, mark_folder, write_json, write_whole
+from jaxid.files import check_folder, mark_folder, new_folder, write_json, write_whole
 from jaxid.logs.log import Log
 from jaxid.numerics.lanes import run_alone
 from jaxid.simulation.sensor_noise import position_noise
@@ -37,6 +38,7 @@ _CHUNKS = "chunks"
 Progress = Callable[[int, int], None]
 
 
+@named_faults()
 def study(
     case: CaseLike,
     *,
@@ -136,11 +138,22 @@ def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
 
 def _begin(folder: Path, plan: Plan) -> None:
     """Prepare the folder of a study; the manifest is written last, so that it marks a complete folder."""
-    mark_folder(folder)
-    (folder / _CHUNKS).mkdir(exist_ok=True)
-    for old in (folder / _CHUNKS).iterdir():
-        old.unlink()
-    write_json(folder / _MANIFEST, plan.manifest)
+    with new_folder(folder):
+        mark_folder(folder)
+        chunks = folder / _CHUNKS
+        try:
+            chunks.mkdir(exist_ok=True)
+            for old in chunks.iterdir():
+                old.unlink()
+            write_json(folder / _MANIFEST, plan.manifest)
+        except OSError as error:
+            raise InputError(
+                f"cannot be written: {error.strerror}", where=str(chunks), hint="choose another -o"
+            ) from error
+        except InputError:
+            # Empty here; the folder itself may now be removed too.
+            chunks.rmdir()
+            raise
 
 
 def _begun(folder: Path) -> dict:
