@@ -6,7 +6,6 @@ import contextlib
 import functools
 import io
 import json
-import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
@@ -164,8 +163,11 @@ def _begun(folder: Path) -> dict:
             "holds no study", where=str(folder), hint="leave out --resume, or give the study's folder"
         )
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        begun = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(begun, dict):
+            raise ValueError("it is no object")
+        return begun
+    except (ValueError, OSError, RecursionError) as error:
         raise InputError(
             f"cannot be read: {error}", where=str(path), hint="start again in another folder"
         ) from error
@@ -194,7 +196,8 @@ def _unpacked(path: Path, identity: str) -> Arrays:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             content = {name: arrays[name] for name in arrays.files}
         study_of_chunk = str(content.pop("study"))
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except Exception as error:
+        # A damaged archive raises errors of a dozen kinds.
         raise InputError(
             f"cannot be read: {error}", where=str(path), hint="remove this file, and resume again"
         ) from error

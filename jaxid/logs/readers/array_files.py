@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.lib import format as npy
 
 from jaxid.errors import InputError, suggest
+from jaxid.logs.readers.mat_file import MatFile
 from jaxid.logs.readers.rows import Rows, resolve_rows
 
 Columns = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]
@@ -72,31 +73,50 @@ def _said(error: BaseException) -> str:
 
 def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
     """Read columns of a MATLAB file up to version 7.2; see `read_columns`."""
-    # Imported here, since reading a CSV should not wait for it.
-    from scipy.io import loadmat, whosmat
-
-    try:
-        # A variable that cannot be read, or is there twice, is a warning of SciPy.
-        with warnings.catch_warnings(action="error"):
-            shapes = {name: shape for name, shape, _ in whosmat(path) if not name.startswith("__")}
-            wanted = {_base(name, shapes) for name in names} & set(shapes)
-            for name in wanted:
-                # 8 bytes a number.
-                _need_size(8.0 * math.prod(shapes[name]), f"{path}, variable '{name}'")
-            content = loadmat(path, variable_names=sorted(wanted))
-    except InputError:
-        raise
-    except NotImplementedError as error:
+    hint = "is it a MATLAB file? save it again with -v7"
+    content = path.read_bytes()
+    if content[124:128] in (b"\x00\x02IM", b"\x02\x00MI"):
         hint = "in MATLAB: save('log.mat', '-v7', ...), or export CSV"
-        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), hint=hint) from error
-    except OSError:
+        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), hint=hint)
+    try:
+        if content[126:128] not in (b"IM", b"MI"):
+            known = _matrices_of_level_4(path, names)
+        else:
+            file = MatFile(content)
+            known = {name: _matrix(file, name, names, path) for name in file.variables}
+    except (InputError, OSError, MemoryError):
         raise
     except Exception as error:
         # A damaged file raises errors of a dozen kinds.
-        hint = "is it a MATLAB file? save it again with -v7"
         raise InputError(f"cannot be read ({_said(error)})", where=str(path), hint=hint) from error
-    known = {name: content.get(name) for name in shapes}
     return pick_columns(path, known, names, rows)
+
+
+def _matrix(file: MatFile, name: str, names: list[str], path: Path) -> np.ndarray | None:
+    """Read a variable of a MATLAB file; None if no column is of it."""
+    if name not in {_base(wanted, file.variables) for wanted in names}:
+        return None
+    variable, where = file.variables[name], f"{path}, variable '{name}'"
+    if not variable.numeric:
+        hint = "save it as a plain array of real numbers"
+        raise InputError(f"is not numeric ({variable.kind})", where=where, hint=hint)
+    _need_size(variable.bytes, where)
+    return file.read(name)
+
+
+def _matrices_of_level_4(path: Path, names: list[str]) -> dict[str, np.ndarray | None]:
+    """Read variables of a MATLAB file of level 4; SciPy's parser of these is Python alone."""
+    # Imported here, since reading other files should not wait for it.
+    from scipy.io import loadmat, whosmat
+
+    # A variable that cannot be read is a warning of SciPy.
+    with warnings.catch_warnings(action="error"):
+        shapes = {name: shape for name, shape, _ in whosmat(path)}
+        wanted = {_base(name, shapes) for name in names} & set(shapes)
+        for name in wanted:
+            _need_size(8 * math.prod(shapes[name]), f"{path}, variable '{name}'")
+        content = loadmat(path, variable_names=sorted(wanted))
+    return {name: content.get(name) for name in shapes}
 
 
 def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
@@ -174,6 +194,8 @@ def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray
         raise InputError(f"is not numeric ({values.dtype})", where=where, hint=hint)
     if values.ndim > 2:
         raise InputError(f"has {values.ndim} dimensions", where=where, hint="save a matrix")
+    if not values.size:
+        raise InputError("is empty", where=where, hint="export the log again")
     values = np.atleast_1d(values).astype(np.float64)
     values = values[:, None] if values.ndim == 1 else values
     # A log has more samples than joints, so the longer side is time.
