@@ -36,12 +36,12 @@ def test_smoothed_fits_take_the_steps_that_the_sign_asks_for(tmp_path):
     assert not numerics.set_valued
     # 10 N over 60 kg and 1e-3 of a typical 0.08 m/s: 2 per ms, and break-away steepens it
     assert 2 <= numerics.substeps <= 16
-    # The motion is that of eight times the steps, to a part of the encoder's noise; with one it is not.
+    # The motion is that of eight times the steps to half of the encoder's noise; with one step it is not.
     motion = {n: _motion(session, numerics, n) for n in (1, numerics.substeps, 8 * numerics.substeps)}
     fine = motion[8 * numerics.substeps]
     error = {n: np.sqrt(np.mean((motion[n] - fine) ** 2)) for n in motion}
-    assert error[numerics.substeps] < 0.1 * session.machine.sensor.position_std
-    assert error[1] > 10 * error[numerics.substeps]
+    allowed = 0.5 * session.machine.sensor.position_std
+    assert error[numerics.substeps] < allowed < error[1], error
 
 
 def _motion(session, numerics, substeps):

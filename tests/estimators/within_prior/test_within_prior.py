@@ -217,8 +217,14 @@ def test_sensitivities_are_those_of_finite_differences(folder):
         slope = (current(at + off) - current(at - off)) / (2 * step)
         # To the size of its own column: some are 1e-5 of others.
         size = float(jnp.abs(slope).max())
-        assert size > 0.0, unknown.names[k]
-        np.testing.assert_allclose(exact[:, k], slope, atol=1e-4 * size, err_msg=unknown.names[k])
+        # The difference itself is rounded: 1e-15 of a current of about 1 A, over the step.
+        rounding = 2e-15 / step
+        # The motor only moves forwards, where the level for the other direction does nothing.
+        idle = unknown.names[k] == "velocity_hysteresis[2].level_negative"
+        assert (size == 0.0) if idle else (size > 50 * rounding), unknown.names[k]
+        np.testing.assert_allclose(
+            exact[:, k], slope, rtol=0, atol=1e-4 * size + rounding, err_msg=unknown.names[k]
+        )
 
 
 @pytest.mark.slow
