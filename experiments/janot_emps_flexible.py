@@ -159,6 +159,24 @@ def minimal_models(folder: Path) -> bool:
     return _sound(found["(6)"]) and not any(told[n] for n in split)
 
 
+def published_noise(folder: Path) -> bool:
+    """Tables 3 to 5 at the published noise, 25 and 100 s: printed, and nothing is expected to hold."""
+    ways = {"(6)": {}, "(7)": {"load": False, "accelerometer": True}, "(13)": {"load": False}}
+    for seconds in (SECONDS, LONG):
+        begin, log = time.perf_counter(), axes.record(duration=seconds, sensor=NOISY)
+        found = {}
+        for name, options in ways.items():
+            stem = f"noisy_{seconds:g}_" + "".join(c for c in name if c.isalnum())
+            case, data = written(folder, stem, log, axes.text(sensor=NOISY, **options))
+            found[name] = jaxid.identify(case, data, method="minimal_model")
+        table = Table(f"minimal models at the published noise, {seconds:g} s", ["parameter", "true", *found])
+        for name, (value, _) in TABLE_2.items():
+            table.row(name, f"{value:.4g}", *(cell_of(f.estimate, name) for f in found.values()))
+        table.row("converged", "", *(str(f.converged) for f in found.values()))
+        table.show(time.perf_counter() - begin)
+    return True
+
+
 def cell_of(estimate: Estimate, name: str) -> str:
     """Value and standard deviation of a parameter, or that it is not told."""
     k = estimate.names.index(name)
@@ -321,6 +339,7 @@ def hidden(folder: Path) -> bool:
 PARTS: dict[str, Callable[[Path], bool]] = {
     "first_model": first_model,
     "minimal_models": minimal_models,
+    "published_noise": published_noise,
     "trajectories": trajectories,
     "added_mass": added_mass,
     "motor_alone": motor_alone,

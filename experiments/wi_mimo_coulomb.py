@@ -209,7 +209,9 @@ def _a_sample(case: Path, log: jaxid.Log) -> float:
 def hidden(folder: Path) -> bool:
     """Friction that the case leaves out at one mass, and a cubic spring at one place: named with it."""
     begin, good = time.perf_counter(), True
-    table = Table("hidden in the six masses, nothing declared", ["true", "verdict", "named", "evidence"])
+    table = Table(
+        "hidden in the six masses, nothing declared", ["true", "verdict", "named", "evidence", "values"]
+    )
     for kind, place, values in (
         ("coulomb_friction", 3, {"level": 4.7}),
         ("cubic_stiffness", 4, {"coefficient": 4e5}),
@@ -220,7 +222,13 @@ def hidden(folder: Path) -> bool:
         found = jaxid.discover(case, log)
         named = ", ".join(e.label for e in found.effects) or "-"
         evidence = ", ".join(f"{e.score.evidence:.0f}" for e in found.effects)
-        table.row(name_of(kind, place), found.verdict, named, evidence)
+        estimates = found.after.names, found.after.theta, found.after.std
+        values = ", ".join(
+            f"{name} = {theta:.6g} ± {std:.2g}"
+            for name, theta, std in zip(*estimates, strict=True)
+            if any(name.startswith(e.label) for e in found.effects)
+        )
+        table.row(name_of(kind, place), found.verdict, named, evidence, values)
         good &= [e.label for e in found.effects] == [name_of(kind, place)]
     table.show(time.perf_counter() - begin)
     return good

@@ -3,6 +3,9 @@
 import difflib
 from collections.abc import Iterable
 
+# Most characters of a name that a hint lists.
+_LONGEST = 40
+
 
 class InputError(ValueError):
     """Input that jaxid cannot work with; its text is one line: where, what, and a hint.
@@ -42,6 +45,8 @@ def suggest(name: str, known: Iterable[str], *, limit: int = 12) -> str:
         return "there are none"
     folded = {other.casefold(): other for other in reversed(names)}
     near = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.6)
-    listed = ", ".join(names[:limit]) + (", ..." if len(names) > limit else "")
+    # Names from a damaged file have any length.
+    short = [known[:_LONGEST] + "..." * (len(known) > _LONGEST) for known in names[:limit]]
+    listed = ", ".join(short) + (", ..." if len(names) > limit else "")
     question = f"did you mean '{folded[near[0]]}'? " if near else ""
     return f"{question}there is: {listed}"

@@ -13,6 +13,7 @@ import numpy as np
 from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
+from jaxid.case.user_faults import is_user_class, where_not_finite
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.logs.log import Log
@@ -322,10 +323,11 @@ def _log(
 ) -> Log:
     command = np.asarray(machine.sensor.read_command(np.asarray(command), noise))
     if not np.all(np.isfinite(reading)):
+        faults = [where_not_finite(e) for e in machine.plant.effects if is_user_class(type(e))]
         raise InputError(
             "the simulation diverged",
             where=case.where,
-            hint="check gains and parameters, or raise substeps in [simulation]",
+            hint=next(filter(None, faults), "check gains and parameters, or raise substeps in [simulation]"),
         )
     reading = np.array(reading)
     if case.plant.cls.load is not None and not case.load_column:

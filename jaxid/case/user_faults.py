@@ -1,12 +1,11 @@
-"""Checks of a user-defined effect class.
-
-Each fault is one line about the class; without them it would be a traceback from compiled code.
-"""
+"""Faults of a user's classes: each is one line about the class, and not a traceback from compiled code."""
 
 from __future__ import annotations
 
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -29,6 +28,12 @@ _RESERVED = ("kind", "port", "shared", *PLACES)
 _NAMING = ("sliding_level", "break_away_level", "stribeck_velocity", "viscous_coefficient", "drive_gain")
 # Longest text of an exception that a message repeats.
 _LONGEST = 160
+# Begin of the names under which users' files are imported.
+USERS = "jaxid_user_"
+# Number of random motions at which an effect is evaluated.
+_MOTIONS = 64
+# Chosen [s]: no drive is that late, and a loop keeps every command of that time.
+_LONGEST_DELAY = 60.0
 
 
 class _Fault(Exception):
@@ -43,7 +48,9 @@ def one_line(error: BaseException, module: ModuleType | Path | None = None) -> s
         module: Module of the user's class, or its file; None: no line is stated.
     """
     text = str(error).strip().splitlines()
-    first = text[0].strip() if text else ""
+    # The text of an error from compiled code is a traceback, whose last line says what happened.
+    at_end = any("Traceback (most recent call last)" in line for line in text)
+    first = text[-1 if at_end else 0].strip() if text else ""
     if len(first) > _LONGEST:
         first = first[:_LONGEST] + " ..."
 
@@ -56,6 +63,37 @@ def _line_of(error: BaseException, module: ModuleType | Path | None) -> str:
     file = str(getattr(module, "__file__", module))
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
     return f", line {lines[-1]}" if lines else ""
+
+
+@contextmanager
+def named_faults() -> Iterator[None]:
+    """Raise an error from a user's file as one line with file, class, method and line; use as a decorator.
+
+    Most faults are found when a case is read. This is for those that depend on values, such as a class that
+    refuses the true values of its parameters.
+
+    Raises:
+        InputError: In place of any other error that a user's code raises.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        files = {
+            str(module.__file__)
+            for name, module in list(sys.modules.items())
+            if name.startswith(USERS) and getattr(module, "__file__", None)
+        }
+        frames = [frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)]
+        own = [code for code in frames if code.co_filename in files]
+        if not own:
+            raise
+        code, path = own[-1], Path(own[-1].co_filename)
+        what = f"{code.co_qualname} fails ({one_line(error, path)})"
+        raise InputError(
+            what, where=str(path), hint=f"correct {path.name}, or the values in the case"
+        ) from error
 
 
 def is_user_class(cls: type) -> bool:
@@ -153,6 +191,57 @@ def _check_action(effect: Effect) -> None:
     hint = "return a number: command_delay a time in s, dry_drift a relative change"
     _need_scalar("command_delay", _traced("command_delay", lambda e: e.command_delay(), effect, hint=hint))
     _need_scalar("dry_drift", _traced("dry_drift", lambda e, t: e.dry_drift(t), effect, scalar, hint=hint))
+    _check_values(effect)
+
+
+def _check_values(effect: Effect) -> None:
+    """Check the delay, and that an effect is finite somewhere."""
+    delay = float(effect.command_delay())
+    if not 0.0 <= delay <= _LONGEST_DELAY:
+        hint = f"return a time between 0 and {_LONGEST_DELAY:g} s at every value of the parameters"
+        raise _Fault(f"command_delay is {delay:g} s at the guesses", hint)
+    for name, finite, _ in _finite(effect):
+        if not finite.any():
+            hint = "correct act, or its guesses: a division by zero or the root of a negative number"
+            raise _Fault(f"act: Action.{name} is not finite at any of {_MOTIONS} random motions", hint)
+
+
+def where_not_finite(effect: Effect) -> str:
+    """Return a line about random motions at which an effect is not finite; empty if there are none."""
+    for name, finite, x in _finite(effect):
+        if not finite.all():
+            k = int(np.argmin(finite))
+            at = f"y = {float(x.y[k]):.3g}, yd = {float(x.yd[k]):.3g}, u = {float(x.u[k]):.3g}"
+            return f"act of effect {type(effect).kind}: Action.{name} is not finite at {at}"
+    return ""
+
+
+def _finite(effect: Effect) -> list[tuple[str, np.ndarray, Signals]]:
+    """Return by entry of the action whether it is finite at random motions, and the motions."""
+    count = len(Signals.__dataclass_fields__)
+    x = Signals(*jnp.asarray(np.random.default_rng(0).uniform(-1.0, 1.0, (count, _MOTIONS))))
+    # Times, widths and factors of friction are positive.
+    x = eqx.tree_at(lambda x: (x.t, x.width, x.dry_scale), x, replace_fn=jnp.abs)
+
+    def act(x: Signals) -> Action:
+        return effect.act(x, effect.initial_state(x.u))
+
+    module = _module(effect)
+    try:
+        operations = str(jax.make_jaxpr(act)(jax.tree.map(lambda a: a[0], x)))
+        if any(name in operations for name in ("pure_callback", "io_callback")):
+            raise _Fault("act calls back into Python", "compute with jax.numpy alone")
+        action = jax.vmap(act)(x)
+    except _Fault:
+        raise
+    except Exception as error:
+        raise _Fault(f"act fails at random motions ({one_line(error, module)})", "correct act") from error
+    out = []
+    for name in Action.__dataclass_fields__:
+        for leaf in jax.tree.leaves(getattr(action, name)):
+            finite = np.isfinite(np.asarray(leaf)).reshape(_MOTIONS, -1).all(axis=1)
+            out.append((name, finite, x))
+    return out
 
 
 def _initial_state(effect: Effect) -> Any:
@@ -232,5 +321,6 @@ def _kind_of(value: Any) -> str:
     if value is None:
         return "nothing (None)"
     if isinstance(value, (jax.ShapeDtypeStruct, jax.Array, np.ndarray)):
-        return "a number" if value.shape == () else f"an array of shape {value.shape}"
+        kind = "" if value.dtype.kind in "fiub" else f"{value.dtype} "
+        return f"a {kind}number" if value.shape == () else f"an array of shape {value.shape}"
     return f"a {type(value).__name__}"

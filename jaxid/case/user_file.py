@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
-from jaxid.case.user_faults import one_line
+from jaxid.case.user_faults import USERS, one_line
 from jaxid.effects import EFFECTS
 from jaxid.errors import suggest
 from jaxid.model.parameter import SIGNS, parameters_of
@@ -119,7 +119,7 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
     changed = path.stat().st_mtime_ns
     if path in _LOADED and _LOADED[path][0] == changed:
         return _LOADED[path][1]
-    name = f"jaxid_user_{path.stem}_{zlib.crc32(str(path).encode()):08x}"
+    name = f"{USERS}{path.stem}_{zlib.crc32(str(path).encode()):08x}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None, "the path ends in .py"
     assert spec.loader is not None, "the path is a file's"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.case.declared import PlantEntry
+from jaxid.case.user_faults import one_line
 from jaxid.case.user_file import check_kind, check_parameters, class_of_file
 from jaxid.case.values import Value
 from jaxid.errors import InputError
@@ -54,6 +56,10 @@ def user_plant(kind: str, folder: Path, spot: Spot) -> type[Plant]:
     check_parameters(cls, kind, spot)
     if cls.linked:
         raise fault("linked = True", "leave it out: a case describes only a serial_arm link by link")
+    for name, info in infos.items():
+        if not all(isinstance(v, int | None) for v in (info.more, info.width)):
+            hint = "more=0: one entry a joint; width=6: six entries"
+            raise fault(f"{name} has more = {info.more!r} and width = {info.width!r}", hint)
     for name, motion in [*((n, i.motion) for n, i in infos.items()), *(("motions", m) for m in cls.motions)]:
         if motion not in (None, *_MOTIONS):
             raise fault(f"{name} has motion {motion!r}", f"use one of {', '.join(_MOTIONS)}")
@@ -101,23 +107,32 @@ def check_user_plant(entry: PlantEntry, kind: str, spot: Spot) -> None:
         except InputError:
             raise
         except Exception as error:
-            raise fault(f"{name} raises {_one_line(error)}", hint) from error
+            raise fault(f"{name} raises {one_line(error, sys.modules.get(cls.__module__))}", hint) from error
 
     options = {"gravity": entry.gravity, "vertical": entry.vertical}
     known = {n: v for n, v in options.items() if v is not None and n in cls.__dataclass_fields__}
     values = {name: _guesses(v) for name, v in entry.parameters.items()}
     hint = f"correct {cls.__name__}"
     plant = attempt(cls.__name__, lambda: cls(**values, **known, **entry.options), hint=hint)
-    motion = attempt("impossible", plant.any_motion, np.random.default_rng(0), hint=hint)
-    q, qd, qdd = jnp.asarray(motion)
+    random = np.random.default_rng(0)
+    motion = attempt("any_motion", lambda: jnp.asarray(plant.any_motion(random)), hint=hint)
+    if motion.shape != (3, entry.joints):
+        given = f"an array of shape {motion.shape}"
+        raise fault(f"any_motion returns {given}", "return position, velocity and acceleration: (3, n)")
+    q, qd, qdd = motion
 
     force = attempt("inertial", plant.inertial, q, qd, qdd, hint="it takes arrays (n,) and returns one")
     _check_array("inertial", force, (entry.joints,), fault)
     ports = attempt("ports", plant.ports, q, hint="it takes an array (n,) and returns one of the ports")
-    _check_ports(plant, entry, q, ports, fault)
+    _check_ports(plant, entry, q, ports, attempt, fault)
 
     compiled = "use jax.numpy, and jnp.where in place of an if that depends on q"
     inertial = jax.jit(lambda *motion: plant.inertial(*motion))
+    operations = attempt(
+        "inertial, compiled,", lambda: str(jax.make_jaxpr(inertial)(q, qd, qdd)), hint=compiled
+    )
+    if "pure_callback" in operations or "io_callback" in operations:
+        raise fault("inertial calls back into Python", "compute with jax.numpy alone")
     attempt("inertial, compiled,", inertial, q, qd, qdd, hint=compiled)
     attempt("ports, compiled,", jax.jit(lambda q: plant.ports(q)), q, hint=compiled)
     _check_mass(plant, q, qd, qdd, attempt, fault)
@@ -131,17 +146,13 @@ def _guesses(value: Value | tuple) -> Any:
     return value.guess if isinstance(value, Value) else [_guesses(v) for v in value]
 
 
-def _one_line(error: Exception) -> str:
-    """Return the kind of an error and the first line of its text."""
-    text = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {text[0].rstrip('.')}" if text else type(error).__name__
-
-
 def _check_array(
     name: str, value: Any, shape: tuple[int, ...], fault: Callable[[str, str], InputError]
 ) -> None:
     if not isinstance(value, jax.Array | np.ndarray):
         raise fault(f"{name} returns a {type(value).__name__}", f"return an array {shape}: jnp.stack([...])")
+    if value.dtype.kind not in "fiu":
+        raise fault(f"{name} returns {value.dtype} numbers", "return real numbers")
     if value.shape != shape:
         raise fault(f"{name} returns shape {value.shape}", f"return {shape}: one entry for each")
     if not np.all(np.isfinite(np.asarray(value))):
@@ -151,7 +162,12 @@ def _check_array(
 
 
 def _check_ports(
-    plant: Plant, entry: PlantEntry, q: Array, ports: Any, fault: Callable[[str, str], InputError]
+    plant: Plant,
+    entry: PlantEntry,
+    q: Array,
+    ports: Any,
+    attempt: Callable[..., Any],
+    fault: Callable[[str, str], InputError],
 ) -> None:
     """Check the number of ports, and that the joints come first."""
     cls, n = entry.cls, entry.joints
@@ -163,9 +179,18 @@ def _check_ports(
     _check_array("ports", ports, (count,), fault)
     if not np.allclose(np.asarray(ports)[:n], q):
         raise fault("ports does not begin with the joints", "return jnp.concatenate([q, ...])")
+    for name in ("port_gravity", "port_normal"):
+        along = attempt(name, getattr(plant, name), q, hint="it takes an array (n,) and returns one")
+        # Springs have no weight: an entry for each joint is enough.
+        short = getattr(along, "shape", None) == (n,)
+        _check_array(name, along, (n,) if short else (count,), fault)
     for port in range(count):
-        if plant.place(port)[1] < 1:
-            raise fault(f"place({port}) = {plant.place(port)}", "numbers of places count from 1")
+        hint = 'it takes the index of a port and returns ("joint", 1)'
+        place = attempt(f"place({port})", plant.place, port, hint=hint)
+        if not (isinstance(place, tuple) and [type(part) for part in place] == [str, int]):
+            raise fault(f"place({port}) = {place!r}", hint)
+        if place[1] < 1:
+            raise fault(f"place({port}) = {place}", "numbers of places count from 1")
 
 
 def _check_mass(

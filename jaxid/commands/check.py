@@ -14,8 +14,9 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.case.case import CaseLike
+from jaxid.case.user_faults import named_faults
 from jaxid.estimators.inverse_dynamics import force_precision
-from jaxid.files import ready_folder, write_json
+from jaxid.files import json_text, write_results
 from jaxid.gap import noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.model.unknowns import scatter
@@ -142,11 +143,12 @@ class Check:
         Raises:
             InputError: If the folder holds files that jaxid did not make and `overwrite` is not given.
         """
-        folder = ready_folder(Path(folder), ["check.json"], overwrite=overwrite)
-        write_json(folder / "check.json", self.json())
+        folder = Path(folder)
+        write_results(folder, {"check.json": json_text(self.json())}, overwrite=overwrite)
         return folder
 
 
+@named_faults()
 def check(case: CaseLike, log: LogLike, *, validate: Sequence[LogLike] = ()) -> Check:
     """Check a log against a case before any fit.
 

@@ -6,12 +6,14 @@ from collections.abc import Callable
 
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.case.user_faults import named_faults
 from jaxid.errors import InputError
 from jaxid.experiment_design.along_reference import Excitation, excite
 from jaxid.experiment_design.in_loop import Design, design_in_loop
 from jaxid.scene import sampling_of
 
 
+@named_faults()
 def design(case: CaseLike, *, progress: Callable[[str], None] = lambda text: None) -> Design | Excitation:
     """Find the reference, or in open loop the input, that identifies the unknowns of a case best.
 

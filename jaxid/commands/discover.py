@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxid.case.case import Case, CaseLike
+from jaxid.case.user_faults import named_faults
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.in_loop.confirm import WHY, hindering
@@ -47,6 +48,7 @@ _ABOVE_FLOOR = 1.3
 _BARRED = 3
 
 
+@named_faults()
 def discover(
     case: CaseLike,
     log: LogLike,

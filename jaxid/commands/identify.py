@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.case.user_faults import named_faults
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import steps_of
 from jaxid.estimators.choice import choose_method, with_choice
@@ -66,6 +67,7 @@ class Identification(FitResult):
         return save_identification(self, Path(folder), overwrite=overwrite)
 
 
+@named_faults()
 def identify(
     case: CaseLike,
     log: LogLike,
@@ -132,6 +134,7 @@ def identify(
     )
 
 
+@named_faults()
 def identify_many(
     case: CaseLike | Sequence[CaseLike],
     logs: Sequence[LogLike],

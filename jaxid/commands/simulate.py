@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from jaxid.case.case import CaseLike, load_case
+from jaxid.case.user_faults import named_faults
 from jaxid.numerics.lanes import run_alone
 from jaxid.scene import Scene, SimulatedLog
 
 
+@named_faults()
 def simulate(case: CaseLike, *, seed: int = 0) -> SimulatedLog:
     """Simulate the log of a case, at its `true` values if it states any.
 

@@ -6,7 +6,6 @@ import contextlib
 import functools
 import io
 import json
-import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
@@ -16,9 +15,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxid.case.case import CaseLike, load_case
+from jaxid.case.user_faults import named_faults
 from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
-from jaxid.files import check_folder, mark_folder, write_json, write_whole
+from jaxid.files import check_folder, mark_folder, new_folder, write_json, write_whole
 from jaxid.logs.log import Log
 from jaxid.numerics.lanes import run_alone
 from jaxid.simulation.sensor_noise import position_noise
@@ -37,6 +37,7 @@ _CHUNKS = "chunks"
 Progress = Callable[[int, int], None]
 
 
+@named_faults()
 def study(
     case: CaseLike,
     *,
@@ -136,11 +137,22 @@ def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
 
 def _begin(folder: Path, plan: Plan) -> None:
     """Prepare the folder of a study; the manifest is written last, so that it marks a complete folder."""
-    mark_folder(folder)
-    (folder / _CHUNKS).mkdir(exist_ok=True)
-    for old in (folder / _CHUNKS).iterdir():
-        old.unlink()
-    write_json(folder / _MANIFEST, plan.manifest)
+    with new_folder(folder):
+        mark_folder(folder)
+        chunks = folder / _CHUNKS
+        try:
+            chunks.mkdir(exist_ok=True)
+            for old in chunks.iterdir():
+                old.unlink()
+            write_json(folder / _MANIFEST, plan.manifest)
+        except OSError as error:
+            raise InputError(
+                f"cannot be written: {error.strerror}", where=str(chunks), hint="choose another -o"
+            ) from error
+        except InputError:
+            # Empty here; the folder itself may now be removed too.
+            chunks.rmdir()
+            raise
 
 
 def _begun(folder: Path) -> dict:
@@ -151,8 +163,11 @@ def _begun(folder: Path) -> dict:
             "holds no study", where=str(folder), hint="leave out --resume, or give the study's folder"
         )
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        begun = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(begun, dict):
+            raise ValueError("it is no object")
+        return begun
+    except (ValueError, OSError, RecursionError) as error:
         raise InputError(
             f"cannot be read: {error}", where=str(path), hint="start again in another folder"
         ) from error
@@ -181,7 +196,8 @@ def _unpacked(path: Path, identity: str) -> Arrays:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             content = {name: arrays[name] for name in arrays.files}
         study_of_chunk = str(content.pop("study"))
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except Exception as error:
+        # A damaged archive raises errors of a dozen kinds.
         raise InputError(
             f"cannot be read: {error}", where=str(path), hint="remove this file, and resume again"
         ) from error

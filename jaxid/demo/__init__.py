@@ -6,7 +6,6 @@ The two logs were made by an exact set-valued friction stepper that shares no co
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 from jaxid.commands.check import check
 from jaxid.commands.discover import discover
 from jaxid.commands.identify import identify
-from jaxid.files import ready_folder
+from jaxid.files import check_folder, write_results
 
 _FILES = ("case.toml", "log.csv", "validation.csv")
 
@@ -36,10 +35,9 @@ def run_demo(
         InputError: If the folder cannot be written to.
     """
     results = ("check.json", "result.json", "discovery.json", "report.html", "case_found.toml")
-    ready_folder(folder, [*_FILES, *results], overwrite=overwrite)
-    for name in _FILES:
-        with resources.as_file(resources.files("jaxid.demo") / name) as source:
-            shutil.copyfile(source, folder / name)
+    check_folder(folder, [*_FILES, *results], overwrite=overwrite)
+    source = resources.files("jaxid.demo")
+    write_results(folder, {name: (source / name).read_bytes() for name in _FILES}, overwrite=overwrite)
     case, log = folder / "case.toml", folder / "log.csv"
     progress("checking the log")
     checked = check(case, log)

@@ -19,6 +19,8 @@ from jaxid.settings import LogTable
 
 # Chosen: with fewer samples nothing remains after filtering and trimming.
 MINIMUM_SAMPLES = 50
+# Chosen, in any unit: beyond it a number is damaged, and its powers overflow.
+_LARGEST = 1e30
 # No shape here: columns may be flat, and `Log` checks their lengths.
 Column = np.ndarray
 
@@ -246,14 +248,20 @@ def _check_distinct(names: dict[str, list[str]]) -> None:
 
 
 def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
-    """Refuse columns with NaN or infinite values."""
+    """Refuse columns with values that are NaN, infinite, or too large for their squares to be finite."""
     for name, values in data.items():
+        where = f"{path}, column '{name}'"
+        large = np.flatnonzero(np.any((np.abs(values) > _LARGEST) & np.isfinite(values), axis=1))
+        if large.size:
+            what = f"row {first + large[0]} is {np.abs(values[large[0]]).max():.3g}, which no sensor reads"
+            raise InputError(
+                what, where=where, hint="correct or remove the row, or exclude it by rows = [first, end]"
+            )
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if not bad.size:
             continue
         kind = "NaN" if np.isnan(values[bad[0]]).any() else "infinite"
         hint = "exclude these rows by rows = [first, end], or interpolate before"
-        where = f"{path}, column '{name}'"
         what = f"{bad.size} row(s) are NaN or infinite, the first is row {first + bad[0]} ({kind})"
         raise InputError(what, where=where, hint=hint)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.files import found_case_file, ready_folder, signal_csv, write_json, write_whole
+from jaxid.files import found_case_file, json_text, signal_csv, write_results
 from jaxid.model.unknowns import leaf, several_places
 from jaxid.results.found_case import case_text, changed_in_python
 from jaxid.results.parameters import Covariance
@@ -332,9 +332,11 @@ def save_identification(result: Identification, folder: Path, *, overwrite: bool
     """Write result.json and report.html."""
     from jaxid.results.report.build import identification_report
 
-    ready_folder(folder, ["result.json", "report.html"], overwrite=overwrite)
-    write_whole(folder / "report.html", identification_report(result))
-    write_json(folder / "result.json", identification_json(result))
+    files = {
+        "report.html": identification_report(result),
+        "result.json": json_text(identification_json(result)),
+    }
+    write_results(folder, files, overwrite=overwrite)
     return folder
 
 
@@ -353,14 +355,14 @@ def save_discovery(result: Discovery, folder: Path, *, overwrite: bool = False) 
     """
     from jaxid.results.report.build import discovery_report
 
-    files = discovery_files(result, folder)
-    ready_folder(folder, files, overwrite=overwrite)
+    files: dict[str, str | bytes] = {}
     for proposal in result.proposals:
         if proposal.separates and proposal.values is not None:
-            write_whole(folder / proposal.file, signal_csv(proposal.signal, proposal.time, proposal.values))
-    for name in files:
-        if name == found_case_file(result.session.declared.path, folder):
-            write_whole(folder / name, case_text(result, folder))
-    write_whole(folder / "report.html", discovery_report(result))
-    write_json(folder / "discovery.json", discovery_json(result))
+            files[proposal.file] = signal_csv(proposal.signal, proposal.time, proposal.values)
+    corrected = found_case_file(result.session.declared.path, folder)
+    if corrected in discovery_files(result, folder):
+        files[corrected] = case_text(result, folder)
+    files["report.html"] = discovery_report(result)
+    files["discovery.json"] = json_text(discovery_json(result))
+    write_results(folder, files, overwrite=overwrite)
     return folder

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.stats
 import xarray as xr
 
-from jaxid.files import ready_folder, write_json, write_whole
+from jaxid.files import json_text, write_results
 from jaxid.model.units import joined
 from jaxid.studies.rows import COLUMNS, Arrays, variables
 from jaxid.studies.settings import SETTINGS
@@ -163,13 +163,16 @@ class Study:
         """
         from jaxid.results.report.study import study_report
 
-        folder = ready_folder(Path(folder), FILES, overwrite=overwrite)
-        write_whole(folder / "study.nc", bytes(self.table.to_netcdf(engine="scipy")))
+        folder = Path(folder)
         words = {"case": self.title, "seconds": self.seconds}
         words |= {"rows": self.summary, "failures": self.failures, "named": self.named}
         words |= {"tracking": self.tracking}
-        write_json(folder / "summary.json", words)
-        write_whole(folder / "report.html", study_report(self))
+        files = {
+            "study.nc": bytes(self.table.to_netcdf(engine="scipy")),
+            "summary.json": json_text(words),
+            "report.html": study_report(self),
+        }
+        write_results(folder, files, overwrite=overwrite)
         return folder
 
 

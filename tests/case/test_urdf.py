@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pinocchio
 import pytest
 
 import jaxid
@@ -54,7 +55,6 @@ def check_against(pinocchio, model, plant):
 
 @pytest.mark.parametrize("name", ARMS)
 def test_dynamics_are_those_that_pinocchio_reads(name, tmp_path):
-    pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio (pip install pin) is not there")
     path = tmp_path / "arm.urdf"
     path.write_text(ARMS[name])
     model = pinocchio.buildModelFromXML(ARMS[name])
@@ -86,7 +86,6 @@ def branching() -> str:
 
 
 def test_what_branches_off_the_way_to_the_tip_is_held(tmp_path):
-    pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio (pip install pin) is not there")
     path = tmp_path / "arm.urdf"
     path.write_text(branching())
     whole = pinocchio.buildModelFromXML(branching())

@@ -86,6 +86,7 @@ def test_what_a_file_registers_stays_its_own(tmp_path):
     assert before == PLANTS
 
 
+PLACE = "def place(self, port):\n        return {}"
 SPRUNG = "def ports(self, q):\n        return {}"
 FAULTS = {
     "no such file": ({"kind": "my.py:Twin"}, "my.py:Twin", "does not exist", "there is: mine.py"),
@@ -124,6 +125,28 @@ FAULTS = {
         {"head": "diagonal = True", "inertial": "return self.mass * qdd + 0.1 * qdd[::-1]"},
         "the mass matrix is not diagonal",
         "leave diagonal out",
+    ),
+    "nothing": ({"inertial": "pass"}, "inertial returns a NoneType", "jnp.stack"),
+    "complex": ({"inertial": RIGHT + " * 1j"}, "inertial returns complex128 numbers", "real numbers"),
+    "NumPy": ({"inertial": "return np.dot(np.eye(2), qdd)"}, "TracerArrayConversionError", "jax.numpy"),
+    "a callback": (
+        {"inertial": "return self.mass * jax.pure_callback(np.positive, qdd, qdd)"},
+        "inertial calls back into Python",
+    ),
+    "place fails": ({"more": PLACE.format("1 / 0")}, "place(0) raises ZeroDivisionError", "index of a port"),
+    "place of another kind": ({"more": PLACE.format("3")}, "place(0) = 3", '("joint", 1)'),
+    "no gravity": (
+        {"more": "def port_gravity(self, q):\n        return None"},
+        "port_gravity returns a NoneType",
+    ),
+    "no motion": (
+        {"more": "def any_motion(self, rng):\n        return 3.0"},
+        "any_motion returns an array of shape ()",
+        "(3, n)",
+    ),
+    "a width that is a text": (
+        {"more": 'drag: jax.Array = parameter("force", "free", "d", more="a")'},
+        "drag has more = 'a'",
     ),
     "undeclared ports": (
         {"more": SPRUNG.format("jnp.concatenate([q, q[1:] - q[:1]])")},

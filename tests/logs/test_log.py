@@ -7,7 +7,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow
 import pytest
+from pyarrow import parquet
 from scipy.io import savemat
 
 from jaxid.errors import InputError
@@ -62,8 +64,6 @@ def test_other_formats_agree_with_csv(tmp_path, csv_file):
 
 
 def test_parquet(tmp_path, csv_file):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
     path = tmp_path / "log.parquet"
     parquet.write_table(pyarrow.table(signals()), path)
     log = read_log(path, {**COLUMNS, "rows": [10, 100]})

@@ -2,7 +2,9 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+import pinocchio
 import pytest
 
 from jaxid.dynamics.rhs import State, acceleration, step
@@ -67,10 +69,24 @@ def test_inverse_dynamics_is_that_of_the_energies(name, seed):
     close(coriolis, arm_oracle.inverse_dynamics(rows, parameters, q, qd, zero, 0 * GRAVITY))
 
 
+def states(name, count=1000):
+    """Random states of an arm: position, velocity and acceleration, (count, n) each."""
+    return np.random.default_rng(17).uniform(-2, 2, (3, count, len(ROWS[name])))
+
+
+def close_at_each(a, b):
+    # As `close`, relative to the largest entry at each state.
+    axes = tuple(range(1, np.ndim(b)))
+    off = np.abs(np.asarray(a) - b).max(axis=axes) / np.abs(b).max(axis=axes)
+    assert off.shape == (1000,)
+    assert off.max() < 1e-10, (off.argmax(), off.max())
+
+
 @pytest.mark.parametrize("name", ROWS)
 def test_inverse_dynamics_is_pinocchios(name):
-    pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio (pip install pin) is not there")
-    rows, parameters, (q, qd, qdd) = case(name)
+    """Torques, mass matrices, weights and Coriolis forces at 1000 states."""
+    rows, parameters, _ = case(name)
+    q, qd, qdd = states(name)
     model = pinocchio.Model()
     before = 0
     for k, ((joint, *dh), body) in enumerate(zip(rows, parameters, strict=True)):
@@ -82,13 +98,27 @@ def test_inverse_dynamics_is_pinocchios(name):
         order = pinocchio.Inertia.FromDynamicParameters(body[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]])
         model.appendBodyToJoint(before, order, pinocchio.SE3.Identity())
     model.gravity.linear = GRAVITY
-    data, plant = model.createData(), arm(rows, parameters)
-    close(plant.inertial(q, qd, qdd), pinocchio.rnea(model, data, q, qd, qdd))
-    mass = pinocchio.crba(model, data, q)
-    mass = np.triu(mass) + np.triu(mass, 1).T
-    close(jax.jacfwd(lambda a: plant.inertial(q, qd, a))(jnp.zeros(len(rows))), mass)
-    zero = np.zeros(len(rows))
-    close(plant.inertial(jnp.asarray(q), zero, zero), pinocchio.computeGeneralizedGravity(model, data, q))
+    data, plant, zero = model.createData(), arm(rows, parameters), np.zeros(len(rows))
+
+    @jax.jit
+    @jax.vmap
+    def ours(q, qd, qdd):
+        mass = jax.jacfwd(lambda a: plant.inertial(q, qd, a))(qdd)
+        weight = plant.inertial(q, zero, zero)
+        return plant.inertial(q, qd, qdd), mass, weight, plant.inertial(q, qd, zero)
+
+    def theirs(q, qd, qdd):
+        mass = np.triu(pinocchio.crba(model, data, q))
+        return (
+            np.array(pinocchio.rnea(model, data, q, qd, qdd)),
+            mass + np.triu(mass, 1).T,
+            np.array(pinocchio.computeGeneralizedGravity(model, data, q)),
+            np.array(pinocchio.nonLinearEffects(model, data, q, qd)),
+        )
+
+    expected = [np.array(x) for x in zip(*map(theirs, q, qd, qdd), strict=True)]
+    for a, b in zip(ours(q, qd, qdd), expected, strict=True):
+        close_at_each(a, b)
 
 
 def mujoco_model(mujoco, rows, parameters, gravity, sites=(), sensors=""):
@@ -124,15 +154,19 @@ def mujoco_model(mujoco, rows, parameters, gravity, sites=(), sensors=""):
 
 @pytest.mark.parametrize("name", ROWS)
 def test_inverse_dynamics_is_mujocos(name):
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo (pip install mujoco) is not there")
-    rows, parameters, (q, qd, qdd) = case(name)
+    rows, parameters, _ = case(name)
+    q, qd, qdd = states(name)
     model = mujoco_model(mujoco, rows, parameters, GRAVITY)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
-    mujoco.mj_inverse(model, data)
-    ours = arm(rows, parameters).inertial(q, qd, qdd)
+
+    def theirs(q, qd, qdd):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
+        mujoco.mj_inverse(model, data)
+        return data.qfrc_inverse.copy()
+
     # MuJoCo diagonalises each inertia and keeps its axes as a quaternion: 1e-10 still holds.
-    close(ours, data.qfrc_inverse)
+    ours = jax.jit(jax.vmap(arm(rows, parameters).inertial))(q, qd, qdd)
+    close_at_each(ours, np.array(list(map(theirs, q, qd, qdd))))
 
 
 def test_regressor_is_linear_and_whole():

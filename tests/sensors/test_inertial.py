@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import scipy.spatial.transform
@@ -39,7 +40,6 @@ def as_site(sensor: Inertial, name: str) -> str:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_readings_are_mujocos(name):
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo (pip install mujoco) is not there")
     rows, parameters, (q, qd, qdd) = case(name)
     sensors = mounted(len(rows))
     pairs = list(enumerate(sensors))

@@ -82,7 +82,7 @@ def refused(capsys, folder, *argv, told):
     assert ran.err.startswith("jaxid: ")
     assert ran.err.endswith("\n")
     assert ran.err.count("\n") == 1
-    assert told in ran.err
+    assert told in ran.err, ran.err
     assert sorted(folder.rglob("*")) == entries
     assert held(folder) == before
     return ran.err

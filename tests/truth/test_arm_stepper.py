@@ -16,7 +16,6 @@ from jaxid.simulation.loops import Drive, closed_loop
 from truth.arm.oracle import NAMES, bodies
 from truth.arm.stepper import Arm, followed
 
-pytest.importorskip("pinocchio", reason="Pinocchio (pip install pin) is not there")
 RATE = 200.0
 KP = np.array([3000.0, 3000.0, 800.0, 800.0, 150.0, 80.0, 30.0])
 KD = np.array([150.0, 150.0, 40.0, 40.0, 4.0, 2.5, 1.0])

@@ -68,16 +68,19 @@ def read_columns(
     if reader is None:
         hint = f"use one of {', '.join(READERS)}"
         raise InputError(f"unknown suffix '{path.suffix}'", where=str(path), hint=hint)
-    if not path.exists():
-        beside = [p.name for p in path.parent.glob("*" + path.suffix)]
-        hint = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
-        raise InputError("no such file", where=str(path), hint=hint)
-    if not path.is_file():
-        raise InputError("is not a file", where=str(path), hint="give the path of the log")
-    if path.stat().st_size == 0:
-        raise InputError("is empty", where=str(path), hint="export the log again")
     try:
+        if not path.exists():
+            beside = [p.name for p in path.parent.glob("*" + path.suffix)]
+            hint = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
+            raise InputError("no such file", where=str(path), hint=hint)
+        if not path.is_file():
+            raise InputError("is not a file", where=str(path), hint="give the path of the log")
+        if path.stat().st_size == 0:
+            raise InputError("is empty", where=str(path), hint="export the log again")
         return reader(path, list(dict.fromkeys(names)), rows)
     except OSError as error:
         hint = "check the permissions of the file"
         raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
+    except MemoryError as error:
+        hint = "cut or decimate the log"
+        raise InputError("is too large for the memory", where=str(path), hint=hint) from error

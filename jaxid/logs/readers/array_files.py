@@ -1,6 +1,8 @@
 """Columns of files that hold arrays: NumPy, MATLAB and Parquet."""
 
+import math
 import re
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,46 +10,113 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.lib import format as npy
 
 from jaxid.errors import InputError, suggest
+from jaxid.logs.readers.mat_file import MatFile
 from jaxid.logs.readers.rows import Rows, resolve_rows
 
 Columns = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]
 _INDEXED = re.compile(r"(.+)\[(\d+)\]$")
+# Largest array that is read [bytes]; chosen: 20 hours at 1 kHz and 7 columns.
+_LARGEST = 4 * 2**30
 
 
 def read_npz(path: Path, names: list[str], rows: Rows | None) -> Columns:
-    """Read columns of a NumPy archive; see `read_columns`. Pickled objects are refused."""
+    """Read columns of a NumPy archive; see `read_columns`. Pickled objects are refused, and never loaded."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
-                raise InputError("holds no named arrays", where=str(path), hint="use numpy.savez")
-            wanted = {_base(name, archive.files) for name in names} & set(archive.files)
-            known = {key: archive[key] if key in wanted else None for key in archive.files}
-    except (ValueError, zipfile.BadZipFile, EOFError) as error:
-        if isinstance(error, InputError):
-            raise
-        hint = "save plain arrays of numbers with numpy.savez"
-        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            wanted = {_base(name, members) for name in names} & set(members)
+            known = {key: _array(archive, members[key], path) if key in wanted else None for key in members}
+    except InputError:
+        raise
+    except OSError:
+        raise
+    except Exception as error:
+        # A damaged archive raises errors of a dozen kinds, down to those of zlib and struct.
+        hint = "save arrays of numbers with numpy.savez(path, t=t, q=q, u=u)"
+        raise InputError(f"cannot be read ({_said(error)})", where=str(path), hint=hint) from error
     return pick_columns(path, known, names, rows)
+
+
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> np.ndarray:
+    """Read an array of an archive, after its declared size and the size of its data."""
+    where = f"{path}, variable '{info.filename.removesuffix('.npy')}'"
+    # The archive reads no more than this size states, however much its data would expand to.
+    _need_size(info.file_size, where)
+    with archive.open(info) as file:
+        version = npy.read_magic(file)
+        header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, kind = header(file)
+        if kind.hasobject:
+            hint = "save it as a plain array of real numbers"
+            raise InputError("is not numeric (object)", where=where, hint=hint)
+        declared = math.prod(shape) * kind.itemsize
+        if declared > info.file_size:
+            what = f"declares the shape {shape}, and its data are {info.file_size} bytes"
+            raise InputError(what, where=where, hint="save the log again")
+    with archive.open(info) as file:
+        return npy.read_array(file, allow_pickle=False)
+
+
+def _need_size(size: float, where: str) -> None:
+    """Refuse an array that is larger than any log, before memory is taken for it."""
+    if size > _LARGEST:
+        what = f"is {size / 2**30:.3g} GiB large"
+        raise InputError(what, where=where, hint=f"at most {_LARGEST / 2**30:g} GiB: cut or decimate the log")
+
+
+def _said(error: BaseException) -> str:
+    return str(error) or type(error).__name__
 
 
 def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
     """Read columns of a MATLAB file up to version 7.2; see `read_columns`."""
-    # Imported here, since reading a CSV should not wait for it.
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        content = loadmat(path)
-    except NotImplementedError as error:
+    hint = "is it a MATLAB file? save it again with -v7"
+    content = path.read_bytes()
+    if content[124:128] in (b"\x00\x02IM", b"\x02\x00MI"):
         hint = "in MATLAB: save('log.mat', '-v7', ...), or export CSV"
-        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), hint=hint) from error
-    except (MatReadError, ValueError, TypeError, KeyError, IndexError) as error:
-        hint = "is it a MATLAB file? save it again with -v7"
-        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
-    known = {key: value for key, value in content.items() if not key.startswith("__")}
+        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), hint=hint)
+    try:
+        if content[126:128] not in (b"IM", b"MI"):
+            known = _matrices_of_level_4(path, names)
+        else:
+            file = MatFile(content)
+            known = {name: _matrix(file, name, names, path) for name in file.variables}
+    except (InputError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        # A damaged file raises errors of a dozen kinds.
+        raise InputError(f"cannot be read ({_said(error)})", where=str(path), hint=hint) from error
     return pick_columns(path, known, names, rows)
+
+
+def _matrix(file: MatFile, name: str, names: list[str], path: Path) -> np.ndarray | None:
+    """Read a variable of a MATLAB file; None if no column is of it."""
+    if name not in {_base(wanted, file.variables) for wanted in names}:
+        return None
+    variable, where = file.variables[name], f"{path}, variable '{name}'"
+    if not variable.numeric:
+        hint = "save it as a plain array of real numbers"
+        raise InputError(f"is not numeric ({variable.kind})", where=where, hint=hint)
+    _need_size(variable.bytes, where)
+    return file.read(name)
+
+
+def _matrices_of_level_4(path: Path, names: list[str]) -> dict[str, np.ndarray | None]:
+    """Read variables of a MATLAB file of level 4; SciPy's parser of these is Python alone."""
+    # Imported here, since reading other files should not wait for it.
+    from scipy.io import loadmat, whosmat
+
+    # A variable that cannot be read is a warning of SciPy.
+    with warnings.catch_warnings(action="error"):
+        shapes = {name: shape for name, shape, _ in whosmat(path)}
+        wanted = {_base(name, shapes) for name in names} & set(shapes)
+        for name in wanted:
+            _need_size(8 * math.prod(shapes[name]), f"{path}, variable '{name}'")
+        content = loadmat(path, variable_names=sorted(wanted))
+    return {name: content.get(name) for name in shapes}
 
 
 def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
@@ -61,11 +130,15 @@ def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
     try:
         known: dict[str, Any] = dict.fromkeys(parquet.read_schema(path).names)
         wanted = [name for name in names if name in known]
+        count = parquet.read_metadata(path).num_rows
+        _need_size(8.0 * count * max(len(wanted), 1), str(path))
         table = parquet.read_table(path, columns=wanted)
         known.update({name: table[name].to_numpy() for name in wanted})
-    except pyarrow.ArrowException as error:
+    except InputError:
+        raise
+    except (pyarrow.ArrowException, ValueError, KeyError, TypeError) as error:
         hint = "is it a Parquet file? export it again"
-        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
+        raise InputError(f"cannot be read ({_said(error)})", where=str(path), hint=hint) from error
     return pick_columns(path, known, names, rows)
 
 
@@ -97,19 +170,32 @@ def pick_columns(path: Path, known: Mapping[str, Any], names: list[str], rows: R
     return {name: values[first:end] for name, values in columns.items()}, (first, end)
 
 
+def _asarray(values: Any, where: str) -> np.ndarray:
+    """Return values as an array, masked ones as NaN."""
+    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "fiub":
+        return np.ma.filled(values.astype(np.float64), np.nan)
+    try:
+        return np.asarray(values)
+    except Exception as error:
+        hint = "give a plain array of real numbers"
+        raise InputError(f"is no array ({_said(error)})", where=where, hint=hint) from error
+
+
 def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray, "samples _"]:
     """Return one column as an array (samples, width) of float64."""
     base = _base(name, known)
     if base not in known:
         hint = suggest(base, known)
         raise InputError(f"has no variable '{name}'", where=str(path), hint=hint)
-    values = np.asarray(known[base])
     where = f"{path}, variable '{base}'"
+    values = _asarray(known[base], where)
     if values.dtype.kind not in "fiub":
         hint = "save it as a plain array of real numbers"
         raise InputError(f"is not numeric ({values.dtype})", where=where, hint=hint)
     if values.ndim > 2:
         raise InputError(f"has {values.ndim} dimensions", where=where, hint="save a matrix")
+    if not values.size:
+        raise InputError("is empty", where=where, hint="export the log again")
     values = np.atleast_1d(values).astype(np.float64)
     values = values[:, None] if values.ndim == 1 else values
     # A log has more samples than joints, so the longer side is time.

@@ -11,6 +11,8 @@ from jaxid.logs.readers.rows import Rows, resolve_rows
 
 # In order of preference if a header has equally many of two of them.
 _DELIMITERS = (";", "\t", ",")
+# Most characters of a cell that a message repeats.
+_SHOWN = 40
 
 
 def read_csv(
@@ -21,6 +23,15 @@ def read_csv(
     NumPy's parser reads the selected lines; if it fails, the lines are examined once more to find the faulty
     cell.
     """
+    try:
+        return _read(path, names, rows)
+    except csv.Error as error:
+        raise InputError(f"cannot be read ({error})", where=str(path), hint="export the log again") from error
+
+
+def _read(
+    path: Path, names: list[str], rows: Rows | None
+) -> tuple[dict[str, Float[np.ndarray, "samples 1"]], Rows]:
     header, delimiter, body = _split(_text(path), path)
     columns = [_find(name, header, path) for name in names]
     first, end = resolve_rows(rows, len(body), path)
@@ -32,7 +43,7 @@ def read_csv(
         values = np.loadtxt(body, delimiter=delimiter, usecols=columns, comments=None, quotechar='"', ndmin=2)
     except ValueError as error:
         _blame(body, names, columns, delimiter, first, path)
-        raise InputError(str(error), where=str(path), hint="export the log again") from error
+        raise InputError(str(error)[:200], where=str(path), hint="export the log again") from error
     return {name: values[:, [k]] for k, name in enumerate(names)}, (first, end)
 
 
@@ -41,8 +52,9 @@ def _text(path: Path) -> str:
     raw = path.read_bytes()
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", errors="replace")
-    if b"\0" in raw[:4096]:
-        raise InputError("is not a text file", where=str(path), hint="export the log as CSV")
+    if b"\0" in raw:
+        what = f"is not a text file: byte {raw.index(0)} is NUL"
+        raise InputError(what, where=str(path), hint="export the log as CSV")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -65,7 +77,7 @@ def _split(text: str, path: Path) -> tuple[list[str], str, list[str]]:
         head, body = lines[comments - 1].lstrip(" #"), lines[comments:]
     if _is_numeric(head):
         hint = "add a first row with the names of the columns"
-        raise InputError(f"no header row: it begins '{head[:40]}'", where=str(path), hint=hint)
+        raise InputError(f"no header row: it begins '{head[:_SHOWN]}'", where=str(path), hint=hint)
 
     if "#" in text:
         body = [line.split("#", 1)[0] for line in body]
@@ -107,19 +119,21 @@ def _find(name: str, header: list[str], path: Path) -> int:
 
 
 def _check_widths(body: list[str], header: list[str], delimiter: str, first: int, path: Path) -> None:
-    """Refuse rows that are wider than the header: their cells belong to other columns.
+    """Refuse rows that are wider or narrower than the header: their cells may belong to other columns.
 
-    NumPy's parser reads the requested columns only, and a decimal comma in a comma-separated file would shift
-    them silently.
+    NumPy's parser reads the requested columns only. A decimal comma in a comma-separated file, or a cell that
+    is missing, would shift them silently.
     """
+    named = max(k for k, name in enumerate(header) if name) + 1 if any(header) else len(header)
     for k, line in enumerate(body):
-        if line.count(delimiter) < len(header):
+        if named <= line.count(delimiter) + 1 <= len(header) and '"' not in line:
             continue
         cells = _cells(line, delimiter)
-        if any(cells[len(header) :]):
-            hint = "give one cell for each column; write decimals with a point"
-            what = f"row {first + k} has {len(cells)} cells, the header {len(header)}"
-            raise InputError(what, where=str(path), hint=hint)
+        if len(cells) >= named and not any(cells[len(header) :]):
+            continue
+        hint = "give one cell for each column; write decimals with a point"
+        what = f"row {first + k} has {len(cells)} cells, the header {named}"
+        raise InputError(what, where=str(path), hint=hint)
 
 
 def _blame(
@@ -137,7 +151,7 @@ def _blame(
             cell = cells[column] if column < len(cells) else ""
             if _number(cell) is not None and "_" not in cell:
                 continue
-            fault = f"'{cell}' is not a number" if cell else "the cell is empty"
+            fault = f"'{cell[:_SHOWN]}' is not a number" if cell else "the cell is empty"
             hint = "correct or remove the row, or exclude it by rows = [first, end]"
             if _number(cell.replace(",", ".")) is not None:
                 hint = "write decimals with a point"
