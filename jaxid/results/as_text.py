@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.parameters import lines_of
+from jaxid.results.precision import precision_lines
 from jaxid.results.report.numbers import with_std
 from jaxid.results.report.words import SLIGHT, place_words, within_prior_words
 
@@ -79,6 +80,7 @@ def identification_table(result: Identification) -> str:
         *_identifiable_combinations(estimate.details.get("directions", [])),
         *_unidentifiable(estimate),
         *within_prior_words(estimate.details),
+        *precision_lines(estimate),
         *(_minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []),
     ]
     gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
