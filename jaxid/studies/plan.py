@@ -32,7 +32,7 @@ _LARGEST, _SAMPLES, _LANES = 8, 6400, 16
 _RUNS_OF_DEVICE = 4096
 _UNSTATED = 2**32
 # Version of the arrays in a chunk, counted up if they change.
-_LAYOUT = 2
+_LAYOUT = 3
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
 
