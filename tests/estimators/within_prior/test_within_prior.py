@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import jaxid
 from jaxid.build import build_machine
@@ -264,6 +265,36 @@ def test_the_full_hessian_is_that_of_differences_of_the_gradient(folder, tmp_pat
     bent = full.estimate.details["directions"]
     found = [f["std"] / g["std"] for f, g in zip(bent, directions, strict=True)]
     np.testing.assert_allclose(found, wanted, rtol=0.03)
+
+
+@pytest.mark.slow
+def test_the_profile_of_an_unknown_is_that_of_the_posterior_by_hand(folder, tmp_path):
+    """All others fitted again by scipy, from the fit on."""
+    name = "motor_inertia"
+    text = (folder / "case.toml").read_text() + "drawn = false\n"
+    (tmp_path / "case.toml").write_text(text + f'[identification]\nprofile = ["{name}"]\n')
+    result = jaxid.identify(tmp_path / "case.toml", logged(1))
+    machine, log, estimate = result.session.machine, result.session.fit.log, result.estimate
+    entry, k = estimate.details["profiles"][name], estimate.names.index(name)
+    assert entry["variance_factor"] >= 1.0
+    problem = Problem.of(machine, log, 0.5, "force", choose_numerics(machine, log))
+    residual = problem.residual.at_sharpness(problem.sharpnesses[-1]).along(jnp.eye(11))
+    w = problem.prior.inward(estimate.theta)
+    squares = float(np.sum(np.asarray(jax.jit(residual)(w)) ** 2))
+    noise = np.sqrt(squares / (len(problem.measured) - len(estimate.details["directions"])))
+    rows = jax.jit(lambda w: jnp.concatenate([residual(w).ravel() / noise, w]))
+    columns = jax.jit(jax.jacfwd(rows))
+    others = np.arange(11) != k
+    for at, rise in zip(entry["at"], entry["rise"], strict=True):
+        held = problem.prior.inward(np.where(others, estimate.theta, at))[k]
+        whole = lambda x, held=held: np.insert(x, k, held)
+        found = scipy.optimize.least_squares(
+            lambda x, whole=whole: np.asarray(rows(whole(x))),
+            w[others],
+            lambda x, whole=whole: np.asarray(columns(whole(x)))[:, others],
+        )
+        wanted = (2 * found.cost - squares / noise**2 - w @ w) / entry["variance_factor"]
+        assert rise == pytest.approx(wanted, abs=0.05)
 
 
 @pytest.mark.slow
