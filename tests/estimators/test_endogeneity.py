@@ -18,7 +18,7 @@ COLOUR = NoiseModel(np.array([1.4, -0.6]), 1.0)
 SAMPLES = 1500
 
 
-def tested(seed: int, common: float):
+def drawn(seed: int, common: float):
     """A regressor whose acceleration has coloured noise, and a part of the coloured residual in it."""
     rng, t = np.random.default_rng(seed), 0.01 * np.arange(SAMPLES)
     v = np.sin(2.0 * t) + 0.6 * np.sin(3.3 * t + 1.0)
@@ -37,7 +37,7 @@ def tested(seed: int, common: float):
 @pytest.mark.parametrize(("common", "least", "most"), [(0.0, 0.02, 0.10), (0.1, 0.35, 0.7), (0.3, 0.98, 1.0)])
 def test_size_and_power(common, least, most):
     """Of 200 draws: binomial deviations of 1.5 % at a twentieth and 3.5 % at one half."""
-    results = [tested(seed, common) for seed in range(200)]
+    results = [drawn(seed, common) for seed in range(200)]
     assert {r.degrees_of_freedom for r in results} == {1}
     assert least <= np.mean([r.biased for r in results]) <= most
 
@@ -51,7 +51,7 @@ def test_a_regressor_that_is_known_exactly_has_nothing_to_test():
 
 def test_the_bias_is_that_of_least_squares():
     """Its step is the ordinary least-squares solution; its sign says what noise does to the acceleration."""
-    result = tested(0, 0.3)
+    result = drawn(0, 0.3)
     assert result.bias.shape == (4,)
     assert int(np.argmax(np.abs(result.bias))) == 0
     words = result.text(["inertia", "viscous", "coulomb", "offset"])
