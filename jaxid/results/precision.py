@@ -73,7 +73,7 @@ def precision_content(estimate: Estimate) -> dict[str, Any] | None:
     profiles: Mapping[str, Mapping[str, Any]] = estimate.details.get("profiles", {})
     words = kind_words(estimate.precision.kind)
     return {
-        "words": f"{words[0].upper()}{words[1:]}." if words else "",
+        "words": f"Source of the standard deviations (σ): {words.removeprefix('σ from ')}." if words else "",
         "names": names,
         "matrix": [_row(name, row) for name, row in zip(names, correlation, strict=True)] if few else [],
         "pairs": [] if few else pairs,
