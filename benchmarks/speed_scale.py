@@ -263,8 +263,9 @@ def tables(found: dict) -> list[str]:
     """In Markdown."""
     met = lambda value, aim: "yes" if value <= aim else "**no**"
     megabytes = lambda x: f"{x / 2**20:.0f}"
-    lines = ["## Fits by the study", "", "| of | cores | as | ms a fit | aim | met | of one core | peak MB |",
-             "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = ["## Fits by the study", "",
+             "| of | cores | as | ms a fit | failed | aim | met | of one core | peak MB |",
+             "|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
     one = {s["case"]: s["ms"] for s in found["study"] if s["cores"] == 1}
     most = max(s["cores"] for s in found["study"])
     for s in found["study"]:
@@ -273,7 +274,8 @@ def tables(found: dict) -> list[str]:
         part = s["ms"] / one[s["case"]]
         # Of a cluster only the memory of the process that asks it is known.
         memory, way = ("", "processes") if s["processes"] else (megabytes(s["memory"]), "threads")
-        cells = (s["case"], s["cores"], way, f"{s['ms']:.1f}", shown, f"{part:.2f}", memory)
+        failed = f"{s['failed']} of {s['runs']}"
+        cells = (s["case"], s["cores"], way, f"{s['ms']:.1f}", failed, shown, f"{part:.2f}", memory)
         lines.append(f"| {' | '.join(map(str, cells))} |")
     lines += ["", "## Against the length of the log", "",
               "| samples | prepare s | inverse dynamics, warm s | output error, cold s | warm s | peak MB |",

@@ -41,10 +41,10 @@ def noise(folder: Path, runs: int = RUNS, exact_runs: int = EXACT_RUNS) -> bool:
     for name, own in methods.items():
         cells = {k: _over_noise(own, k, "rmse") for k in KINDS}
         for i, level in enumerate(LEVELS):
-            failed = np.mean([r["failed"] for r in own if r["noise"] == level])
+            failed = np.mean([1 - r["used"] / r["runs"] for r in own if r["noise"] == level])
             table.row(name, f"{level:g}", *(f"{cells[k][i]:.2g}" for k in KINDS), f"{100 * failed:.0f}")
         # What fails in most runs has no line.
-        if np.mean([r["failed"] for r in own]) < 0.5:
+        if np.mean([1 - r["used"] / r["runs"] for r in own]) < 0.5:
             lines[name] = {(k, w): _over_noise(own, k, w) for k in KINDS for w in ("spread", "bias")}
     table.show(time.perf_counter() - begin)
     begin, exact = time.perf_counter(), _exact(folder, exact_runs)

@@ -12,7 +12,7 @@ from typing import NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
-from jaxid.names import METHODS, MINIMISERS, OUTPUTS, SOLVERS, WHEN
+from jaxid.names import LIKELIHOOD_METHODS, METHODS, MINIMISERS, OUTPUTS, SOLVERS, WHEN
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -188,6 +188,20 @@ def _identify(commands: argparse._SubParsersAction) -> None:
         "or position",
     )
     _numerics(parser)
+    parser.add_argument(
+        "--hessian",
+        action="store_true",
+        default=None,
+        help="covariance by the full Hessian in place of Gauss-Newton's, for a method that maximises a "
+        f"likelihood: {', '.join(LIKELIHOOD_METHODS)}",
+    )
+    parser.add_argument(
+        "--profile",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="compute the profile likelihood of an unknown, for such a method; may be repeated",
+    )
     _validate(parser)
 
 
@@ -345,6 +359,8 @@ def _run_identify(args: argparse.Namespace) -> int:
             solver=args.solver,
             minimiser=args.minimiser,
             on=args.on,
+            hessian=args.hessian,
+            profile=args.profile,
             validate=args.validate,
             progress=show,
         )

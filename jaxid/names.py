@@ -24,7 +24,7 @@ METHODS = (
 # When to take each method, for `jaxid methods`.
 WHEN = {
     "output_error": "a simulated loop whose log is slower than it; break-away; an unknown reference",
-    "prediction_error": "most logs: open loop or feedback, sensors stated or not; the default where it applies",
+    "prediction_error": "most logs, open loop or feedback, sensors stated or not; the usual default",
     "within_prior": "a short log and guesses of known precision",
     "inverse_dynamics": "arms, very long logs, a first estimate; needs a well chosen filter",
     "algebraic": "an online estimate by integrals, without derivatives",
@@ -41,6 +41,8 @@ WHEN = {
 }
 # Further entries of [study] estimators: the search, and the estimate of an adaptive controller.
 DISCOVER, IN_LOOP = "discover", "in_loop"
+# Methods that maximise a likelihood, so that it has a Hessian and profiles.
+LIKELIHOOD_METHODS = ("output_error", "within_prior")
 # Signals of a simulated loop that output error compares with the log.
 OUTPUTS = ("position", "force", "both")
 # Methods that output error may take its start from.

@@ -140,6 +140,16 @@ class Identification:
     physically_consistent: bool = key(
         flag, "whether the links of an arm must have parameters that rigid bodies can have", default=False
     )
+    hessian: bool = key(
+        flag,
+        "whether the covariance uses the full Hessian, of a method that maximises a likelihood",
+        default=False,
+    )
+    profile: tuple[str, ...] = key(
+        several(text),
+        "names of the unknowns whose profile likelihood is computed, by a method that maximises a likelihood",
+        default=(),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,10 @@ import numpy as np
 from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.case.user_faults import named_faults
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import steps_of
+from jaxid.estimators import refuse_without_likelihood, steps_of
 from jaxid.estimators.choice import choose_method, with_choice
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
+from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
@@ -76,6 +77,8 @@ def identify(
     solver: str | None = None,
     minimiser: str | Minimiser | None = None,
     on: str | None = None,
+    hessian: bool | None = None,
+    profile: Sequence[str] = (),
     validate: Sequence[LogLike] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
@@ -93,11 +96,15 @@ def identify(
             optimistix; None: that of the case, or jaxid's Levenberg-Marquardt.
         on: For `output_error`, the outputs of the simulated loop that are fitted: one of
             `jaxid.names.OUTPUTS`; None: those that the case names, or position.
+        hessian: Whether the covariance uses the full Hessian in place of Gauss-Newton's, for a method that
+            maximises a likelihood; None: as the case says. `result.covariance.kind` says which one it is.
+        profile: Names of the unknowns whose profile likelihood is computed, for such a method; empty: those
+            of the case.
         validate: Logs to validate on, beside those of the case.
         progress: Function called with a line of text at every stage.
 
     Raises:
-        InputError: If case, log, method, solver, minimiser or `on` are unsound.
+        InputError: If case, log, method or an option is unsound, or an option does not go with the method.
     """
     if method is not None:
         _check_method(method)
@@ -110,7 +117,16 @@ def identify(
         options["minimiser"] = minimiser
     if on is not None:
         options["on"] = _checked("on", on, OUTPUTS, method)
+    if hessian is not None:
+        if method is not None:
+            refuse_without_likelihood("hessian", method)
+        options["hessian"] = hessian
+    if profile:
+        if method is not None:
+            refuse_without_likelihood("profile", method)
+        options["profile"] = (profile,) if isinstance(profile, str) else tuple(profile)
     session = open_session(case, log, validate, method=method)
+    need_names(options.get("profile", session.case.identification.profile), session.machine.parameters.names)
     if not session.machine.parameters.free:
         raise InputError(
             "no parameter is unknown",

@@ -7,7 +7,7 @@ are keyword arguments.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.unknowns import REFERENCE
-from jaxid.names import USER_METHODS
+from jaxid.names import LIKELIHOOD_METHODS, USER_METHODS
 from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ def _output_error(
     minimiser: str | Minimiser | None = None,
     on: str | None = None,
     numerics: Numerics | None = None,
+    hessian: bool | None = None,
+    profile: Sequence[str] | None = None,
 ) -> Steps[Estimate]:
     case, log = session.case, session.fit.log
     stated = case.output_error
@@ -50,6 +52,8 @@ def _output_error(
             minimiser=minimiser,
             on=on,
             numerics=numerics,
+            hessian=hessian,
+            profile=profile,
             asked="[output_error] prior",
         )
         return replace(result, method="output_error")
@@ -57,18 +61,25 @@ def _output_error(
     from jaxid.estimators.output_error import choose_numerics, output_error_steps
 
     solver, minimiser = solver or stated.solver, minimiser or stated.minimiser
+    demands = case.identification
+    precision = {
+        "hessian": demands.hessian if hessian is None else hessian,
+        "profile": demands.profile if profile is None else profile,
+    }
     start = yield from _start(session)
     if solver is not None and numerics is None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, log, solver=solver)
     result = yield from output_error_steps(
-        session.machine, log, start=start, numerics=numerics, on=on, minimiser=minimiser
+        session.machine, log, start=start, numerics=numerics, on=on, minimiser=minimiser, **precision
     )
     result = replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
     if start is None or all(log.measured):
         return result
     # Without an encoder on every joint inverse dynamics may end far off, especially with coarse readings.
-    other = yield from output_error_steps(session.machine, log, numerics=numerics, on=on, minimiser=minimiser)
+    other = yield from output_error_steps(
+        session.machine, log, numerics=numerics, on=on, minimiser=minimiser, **precision
+    )
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
 
@@ -101,6 +112,8 @@ def _within_prior(
     minimiser: str | Minimiser | None = None,
     on: str | None = None,
     numerics: Numerics | None = None,
+    hessian: bool | None = None,
+    profile: Sequence[str] | None = None,
     asked: str = "the method within_prior",
 ) -> Steps[Estimate]:
     """Fit within the prior of the guesses; `asked` names the request in messages."""
@@ -113,6 +126,7 @@ def _within_prior(
     if solver is not None and numerics is None:
         numerics = choose_numerics(session.machine, log, solver=solver)
     others = yield from _beside_the_guesses(session)
+    demands = session.case.identification
     return (
         yield from within_prior_steps(
             session.machine,
@@ -121,8 +135,9 @@ def _within_prior(
             on=on or settings.on,
             starts=settings.starts,
             others=others,
-            hessian=settings.hessian,
+            hessian=settings.hessian or demands.hessian if hessian is None else hessian,
             profile=settings.profile,
+            profile_of=demands.profile if profile is None else profile,
             numerics=numerics,
             drawn=settings.drawn,
             minimiser=minimiser or settings.minimiser,
@@ -321,9 +336,11 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         options: Keyword arguments of the method.
 
     Raises:
-        InputError: If the reference has unknowns and the method does not fit them in a simulated loop; or if
-            links must be physically consistent, and the method or the links do not allow it.
+        InputError: If the reference has unknowns and the method does not fit them in a simulated loop; if
+            links must be physically consistent, and the method or the links do not allow it; or if the case
+            asks for a Hessian or a profile, and the method maximises no likelihood.
     """
+    need_likelihood(method, session.case)
     if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
     if not session.case.identification.physically_consistent:
@@ -332,6 +349,31 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
 
     need_consistent(method, session.case)
     return with_links(METHODS[method](need_bodies(session), **options))
+
+
+def need_likelihood(method: str, case: Case) -> None:
+    """Refuse a method that maximises no likelihood if the case asks for a Hessian or for profiles.
+
+    Raises:
+        InputError: If [identification] has `hessian` or `profile`, and the method maximises no likelihood.
+    """
+    for option in ("hessian", "profile"):
+        if getattr(case.identification, option):
+            refuse_without_likelihood(option, method, f"{case.where}, [identification]")
+
+
+def refuse_without_likelihood(option: str, method: str, where: str = "") -> None:
+    """Refuse an option of the likelihood for a method that maximises none; user methods decide themselves.
+
+    Raises:
+        InputError: If the method is one of jaxid and maximises no likelihood.
+    """
+    if method not in LIKELIHOOD_METHODS and method not in USER_METHODS:
+        raise InputError(
+            f"{option} needs a method that maximises a likelihood, and {method} does not",
+            where=where,
+            hint=f"choose one of {', '.join(LIKELIHOOD_METHODS)}, or leave out {option}",
+        )
 
 
 def need_consistent(method: str, case: Case) -> None:

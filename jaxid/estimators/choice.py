@@ -46,6 +46,8 @@ def choose_method(session: Session, asked: str | None = None) -> Choice:
 
     if asked is not None:
         return Choice("output_error", f"{asked} is an option of it")
+    if case.within_prior is None and (case.identification.hessian or case.identification.profile):
+        return Choice("output_error", "[identification] asks for a Hessian or a profile, which it gives")
     if "output_error" in case.tables and case.within_prior is None:
         return Choice("output_error", "the case has a table [output_error]")
     if case.fits_within_prior(None):

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.estimators.common.endogeneity import endogeneity
 from jaxid.estimators.common.rerun import Rerun, best_step, settled, span
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import force_precision, inverse_dynamics_steps
@@ -47,7 +48,8 @@ def instrumental_variable(
 
     Returns:
         The estimate; its covariance accounts for a coloured residual. The fit starts from
-        inverse dynamics if all unknowns are identifiable by it.
+        inverse dynamics if all unknowns are identifiable by it. If the loop is simulated,
+        `details["durbin_wu_hausman"]` says whether noise biases least squares.
 
     Raises:
         InputError: If the simulation in open loop departs too far from the log.
@@ -80,6 +82,10 @@ def instrumental_variable_steps(
     seen[rows] = columns[rows] if basis is None else basis @ (basis.T @ columns[rows])
     precision = force_precision(machine, size, theta, e, seen, rows)
     how = "in its loop" if rerun.looped else "in open loop from the measured force"
+    # In open loop the instruments hold the noise of the force, which is in the residual too.
+    valid = rerun.looped and basis is not None and found.message == "converged"
+    test = endogeneity(e, columns, basis, rows) if valid and basis is not None else None
+    notes = [f"instruments: the regressor along the motion simulated {how}"]
     return Estimate(
         method="instrumental_variable",
         machine=machine.with_estimate(theta),
@@ -90,7 +96,8 @@ def instrumental_variable_steps(
         residual=np.where(rows, e, np.nan),
         samples=int(rows.sum()),
         steps=found.steps,
-        notes=(f"instruments: the regressor along the motion simulated {how}",),
+        notes=(*notes, *([] if test is None else [test.text(machine.parameters.names)])),
+        details={} if test is None else {"durbin_wu_hausman": test.json(machine.parameters.names)},
     )
 
 

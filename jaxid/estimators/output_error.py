@@ -6,7 +6,7 @@ error would grow without bound, it runs in segments that restart from the log.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
 from jaxid.estimators.common.minimise import failure_text, minimise
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
+from jaxid.estimators.common.profile import BETTER, OFFSETS, falls_below, need_names, profile_entry, profiled
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import SHORT
 from jaxid.logs.log import Log
@@ -27,7 +28,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.precision import assess, full_hessian
+from jaxid.numerics.precision import Precision, assess, full_hessian, hessian_notes
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
     Numerics,
@@ -167,6 +168,7 @@ def output_error(
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     hessian: bool = False,
+    profile: Sequence[str] = (),
     on: str = "position",
     minimiser: str | Minimiser | None = None,
 ) -> Estimate:
@@ -177,7 +179,10 @@ def output_error(
         log: The log with the measured output.
         start: Start of the fit in place of the guesses, for example from `inverse_dynamics`, (p,).
         numerics: Settings of the integration; None: chosen from plant and log.
-        hessian: Whether the covariance uses the full Hessian in place of Gauss-Newton's.
+        hessian: Whether the covariance uses the full Hessian in place of Gauss-Newton's; see
+            `jaxid.numerics.precision.hessian_covariance`.
+        profile: Names of the unknowns whose profile likelihood is computed; see
+            `jaxid.estimators.common.profile`.
         on: One of `jaxid.names.OUTPUTS`. With "both" each column is divided by the standard deviation of its
             residual in a fit of position. A fit of the force needs a closed loop.
         minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix; None:
@@ -187,11 +192,19 @@ def output_error(
         The estimate; its covariance accounts for a coloured residual.
 
     Raises:
-        InputError: If the force is fitted without a closed loop, or the minimiser is not known.
+        InputError: If the force is fitted without a closed loop, or the minimiser or a name in `profile` is
+            not known.
     """
     return run_alone(
         output_error_steps(
-            machine, log, start=start, numerics=numerics, hessian=hessian, on=on, minimiser=minimiser
+            machine,
+            log,
+            start=start,
+            numerics=numerics,
+            hessian=hessian,
+            profile=profile,
+            on=on,
+            minimiser=minimiser,
         )
     )
 
@@ -203,11 +216,13 @@ def output_error_steps(
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     hessian: bool = False,
+    profile: Sequence[str] = (),
     on: str = "position",
     minimiser: str | Minimiser | None = None,
 ) -> Steps[Estimate]:
     """Run `output_error` as a generator of solve requests."""
     solver = minimiser_of(minimiser)
+    need_names(profile, machine.parameters.names)
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
     machine = machine if start is None else machine.with_estimate(start)
@@ -266,6 +281,8 @@ def output_error_steps(
         crossed=on == "both",
     ).first(machine.parameters.names)
     converged = bool(minimum.converged)
+    profiles, remarks = yield from _profiles(problem, active, minimum, solver, machine, precision, profile)
+    remarks = [*hessian_notes(precision, hessian), *remarks]
     return Estimate(
         method="output_error",
         machine=machine.with_estimate(theta[:p]),
@@ -276,8 +293,78 @@ def output_error_steps(
         residual=np.where(counts, e, np.nan),
         samples=int(counts.sum()),
         steps=int(minimum.steps),
-        notes=notes_of(machine, numerics, log, on, minimiser),
+        notes=(*notes_of(machine, numerics, log, on, minimiser), *remarks),
+        details={"profiles": profiles} if profile else {},
     )
+
+
+def _profiles(
+    problem: tuple,
+    active: np.ndarray,
+    minimum: Minimum,
+    solver: Minimiser | None,
+    machine: Machine,
+    precision: Precision,
+    asked: Sequence[str],
+) -> Steps[tuple[dict[str, Any], list[str]]]:
+    """Compute the profile likelihood of some unknowns, and notes about those that have none.
+
+    The cost takes the residual for white. Its rise is divided by the variance of the white residual that
+    would give the unknown the same standard deviation as the coloured one.
+
+    Args:
+        problem: Arguments of `_fit`, up to the mask.
+        active: Mask of the unknowns of the fit, (p + nuisance,).
+        minimum: The fit.
+        solver: Its minimiser.
+        machine: The machine, with its unknowns.
+        precision: Precision of the unknowns.
+        asked: Names of the unknowns.
+
+    Source:
+        Chandler and Bate (2007), Biometrika 94, 167-183: an independence likelihood, scaled vertically.
+    """
+    profiles, notes = {}, []
+    theta, (lower, upper) = np.asarray(minimum.theta), problem[7]
+    white = 2 * float(minimum.cost) / max(np.sum(problem[4] > 0) - active.sum(), 1)
+    bound = np.isin(np.arange(theta.size), [k for b in machine.parameters.bodies for k in b.places])
+    for name in asked:
+        k = machine.parameters.names.index(name)
+        if not precision.identifiable[k] or precision.equivalent_variance is None:
+            notes.append(f"no profile of {name}: it is not identifiable from this log")
+            continue
+        if bound[k]:
+            notes.append(f"no profile of {name}: it belongs to a link that is kept physically consistent")
+            continue
+        std, variance = float(precision.std[k]), float(precision.equivalent_variance[k])
+        others = active & (np.arange(theta.size) != k)
+
+        def refit(
+            at: np.ndarray,
+            offset: float,
+            k: int = k,
+            others: np.ndarray = others,
+            of: tuple = (std, variance),
+        ) -> Steps[tuple[np.ndarray, float]]:
+            held = theta[k] + offset * of[0]
+            if not lower[k] < held < upper[k]:
+                return at, np.nan
+            start = np.where(np.arange(theta.size) == k, held, at)
+            there = yield SolveRequest(_fit, (*problem[:5], start, *problem[6:], others, solver))
+            rise = 2 * (float(there.cost) - float(minimum.cost)) / of[1]
+            return np.asarray(there.theta), rise if bool(there.converged) else np.nan
+
+        rise = yield from profiled(refit, theta)
+        notes += [BETTER.format(name)] if falls_below(rise) else []
+        unit = machine.parameters.free[k].unit
+        profiles[name] = profile_entry(
+            float(theta[k]), std, theta[k] + OFFSETS * std, rise, variance / white, unit
+        )
+    if profiles:
+        notes.append(
+            "profiles: the residual counts as Gaussian, and its colour as a constant factor of the variance"
+        )
+    return profiles, notes
 
 
 def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,16 @@ _NEGLIGIBLE = 0.1
 _REMEMBERED = 4096
 # Samples over which the innovations of two residuals may be correlated.
 _COMMON = 40
+# Kinds of covariance in results, and in words where its numbers come from.
+GAUSS_NEWTON, FULL_HESSIAN = "gauss_newton", "full_hessian"
+POSTERIOR, LAPLACE, ROUNDING = "posterior_draws", "laplace", "simulated_rounding"
+KINDS = {
+    GAUSS_NEWTON: "the Gauss-Newton matrix and the colour of the residual",
+    FULL_HESSIAN: "the full Hessian and the colour of the residual",
+    POSTERIOR: "draws from the posterior and the colour of the residual",
+    LAPLACE: "the Gauss-Newton matrix with the prior, and the colour of the residual",
+    ROUNDING: "simulated rounding of the readings",
+}
 
 
 @dataclass(frozen=True)
@@ -166,12 +176,20 @@ class Precision:
         unidentifiable: Unidentifiable combinations, each a dictionary from name to weight
             in the scaled parameters.
         information: Eigenvalues of the scaled information matrix, relative to the largest, (p,).
+        kind: Kind of the covariance, one of `KINDS`; empty if the method has its own.
+        curvature: Smallest and largest ratio of the full Hessian to Gauss-Newton's over all directions, (2,);
+            None if no Hessian was computed.
+        equivalent_variance: Variance of the white residual that would give each parameter its variance by
+            Gauss-Newton, (p,) [unit of the residual, squared]; None if not computed.
     """
 
     covariance: Float[np.ndarray, "p p"]
     identifiable: Bool[np.ndarray, " p"]
     unidentifiable: list[dict[str, float]]
     information: Float[np.ndarray, " p"]
+    kind: str = ""
+    curvature: Float[np.ndarray, " 2"] | None = None
+    equivalent_variance: Float[np.ndarray, " p"] | None = None
 
     @property
     def std(self) -> Float[np.ndarray, " p"]:
@@ -182,7 +200,13 @@ class Precision:
         """Return the precision of the first parameters, which have these names, without the nuisances."""
         p = len(names)
         told = [c for c in self.unidentifiable if any(n in names for n in c)]
-        return Precision(self.covariance[:p, :p], self.identifiable[:p], told, self.information)
+        return replace(
+            self,
+            covariance=self.covariance[:p, :p],
+            identifiable=self.identifiable[:p],
+            unidentifiable=told,
+            equivalent_variance=None if self.equivalent_variance is None else self.equivalent_variance[:p],
+        )
 
     def beside(self, std: float) -> Precision:
         """Return the precision with one more parameter, whose standard deviation is known independently."""
@@ -213,7 +237,8 @@ def assess(
         counts: Mask of the samples that count, (time, n).
         signal: 2-norm of the measured signal that the residual belongs to.
         scale: Natural size of each parameter, (p,), which decides whether its column counts as zero.
-        hessian: Matrix used in place of J'J, for the full-Hessian form, (p, p).
+        hessian: Full Hessian of half the sum of squares, for the covariance by `hessian_covariance`, (p, p).
+            It is not used if it is not positive definite; `kind` of the result says which matrix was.
         crossed: Whether the columns of the residual have common noise, such as a reading and the command
             that a loop computes from it; otherwise they count as independent.
 
@@ -227,7 +252,7 @@ def assess(
     norm = np.linalg.norm(flat, axis=0)
     dead = norm * np.abs(scale) <= 1e-9 * signal
     norm = np.where(dead, 1.0, norm)
-    normal = (flat.T @ flat if hessian is None else hessian) / np.outer(norm, norm)
+    normal = flat.T @ flat / np.outer(norm, norm)
     normal[dead] = 0.0
     normal[:, dead] = 0.0
     meat = np.zeros_like(normal)
@@ -245,14 +270,54 @@ def assess(
     spread = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", vectors, meat, vectors), 0.0))
     safe = np.maximum(values, 1e-300)
     blind = (values < _ROUNDING * values[-1]) | (spread > _UNTOLD * signal * safe)
-    seen = vectors[:, ~blind]
-    inverse = seen @ np.diag(1 / values[~blind]) @ seen.T if (~blind).any() else 0 * normal
-    covariance = inverse @ meat @ inverse / np.outer(norm, norm)
+    seen, strength = vectors[:, ~blind], values[~blind]
+    inverse = seen @ np.diag(1 / strength) @ seen.T if strength.size else 0 * normal
+    covariance, kind, curvature = inverse @ meat @ inverse, GAUSS_NEWTON, None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        white = np.diag(covariance) / np.diag(inverse)
+    if hessian is not None and strength.size:
+        inner = seen.T @ (hessian / np.outer(norm, norm)) @ seen
+        curved, curvature = hessian_covariance(np.diag(strength), seen.T @ meat @ seen, inner)
+        if curved is not None:
+            covariance, kind = seen @ curved @ seen.T, FULL_HESSIAN
+    covariance = covariance / np.outer(norm, norm)
     identifiable = ~held(vectors[:, blind])
     covariance[~identifiable] = np.nan
     covariance[:, ~identifiable] = np.nan
     untold = named_directions(names, vectors[:, blind])
-    return Precision(covariance, identifiable, untold, values / max(values[-1], 1e-300))
+    information = values / max(values[-1], 1e-300)
+    return Precision(covariance, identifiable, untold, information, kind, curvature, white)
+
+
+def hessian_covariance(
+    normal: Float[np.ndarray, "p p"], meat: Float[np.ndarray, "p p"], hessian: Float[np.ndarray, "p p"]
+) -> tuple[Float[np.ndarray, "p p"] | None, Float[np.ndarray, " 2"]]:
+    """Return the covariance by the full Hessian, widened by the colour of the residual.
+
+    With V the directions in which normal matrix N and Hessian H are both diagonal, V' N V = 1 and
+    V' H V = L, Gauss-Newton's covariance N^-1 M N^-1 is V (V' M V) V'. By the Hessian it is
+    V L^(-1/2) (V' M V) L^(-1/2) V'. For white noise M is the variance times N, and this is the variance times
+    H^-1, the inverse of the observed information.
+
+    Args:
+        normal: Gauss-Newton's matrix J'J, positive definite, (p, p).
+        meat: Covariance J'RJ of the gradient, with R that of the residual, (p, p).
+        hessian: Full Hessian of half the sum of squares, (p, p).
+
+    Returns:
+        The covariance, (p, p), None if the Hessian is not positive definite; and the smallest and the largest
+        element of L, (2,).
+
+    Source:
+        Efron and Hinkley (1978), Biometrika 65, 457-482: the observed information, and not the expected one,
+        gives the variance of an estimate that its own log supports.
+    """
+    ratio, directions = scipy.linalg.eigh(0.5 * (hessian + hessian.T), normal)
+    curvature = np.array([ratio[0], ratio[-1]])
+    if not ratio[0] > 0.0:
+        return None, curvature
+    curved = directions / np.sqrt(ratio)
+    return curved @ (directions.T @ meat @ directions) @ curved.T, curvature
 
 
 def held(directions: Float[np.ndarray, "p k"]) -> Bool[np.ndarray, " p"]:
@@ -291,6 +356,21 @@ def _signed(v: np.ndarray) -> np.ndarray:
     """Return the direction with its first named entry positive; the sign of an eigenvector is arbitrary."""
     first = v[np.argmax(np.abs(v) > _NEGLIGIBLE)]
     return v if first > 0 else -v
+
+
+def hessian_notes(precision: Precision, asked: bool) -> list[str]:
+    """Return the note that says which matrix the covariance comes from, if the full Hessian was asked for."""
+    if not asked:
+        return []
+    if precision.curvature is None:
+        return ["the full Hessian was not used: no direction is identifiable"]
+    low, high = precision.curvature
+    if precision.kind != FULL_HESSIAN:
+        return [
+            "the full Hessian is not positive definite and was not used; the covariance comes from "
+            f"{KINDS[precision.kind]}"
+        ]
+    return [f"the full Hessian is {low:.3g} to {high:.3g} times the Gauss-Newton matrix, by direction"]
 
 
 def full_hessian(

@@ -135,7 +135,8 @@ def versions() -> dict[str, str]:
 
 def covariance_of(estimate: Estimate) -> Covariance:
     """Return the covariance of an estimate's parameters."""
-    return Covariance(tuple(estimate.names), estimate.precision.covariance)
+    precision = estimate.precision
+    return Covariance(tuple(estimate.names), precision.covariance, precision.kind)
 
 
 def derived(session: Session, estimate: Estimate) -> list[Derived]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.parameters import lines_of
+from jaxid.results.precision import precision_lines
 from jaxid.results.report.numbers import with_std
 from jaxid.results.report.words import SLIGHT, place_words, within_prior_words
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from jaxid.session import Session
     from jaxid.studies.result import Study
 
+# Number of sets of unidentified parameters that a study prints.
+_PARTIAL = 6
 # Stands in tables in place of a standard deviation.
 UNIDENTIFIABLE = "not identifiable from this log"
 
@@ -79,6 +82,7 @@ def identification_table(result: Identification) -> str:
         *_identifiable_combinations(estimate.details.get("directions", [])),
         *_unidentifiable(estimate),
         *within_prior_words(estimate.details),
+        *precision_lines(estimate),
         *(_minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []),
     ]
     gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
@@ -267,6 +271,15 @@ def study_table(result: Study) -> str:
         lines += ["", "named:"] if k == 0 else []
         lines += [f"  {words_of(n)}: {n['runs']} of {runs}: {n['what']}"]
 
+    lines += ["", *result.verdicts] if result.verdicts else []
+
+    for k, part in enumerate(result.partial[:_PARTIAL]):
+        lines += ["", "identified in part:"] if k == 0 else []
+        without = ", ".join(part["unidentifiable"])
+        lines += [f"  {part['estimator']} at {words_of(part)}: {part['runs']} of {runs}: without {without}"]
+    more = len(result.partial) - _PARTIAL
+    lines += [f"  and {more} more; summary.json has all"] if more > 0 else []
+
     for k, f in enumerate(result.failures):
         lines += ["", "failed:"] if k == 0 else []
         lines += [f"  {f['estimator']} at {words_of(f)}: {f['runs']} of {runs}: {f['why']}"]
@@ -281,11 +294,13 @@ def study_rows(result: Study) -> list[list[str]]:
         return f"{100 * x:.1f} %" if np.isfinite(x) else "-"
 
     settings = [name for name in SETTINGS if name in result.table.dims]
-    heads = ["bias", "spread", "reported", "bound", "unit", "68 %", "95 %", "failed"]
+    levels = [f"coverage_{level}" for level in (50, 68, 80, 95)]
+    heads = ["bias", "spread", "reported", "bound", "unit", "50 %", "68 %", "80 %", "95 %"]
+    heads += ["identifiable", "failed"]
     rows = [["estimator", *settings, "parameter", *heads]]
     for r in result.summary:
         sizes = [*[_number(r[k]) for k in ("bias", "spread", "std", "bound")], r["unit"]]
-        parts = [percent(r[k]) for k in ("coverage_68", "coverage_95", "failed")]
+        parts = [percent(r[k]) for k in (*levels, "identifiable", "failed")]
         rows.append([r["estimator"], *[f"{r[k]:g}" for k in settings], r["parameter"], *sizes, *parts])
     return rows
 

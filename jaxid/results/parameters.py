@@ -124,10 +124,13 @@ class Covariance:
         names: Names of the parameters, one an entry.
         matrix: Covariance in the units of the parameters, (p, p); NaN in rows and columns of
             parameters that are not identifiable.
+        kind: Kind of the covariance, one of `jaxid.numerics.precision.KINDS`; empty if the method has one of
+            its own.
     """
 
     names: tuple[str, ...]
     matrix: Float[np.ndarray, "p p"]
+    kind: str = ""
 
     @property
     def std(self) -> Float[np.ndarray, " p"]:
@@ -142,7 +145,8 @@ class Covariance:
 
     def json(self) -> dict[str, Any]:
         """Return the object `covariance` of result.json."""
-        return {"names": list(self.names), "matrix": self.matrix}
+        kind = {"kind": self.kind} if self.kind else {}
+        return {"names": list(self.names), "matrix": self.matrix, **kind}
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the matrix with names on both sides; needs pandas."""

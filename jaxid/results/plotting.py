@@ -16,9 +16,11 @@ from jaxid.results.report.build import history_of, search_step, units_of, view_o
 from jaxid.results.report.data import LogView
 from jaxid.results.report.history_plots import draw_history
 from jaxid.results.report.numbers import is_number, pretty_unit, scaled_unit
-from jaxid.results.report.study_plots import draw_coverage, draw_errors, draw_scatter
+from jaxid.results.report.study_plots import draw_coverage, draw_ecdf, draw_errors, draw_scatter
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from jaxid.commands.identify import Identification
     from jaxid.discovery.result import Discovery
     from jaxid.studies.result import Study
@@ -234,13 +236,23 @@ def _coverage(ax: Axes, result: Study, at: Selection) -> None:
 
 
 def _study_scatter(ax: Axes, result: Study, at: Selection) -> None:
+    draw_scatter(ax, _setting_of(result, at), _named(at.parameter, _parameters_of(result)))
+    legend(ax)
+
+
+def _setting_of(result: Study, at: Selection) -> xr.Dataset:
+    """Return the part of a study's table under the chosen setting."""
     from jaxid.studies.result import conditions
 
     settings = [own for _, own in conditions(result.table)]
     number = at.step or 0
     if not -len(settings) <= number < len(settings):
         raise InputError(f"the study has no setting {number}", hint=f"choose 0 to {len(settings) - 1}")
-    draw_scatter(ax, settings[number], _named(at.parameter, _parameters_of(result)))
+    return settings[number]
+
+
+def _study_ecdf(ax: Axes, result: Study, at: Selection) -> None:
+    draw_ecdf(ax, _setting_of(result, at), _named(at.parameter, _parameters_of(result)))
     legend(ax)
 
 
@@ -267,4 +279,5 @@ STUDY_KINDS: dict[str, Callable[[Axes, Study, Selection], None]] = {
     "errors": _errors,
     "coverage": _coverage,
     "scatter": _study_scatter,
+    "ecdf": _study_ecdf,
 }

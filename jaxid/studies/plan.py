@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxid.case.case import Case
 from jaxid.errors import InputError
-from jaxid.estimators import need_consistent
+from jaxid.estimators import need_consistent, need_likelihood
 from jaxid.machine import Machine
 from jaxid.names import DISCOVER, IN_LOOP
 from jaxid.numerics.lanes import cores
@@ -32,7 +32,7 @@ _LARGEST, _SAMPLES, _LANES = 8, 6400, 16
 _RUNS_OF_DEVICE = 4096
 _UNSTATED = 2**32
 # Version of the arrays in a chunk, counted up if they change.
-_LAYOUT = 2
+_LAYOUT = 3
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
 
@@ -92,6 +92,7 @@ class Plan:
                 _need_learner(case, levels[0].scene)
             elif method != DISCOVER:
                 need_consistent(method, case)
+                need_likelihood(method, case)
         runs = int(setting.runs if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, hint="give one or more")

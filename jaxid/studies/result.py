@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.stats
 import xarray as xr
 
 from jaxid.files import json_text, write_results
 from jaxid.model.units import joined
+from jaxid.studies.calibration import calibration_of, normal_pit, verdict_words
 from jaxid.studies.rows import COLUMNS, Arrays, variables
-from jaxid.studies.settings import SETTINGS
+from jaxid.studies.settings import SETTINGS, setting_of, words_of
 
 if TYPE_CHECKING:
     import pandas
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from jaxid.studies.plan import Plan
 
 FILES = ("study.nc", "summary.json", "report.html")
-# Nominal coverage of the intervals that are counted.
-COVERAGES = (0.68, 0.95)
 
 
 @dataclass(frozen=True, repr=False)
@@ -38,9 +36,12 @@ class Study:
     Args:
         table: Every run: `estimate`, `std`, `identifiable` (estimator, noise, run, parameter),
             `converged`, `steps`, `message`, `named` (estimator, noise, run), `truth` and `start` (run,
-            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter); for loops
-            `tracking_rms` and `tracking_peak` (noise, run, drive) in the last quarter of a run. SI units.
-            `sample_rate` [Hz] and `position_resolution` come before noise if the study varies them.
+            parameter), and `bound`, the Cramer-Rao bound on the deviation (noise, parameter).
+            `combinations` (estimator, noise, run) and `combination_error` (estimator, noise, run,
+            parameter) are number and errors of the combinations that a fit within a prior identifies, the
+            errors in units of their deviation. For loops it has `tracking_rms` and `tracking_peak` (noise,
+            run, drive) in the last quarter of a run. SI units. `sample_rate` [Hz] and `position_resolution`
+            come before noise if the study varies them.
         seconds: Time of all chunks [s], added up over the threads, those of earlier starts included.
         title: Name of the case.
     """
@@ -82,9 +83,11 @@ class Study:
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """Reasons (`why`) for which runs lack a value for some parameter, with their number of `runs`.
+        """Reasons (`why`) for which runs failed, with their number of `runs`.
 
-        Rows are by estimator and setting. Reasons that differ only in numbers count as one.
+        A run fails if its fit does not converge, or identifies nothing at all; see `partial` for fits that
+        identify some parameters only. Rows are by estimator and setting. Reasons that differ only in numbers
+        count as one.
         """
         out = []
         for estimator, setting, own in cells(self.table):
@@ -103,6 +106,53 @@ class Study:
         return out
 
     @property
+    def partial(self) -> list[dict[str, Any]]:
+        """Parameters (`unidentifiable`, a list) that fits did not identify, with the number of `runs`.
+
+        Such fits are successes: the log does not determine all parameters. Rows are by estimator and setting,
+        and a row for each set of parameters.
+        """
+        out = []
+        for estimator, setting, own in cells(self.table):
+            names, told = own.parameter.values, own["identifiable"].values.astype(bool)
+            lacking = [tuple(map(str, names[~t])) for t in told[_succeeded(own)] if not t.all()]
+            out += [
+                {"estimator": estimator, **setting, "unidentifiable": list(which), "runs": runs}
+                for which, runs in Counter(lacking).most_common()
+            ]
+        return out
+
+    @property
+    def combinations(self) -> list[dict[str, Any]]:
+        """Coverage of the combinations of parameters that fits within a prior identify.
+
+        Rows are by estimator and setting: `runs` that identify any, `mean` number of combinations of these
+        runs, and over all combinations `coverage_50` and so on, as in `summary`. Empty without such fits.
+        """
+        out = []
+        for estimator, setting, own in cells(self.table):
+            if "combinations" not in own:
+                continue
+            counts, good = own["combinations"].values, own["converged"].values.astype(bool)
+            used = good & (counts > 0)
+            if used.any():
+                errors = own["combination_error"].values[used]
+                pit = normal_pit(errors[np.isfinite(errors)], np.ones(1))
+                row = {"runs": int(used.sum()), "mean": float(counts[used].mean()), **calibration_of(pit)}
+                out.append({"estimator": estimator, **setting, **row})
+        return out
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Sentences on the intervals of every estimator, setting and parameter: whether to rely on them."""
+        rows = self.summary
+        several = len({tuple(setting_of(r).items()) for r in rows}) > 1
+        lines = [(r, verdict_words(r["parameter"], r)) for r in rows]
+        lines += [(r, verdict_words("identified combinations", r)) for r in self.combinations]
+        where = lambda r: f"{r['estimator']} at {words_of(r)}" if several else r["estimator"]
+        return [f"{where(r)}: {line}" for r, line in lines if line]
+
+    @property
     def named(self) -> list[dict[str, Any]]:
         """Effects that discover named, or its verdict (`what`), with the number of `runs`, by setting."""
         return [
@@ -118,11 +168,12 @@ class Study:
         """Draw one plot for one parameter.
 
         Args:
-            kind: "errors" (RMS error against the setting with most values), "coverage" (of 95 % intervals)
-                or "scatter" (errors in units of their reported deviation).
+            kind: "errors" (RMS error against the setting with most values), "coverage" (of 95 % intervals),
+                "scatter" (errors in units of their reported deviation), or "ecdf" (of the truth's place in
+                the reported distribution, minus the diagonal, with its simultaneous 95 % band).
             ax: Axes to draw on; None: a new figure, which a notebook shows.
             parameter: Name of the parameter; None: the first.
-            step: Setting of "scatter", in the order of the table; None: the first.
+            step: Setting of "scatter" and "ecdf", in the order of the table; None: the first.
 
         Returns:
             The axes.
@@ -166,7 +217,8 @@ class Study:
         folder = Path(folder)
         words = {"case": self.title, "seconds": self.seconds}
         words |= {"rows": self.summary, "failures": self.failures, "named": self.named}
-        words |= {"tracking": self.tracking}
+        words |= {"tracking": self.tracking, "partial": self.partial}
+        words |= {"combinations": self.combinations, "verdicts": self.verdicts}
         files = {
             "study.nc": bytes(self.table.to_netcdf(engine="scipy")),
             "summary.json": json_text(words),
@@ -237,56 +289,79 @@ def _tracking_unit(machine: Machine) -> str:
 
 
 def _why(run: xr.Dataset) -> str:
-    """Return the reason for which a run lacks a value for some parameter; empty if it has all."""
+    """Return the reason for which a run failed; empty if it is a success."""
     if not run["converged"].item():
         return str(run["message"].item())
-    missing = run.parameter.values[run["identifiable"].values == 0]
-    return f"not identifiable: {', '.join(map(str, missing))}" if len(missing) else ""
+    return "" if _succeeded(run.expand_dims("run"))[0] else "nothing is identifiable"
+
+
+def _succeeded(runs: xr.Dataset) -> np.ndarray:
+    """Return the mask of the runs that converged and identified any parameter or combination, (run,)."""
+    any_told = (runs["identifiable"].values != 0).any(axis=-1)
+    if "combinations" in runs:
+        any_told = any_told | (runs["combinations"].values > 0)
+    return runs["converged"].values.astype(bool) & any_told
 
 
 def summarised(table: xr.Dataset) -> list[dict[str, Any]]:
     """Compute bias, spread and coverage of every estimator, setting and parameter.
 
+    A run is a success if its fit converged and identified any parameter, or any combination of them.
+
     Returns:
-        Rows with `runs` and `used` (converged, and the parameter identifiable); `failed`, the fraction of
-        the others; over the runs used `bias` (mean error), `bias_std` (standard deviation of the mean),
-        `spread` (standard deviation of the error), `rmse`, `std` (mean of those reported), `bound`
-        (Cramer-Rao), and `coverage_68`, `coverage_95`: the fraction of intervals of that nominal coverage
-        that hold the truth. NaN if no run has the quantity, such as for an estimator without a
-        standard deviation.
+        Rows with `runs`; `failed`, the fraction of runs that are no success; `identifiable`, the fraction of
+        the successes that identify this parameter; and `used`, their number. Over the runs used `bias` (mean
+        error), `bias_std` (standard deviation of the mean), `spread` (standard deviation of the error),
+        `rmse`, `std` (mean of those reported), and `bound` (Cramer-Rao). Over their finite intervals
+        `intervals` (number), `coverage_50`, `coverage_68`, `coverage_80` and `coverage_95`: the fraction of
+        intervals of that nominal coverage that hold the truth; `accepted_95`: the range in which the last is
+        with a probability of 99 % if the intervals are sound; `verdict`: see
+        `jaxid.studies.calibration.verdict_of`; `pit_uniform`: whether the truth's place in the reported
+        distribution is uniform, by the simultaneous band of its ECDF. NaN or None if no run has the quantity,
+        such as for an estimator without a standard deviation.
     """
     rows = []
     for estimator, setting, whole in cells(table):
+        good = _succeeded(whole)
         for k, name in enumerate(table.parameter.values):
             own = whole.isel(parameter=k)
-            truth, std = own["truth"].values, own["std"].values
-            error = own["estimate"].values - truth
-            used = own["converged"].values.astype(bool) & np.isfinite(error)
+            error, std = errors_of(own)
+            used = good & np.isfinite(error)
             rows.append({
                 "estimator": estimator, **setting, "parameter": str(name),
-                "unit": str(own["unit"].values), "true": float(np.mean(truth)),
-                "runs": len(used), "used": int(used.sum()), "failed": float(1 - used.mean()),
+                "unit": str(own["unit"].values), "true": float(np.mean(own["truth"].values)),
+                "runs": len(used), "used": int(used.sum()), "failed": float(1 - good.mean()),
+                "identifiable": float(used.sum() / good.sum()) if good.any() else np.nan,
                 **_moments(error[used], std[used]), "bound": float(own["bound"].values),
+                **calibration_of(pits_of(own)),
             })  # fmt: skip
     return rows
 
 
+def errors_of(own: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors and reported deviations of one parameter under one setting, (run,) each."""
+    return own["estimate"].values - own["truth"].values, own["std"].values
+
+
+def pits_of(own: xr.Dataset) -> np.ndarray:
+    """Return the truth's places in the reported distributions of one parameter, of the runs that have one.
+
+    Args:
+        own: Part of the table for one estimator, setting and parameter.
+    """
+    error, std = errors_of(own)
+    used = own["converged"].values.astype(bool) & np.isfinite(error) & np.isfinite(std)
+    return normal_pit(error[used], std[used])
+
+
 def _moments(error: np.ndarray, std: np.ndarray) -> dict[str, float]:
     if not len(error):
-        coverages = [f"coverage_{_percent(c)}" for c in COVERAGES]
-        return dict.fromkeys(("bias", "bias_std", "spread", "rmse", "std", *coverages), np.nan)
+        return dict.fromkeys(("bias", "bias_std", "spread", "rmse", "std"), np.nan)
     spread = float(np.std(error, ddof=1)) if len(error) > 1 else np.nan
-    widths = {c: scipy.stats.norm.ppf(0.5 + 0.5 * c) for c in COVERAGES}
-    held = {c: np.where(np.isfinite(std), np.abs(error) <= w * std, np.nan) for c, w in widths.items()}
     return {
         "bias": float(np.mean(error)),
         "bias_std": spread / np.sqrt(len(error)),
         "spread": spread,
         "rmse": float(np.sqrt(np.mean(error**2))),
         "std": float(np.mean(std)),
-        **{f"coverage_{_percent(c)}": float(np.mean(x)) for c, x in held.items()},
     }
-
-
-def _percent(part: float) -> int:
-    return round(100 * part)

@@ -28,6 +28,8 @@ class RunRow:
         steps: Evaluations of the Jacobian.
         message: Message of the solver, or of the error that ended the run.
         named: Effects that a search named, or its verdict; else empty.
+        combinations: Number of combinations that a fit within a prior identifies; else zero.
+        combination_error: Errors of the first p of them in units of their reported deviation, (p,); else NaN.
     """
 
     estimate: np.ndarray = _column(by_parameter=True)
@@ -37,6 +39,8 @@ class RunRow:
     steps: int = _column(np.int32)
     message: str = _column(object)
     named: str = _column(object)
+    combinations: int = _column(np.int32)
+    combination_error: np.ndarray = _column(by_parameter=True)
 
     @classmethod
     def failed(cls, parameters: int, why: str) -> RunRow:
@@ -55,6 +59,8 @@ class RunRow:
             steps=0,
             message=why,
             named="",
+            combinations=0,
+            combination_error=none,
         )
 
 

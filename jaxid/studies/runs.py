@@ -109,7 +109,9 @@ class Runner:
                     rows.append(_row_of_search(plan, whole))
                     continue
                 options = {"numerics": ways.numerics} if method in SIMULATING else {}
-                rows.append(_row((yield from steps_of(method, session, **options))))
+                estimate = yield from steps_of(method, session, **options)
+                moved = np.asarray(simulated_log.trajectory.position)[0] - session.fit.log.filled[0]
+                rows.append(_row(estimate, _combinations(session, estimate, truth[plan.own], moved)))
             except Exception as error:
                 rows.append(RunRow.failed(len(plan.names), _words(error)))
         driven = machine.plant.driven(simulated_log.trajectory.position.shape[1])
@@ -122,8 +124,28 @@ class Runner:
         return _run_arrays(rows, np.full((drives, 2), np.nan))
 
 
-def _row(estimate: Estimate) -> RunRow:
+def _combinations(session: Session, estimate: Estimate, truth: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Return the errors of the combinations that a fit within a prior identifies, over their deviations.
+
+    Args:
+        session: Case and log of the fit.
+        estimate: The estimate.
+        truth: True values of the unknowns, (p,).
+        moved: True minus read position of each joint at the start, (n,).
+    """
+    directions = estimate.details.get("directions")
+    if not directions:
+        return np.zeros(0)
+    from jaxid.estimators.within_prior.coverage import errors_of_directions
+
+    return errors_of_directions(session.machine, session.case.need_prior().prior, directions, truth, moved)
+
+
+def _row(estimate: Estimate, combinations: np.ndarray | None = None) -> RunRow:
     identifiable = estimate.identifiable & np.all(np.isfinite(estimate.theta))
+    errors = np.zeros(0) if combinations is None else combinations
+    padded = np.full(len(estimate.theta), np.nan)
+    padded[: len(errors)] = errors[: len(padded)]
     return RunRow(
         estimate=np.where(identifiable, estimate.theta, np.nan),
         std=np.where(identifiable, estimate.std, np.nan),
@@ -132,6 +154,8 @@ def _row(estimate: Estimate) -> RunRow:
         steps=estimate.steps,
         message=estimate.message,
         named="",
+        combinations=len(errors),
+        combination_error=padded,
     )
 
 
@@ -167,6 +191,7 @@ def _row_of_search(plan: Plan, session: Session) -> RunRow:
         estimate=row.estimate[at],
         std=row.std[at],
         identifiable=row.identifiable[at],
+        combination_error=row.combination_error[at],
         named=" + ".join(sorted(e.label for e in result.effects)) or result.verdict,
     )
 

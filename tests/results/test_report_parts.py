@@ -132,7 +132,7 @@ def test_study_of_estimators_without_deviation_or_value():
     study = SimpleNamespace(summary=rows, failures=[{"runs": 8}], table=_Table(table, ["a", "b", "c"]))
     assert _answer(study) == (
         "95 % intervals held the truth, over all parameters and settings, in: a: 90 %. "
-        "8 of 24 fits gave no value for some parameter. c gave none at all."
+        "8 of 24 fits failed. c gave none at all."
     )
     drawn = lambda figure: [t.get_text() for t in figure.legends[0].get_texts()]
     assert drawn(plot_errors(rows)) == ["a", "b", "reported σ"]

@@ -225,7 +225,7 @@ def studied():
     return jaxid.Study(table, 1.0, "axis")
 
 
-@pytest.mark.parametrize("kind", ["errors", "coverage", "scatter"])
+@pytest.mark.parametrize("kind", ["errors", "coverage", "scatter", "ecdf"])
 def test_plots_of_a_study(kind, studied):
     ax = Figure().add_subplot()
     assert studied.plot(kind, ax, parameter="friction") is ax

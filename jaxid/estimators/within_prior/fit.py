@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
+from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import choose_numerics, notes_of
 from jaxid.estimators.within_prior.evaluations import BLOCK, DRAWS, linearise, precompile_residuals_at
@@ -37,6 +38,7 @@ from jaxid.estimators.within_prior.precision import (
     cost_hessian,
     parameter_precision,
     precision_of_directions,
+    profiles_of,
     with_prior,
 )
 from jaxid.estimators.within_prior.problem import Problem
@@ -55,7 +57,14 @@ from jaxid.estimators.within_prior.subspace import (
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Precision
+from jaxid.numerics.precision import (
+    FULL_HESSIAN,
+    LAPLACE,
+    POSTERIOR,
+    Precision,
+    hessian_covariance,
+    hessian_notes,
+)
 from jaxid.simulation.replay import Numerics
 
 # Number of random points from which the fit restarts if no direction is identifiable at the guesses.
@@ -75,6 +84,7 @@ def within_prior_steps(
     others: Sequence[np.ndarray] = (),
     hessian: bool = False,
     profile: bool = False,
+    profile_of: Sequence[str] = (),
     numerics: Numerics | None = None,
     widths: Mapping[str, float] | None = None,
     begin: np.ndarray | None = None,
@@ -94,6 +104,7 @@ def within_prior_steps(
         others: More starts, each as values of the unknowns, (p,).
         hessian: Take the curvature from the full Hessian in place of Gauss-Newton's.
         profile: Add profile likelihoods of the fitted directions.
+        profile_of: Names of the unknowns whose profile likelihood is added.
         numerics: Integration settings; chosen from machine and log if absent.
         widths: Standard deviations of single guesses, by name; of the logarithm for positive unknowns.
         begin: Start of the fit, as values of the unknowns; absent: the best of many points about the guesses.
@@ -113,6 +124,7 @@ def within_prior_steps(
         Precision: Bogdan and Abba, (12)-(27), with the residual's colour in place of white noise.
         (27) lacks the inverse of B: 100 (sigma^2 diag B^-1)^(1/2) / theta.
     """
+    need_names(profile_of, machine.parameters.names)
     numerics = numerics or choose_numerics(machine, log)
     problem = Problem.of(machine, log, prior, on, numerics, widths)
     problem = replace(problem, minimiser=minimiser_of(minimiser))
@@ -127,25 +139,33 @@ def within_prior_steps(
         f"{fit.count} directions of {len(problem.places)} unknowns fitted, the others are left to the prior"
     ]
     if precision is not None and exact and hessian:
-        precision, remarks = yield from _with_full_hessian(fit, precision)
-        notes += remarks
+        precision = yield from _with_full_hessian(fit, precision)
     whole, stated = parameter_precision(machine, fit, precision)
+    if exact or precision is None:
+        notes += hessian_notes(whole, hessian)
+    details: dict[str, Any] = {"directions": stated}
     if exact and profile:
         notes += yield from add_profiles(fit, fit.problem.noise(fit.minimum, fit.count), stated)
+    if exact and profile_of:
+        details["profiles"], remarks = yield from profiles_of(machine, fit, whole, profile_of)
+        notes += remarks
     if quantised:
-        notes += _quantisation_notes(drawn, precision is not None, hessian or profile)
+        more = [
+            name for name, asked in (("full Hessian", hessian), ("profiles", profile or profile_of)) if asked
+        ]
+        notes += _quantisation_notes(drawn, precision is not None, more)
 
     notes = (*notes_of(machine, numerics, log, on, minimiser), *notes)
-    return _estimate(machine, fit, whole, notes, {"directions": stated} | multistart)
+    return _estimate(machine, fit, whole, notes, details | multistart)
 
 
-def _quantisation_notes(drawn: bool, identifiable: bool, more: bool) -> list[str]:
+def _quantisation_notes(drawn: bool, identifiable: bool, more: Sequence[str]) -> list[str]:
     """Return the notes about a loop with quantised readings.
 
     Args:
         drawn: Whether quantisation was simulated.
         identifiable: Whether any direction is identifiable.
-        more: Whether a Hessian or profiles were asked for.
+        more: Other forms of the precision that were asked for.
     """
     if not drawn:
         return ["drawn = false: values and standard deviations leave out the quantisation of the readings"]
@@ -156,7 +176,12 @@ def _quantisation_notes(drawn: bool, identifiable: bool, more: bool) -> list[str
         "of the fit before that"
     ]
     if more:
-        notes.append("quantisation was simulated: Hessian and profiles do not apply and were not computed")
+        verb = "was" if len(more) == 1 and more[0] == "full Hessian" else "were"
+        notes.append(
+            f"{' and '.join(more)} {verb} not computed: the readings are rounded, and the cost of a loop "
+            "with rounded readings has steps in place of a curvature; the covariance comes from simulated "
+            "rounding"
+        )
     return notes
 
 
@@ -190,17 +215,20 @@ def _estimate(
     )
 
 
-def _with_full_hessian(
-    fit: SubspaceFit, precision: SubspacePrecision
-) -> Steps[tuple[SubspacePrecision, list[str]]]:
-    """Return the precision by the full Hessian, if it is positive definite, and notes."""
+def _with_full_hessian(fit: SubspaceFit, precision: SubspacePrecision) -> Steps[SubspacePrecision]:
+    """Return the precision by the full Hessian of the negative log-posterior, if it is positive definite."""
     z, noise = np.asarray(fit.minimum.theta), fit.problem.noise(fit.minimum, fit.count)
     args = (fit.problem.residual, fit.problem.sharpnesses[-1], fit.vectors, z)
     full = np.asarray((yield SolveRequest(cost_hessian, args))) / noise**2 + np.eye(z.size)
-    if np.linalg.eigvalsh(full)[0] <= 0.0:
-        return precision, ["the full Hessian is not positive definite and was not used"]
-    covariance = fit.vectors @ np.linalg.inv(full) @ fit.vectors.T
-    return with_prior(fit, precision_of_directions(fit), covariance), []
+    jacobian = np.asarray(fit.minimum.jacobian) / noise
+    normal = jacobian.T @ jacobian + np.eye(z.size)
+    covariance, curvature = hessian_covariance(normal, normal, full)
+    precision = replace(precision, curvature=curvature)
+    if covariance is None:
+        return precision
+    whitened = fit.vectors @ covariance @ fit.vectors.T
+    of_hessian = with_prior(fit, precision_of_directions(fit), whitened, FULL_HESSIAN)
+    return replace(of_hessian, curvature=curvature)
 
 
 def _search(
@@ -338,9 +366,10 @@ def _posterior_fit(
             covariance, _ = yield from posterior_second_moment(fit, fit.noise)
     else:
         covariance = laplace_covariance(fit, fit.noise)
+    kind = POSTERIOR if drawn else LAPLACE
 
     while fit.count:
-        precision = with_prior(fit, precision_of_directions(fit), covariance)
+        precision = with_prior(fit, precision_of_directions(fit), covariance, kind)
         kept = precision.std <= KEPT_STD
         if np.all(kept):
             return fit, precision

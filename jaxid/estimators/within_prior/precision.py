@@ -10,22 +10,22 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Array
-from jaxid.estimators.within_prior.posterior import maximum_a_posteriori, negative_log_posterior
+from jaxid.estimators.common.profile import BETTER, OFFSETS, falls_below, profile_entry, profiled
+from jaxid.estimators.within_prior.posterior import (
+    laplace_covariance,
+    maximum_a_posteriori,
+    negative_log_posterior,
+)
 from jaxid.estimators.within_prior.problem import WeightedResidual
 from jaxid.estimators.within_prior.subspace import SubspaceFit
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
-from jaxid.numerics.precision import Precision, assess, full_hessian
+from jaxid.numerics.precision import GAUSS_NEWTON, LAPLACE, Precision, assess, full_hessian
 
 # An unknown is identifiable if its posterior standard deviation is below this, in those of its prior.
 _IDENTIFIABLE_STD = 0.5
 # Entries of a unit vector below this are omitted from the named combination.
 _NEGLIGIBLE = 0.1
-# Offsets at which a profile likelihood is taken, in posterior standard deviations.
-_PROFILE_AT = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-# Rise of twice the negative log-posterior by which a profile may be below the fit: an optimum is not
-# converged to the last digit.
-_BELOW = 0.1
 
 
 @eqx.filter_jit
@@ -51,12 +51,17 @@ class SubspacePrecision:
         information: Eigenvalues of the scaled information matrix, see `jaxid.numerics.precision.Precision`.
         whitened_covariance: Posterior covariance of all unknowns in whitened coordinates, (q, q); None: that
             of the fitted directions, and the prior along the others.
+        kind: Kind of the covariance, one of `jaxid.numerics.precision.KINDS`.
+        curvature: Smallest and largest ratio of the full Hessian to Gauss-Newton's, see
+            `jaxid.numerics.precision.Precision`.
     """
 
     covariance: np.ndarray
     white_std: np.ndarray
     information: np.ndarray
     whitened_covariance: np.ndarray | None = None
+    kind: str = GAUSS_NEWTON
+    curvature: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:
@@ -98,7 +103,7 @@ def precision_of_directions(fit: SubspaceFit) -> SubspacePrecision:
 
 
 def with_prior(
-    fit: SubspaceFit, precision: SubspacePrecision, whitened_covariance: np.ndarray
+    fit: SubspaceFit, precision: SubspacePrecision, whitened_covariance: np.ndarray, kind: str = LAPLACE
 ) -> SubspacePrecision:
     """Return the precision with the prior included.
 
@@ -106,13 +111,15 @@ def with_prior(
         fit: The fit.
         precision: Precision of the fitted directions from the log alone.
         whitened_covariance: Posterior covariance of all unknowns as if the noise were white, (q, q).
+        kind: Kind of that covariance, one of `jaxid.numerics.precision.KINDS`.
     """
     fitted = fit.vectors[:, : fit.count]
     # The colour of the noise widens the fitted directions.
     widening = np.eye(len(whitened_covariance))
     widening = widening + (fitted * (precision.std / precision.white_std - 1.0)) @ fitted.T
     covariance = widening @ whitened_covariance @ widening.T
-    return replace(precision, covariance=fitted.T @ covariance @ fitted, whitened_covariance=covariance)
+    inner = fitted.T @ covariance @ fitted
+    return replace(precision, covariance=inner, whitened_covariance=covariance, kind=kind)
 
 
 def parameter_precision(
@@ -153,7 +160,11 @@ def parameter_precision(
     ]
     combinations = [_named(names, v) for v in unidentifiable.T]
     combinations = [c for c in combinations if any(n in c for n in names[:p])]
-    return Precision(covariance, identifiable, combinations, precision.information), stated
+    return replace(
+        Precision(covariance, identifiable, combinations, precision.information),
+        kind=precision.kind,
+        curvature=precision.curvature,
+    ), stated
 
 
 def _nothing_identifiable(machine: Machine) -> tuple[Precision, list[dict[str, Any]]]:
@@ -179,22 +190,72 @@ def add_profiles(fit: SubspaceFit, noise: float, stated: list[dict[str, Any]]) -
     Returns:
         Notes about profiles that fall below the fit.
     """
-    best, notes = fit.point, []
-    below = "the profile of direction {} falls below the fit: there is a better optimum beside it"
+    notes = []
     for k, direction in enumerate(stated):
-        along, rise = fit.vectors[:, k], np.full(_PROFILE_AT.size, np.nan)
-        lowest = negative_log_posterior(noise, fit.minimum, best)
-        # From the fit outwards: each descent begins at the optimum of its neighbour.
-        for side in (_PROFILE_AT < 0, _PROFILE_AT > 0):
-            w, before = best, 0.0
-            places = np.flatnonzero(side)
-            for i in places[np.argsort(np.abs(_PROFILE_AT[places]))]:
-                w = w + (_PROFILE_AT[i] - before) * direction["std"] * along
-                before = _PROFILE_AT[i]
-                w, here, _ = yield from maximum_a_posteriori(fit.problem, noise, w, held=along)
-                rise[i] = 2 * (negative_log_posterior(noise, here, w) - lowest)
-
-        direction["profile"] = {"at_std": _PROFILE_AT.tolist(), "rise": rise.tolist()}
-        if np.nanmin(rise) < -_BELOW:
-            notes.append(below.format(k + 1))
+        rise = yield from _profile_along(fit, noise, fit.vectors[:, k], direction["std"])
+        direction["profile"] = {"at_std": OFFSETS.tolist(), "rise": rise.tolist()}
+        notes += [BETTER.format(f"direction {k + 1}")] if falls_below(rise) else []
     return notes
+
+
+def profiles_of(
+    machine: Machine, fit: SubspaceFit, precision: Precision, asked: Sequence[str]
+) -> Steps[tuple[dict[str, Any], list[str]]]:
+    """Compute the profile of the posterior of some unknowns, and notes about those that have none.
+
+    The rise is divided by the factor by which the residual's colour changes the variance of the unknown.
+
+    Args:
+        machine: The machine whose unknowns were fitted.
+        fit: The fit, at the maximum a posteriori.
+        precision: Precision of the unknowns.
+        asked: Names of the unknowns.
+    """
+    profiles, notes = {}, []
+    noise, prior, names = (
+        fit.problem.noise(fit.minimum, fit.count),
+        fit.problem.prior,
+        machine.parameters.names,
+    )
+    theta, size = np.asarray(prior.outward(fit.point)), fit.point.size
+    laplace = laplace_covariance(fit, noise)
+    coloured = with_prior(fit, precision_of_directions(fit), laplace).whitened_covariance
+    assert coloured is not None, "with_prior gives the covariance of all unknowns"
+    for name in asked:
+        k = names.index(name)
+        if not precision.identifiable[k]:
+            notes.append(f"no profile of {name}: it is not identifiable from this log")
+            continue
+        factor = float(coloured[k, k] / laplace[k, k])
+        std = float(precision.std[k] / prior.slope(theta)[k])
+        along = np.eye(size)[k]
+        rise = (yield from _profile_along(fit, noise, along, std)) / factor
+        notes += [BETTER.format(name)] if falls_below(rise) else []
+        at = np.array([np.asarray(prior.outward(fit.point + x * std * along))[k] for x in OFFSETS])
+        unit = machine.parameters.free[k].unit
+        profiles[name] = profile_entry(float(theta[k]), float(precision.std[k]), at, rise, factor, unit)
+    if profiles:
+        notes.append(
+            "profiles: of the posterior, with the priors of the guesses; the residual counts as Gaussian, "
+            "and its colour as a constant factor of the variance"
+        )
+    return profiles, notes
+
+
+def _profile_along(fit: SubspaceFit, noise: float, along: np.ndarray, std: float) -> Steps[np.ndarray]:
+    """Return the rise of twice the negative log-posterior at all offsets along a direction.
+
+    Args:
+        fit: The fit, at the maximum a posteriori.
+        noise: Standard deviation of its residual, taken as white.
+        along: Direction in whitened coordinates, of norm one, (q,).
+        std: Standard deviation of the coordinate along it.
+    """
+    lowest = negative_log_posterior(noise, fit.minimum, fit.point)
+
+    def refit(w: np.ndarray, offset: float) -> Steps[tuple[np.ndarray, float]]:
+        w = w + (along @ (fit.point - w) + offset * std) * along
+        w, here, _ = yield from maximum_a_posteriori(fit.problem, noise, w, held=along)
+        return w, 2 * (negative_log_posterior(noise, here, w) - lowest)
+
+    return (yield from profiled(refit, fit.point))

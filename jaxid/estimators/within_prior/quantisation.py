@@ -20,6 +20,7 @@ from jaxid.estimators.within_prior.problem import Problem
 from jaxid.estimators.within_prior.subspace import KEPT_STD, SubspaceFit, with_definite_signs
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Precompile, Steps, run_alone
+from jaxid.numerics.precision import ROUNDING
 from jaxid.simulation.replay import with_sensor
 
 # Until the passes settle, points are drawn from a box about the last estimate. Its half width is this many
@@ -374,7 +375,8 @@ def _in_uncorrelated_directions(
     if not count:
         return ended, None
     precision = precision_of_directions(ended)
-    return ended, replace(precision, covariance=np.diag(variances[:count]), whitened_covariance=whitened)
+    covariance = np.diag(variances[:count])
+    return ended, replace(precision, covariance=covariance, whitened_covariance=whitened, kind=ROUNDING)
 
 
 def _missing_noise(

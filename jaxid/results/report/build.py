@@ -12,6 +12,7 @@ import numpy as np
 from jaxid.estimators.minimal.report import minimal_rows
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
+from jaxid.results.precision import precision_content
 from jaxid.results.proposals import sentence
 from jaxid.results.report.data import (
     CandidateScore,
@@ -121,6 +122,7 @@ def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
         "case_name": session.case.name,
         "log_name": Path(session.fit.log.source).name,
         "parameters": _rows(estimate),
+        "precision": precision_content(estimate),
         "derived": _derived(session, estimate),
         "units": units_of(session),
         "notes": tuple(notes),

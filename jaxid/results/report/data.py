@@ -195,6 +195,8 @@ class ReportData:
         within_prior: `directions`, `criterion_percent` and `starts` of the JSON result of a fit within a
             prior; None for any other.
         history: History of a recursive estimate; None for any other.
+        precision: Content of the section on precision, see `jaxid.results.precision.precision_content`; None
+            without parameters.
     """
 
     title: str
@@ -220,3 +222,4 @@ class ReportData:
     statistics: tuple[str, ...] = ()
     within_prior: Mapping | None = None
     history: HistoryView | None = None
+    precision: Mapping | None = None

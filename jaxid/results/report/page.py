@@ -18,6 +18,7 @@ from jaxid.results.report import words as tables
 from jaxid.results.report.data import ExperimentView, HistoryView, LogView, ReportData
 from jaxid.results.report.history_plots import plot_history
 from jaxid.results.report.numbers import is_number, nats, pretty_unit, short
+from jaxid.results.report.profile_plots import plot_profiles
 
 View = LogView | ExperimentView | HistoryView
 
@@ -54,6 +55,7 @@ def render(data: ReportData) -> str:
         notes=[tables.unbroken(note) for note in data.notes],
         where_figure=_where_figure(data),
         history=_history(data),
+        precision=_precision(data),
         experiments=[_experiment(data, view) for view in data.experiments],
         views=[_view_entry(data, view, i) for i, view in enumerate(data.views)],
     )
@@ -136,6 +138,15 @@ def _history(data: ReportData) -> dict | None:
     if data.history is None:
         return None
     return _picture("Estimates and running residual over time", plot_history, data.history, data.units)
+
+
+def _precision(data: ReportData) -> dict | None:
+    """Return the section on precision: the kind of the covariance, profiles, and correlations."""
+    if data.precision is None:
+        return None
+    profiles = data.precision["profiles"]
+    figure = image(plot_profiles(profiles), "Profile likelihoods and parabolas") if profiles else None
+    return {**data.precision, "figure": figure}
 
 
 def _where_figure(data: ReportData) -> dict | None:

@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 
 from jaxid.results.report.axes import FONT, TEXT, dress
 from jaxid.results.report.numbers import pretty_unit
+from jaxid.studies.calibration import ecdf_band
+from jaxid.studies.result import pits_of
 from jaxid.studies.settings import widest, words_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#6b6b6b")
@@ -159,6 +161,47 @@ def draw_scatter(ax: Axes, table: xr.Dataset, name: str) -> None:
             ax.hist(np.clip(z, -_REACH, _REACH), ends.tolist(), label=str(estimator), **style)
     ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
     dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
+
+
+def plot_ecdf(table: xr.Dataset) -> Figure:
+    """Draw the ECDF of the truth's place in the reported distribution, a panel a parameter; see `draw_ecdf`.
+
+    Args:
+        table: `Study.table` under one setting.
+    """
+    names = [str(n) for n in table.parameter.values]
+    figure, panels = _grid(len(names))
+    for name, ax in zip(names, panels, strict=True):
+        draw_ecdf(ax, table, name)
+    _legend(figure, panels[0])
+    return figure
+
+
+def draw_ecdf(ax: Axes, table: xr.Dataset, name: str) -> None:
+    """Draw the ECDF of one parameter minus the diagonal on one axes, with its simultaneous band.
+
+    Args:
+        ax: The axes to draw on.
+        table: `Study.table` under one setting.
+        name: Name of the parameter.
+    """
+    of_name = table.isel(parameter=[str(n) for n in table.parameter.values].index(name))
+    pits = [pits_of(of_name.isel(estimator=i)) for i in range(len(table.estimator))]
+    for i, pit in enumerate(pits):
+        if len(pit):
+            x = np.sort(pit)
+            ends = np.concatenate([[0.0], np.repeat(x, 2), [1.0]])
+            steps = np.concatenate([[0.0, 0.0], np.repeat(np.arange(1, len(x) + 1) / len(x), 2)])
+            style = {"color": _look(i)["color"], "lw": 1.4}
+            ax.plot(ends, steps - ends, label=str(table.estimator.values[i]), **style)
+    most = max(len(pit) for pit in pits)
+    if most:
+        points, low, high = ecdf_band(most)
+        for k, edge in enumerate((low, high)):
+            ax.plot(points, edge, color=TEXT, lw=0.9, ls="--", label="95 % band" if k == 0 else None)
+    ax.axhline(0.0, color=TEXT, lw=0.5)
+    dress(ax, "place of the truth [-]", f"{name}\nECDF minus diagonal [-]")
+    ax.set_xlim(0, 1)
 
 
 def others_of(rows: Sequence[dict]) -> list[str]:
