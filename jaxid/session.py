@@ -10,6 +10,9 @@ import numpy as np
 
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.consistency.balance_fit import balance_fits
+from jaxid.consistency.noise import estimated_force_noise, noise_findings
+from jaxid.consistency.sign import sign_findings
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log, with_load
@@ -142,6 +145,10 @@ def open_session(
         opened.append(_run(name, measured, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
     need_finite_effects(machine.plant, opened[0].data, fit.source)
+    if not short:
+        opened[0], doubts = _held_against(as_logged, machine, opened[0])
+        findings += doubts
+        raise_on_error(findings)
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged)
 
 
@@ -268,6 +275,21 @@ def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]
         findings += [slip] if slip is not None else []
     raise_on_error(findings)
     return findings
+
+
+def _held_against(case: Case, machine: Machine, opened: OpenedLog) -> tuple[OpenedLog, list[Finding]]:
+    """Hold a prepared log against its case; return it with the noise of its force, and the findings."""
+    log, data = opened.log, opened.data
+    declared = balance_fits(machine, data)[0]
+    gain = None
+    if case.actuator.transmission is None:
+        gain = np.broadcast_to(case.actuator.gain, (case.plant.drives,)).tolist()
+    findings = sign_findings(machine, log, data, declared, gain)
+    raise_on_error(findings)
+
+    noise = estimated_force_noise(machine, log, data, declared)
+    findings += noise_findings(machine, log, data, declared, noise)
+    return replace(opened, data=replace(data, force_noise=noise)), findings
 
 
 def enough(machine: Machine) -> int:

@@ -89,7 +89,7 @@ def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
     findings = []
     for (joint, q), reason in zip(measured, reasons, strict=True):
         where = f"{path}, position of joint {joint}"
-        levels, step = _levels(q)
+        levels, step = position_levels(q)
         if reason:
             hint = "its parameters are not identifiable from this log; check the column"
             findings.append(Finding("warning", f"the joint does not move: {reason}", where, hint))
@@ -105,7 +105,7 @@ def _stillness(q: np.ndarray, fewest: int) -> str:
     """Explain why a position shows no motion; empty if it does."""
     if np.ptp(q) == 0:
         return f"the position is {q[0]:.6g} throughout"
-    levels, step = _levels(q)
+    levels, step = position_levels(q)
     if levels < fewest:
         return f"the position takes only {levels} values, {step:.3g} apart"
     centred = q - q.mean()
@@ -117,7 +117,7 @@ def _stillness(q: np.ndarray, fewest: int) -> str:
     return ""
 
 
-def _levels(q: np.ndarray) -> tuple[int, float]:
+def position_levels(q: np.ndarray) -> tuple[int, float]:
     """Return the number of distinct positions and their spacing; spacing 0 if they are on no grid."""
     levels = np.unique(q)
     gaps = np.diff(levels)
