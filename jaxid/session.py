@@ -12,6 +12,7 @@ from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.consistency.balance_fit import balance_fits
 from jaxid.consistency.hold import better_hold, hold_finding
+from jaxid.consistency.law import law_findings, replayed_law
 from jaxid.consistency.noise import estimated_force_noise, noise_findings
 from jaxid.consistency.sign import sign_findings
 from jaxid.errors import InputError
@@ -319,7 +320,12 @@ def _held_against(
             log, data = opened.log, opened.data
             declared = balance_fits(machine, data)[0]
 
-    noise = estimated_force_noise(machine, log, data, declared)
+    replayed = replayed_law(machine, log)
+    findings += law_findings(machine, log, replayed)
+    raise_on_error(findings)
+
+    made = replayed.command if replayed is not None and replayed.exact else None
+    noise = estimated_force_noise(machine, log, data, declared, made)
     findings += noise_findings(machine, log, data, declared, noise)
     return findings, hold, noise
 
