@@ -12,7 +12,14 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
-from jaxid.logs.units_check import ByJoint, magnitude_findings, plausible_inertia, ratio_findings
+from jaxid.logs.units_check import (
+    ByJoint,
+    magnitude_findings,
+    period_findings,
+    plausible_inertia,
+    ratio_findings,
+)
+from jaxid.logs.wrap import wrap_findings
 
 __all__ = ["Finding", "check_log", "plausible_inertia", "raise_on_error"]
 
@@ -53,10 +60,17 @@ def check_log(
         The faults; empty for a sound log.
     """
     where = str(path or log.source)
-    findings = [*_movement(log, where, fewest_levels, resolution_stated), *_force(log, command_limit, where)]
+    findings = [
+        *wrap_findings(log.position, where),
+        *_movement(log, where, fewest_levels, resolution_stated),
+        *_force(log, command_limit, where),
+    ]
     still = any(finding.severity == "error" for finding in findings)
     if not still:
-        findings += ratio_findings(log, motion, where, driven)
+        ratios = ratio_findings(log, motion, where, driven)
+        # Two columns that disagree by the unit of time say more than the period.
+        timed = any(finding.severity == "error" for finding in ratios)
+        findings += ratios if timed else ratios + period_findings(log, where)
         label = (units or {}).get("position", "m")
         if label in ("m", "rad"):
             findings += magnitude_findings(log, motion, where)
