@@ -31,9 +31,9 @@ from jaxid.sensors.encoder import Sensor
 from jaxid.sensors.inertial import Inertial, InertialSensors
 from jaxid.settings import Recursive
 
-# A period without bounds stays within this factor of its guess: the fit has a minimum at every fraction of a
-# position's resolution, and a ripple of 72 a turn is not one of a thousand.
-_NEAR = 2.0
+# A period without bounds stays within this factor of its guess: a fit may run to a period far below the
+# encoder's count, or to the harmonic of half the period.
+_NEAR = 1.5
 # Velocity [m/s or rad/s] above which a joint's row counts for an adaptive controller by default.
 _GATE = 1e-2
 

@@ -282,8 +282,8 @@ def test_disturbance_from_a_column_is_held(tmp_path):
 @pytest.mark.parametrize(
     ("period", "bounds"),
     [
-        ({"guess": 0.0873}, (0.04365, 0.1746)),
-        ({"guess": 0.0873, "true": 0.4}, (0.04365, 0.8)),
+        ({"guess": 0.0873}, (0.0582, 0.13095)),
+        ({"guess": 0.0873, "true": 0.4}, (0.0582, 0.6)),
         ({"guess": 0.0873, "max": 0.5}, (8.73e-11, 0.5)),
     ],
 )
