@@ -53,7 +53,7 @@ def find_wrap(q: Float[np.ndarray, " time"]) -> Wrap | None:
         return None
 
     # A turn is the jump and the way that the joint goes on meanwhile.
-    meanwhile = np.array([_neighbours(step, jumps, k) for k in jumps])
+    meanwhile = np.array([_neighbours(step, jumps, int(k)) for k in jumps])
     sizes = np.abs(step[jumps] - meanwhile)
     turn = float(np.median(sizes))
     room = max(_SAME * turn, 3 * float(np.median(np.abs(others))))

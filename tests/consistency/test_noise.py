@@ -6,6 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 
+import jaxid
 from jaxid.gap import noise_floor
 from jaxid.session import Session, open_session
 from truth.axis.cases import case_text
@@ -98,3 +99,17 @@ def test_stated_noise_that_the_log_contradicts_is_named():
     assert "readings lie on steps of 1e-06" in coarse
     (noisy,) = told("position_noise = 1e-5")
     assert noisy.startswith("position_noise = 1e-05 is stated")
+
+
+def test_check_gives_the_noise_with_its_source():
+    of = setup()
+    run = of.run()
+    log = {"t": run["t"], "q": run["position"], "u": run["force"]}
+    text = case_text(of, tuple(EFFECTS.items()), sensor=False, closed=False)
+    found = jaxid.check(tomllib.loads(text + "[sensor]\nposition_resolution = 1e-6\n"), log)
+    content = found.json()["log"]
+    assert content["noise_from"] == {"position": "stated", "force": "estimated"}
+    assert content["force_noise"] == pytest.approx(NOISE, rel=0.05)
+    assert content["position_noise"] == pytest.approx(1e-6 / np.sqrt(12))
+    assert "force 0.029" in str(found)
+    assert "in units of the log (estimated)" in str(found)
