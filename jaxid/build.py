@@ -31,6 +31,9 @@ from jaxid.sensors.encoder import Sensor
 from jaxid.sensors.inertial import Inertial, InertialSensors
 from jaxid.settings import Recursive
 
+# A period without bounds stays within this factor of its guess: a fit may run to a period far below the
+# encoder's count, or to the harmonic of half the period.
+_NEAR = 1.5
 # Velocity [m/s or rad/s] above which a joint's row counts for an adaptive controller by default.
 _GATE = 1e-2
 
@@ -231,8 +234,18 @@ def _with_effect(
         if name in values:
             path = ("effects", len(plant.effects), name)
             motion = plant.motion(effect.port)
+            if name == "period" and info.sign == "positive":
+                values[name] = _near(values[name])
             free += _free(values[name], f"{key}.{name}", path, info, motion, case, at_truth)
     return plant.with_effect(effect), free
+
+
+def _near(value: Value) -> Value:
+    """Return an unknown without bounds with bounds about its guess."""
+    if not value.free or np.isfinite(value.lower) or np.isfinite(value.upper):
+        return value
+    near = value.start(False), value.start(True)
+    return replace(value, lower=min(near) / _NEAR, upper=max(near) * _NEAR)
 
 
 def _free(

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -26,7 +24,7 @@ from jaxid.simulation.replay import (
     start_shows,
     with_fitted_start,
 )
-from jaxid.simulation.sensor_noise import position_noise
+from jaxid.simulation.sensor_noise import noise_density as noise_density
 from jaxid.simulation.step_size import TooStiffError
 
 # In a loop, the error of the start decays. On a log of at most this many samples it may not be small beside
@@ -120,88 +118,6 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
     """Compute the RMS force that the sensors' noise alone causes in the band [N or N m], by joint."""
     f, power = noise_density(machine, log, data)
     return np.sqrt(np.trapezoid(power, f, axis=0))
-
-
-def noise_density(
-    machine: Machine,
-    log: Log,
-    data: Prepared,
-    force_noise: Float[np.ndarray, " m"] | None = None,
-) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f n"]]:
-    """Compute the one-sided density of the force that the sensors' noise alone causes [N^2/Hz], by joint.
-
-    Position noise passes the plant's impedance -M w^2 + i C w + K (linearised at a typical velocity), the
-    response of each derivative and the parallel filter; force noise passes the parallel filter. The noise is
-    that of the case's `[sensor]`. If it is not stated, position noise is estimated from the high band of the
-    log, and the logged force counts as exact.
-
-    Args:
-        machine: The machine; its parameters enter through the impedance only.
-        log: The log before preparation.
-        data: The same log, prepared.
-        force_noise: Standard deviation of the logged force, if the case states none, (m,).
-
-    Returns:
-        Frequencies up to half the log's sampling rate [Hz], and the density at these.
-    """
-    rate, recipe = log.rate_hz, data.recipe
-    f = np.linspace(0, rate / 2, 2049)[1:]
-    sigma = position_noise(machine, log)
-    mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
-    w = 2 * np.pi * f[:, None, None]
-    of_position, of_velocity, of_acceleration = (recipe.response(f, rate, k)[:, None, None] for k in range(3))
-    impedance = _measured_joints(
-        -mass * w**2 * of_acceleration + 1j * w * damping * of_velocity + stiffness * of_position,
-        -mass * w**2 + 1j * w * damping + stiffness,
-        data.measured,
-    )
-    through = recipe.decimator.response(f, rate)
-    density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
-    power = np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
-
-    stated = machine.sensor.force_noise
-    std = force_noise if stated is None else np.asarray(stated)
-    if std is not None:
-        by_drive = jnp.asarray(2 * np.square(np.asarray(std) * machine.gain) / rate)
-        white = np.asarray(machine.plant.applied(by_drive, len(mass)))
-        power = power + white * recipe.decimator.response(f, rate)[:, None] ** 2
-    return f, power
-
-
-def _measured_joints(impedance: np.ndarray, exact: np.ndarray, measured: tuple[bool, ...]) -> np.ndarray:
-    """Reduce an impedance to the joints with an encoder; rows and columns of the others become zero.
-
-    Args:
-        impedance: Impedance with the response of the filters, (f, n, n).
-        exact: Exact impedance, by which joints without an encoder follow the others, (f, n, n).
-        measured: Whether each joint has an encoder.
-    """
-    if all(measured):
-        return impedance
-    known, hidden = np.flatnonzero(measured), np.flatnonzero(~np.array(measured))
-
-    def part(of: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        return of[:, i[:, None], j]
-
-    follow = np.linalg.solve(part(exact, hidden, hidden), part(exact, hidden, known))
-    through = part(impedance, known, hidden) @ follow
-    out = np.zeros_like(impedance)
-    out[:, known[:, None], known] = part(impedance, known, known) - through
-    return out
-
-
-@eqx.filter_jit
-def _impedance(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
-    """Linearise the balance at median position and RMS velocity: mass, damping and stiffness, (n, n)."""
-    q, v = jnp.median(data.q, axis=0), jnp.sqrt(jnp.mean(data.qd**2, axis=0))
-    u = jnp.median(data.force, axis=0)
-    states = plant.initial_states(u)
-
-    def residual(q: Array, v: Array, a: Array) -> Array:
-        return plant.balance(q, v, a, u, jnp.zeros(()), states).residual
-
-    stiffness, damping, mass = jax.jacfwd(residual, argnums=(0, 1, 2))(q, v, jnp.zeros_like(q))
-    return mass, damping, stiffness
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,8 @@ OPTIONAL_COLUMNS = (
 )
 # Ways to differentiate a position, see `jaxid.logs.prepare`.
 DERIVATIVES = ("central", "spectral", "parabolic")
+# Signals that the derivative gain of a PD law acts on.
+LAW_DERIVATIVES = ("error", "velocity")
 # Criteria by which `jaxid design` improves a trajectory.
 CRITERIA = ("determinant", "condition")
 MOTIONS = ("linear", "rotary")

@@ -517,6 +517,13 @@ def either_text(read: Reader) -> Reader:
     )
 
 
+# True or false, or a positive number.
+flag_or_positive = Reader(
+    lambda value, spot: (_flag if isinstance(value, bool) else number("positive"))(value, spot),
+    either({"type": "boolean"}, number("positive").schema),
+)
+
+
 def schema_of(keys: Keys, doc: str = "") -> dict[str, Any]:
     """Return the JSON Schema of a table: types, required keys, descriptions with units, defaults.
 

@@ -10,6 +10,11 @@ import numpy as np
 
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.consistency.balance_fit import balance_fits
+from jaxid.consistency.hold import better_hold, hold_finding
+from jaxid.consistency.law import law_findings, replayed_law
+from jaxid.consistency.noise import estimated_force_noise, noise_findings
+from jaxid.consistency.sign import sign_findings
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log, with_load
@@ -142,6 +147,15 @@ def open_session(
         opened.append(_run(name, measured, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
     need_finite_effects(machine.plant, opened[0].data, fit.source)
+    if not short:
+        free_hold = not isinstance(log, Log) and "hold" not in case.tables.get("log", {})
+        doubts, hold, noise = _held_against(as_logged, machine, opened[0], free_hold)
+        findings += doubts
+        if hold is not None:
+            machine = replace(machine, hold=hold)
+            own = [v["name"] for v in case.tables.get("validation", []) if "hold" in v]
+            opened = [run if run.name in own else _under(hold, run, machine) for run in opened]
+        opened[0] = replace(opened[0], data=replace(opened[0].data, force_noise=noise))
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged)
 
 
@@ -161,7 +175,8 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
     _check(at_joints(case), measured, machine, held)
     needed = 0 if held else enough(machine)
     name = Path(measured.source).stem
-    return _run(name, measured, machine, session.recipe, needed, machine.disturbance)
+    run = _run(name, measured, machine, session.recipe, needed, machine.disturbance)
+    return run if run.log.hold == machine.hold else _under(machine.hold, run, machine)
 
 
 def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None = None) -> Session:
@@ -268,6 +283,58 @@ def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]
         findings += [slip] if slip is not None else []
     raise_on_error(findings)
     return findings
+
+
+def _held_against(
+    case: Case, machine: Machine, opened: OpenedLog, free_hold: bool
+) -> tuple[list[Finding], str | None, np.ndarray]:
+    """Hold a prepared log against its case.
+
+    Args:
+        case: The case, as it was logged.
+        machine: Its machine.
+        opened: The log.
+        free_hold: Whether the hold of the force is to be chosen, because the case does not state it.
+
+    Returns:
+        Warnings; the hold to take in place of the log's (None: the log's), and the estimated noise of its
+        force, in units of the command, (m,).
+
+    Raises:
+        InputError: If the log contradicts the case.
+    """
+    log, data = opened.log, opened.data
+    declared = balance_fits(machine, data)[0]
+    gain = None
+    if case.actuator.transmission is None:
+        gain = np.broadcast_to(case.actuator.gain, (case.plant.drives,)).tolist()
+    findings = sign_findings(machine, log, data, declared, gain)
+    raise_on_error(findings)
+
+    hold, better = None, better_hold(machine, log, data, declared)
+    if better is not None:
+        findings.append(hold_finding(log, *better, machine.unit("force"), used=free_hold))
+        if free_hold:
+            hold = better[0]
+            opened = _under(hold, opened, machine)
+            log, data = opened.log, opened.data
+            declared = balance_fits(machine, data)[0]
+
+    replayed = replayed_law(machine, log)
+    findings += law_findings(machine, log, replayed)
+    raise_on_error(findings)
+
+    made = replayed.command if replayed is not None and replayed.exact else None
+    noise = estimated_force_noise(machine, log, data, declared, made)
+    findings += noise_findings(machine, log, data, declared, noise)
+    return findings, hold, noise
+
+
+def _under(hold: str, opened: OpenedLog, machine: Machine) -> OpenedLog:
+    """Return a log under another hold of its force."""
+    log = replace(opened.log, hold=hold)
+    held = opened.data.recipe.hold(log, machine.hold_period)
+    return replace(opened, log=log, data=replace(opened.data, hold=held))
 
 
 def enough(machine: Machine) -> int:

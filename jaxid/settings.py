@@ -31,6 +31,7 @@ from jaxid.schema import (
     choice,
     columns,
     flag,
+    flag_or_positive,
     key,
     number,
     odd,
@@ -75,6 +76,12 @@ class LogTable:
         columns("drive"), f"{_COLUMN} of the command, one a drive", required=True
     )
     hold: str = key(choice(HOLDS), "course of the command between samples", default=HOLDS[0])
+    unwrap: bool | float = key(
+        flag_or_positive,
+        "whether positions and references start anew after a turn, or the size of a turn",
+        unit="position",
+        default=False,
+    )
     rows: tuple[int, int] | None = key(rows, "first row and end, 0-based, half open", note="all rows")
     velocity: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of the velocity, one a joint; only its unit is checked"

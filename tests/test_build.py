@@ -277,3 +277,19 @@ def test_disturbance_from_a_column_is_held(tmp_path):
         disturbance_at("d", t)
     with pytest.raises(InputError, match="'e'"):
         disturbance_at("e", t, log)
+
+
+@pytest.mark.parametrize(
+    ("period", "bounds"),
+    [
+        ({"guess": 0.0873}, (0.0582, 0.13095)),
+        ({"guess": 0.0873, "true": 0.4}, (0.0582, 0.6)),
+        ({"guess": 0.0873, "max": 0.5}, (8.73e-11, 0.5)),
+    ],
+)
+def test_a_period_stays_near_its_guess_unless_it_has_bounds(period, bounds):
+    effect = {"kind": "cogging", "amplitude": {"guess": 1.0}, "period": period, "phase": {"guess": 0.0}}
+    case = {"plant": {"kind": "axis", "parameters": {"inertia": 1.0}}, "effects": [effect]}
+    parameters = build_machine(load_case(case)).parameters
+    at = parameters.names.index("cogging.period")
+    assert [b[at] for b in parameters.bounds] == pytest.approx(bounds)

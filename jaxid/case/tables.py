@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 from jaxid.controllers import CONTROLLERS, Controller
-from jaxid.names import MOTIONS, ORIENTATIONS
+from jaxid.names import LAW_DERIVATIVES, MOTIONS, ORIENTATIONS
 from jaxid.schema import (
     Key,
     Keys,
@@ -81,6 +81,7 @@ _LAW: dict[str, tuple[Reader, str]] = {
     "kv": (by_drive(number()), "gain of the velocity loop"),
     "ki": (by_drive(number()), "gain of the integral of the position error"),
     "kd": (by_drive(number()), "gain of the velocity error"),
+    "derivative": (choice(LAW_DERIVATIVES), "signal that kd acts on: the error, or the velocity alone"),
     "coulomb": (by_drive(number()), "Coulomb friction fed forward, in units of the command"),
     "viscous": (by_drive(number()), "viscous friction fed forward, units of the command per velocity"),
     "inertia": (by_drive(number()), "inertia fed forward, units of the command per acceleration"),

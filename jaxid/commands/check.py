@@ -20,10 +20,10 @@ from jaxid.files import json_text, write_results
 from jaxid.gap import noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.model.unknowns import scatter
-from jaxid.numerics import filters as signals
 from jaxid.numerics.precision import Precision
 from jaxid.session import Session, open_session
 from jaxid.simulation.force_balance import ForceData, force_residual, force_size, sharpened
+from jaxid.simulation.sensor_noise import force_noise, position_noise
 
 if TYPE_CHECKING:
     import pandas
@@ -85,9 +85,10 @@ class Check:
 
     def json(self) -> dict[str, Any]:
         """Return the content of check.json."""
-        from jaxid.results.as_json import recipe_json
+        from jaxid.results.as_json import one_or_list, recipe_json
 
         session, log = self.session, self.session.fit.log
+        sensor = session.machine.sensor
         free = session.machine.parameters.free
         identifiable = self.precision.identifiable
 
@@ -105,7 +106,12 @@ class Check:
                 "peak_velocity": np.abs(at_encoders(session.fit.data.qd)).max(axis=0),
                 "peak_force": np.abs(session.fit.data.force).max(axis=0),
                 "moving": float(session.fit.data.moving.mean()),
-                "position_noise": at_encoders(signals.high_band_std(log.filled)),
+                "position_noise": at_encoders(position_noise(session.machine, log)),
+                "force_noise": one_or_list(force_noise(session.machine, session.fit.data)),
+                "noise_from": {
+                    "position": "estimated" if sensor.position_std is None else "stated",
+                    "force": "estimated" if sensor.force_noise is None else "stated",
+                },
             },
             "preprocess": recipe_json(session),
             "noise_floor": self.noise_floor,

@@ -23,16 +23,21 @@ class CascadePD(Controller):
 
 
 class PD(Controller):
-    """u = kp (reference - q) + kd (d reference - dq), the reference differenced backwards."""
+    """u = kp (reference - q) + kd (d reference - dq), the reference differenced backwards.
+
+    With derivative = "velocity" the reference is not differenced: u = kp (reference - q) - kd dq, as most
+    servos of robots have it. `CascadePD` is that law with kv = kd and kp / kd in place of kp.
+    """
 
     kp: Array
     kd: Array
+    derivative: str = eqx.field(static=True, default="error", kw_only=True)
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Array:
         return tick.reference
 
     def law(self, tick: Tick, velocity: Array, memory: Array, disturbance: Array) -> tuple:
-        slope = (tick.reference - memory) / self.period
+        slope = (tick.reference - memory) / self.period if self.derivative == "error" else 0.0
         error = tick.reference - tick.position
         return self.kp * error + self.kd * (slope - tick.at_drives(velocity)), tick.reference
 

@@ -13,6 +13,7 @@ from jaxid.logs.readers import read_columns
 from jaxid.logs.readers.array_files import Columns
 from jaxid.logs.readers.rows import Rows
 from jaxid.logs.timebase import sound_time
+from jaxid.logs.wrap import joined
 from jaxid.names import HOLDS, OPTIONAL_COLUMNS
 from jaxid.schema import Spot, read_settings
 from jaxid.settings import LogTable
@@ -207,6 +208,9 @@ def read_log(
         hint = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
         raise InputError(f"is too short: {samples} samples", where=str(path), hint=hint)
     time = _time(groups.pop("time", None), table, rows, path)
+    if table.unwrap:
+        position, reference = joined(groups["position"], groups.get("reference"), table.unwrap)
+        groups |= {"position": position} | ({} if reference is None else {"reference": reference})
     return Log(time=time, hold=table.hold, rows=rows, source=str(path), **groups)
 
 

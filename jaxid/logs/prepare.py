@@ -149,6 +149,8 @@ class Prepared:
         measured: Whether each joint has an encoder; the motion of the others is that of `Log.filled`.
         steps: Integration steps in a sample for the motion of joints without an encoder (see
             `jaxid.dynamics.hidden_joints`).
+        force_noise: Estimated standard deviation of the logged force, in units of the command, (m,); None:
+            not estimated.
     """
 
     q: Float[np.ndarray, "time n"]
@@ -164,6 +166,7 @@ class Prepared:
     start: float = 0.0
     measured: tuple[bool, ...] = (True,)
     steps: int = 1
+    force_noise: Float[np.ndarray, " m"] | None = None
 
     @property
     def times(self) -> Float[np.ndarray, " kept"]:

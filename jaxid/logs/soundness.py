@@ -12,7 +12,14 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
-from jaxid.logs.units_check import ByJoint, magnitude_findings, plausible_inertia, ratio_findings
+from jaxid.logs.units_check import (
+    ByJoint,
+    magnitude_findings,
+    period_findings,
+    plausible_inertia,
+    ratio_findings,
+)
+from jaxid.logs.wrap import wrap_findings
 
 __all__ = ["Finding", "check_log", "plausible_inertia", "raise_on_error"]
 
@@ -53,10 +60,17 @@ def check_log(
         The faults; empty for a sound log.
     """
     where = str(path or log.source)
-    findings = [*_movement(log, where, fewest_levels, resolution_stated), *_force(log, command_limit, where)]
+    findings = [
+        *wrap_findings(log.position, where),
+        *_movement(log, where, fewest_levels, resolution_stated),
+        *_force(log, command_limit, where),
+    ]
     still = any(finding.severity == "error" for finding in findings)
     if not still:
-        findings += ratio_findings(log, motion, where, driven)
+        ratios = ratio_findings(log, motion, where, driven)
+        # Two columns that disagree by the unit of time say more than the period.
+        timed = any(finding.severity == "error" for finding in ratios)
+        findings += ratios if timed else ratios + period_findings(log, where)
         label = (units or {}).get("position", "m")
         if label in ("m", "rad"):
             findings += magnitude_findings(log, motion, where)
@@ -89,7 +103,7 @@ def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
     findings = []
     for (joint, q), reason in zip(measured, reasons, strict=True):
         where = f"{path}, position of joint {joint}"
-        levels, step = _levels(q)
+        levels, step = position_levels(q)
         if reason:
             hint = "its parameters are not identifiable from this log; check the column"
             findings.append(Finding("warning", f"the joint does not move: {reason}", where, hint))
@@ -105,7 +119,7 @@ def _stillness(q: np.ndarray, fewest: int) -> str:
     """Explain why a position shows no motion; empty if it does."""
     if np.ptp(q) == 0:
         return f"the position is {q[0]:.6g} throughout"
-    levels, step = _levels(q)
+    levels, step = position_levels(q)
     if levels < fewest:
         return f"the position takes only {levels} values, {step:.3g} apart"
     centred = q - q.mean()
@@ -117,7 +131,7 @@ def _stillness(q: np.ndarray, fewest: int) -> str:
     return ""
 
 
-def _levels(q: np.ndarray) -> tuple[int, float]:
+def position_levels(q: np.ndarray) -> tuple[int, float]:
     """Return the number of distinct positions and their spacing; spacing 0 if they are on no grid."""
     levels = np.unique(q)
     gaps = np.diff(levels)

@@ -18,6 +18,10 @@ from jaxid.logs.rough_inertia import correlation, implied_inertia, smooth, windo
 ByJoint = float | int | Sequence[float | int] | np.ndarray
 _DEGREES = 180.0 / math.pi
 _RPM = 30.0 / math.pi
+# Chosen: a motion is hardly logged with a period beyond the first [s], and never beyond the second.
+_SLOW, _SLOWEST = 0.5, 10.0
+# A period [s] as this one is half a millisecond, written in microseconds.
+_MICRO = 500.0
 # Chosen: two columns with a smaller correlation are not the same quantity in two units.
 _SIMILAR = 0.9
 
@@ -148,8 +152,22 @@ def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: 
     return [Finding("warning", f"{finding}, which should be 1", where, hint)]
 
 
+def period_findings(log: Log, path: str) -> list[Finding]:
+    """Find sampling periods that no machine has, whatever the unit of its positions.
+
+    Whole numbers from sample to sample are milliseconds or rows.
+    """
+    if log.period < _SLOW:
+        return []
+    whole = bool(np.all(np.abs(log.time - np.round(log.time)) < 1e-6))
+    severity = "error" if log.period > _SLOWEST or whole else "warning"
+    unit = "milliseconds or rows" if log.period < _MICRO else "microseconds"
+    what = f"the sampling period is {log.period:.4g} s: time looks like {unit}"
+    return [Finding(severity, what, f"{path}, time", "give time in seconds, or sample_rate in its place")]
+
+
 def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list[Finding]:
-    """Find strokes, speeds and sampling periods that no machine has.
+    """Find strokes and speeds that no machine has.
 
     Args:
         log: The log, in mechanical units.
@@ -157,10 +175,6 @@ def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list
         path: Name of the log in messages.
     """
     findings = []
-    if log.period >= 0.5:
-        severity = "error" if log.period > 10.0 else "warning"
-        what = f"the sampling period is {log.period:.4g} s: time looks like milliseconds or rows"
-        findings.append(Finding(severity, what, f"{path}, time", "give time in seconds"))
     motions = _by_joint(motion, log)
     for joint, q in enumerate(log.position.T, start=1):
         if not log.measured[joint - 1]:

@@ -218,10 +218,17 @@ def check_table(result: Check) -> str:
         f"filter: {what}, one sample in {recipe['decimation']} kept; noise "
         f"floor {_number(one(content['noise_floor']))} {unit('force')}"
     )
+    source = log["noise_from"]
+    noise = (
+        f"noise of a reading: position {_number(one(log['position_noise']))} {unit('position')} "
+        f"({source['position']}), force {_number(log['force_noise'])} in units of the log ({source['force']})"
+    )
     rows = check_rows(content)
     combinations = _unidentifiable_lines([c["combination"] for c in content["unidentifiable"]])
     table = ["", aligned(rows)] if len(rows) > 1 else []
-    return "\n".join(["the log is sound", head, how, *table, *combinations, *_notes(content["warnings"])])
+    return "\n".join(
+        ["the log is sound", head, how, noise, *table, *combinations, *_notes(content["warnings"])]
+    )
 
 
 def check_rows(content: Mapping[str, Any]) -> list[list[str]]:

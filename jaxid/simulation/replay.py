@@ -27,8 +27,10 @@ from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
 from jaxid.simulation.solvers import AdaptiveStep
 from jaxid.simulation.step_size import needed_steps
 
-# Ticks of past command that a delay in a loop may reach back.
-_LONGEST_DELAY = 12
+# Ticks of past command that a loop keeps for a delay at least, and at most.
+_SHORTEST_MEMORY, _LONGEST_MEMORY = 12, 1536
+# The memory over the delay at its guess, so that a fit finds a delay so many times as long.
+_LONGER = 2.0
 # Number of first samples in which an error of a loop's start appears, and the factor by which their mean
 # square residual then exceeds that of the others.
 _FIRST, _FAR_MORE = 100, 5.0
@@ -377,8 +379,39 @@ def exact_numerics(machine: Machine, log: Log, steps: int | None = None) -> Nume
 
     Raises:
         TooStiffError: If the machine needs more steps than any plausible one.
+        InputError: If a delay reaches back more ticks of the controller than a loop can keep.
     """
-    delayed = any(e.delays_command() for e in machine.plant.effects)
-    looped = machine.controller is not None
     steps = needed_steps(machine, log) if steps is None else steps
-    return Numerics(substeps=steps, longest_delay=_LONGEST_DELAY if delayed and looped else 0)
+    return Numerics(substeps=steps, longest_delay=remembered_ticks(machine, log))
+
+
+def remembered_ticks(machine: Machine, log: Log) -> int:
+    """Return the ticks of past command that the machine's loop keeps for its delays; 0 without any.
+
+    They reach twice as far back as the delays at their guesses, and as far as their stated upper bounds.
+
+    Raises:
+        InputError: If these are more ticks of the controller than a loop can keep.
+    """
+    if machine.controller is None or not any(e.delays_command() for e in machine.plant.effects):
+        return 0
+    effects, period = machine.plant.effects, machine.controller.period
+    delay = float(np.max(np.asarray(machine.plant.command_delays(machine.gain.size))))
+    stated = [
+        f.upper
+        for f in machine.parameters.free
+        if f.effect is not None and effects[f.effect].delays_command() and np.isfinite(f.upper)
+    ]
+    needed = int(np.ceil(max(_LONGER * delay, *stated, 0.0) / period))
+    if needed > _LONGEST_MEMORY:
+        raise InputError(
+            f"a delay of {delay:g} s, which may grow to {needed * period:g} s in a fit, is {needed} ticks of "
+            f"the controller, and a loop keeps at most {_LONGEST_MEMORY}",
+            where=log.source,
+            hint="give the delay a smaller guess or max, or leave out [controller]",
+        )
+    # Few lengths, so that fits of similar delays share compiled code.
+    ticks = _SHORTEST_MEMORY
+    while ticks < needed:
+        ticks *= 2
+    return ticks

@@ -1,13 +1,20 @@
-"""Noise of position readings, as stated or as estimated from a log."""
+"""Noise of the sensors, as stated or as estimated from a log, and the force that it causes in a balance."""
 
 from __future__ import annotations
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
+from jaxid.simulation.force_balance import ForceData
 
 
 def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
@@ -20,3 +27,113 @@ def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
     if stated is None:
         stated = signals.high_band_std(log.filled)
     return np.broadcast_to(np.asarray(stated), log.position.shape[1]) * log.measured
+
+
+def force_noise(machine: Machine, data: Prepared) -> Float[np.ndarray, " m"]:
+    """Return the standard deviation of each logged force, (m,), in units of the command.
+
+    It is the stated one, or else that of the prepared log, which `jaxid.consistency.noise` estimates; zero if
+    there is neither.
+    """
+    known = data.force_noise if machine.sensor.force_noise is None else machine.sensor.force_noise
+    return np.broadcast_to(np.zeros(()) if known is None else np.asarray(known), machine.gain.shape)
+
+
+def position_density(
+    machine: Machine, log: Log, data: Prepared
+) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f n"]]:
+    """Compute the one-sided density of the force that position noise alone causes [N^2/Hz], by joint.
+
+    The noise passes the plant's impedance -M w^2 + i C w + K (linearised at a typical velocity), the response
+    of each derivative and the parallel filter.
+
+    Args:
+        machine: The machine; its parameters enter through the impedance only.
+        log: The log before preparation.
+        data: The same log, prepared.
+
+    Returns:
+        Frequencies up to half the log's sampling rate [Hz], and the density at these.
+    """
+    rate, recipe = log.rate_hz, data.recipe
+    f = np.linspace(0, rate / 2, 2049)[1:]
+    sigma = position_noise(machine, log)
+    mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
+    w = 2 * np.pi * f[:, None, None]
+    of_position, of_velocity, of_acceleration = (recipe.response(f, rate, k)[:, None, None] for k in range(3))
+    impedance = _measured_joints(
+        -mass * w**2 * of_acceleration + 1j * w * damping * of_velocity + stiffness * of_position,
+        -mass * w**2 + 1j * w * damping + stiffness,
+        data.measured,
+    )
+    through = recipe.decimator.response(f, rate)
+    density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
+    return f, np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
+
+
+def noise_density(
+    machine: Machine,
+    log: Log,
+    data: Prepared,
+    force_std: Float[np.ndarray, " m"] | None = None,
+) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f n"]]:
+    """Compute the one-sided density of the force that the sensors' noise alone causes [N^2/Hz], by joint.
+
+    Position noise enters as in `position_density`; force noise passes the parallel filter. The noise is that
+    of the case's `[sensor]`, or else the one estimated from the log.
+
+    Args:
+        machine: The machine; its parameters enter through the impedance only.
+        log: The log before preparation.
+        data: The same log, prepared.
+        force_std: Standard deviation of the logged force if the case states none, in place of the estimated
+            one, (m,).
+
+    Returns:
+        Frequencies up to half the log's sampling rate [Hz], and the density at these.
+    """
+    f, power = position_density(machine, log, data)
+    std = force_noise(machine, data)
+    if force_std is not None and machine.sensor.force_noise is None:
+        std = force_std
+    if np.any(std):
+        by_drive = jnp.asarray(2 * np.square(std * machine.gain) / log.rate_hz)
+        white = np.asarray(machine.plant.applied(by_drive, power.shape[1]))
+        power = power + white * data.recipe.decimator.response(f, log.rate_hz)[:, None] ** 2
+    return f, power
+
+
+def _measured_joints(impedance: np.ndarray, exact: np.ndarray, measured: tuple[bool, ...]) -> np.ndarray:
+    """Reduce an impedance to the joints with an encoder; rows and columns of the others become zero.
+
+    Args:
+        impedance: Impedance with the response of the filters, (f, n, n).
+        exact: Exact impedance, by which joints without an encoder follow the others, (f, n, n).
+        measured: Whether each joint has an encoder.
+    """
+    if all(measured):
+        return impedance
+    known, hidden = np.flatnonzero(measured), np.flatnonzero(~np.array(measured))
+
+    def part(of: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        return of[:, i[:, None], j]
+
+    follow = np.linalg.solve(part(exact, hidden, hidden), part(exact, hidden, known))
+    through = part(impedance, known, hidden) @ follow
+    out = np.zeros_like(impedance)
+    out[:, known[:, None], known] = part(impedance, known, known) - through
+    return out
+
+
+@eqx.filter_jit
+def _impedance(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
+    """Linearise the balance at median position and RMS velocity: mass, damping and stiffness, (n, n)."""
+    q, v = jnp.median(data.q, axis=0), jnp.sqrt(jnp.mean(data.qd**2, axis=0))
+    u = jnp.median(data.force, axis=0)
+    states = plant.initial_states(u)
+
+    def residual(q: Array, v: Array, a: Array) -> Array:
+        return plant.balance(q, v, a, u, jnp.zeros(()), states).residual
+
+    stiffness, damping, mass = jax.jacfwd(residual, argnums=(0, 1, 2))(q, v, jnp.zeros_like(q))
+    return mass, damping, stiffness

@@ -22,6 +22,7 @@ CASES: dict[str, dict[str, Any]] = {
     "cascade_pd averaged": {"kp": 30.0, "kv": 12.0, "velocity_average": 3},
     "cascade_pd limited": {"kp": 30.0, "kv": 12.0, "limit": 6.0},
     "pd": {"kp": 300.0, "kd": 10.0},
+    "pd on velocity": {"kp": 300.0, "kd": 10.0, "velocity_average": 2, "derivative": "velocity"},
     "pd disturbed": {"kp": 300.0, "kd": 10.0, "limit": 11.0, "velocity_average": 2},
     "friction_compensation": {"kp": 300.0, "kd": 10.0, "coulomb": 0.7, "viscous": 3.0, "inertia": 1.5},
     "pid": {"kp": 300.0, "ki": 900.0, "kd": 10.0},
@@ -66,13 +67,14 @@ def plain(name: str, reading: np.ndarray) -> np.ndarray:
             u += law["inertia"] * (after - 2 * here + before) / PERIOD**2
             u += law["viscous"] * velocity + law["coulomb"] * np.sign(velocity)
         else:
+            aim = 0.0 if law.get("derivative") == "velocity" else aim
             u = law["kp"] * error + law["kd"] * (aim - velocity)
         out.append(np.clip(u + extra, -law["limit"], law["limit"]))
     return np.array(out)
 
 
 def in_loop(name: str, sensor: Sensor | None = None):
-    static = ("velocity_average", "anti_windup")
+    static = ("velocity_average", "anti_windup", "derivative")
     arrays = {k: v if k in static else jnp.asarray(v) for k, v in CASES[name].items()}
     law = CONTROLLERS[name.split()[0]](period=PERIOD, **arrays)
     plant = Axis(MASS, effects=(EFFECTS["viscous_friction"](coefficient=4.0),))

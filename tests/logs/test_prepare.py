@@ -249,7 +249,7 @@ def test_noise_floor_of_a_parabola_is_what_its_noise_makes_of_the_balance(tmp_pa
     session = open_session(case_of(tmp_path, *lines), axis[0])
     # the encoder's noise alone
     machine = dataclasses.replace(
-        session.machine, sensor=dataclasses.replace(session.machine.sensor, force_noise=None)
+        session.machine, sensor=dataclasses.replace(session.machine.sensor, force_noise=np.zeros(()))
     )
     floor = noise_floor(machine, session.fit.log, session.fit.data)
     sensor = emps_like(0).sensor

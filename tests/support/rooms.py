@@ -26,6 +26,7 @@ ROOMS = {
     "machine": "a plant with its actuator, controller and sensors",
     "build": "a machine, built from its case",
     "simulation": "loops, solvers, and replays of a log",
+    "consistency": "a prepared log held against its case: sign, noise, hold, control law",
     "session": "a case with its logs, opened and checked",
     "scene": "a case set up for simulation",
     "gap": "the gap between simulation and measurement",

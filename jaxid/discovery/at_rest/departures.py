@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.controllers import Controller, Tick
 from jaxid.dynamics.residuals import integrate_internal_states
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -22,6 +21,7 @@ from jaxid.numerics import filters as signals
 from jaxid.session import OpenedLog
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.force_balance import ForceData
+from jaxid.simulation.law_replay import commands
 
 # Readings that agree within this range, in standard deviations of their noise, count as a rest: noise alone
 # exceeds it once in a thousand times. A rest needs more agreeing readings than a reversal without sticking
@@ -216,30 +216,9 @@ def _applied_command(machine: Machine, log: Log) -> np.ndarray:
     extra = disturbance_at(machine.disturbance, log.time, log)
     arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
     driven = machine.plant.driven(log.position.shape[1])
-    made = np.asarray(_commands(machine.controller, driven, *(jnp.asarray(a) for a in arrays)))
+    made = np.asarray(commands(machine.controller, driven, *(jnp.asarray(a) for a in arrays)))
     size = np.sqrt(np.mean(log.force**2, axis=0))
     stated = machine.sensor.force_noise
     noise = 0.0 if stated is None else np.asarray(stated)
     off = np.sqrt(np.mean((made - log.force) ** 2, axis=0))
     return np.where(off <= np.maximum(_SAME * noise, _NEARLY * size), made, log.force)
-
-
-@eqx.filter_jit
-def _commands(
-    controller: Controller,
-    driven: tuple[int, ...],
-    position: Array,
-    reference: Array,
-    disturbance: Array,
-) -> Array:
-    """Run a controller's law over logged readings."""
-
-    def tick(memory: tuple, now: tuple) -> tuple[tuple, Array]:
-        position, path, disturbance = now
-        u, memory = controller.command(Tick(position, path, driven), memory, disturbance)
-        return memory, u
-
-    path = controller.path(reference)
-    first = Tick(position[0], jax.tree.map(lambda x: x[0], path), driven)
-    start = controller.start(first, jnp.zeros_like(position[0]))
-    return jax.lax.scan(tick, start, (position, path, disturbance))[1]

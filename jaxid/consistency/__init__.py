@@ -1,0 +1,1 @@
+"""A prepared log held against its case, before any fit: sign of the force, noise, hold, control law."""

@@ -1,0 +1,115 @@
+"""Course of the logged force between samples, held against the motion: zero_order or linear."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.consistency.balance_fit import BalanceFit, measured
+from jaxid.logs.finding import Finding
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
+from jaxid.machine import Machine
+from jaxid.simulation.force_balance import ForceData
+
+# Part of the gap under one hold that the other leaves at most, to be the better one.
+_CLEARLY = 0.9
+# Stretches of a log whose gaps are compared. Their mean difference must exceed so many standard errors: one
+# reversal alone, which a model may meet by chance, is no evidence.
+_STRETCHES = 20
+_SURE = 2.0
+# Smallest gain in log-likelihood, over the samples with independent residuals.
+_EVIDENCE = 12.0
+
+
+def better_hold(
+    machine: Machine, log: Log, data: Prepared, fit: BalanceFit
+) -> tuple[str, Float[np.ndarray, " 2"]] | None:
+    """Compare the force gaps under both holds.
+
+    A held force acts half a sample later than its samples, one that is joined by lines does not. All
+    unknowns, forces of position, and a viscous and a Coulomb friction of every joint are fitted under both:
+    a friction that is missing acts as a shift in time does.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        data: The same log, prepared under its hold.
+        fit: Balance of the prepared log.
+
+    Returns:
+        The other hold and the gaps under the log's and under the other [N or N m], of the drive whose gap
+        falls most; None if the other hold is not clearly better, or the two cannot be compared.
+    """
+    holds = {"zero_order": "linear", "linear": "zero_order"}
+    # A drive with a delay or a lag shifts the force by itself.
+    shifts = any(e.delays_command() or not e.adds_force for e in machine.plant.effects)
+    if log.hold not in holds or shifts or not data.recipe.align_hold or not all(log.measured):
+        return None
+    other = holds[log.hold]
+    held = data.recipe.hold(replace(log, hold=other), machine.hold_period)
+    now, then = (
+        np.asarray(measured(machine.plant, ForceData.of(replace(data, hold=h)))) for h in (data.hold, held)
+    )
+    wider = _with_friction(fit)
+    residuals = [wider.fit(bounded=False)[1]]
+    moved = replace(wider, known=wider.known + now - then)
+    residuals.append(moved.fit(bounded=False)[1])
+
+    parts = [np.where(fit.counts, e / fit.scale, 0.0) ** 2 for e in residuals]
+    gain = [piece.sum() for piece in np.array_split(parts[0] - parts[1], _STRETCHES)]
+    error = np.std(gain, ddof=1) / np.sqrt(len(gain))
+    sure = np.mean(gain) > _SURE * error
+    gaps = np.array([fit.rms(e) for e in residuals])
+    driven = [int(j) for j in machine.plant.driven(machine.plant.joints)]
+    least = driven[int(np.argmin(gaps[1, driven] / np.maximum(gaps[0, driven], 1e-300)))]
+    total = np.sqrt(parts[1].sum() / max(parts[0].sum(), 1e-300))
+    evidence = -_independent(residuals[1], fit) * np.log(max(total, 1e-300))
+    if not sure or not total < _CLEARLY or not evidence > _EVIDENCE:
+        return None
+    return other, gaps[:, least]
+
+
+def _independent(residual: np.ndarray, fit: BalanceFit) -> float:
+    """Return the number of samples with independent residuals, by the correlation of neighbours."""
+    total = 0.0
+    for e, counts in zip(residual.T, fit.counts.T, strict=True):
+        x, both = np.where(counts, e, 0.0), counts[1:] & counts[:-1]
+        alike = float(x[1:] @ x[:-1]) / max(float(np.sum(x[:-1][both] ** 2)), 1e-300)
+        alike = float(np.clip(alike, 0.0, 0.99))
+        total += counts.sum() * (1 - alike) / (1 + alike)
+    return total
+
+
+def _with_friction(fit: BalanceFit) -> BalanceFit:
+    """Return the balance with a viscous and a Coulomb friction of every joint among the undeclared forces."""
+    joints = fit.velocity.shape[1]
+    more = np.zeros((*fit.velocity.shape, 2 * joints))
+    for j in range(joints):
+        more[:, j, 2 * j] = fit.velocity[:, j]
+        more[:, j, 2 * j + 1] = np.sign(fit.velocity[:, j])
+    return replace(fit, potential=np.concatenate([fit.potential, more], axis=2))
+
+
+def hold_finding(log: Log, other: str, gaps: np.ndarray, unit: str, *, used: bool) -> Finding:
+    """Return the note that another hold fits better.
+
+    Args:
+        log: The log under its hold.
+        other: The better hold.
+        gaps: Force gaps under the log's hold and under the other one.
+        unit: Unit of the gaps.
+        used: Whether the other one is used, because the case states none.
+    """
+    sizes = f"leaves a force gap of {gaps[1]:.3g} {unit}, '{log.hold}' {gaps[0]:.3g} {unit}"
+    if used:
+        what = f"hold is not stated, and '{other}' is used: it {sizes}"
+        hint = f"state hold = '{other}' in [log] to confirm it, or hold = '{log.hold}'"
+    else:
+        what = f"hold = '{log.hold}' is stated, but '{other}' {sizes}"
+        hint = f"set hold = '{other}' in [log] if the force is not held between its samples"
+        if other == "zero_order":
+            hint = f"set hold = '{other}' in [log] if each force is held until the next sample"
+    return Finding("warning", what, f"{log.source}, force", hint)

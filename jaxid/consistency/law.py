@@ -1,0 +1,202 @@
+"""The declared control law held against the logged command, and the law that fits it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.interpolate
+from jaxtyping import Float
+
+from jaxid.controllers import PD, PID, CascadePD, Controller, FrictionCompensation
+from jaxid.logs.finding import Finding
+from jaxid.logs.log import Log
+from jaxid.machine import Machine
+from jaxid.numerics import filters as signals
+from jaxid.simulation.disturbance import disturbance_at
+from jaxid.simulation.law_replay import commands
+from jaxid.simulation.replay import start_velocity
+
+# Part of the command that a law may leave: readings in the controller may differ from those in the log.
+_LEFT = 0.05
+# Part from which the log contradicts the law, if another one leaves at most a fifth of that.
+_CONTRADICTED, _FIFTH = 0.1, 0.2
+# Part of the command up to which a law reproduces it, so that the rest is noise of the logged command.
+_EXACT = 0.02
+# A residual within so many times the noise of the logged command is noise.
+_NOISY = 2.0
+# Largest average of velocities that is tried for a law.
+_AVERAGES = (1, 2, 3, 4)
+# A longer law is named only if it leaves less than this part of what a shorter one leaves.
+_BETTER = 0.7
+# Laws without a model of the plant.
+_PLAIN = (CascadePD, PD, PID, FrictionCompensation)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A logged command beside that of the declared law at the logged readings.
+
+    Args:
+        command: Command of the law at the samples of the log, (time, m).
+        relative: 2-norm of the difference over that of the logged command, by drive.
+        exact: Whether the law reproduces every command up to noise.
+    """
+
+    command: Float[np.ndarray, "time m"]
+    relative: Float[np.ndarray, " m"]
+    exact: bool
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A law with gains fitted to the logged command of one drive.
+
+    Args:
+        text: The law as the case would state it.
+        remaining: 2-norm of the residual over that of the logged command.
+    """
+
+    text: str
+    remaining: float
+
+
+def replayed_law(machine: Machine, log: Log) -> Replayed | None:
+    """Run the declared law along the logged readings and reference.
+
+    Returns:
+        The command beside the logged one; None without a controller or a logged reference, and for a law that
+        has a model of the plant or reads other sensors.
+    """
+    controller = machine.controller
+    if not isinstance(controller, _PLAIN) or log.reference is None or not all(log.measured):
+        return None
+    if machine.sensor.inertial is not None or machine.sensor.hold > 1:
+        return None
+    ticks = _at_ticks(controller, machine, log)
+    if ticks is None:
+        return None
+    position, reference, extra, every = ticks
+    driven = machine.plant.driven(position.shape[1])
+    arrays = (jnp.asarray(a) for a in (position, reference, extra, start_velocity(log)))
+    made = np.asarray(commands(controller, driven, *arrays))[::every]
+    if isinstance(controller, PID):
+        # The integral before the first row is not known.
+        made = made + np.median(log.force - made, axis=0)
+        made = made if controller.limit is None else np.clip(made, -controller.limit, controller.limit)
+    size = np.maximum(np.linalg.norm(log.force, axis=0), 1e-300)
+    relative = np.linalg.norm(log.force - made, axis=0) / size
+    return Replayed(made, relative, bool(np.all(relative < _EXACT)) and every == 1)
+
+
+def _at_ticks(
+    controller: Controller, machine: Machine, log: Log
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int] | None:
+    """Return positions, reference and disturbance at every tick, and the ticks in a sample of the log."""
+    every = max(1, round(log.period / controller.period))
+    if abs(log.period / controller.period / every - 1) > 1e-3:
+        return None
+    assert log.reference is not None, "asked only with a reference"
+    reference = np.broadcast_to(log.reference, log.force.shape)
+    times = log.time[0] + controller.period * np.arange((log.samples - 1) * every + 1)
+    position = log.position
+    if every > 1:
+        inside = np.minimum(times, log.time[-1])
+        position = scipy.interpolate.CubicSpline(log.time, position, axis=0)(inside)
+        reference = scipy.interpolate.Akima1DInterpolator(log.time, reference, axis=0)(inside)
+    extra = disturbance_at(machine.disturbance, log.time if every == 1 else times, log)
+    return position, reference, np.broadcast_to(extra, reference.shape), every
+
+
+def law_findings(machine: Machine, log: Log, replayed: Replayed | None) -> list[Finding]:
+    """Find drives whose logged command is not that of the declared law, and name the law that fits.
+
+    Args:
+        machine: The machine with its controller.
+        log: The log.
+        replayed: Result of `replayed_law`.
+
+    Returns:
+        A warning for each such drive; an error if another known law reproduces its command.
+    """
+    if replayed is None:
+        return []
+    off = replayed.command - log.force
+    noise = signals.high_band_std(log.force)
+    findings = []
+    for k, relative in enumerate(replayed.relative):
+        if relative < _LEFT or np.sqrt(np.mean(off[:, k] ** 2)) < _NOISY * noise[k]:
+            continue
+        number = f" {k + 1}" if len(replayed.relative) > 1 else ""
+        best = _best_law(machine, log, k)
+        what = f"the declared control law leaves {100 * relative:.3g} % of the logged command{number}"
+        if best is None or not best.remaining < _BETTER * relative:
+            hint = "check kind, gains, period and limit in [controller], and the column of the reference"
+            severity = "warning"
+        else:
+            hint = f"take {best.text}, which leaves {100 * best.remaining:.2g} %"
+            sure = relative > _CONTRADICTED and best.remaining < _FIFTH * relative
+            severity = "error" if sure else "warning"
+        findings.append(Finding(severity, what, f"{log.source}, [controller]", hint))
+    return findings
+
+
+def _best_law(machine: Machine, log: Log, drive: int) -> _Fitted | None:
+    """Return the known law that fits the command of a drive best; a longer one only if it fits far better."""
+    by_length: dict[int, _Fitted] = {}
+    for length, fitted in _fitted_laws(machine, log, drive):
+        if length not in by_length or fitted.remaining < by_length[length].remaining:
+            by_length[length] = fitted
+    best = None
+    for _, fitted in sorted(by_length.items()):
+        if best is None or fitted.remaining < _BETTER * best.remaining:
+            best = fitted
+    return best
+
+
+def _fitted_laws(machine: Machine, log: Log, drive: int) -> Iterator[tuple[int, _Fitted]]:
+    """Yield known laws with gains fitted by least squares, each after its number of gains."""
+    controller = machine.controller
+    assert controller is not None, "asked only with a controller"
+    ticks = _at_ticks(controller, machine, log)
+    assert ticks is not None, "checked before"
+    position, reference, extra, every = ticks
+    joint = int(machine.plant.driven(position.shape[1])[drive])
+    q, r, period = position[:, joint], reference[:, drive], controller.period
+    u = log.force[:, drive] - extra[::every, drive]
+    counts = np.ones(u.size, bool)
+    # The first ticks depend on readings before the log.
+    counts[: 2 * max(_AVERAGES)] = False
+    if controller.limit is not None:
+        limit = np.broadcast_to(np.asarray(controller.limit), log.force.shape[1])[drive]
+        counts &= np.abs(log.force[:, drive]) < (1 - 1e-6) * limit
+    size = float(np.linalg.norm(log.force[counts, drive]))
+    error, slope = r - q, np.diff(r, prepend=r[0]) / period
+    ones, integral = np.ones_like(q), period * np.cumsum(error)
+
+    def fitted(*columns: np.ndarray) -> tuple[np.ndarray, float]:
+        rows = np.stack(columns, axis=1)[::every][counts]
+        gains = np.linalg.lstsq(rows, u[counts], rcond=1e-12)[0]
+        return gains, float(np.linalg.norm(u[counts] - rows @ gains)) / max(size, 1e-300)
+
+    for average in _AVERAGES:
+        before = np.concatenate([np.full(average, q[0]), q[:-average]])
+        velocity = (q - before) / (average * period)
+        more = f", velocity_average = {average}" if average > 1 else ""
+        (kp, kd), remaining = fitted(error, -velocity)
+        if kp > 0 and kd > 0:
+            text = f"kind = 'cascade_pd' with kp = {kp / kd:.4g}, kv = {kd:.4g}"
+            if not isinstance(controller, CascadePD):
+                plain = f"kind = 'pd' with derivative = 'velocity', kp = {kp:.4g}, kd = {kd:.4g}"
+                text = f"{plain} (the same as {text})"
+            yield 2, _Fitted(text + more, remaining)
+        (kp, kd), remaining = fitted(error, slope - velocity)
+        if kp > 0 and kd > 0:
+            text = f"kind = 'pd' with kp = {kp:.4g}, kd = {kd:.4g}"
+            yield 2, _Fitted(text + more, remaining)
+        (kp, ki, kd, _), remaining = fitted(error, integral, slope - velocity, ones)
+        if kp > 0 and ki > 0 and kd > 0:
+            text = f"kind = 'pid' with kp = {kp:.4g}, ki = {ki:.4g}, kd = {kd:.4g}"
+            yield 3, _Fitted(text + more, remaining)

@@ -1,0 +1,220 @@
+"""Noise of the logged force, estimated from the log; and stated noise that the log contradicts."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxid.consistency.balance_fit import BalanceFit
+from jaxid.logs.finding import Finding
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
+from jaxid.logs.soundness import position_levels
+from jaxid.machine import Machine
+from jaxid.numerics import filters as signals
+from jaxid.numerics.fft import rfft
+from jaxid.simulation.sensor_noise import position_density
+
+# Samples before and after, up to which a force may be a linear function of positions and reference: the law
+# of a sampled controller, with an average or a filter in it, and the inertia of a motion near the band's top.
+_BEFORE, _AFTER = 8, 4
+# Samples of a log for each of these coefficients.
+_SAMPLES_EACH = 40
+# Part of the band of inverse dynamics in which its residual bounds the noise of the force.
+_BAND = (0.3, 0.8)
+# Fewest frequencies that give a median.
+_FREQUENCIES = 20
+# Numbers of levels between which a force counts as quantised: fewer are a switched command, and the steps of
+# more are as small as any noise.
+_LEVELS = (8, 1000)
+# Factor between stated and estimated noise from which they contradict each other.
+_FACTOR = 3.0
+# Largest ratio of two estimates in different bands of one white noise.
+_ALIKE = 1.5
+
+
+def estimated_force_noise(
+    machine: Machine,
+    log: Log,
+    data: Prepared,
+    fit: BalanceFit,
+    law: Float[np.ndarray, "time m"] | None = None,
+) -> Float[np.ndarray, " m"]:
+    """Estimate the standard deviation of white noise of each logged force, in units of the command, (m,).
+
+    Each of the following is an upper bound for it, and the lowest counts:
+
+    - the force in the high band that is no linear function of positions and reference around the sample. The
+      rest comes from the controller, which differentiates the noise of its encoder: it is a force, and the
+      log has it exactly.
+    - the residual of inverse dynamics in the upper part of its band, position noise subtracted. It excludes a
+      rough force that was commanded and logged exactly.
+    - the high band of the logged force minus that of the declared control law, if that reproduces it.
+
+    A force on few levels has at least the noise of its rounding, step / sqrt(12).
+
+    Args:
+        machine: The machine at its guesses.
+        log: The log.
+        data: The same log, prepared.
+        fit: Balance of the prepared log.
+        law: Command of the declared control law at the logged readings, in units of the command; None: there
+            is none that reproduces the logged one.
+    """
+    bounds = [_beyond_controller(machine, log), _in_band(machine, log, data, fit)]
+    if law is not None:
+        bounds.append(signals.high_band_std(log.force - law))
+    if data.recipe.median:
+        white = signals.median_noise(data.recipe.median)
+        bounds = [b if k == 1 else b / white for k, b in enumerate(bounds)]
+    noise = np.min(bounds, axis=0)
+    steps = np.array([_step(u) for u in log.force.T])
+    return np.maximum(noise, steps / np.sqrt(12))
+
+
+def _step(u: np.ndarray) -> float:
+    """Return the step of a force on few levels; 0 if it is not quantised so coarsely."""
+    levels, step = position_levels(u)
+    return step if _LEVELS[0] <= levels <= _LEVELS[1] else 0.0
+
+
+def _beyond_controller(machine: Machine, log: Log) -> np.ndarray:
+    """Return the noise of each force in the high band, without its linear part in positions and reference."""
+    driven = machine.plant.driven(machine.plant.joints)
+    out = np.empty(log.force.shape[1])
+    for k, j in enumerate(driven):
+        of = [log.filled[:, int(j)]]
+        if log.reference is not None:
+            of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
+        out[k] = _unexplained(log.force[:, k], of)
+    return out
+
+
+def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> float:
+    """Return the noise in the high band of a signal that no linear filter of others explains."""
+    room = max(u.size // (_SAMPLES_EACH * len(of)), 1)
+    share = min(1.0, room / (_BEFORE + _AFTER + 1))
+    before, after = int(_BEFORE * share), int(_AFTER * share)
+    size = u.size - before - after
+
+    def spectra(x: np.ndarray, lags: range) -> np.ndarray:
+        shifted = np.stack([x[before - lag : before - lag + size] for lag in lags], axis=1)
+        return _high_band(shifted)
+
+    target = spectra(u, range(1))
+    columns = np.concatenate([spectra(x, range(-after, before + 1)) for x in of], axis=1)
+    power = np.linalg.norm(columns, axis=0)
+    columns = columns[:, power > 0] / power[power > 0]
+
+    # Real coefficients for complex spectra: both parts are rows.
+    rows, right = (np.concatenate([np.real(x), np.imag(x)]) for x in (columns, target))
+    solved = np.linalg.lstsq(rows, right, rcond=1e-10)[0]
+    return float(np.sqrt(np.median(np.abs(target - columns @ solved) ** 2) / np.log(2.0)))
+
+
+def _high_band(x: Float[np.ndarray, "time k"]) -> np.ndarray:
+    """Return the spectra of signals in the band of `signals.high_band_std`, noise of deviation one at one."""
+    window = np.hanning(len(x) + 2)[1:-1, None]
+    line = np.linspace(-1.0, 1.0, len(x))[:, None] ** np.arange(2)
+    flat = x - line @ np.linalg.lstsq(line, x, rcond=None)[0]
+    spectrum = rfft(window * flat, axis=0)
+    f = np.arange(len(spectrum)) / len(x)
+    return spectrum[(f > 0.3) & (f < 0.475)] / np.linalg.norm(window)
+
+
+def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.ndarray:
+    """Return the white noise of each force that the residual of inverse dynamics allows; inf if unknown."""
+    out = np.full(log.force.shape[1], np.inf)
+    if not all(log.measured):
+        return out
+    residual = fit.fit(bounded=False)[1]
+    rate = log.rate_hz / data.recipe.decimation
+    top = data.recipe.edge * log.rate_hz / 2 if data.recipe.edge else data.recipe.band_hz(log.rate_hz)
+    top = min(top, 0.5 * rate)
+    f_all, of_position = position_density(machine, log, data)
+    for k, joint in enumerate(machine.plant.driven(machine.plant.joints)):
+        j = int(joint)
+        f, power = _periodogram(residual[:, j], fit.counts[:, j], rate)
+        band = (f > _BAND[0] * top) & (f < _BAND[1] * top)
+        if band.sum() < _FREQUENCIES or machine.gain[k] == 0:
+            continue
+        own = power[band] / np.log(2.0) - np.interp(f[band], f_all, of_position[:, j])
+        white = own / np.square(data.recipe.decimator.response(f[band], log.rate_hz))
+        density = max(float(np.median(white)), 0.0)
+        out[k] = np.sqrt(density * log.rate_hz / 2) / abs(machine.gain[k])
+    return out
+
+
+def _periodogram(
+    e: Float[np.ndarray, " kept"], counts: Bool[np.ndarray, " kept"], rate_hz: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies [Hz] and the one-sided density of a residual with gaps."""
+    window = np.hanning(e.size + 2)[1:-1] * counts
+    spectrum = rfft((window * np.where(counts, e, 0.0))[:, None], axis=0)[:, 0]
+    size = max(float(np.sum(window**2)), 1e-300)
+    return np.arange(spectrum.size) * rate_hz / e.size, 2 * np.abs(spectrum) ** 2 / (rate_hz * size)
+
+
+def noise_findings(
+    machine: Machine, log: Log, data: Prepared, fit: BalanceFit, estimate: np.ndarray
+) -> list[Finding]:
+    """Find stated noise and resolution that the log contradicts by a factor of three.
+
+    Args:
+        machine: The machine with its stated sensor.
+        log: The log.
+        data: The same log, prepared.
+        fit: Balance of the prepared log.
+        estimate: Result of `estimated_force_noise`.
+    """
+    return [*_force(machine, log, data, fit, estimate), *_position(machine, log)]
+
+
+def _force(
+    machine: Machine, log: Log, data: Prepared, fit: BalanceFit, estimate: np.ndarray
+) -> list[Finding]:
+    """Compare the stated noise of each force with the estimate."""
+    if machine.sensor.force_noise is None:
+        return []
+    stated = np.broadcast_to(np.asarray(machine.sensor.force_noise), estimate.shape)
+    high, low = _beyond_controller(machine, log), _in_band(machine, log, data, fit)
+    white = (high < _ALIKE * low) & (low < _ALIKE * high)
+    findings = []
+    for k, (of, found) in enumerate(zip(stated, estimate, strict=True)):
+        more = found > _FACTOR * of and white[k]
+        if not more and not of > _FACTOR * found:
+            continue
+        bound = "about" if more else "at most"
+        what = f"force_noise = {of:.3g} is stated, and the log has {bound} {found:.2g}"
+        number = f" {k + 1}" if estimate.size > 1 else ""
+        hint = f"set force_noise = {found:.2g} in [sensor], in units of the logged column, or remove it"
+        findings.append(Finding("warning", what, f"{log.source}, force{number}", hint))
+    return findings
+
+
+def _position(machine: Machine, log: Log) -> list[Finding]:
+    """Compare the stated resolution and noise of each position with the log."""
+    sensor, findings = machine.sensor, []
+    joints = log.position.shape[1]
+
+    def stated(value: object) -> np.ndarray:
+        return np.broadcast_to(np.nan if value is None else np.asarray(value, float), joints)
+
+    resolution, noise = stated(sensor.position_resolution), stated(sensor.position_noise)
+    found = signals.high_band_std(log.filled)
+    for j in np.flatnonzero(log.measured):
+        where = f"{log.source}, position" + (f" of joint {j + 1}" if joints > 1 else "")
+        step = position_levels(log.position[:, j])[1]
+        if np.isfinite(resolution[j]) and not resolution[j] / _FACTOR < step < _FACTOR * resolution[j]:
+            finer = step < resolution[j]
+            # Readings off every grid contradict a coarse step only; rounded ones may have a finer one.
+            if finer or np.isnan(noise[j]) or noise[j] < step:
+                lie = f"lie on steps of {step:.3g}" if step else "lie on no steps"
+                what = f"position_resolution = {resolution[j]:.3g} is stated, and the readings {lie}"
+                hint = "correct position_resolution in [sensor], or remove it"
+                findings.append(Finding("warning", what, where, hint))
+        if np.isfinite(noise[j]) and noise[j] > _FACTOR * found[j]:
+            what = f"position_noise = {noise[j]:.3g} is stated, and the log has about {found[j]:.2g}"
+            hint = f"set position_noise = {found[j]:.2g} in [sensor], or remove it"
+            findings.append(Finding("warning", what, where, hint))
+    return findings

@@ -1,0 +1,58 @@
+"""A delay of many ticks in a loop: as long as the case needs it, or refused, and never cut."""
+
+import dataclasses
+import tomllib
+
+import numpy as np
+import pytest
+
+from jaxid.errors import InputError
+from jaxid.gap import simulated
+from jaxid.session import Session, open_session
+from jaxid.simulation.replay import remembered_ticks
+from truth.axis.cases import case_text
+from truth.axis.machines import Setup, moves
+from truth.axis.stepper import Loop, Machine, Sensor
+
+DELAY, RATE, SECONDS = 0.0305, 1000.0, 2.0
+TIME = np.arange(round(RATE * SECONDS)) / RATE
+FRICTION = {"viscous_friction": {"coefficient": 400.0}, "coulomb_friction": {"level": 60.0}}
+DELAYED = {**FRICTION, "input_delay": {"delay": DELAY}}
+LOOP = Loop(
+    kind="pd", kp=20.0, kd=4.0, limit=40.0, reference=moves(TIME, [0.0, 0.1, 0.02], [0.1, 0.3, 0.2], 2.0)
+)
+
+
+def opened(delay: float | dict) -> Session:
+    machine = Machine(inertia=180.0, actuator_gain=226.19, effects=DELAYED)
+    of = Setup(machine, LOOP, Sensor(position_resolution=1e-7), RATE, SECONDS, 0)
+    run = of.run()
+    log = {c: run[n] for c, n in {"t": "t", "q": "position", "u": "force", "ref": "reference"}.items()}
+    case = tomllib.loads(case_text(of, tuple(DELAYED.items()), off=1.0))
+    case["effects"][-1]["delay"] = delay
+    return open_session(case, log)
+
+
+def test_a_delay_of_thirty_ticks_is_simulated_whole():
+    session = opened({"guess": DELAY})
+    gap = simulated(session.machine, session.fit.log)
+    # The stroke is 0.1 m; a delay that is cut at 12 ticks is off by millimetres.
+    assert gap is not None
+    assert gap.rms[0] < 2e-5
+    short = dataclasses.replace(opened({"guess": 0.012}).machine)
+    assert simulated(short, session.fit.log).rms[0] > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("delay", "ticks"), [(0.002, 12), (DELAY, 96), ({"guess": 0.004, "max": 0.04}, 48), (0.0, 12)]
+)
+def test_the_memory_is_as_long_as_guess_and_max_need(delay, ticks):
+    delay = delay if isinstance(delay, dict) else {"guess": delay}
+    session = opened(delay)
+    assert remembered_ticks(session.machine, session.fit.log) == ticks
+
+
+def test_a_delay_that_no_loop_can_keep_is_refused():
+    session = opened({"guess": 1.0})
+    with pytest.raises(InputError, match=r"a delay of 1 s.*2000 ticks.*at most 1536"):
+        remembered_ticks(session.machine, session.fit.log)
