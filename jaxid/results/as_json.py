@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jaxid.gap import Gap
     from jaxid.model.plant import Plant
     from jaxid.model.unknowns import Free
+    from jaxid.results.result import FitResult
     from jaxid.session import Session
 
 
@@ -153,6 +154,16 @@ def derived_json(session: Session, estimate: Estimate) -> dict[str, Any]:
     return {"derived": entries} if entries else {}
 
 
+def judgement_json(result: FitResult) -> dict[str, Any]:
+    """Return the verdict on the model, with its reasons, as keys of result.json and discovery.json."""
+    judgement = result.judgement
+    return {
+        "model_complete": judgement.model_complete,
+        "explains_log": judgement.explains,
+        "findings": list(judgement.findings),
+    }
+
+
 def identification_json(result: Identification) -> dict[str, Any]:
     """Return the content of result.json."""
     estimate = result.estimate
@@ -160,6 +171,7 @@ def identification_json(result: Identification) -> dict[str, Any]:
         "method": estimate.method,
         "converged": estimate.converged,
         "message": estimate.message,
+        **judgement_json(result),
         "samples": estimate.samples,
         "parameters": parameters_json(estimate),
         **derived_json(result.session, estimate),
@@ -246,6 +258,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
     return {
         "verdict": result.verdict,
         "converged": result.converged,
+        **judgement_json(result),
         "where": where_json(result),
         "effects": [effect_json(e, result.after) for e in result.effects],
         "experiments": [proposal_json(p, machine) for p in result.proposals],

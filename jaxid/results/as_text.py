@@ -82,21 +82,26 @@ def identification_table(result: Identification) -> str:
         *(_minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []),
     ]
     gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
-    return "\n".join([head, "", parameters, *below, "", gap, *_notes(results.notes(session, estimate))])
+    notes = _notes(results.notes(session, estimate))
+    return "\n".join([*result.findings, "", head, "", parameters, *below, "", gap, *notes])
 
 
 def identification_summary(result: Identification) -> str:
     """Return an identification in a few lines."""
     estimate = result.estimate
     head = f"Identification of {result.session.case.name} by {estimate.method}: {estimate.message}"
-    return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
+    return "\n".join([head, *_indented(result), *lines_of(result.parameters), _gap_line(result)])
+
+
+def _indented(result: FitResult) -> list[str]:
+    return [f"  {finding}" for finding in result.findings]
 
 
 def discovery_summary(result: Discovery) -> str:
     """Return a discovery in a few lines."""
     effects = ": " + ", ".join(e.label for e in result.effects) if result.effects else ""
     head = f"Discovery in {result.session.case.name}: {result.verdict.replace('_', ' ')}{effects}"
-    return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
+    return "\n".join([head, *_indented(result), *lines_of(result.parameters), _gap_line(result)])
 
 
 def _gap_line(result: FitResult) -> str:
@@ -128,7 +133,7 @@ def _minimal(content: dict[str, Any]) -> list[str]:
 def discovery_table(result: Discovery) -> str:
     """Return the text that `discover` prints."""
     content = results.discovery_json(result)
-    lines = [f"verdict: {result.verdict}"]
+    lines = [f"verdict: {result.verdict}", *[f"finding: {finding}" for finding in result.findings]]
     if content["where"]:
         lines.append(f"where:   {content['where']['text']}")
     for effect in result.effects:

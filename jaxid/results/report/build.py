@@ -52,6 +52,7 @@ def identification_report(result: Identification) -> str:
             coefficients=tuple(rows),
             statistics=tuple(below),
             history=history_of(result.estimate),
+            **_judged(result),
             **_common(session, result.estimate, content["notes"]),
         )
     )
@@ -75,6 +76,7 @@ def discovery_report(result: Discovery) -> str:
             experiments=tuple(_experiment(p, session) for p in result.proposals),
             views=views(result),
             converged=result.converged,
+            **_judged(result),
             **_common(session, result.after, content["notes"]),
         )
     )
@@ -114,6 +116,17 @@ def history_of(estimate: Estimate) -> HistoryView | None:
     return HistoryView(
         history["time"], [f.name for f in free], [f.unit for f in free], value, std, history["residual"]
     )
+
+
+def _judged(result: Identification | Discovery) -> dict:
+    judgement = result.judgement
+    return {
+        "findings": judgement.findings,
+        "model_complete": judgement.model_complete,
+        "explains": judgement.explains,
+        "identified": judgement.identified,
+        "drifted": judgement.drifted,
+    }
 
 
 def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:

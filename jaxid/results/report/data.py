@@ -195,6 +195,11 @@ class ReportData:
         within_prior: `directions`, `criterion_percent` and `starts` of the JSON result of a fit within a
             prior; None for any other.
         history: History of a recursive estimate; None for any other.
+        findings: What to know about the result, in sentences, the most important first.
+        model_complete: Whether the model leaves nothing but noise; None if that is not known.
+        explains: Whether the model explains the log at all.
+        identified: Whether the log determines at least one parameter.
+        drifted: Whether the simulated position measures nothing, because an open-loop run drifts.
     """
 
     title: str
@@ -220,3 +225,8 @@ class ReportData:
     statistics: tuple[str, ...] = ()
     within_prior: Mapping | None = None
     history: HistoryView | None = None
+    findings: tuple[str, ...] = ()
+    model_complete: bool | None = None
+    explains: bool = True
+    identified: bool = True
+    drifted: bool = False
