@@ -155,7 +155,7 @@ def explore(
         verdict,
         None if verdict == "nothing_missing" else where,
         effects,
-        tuple(_round(search, s) for s in steps),
+        _as_refitted([_round(search, s) for s in steps], old, new),
         before,
         after,
         old,
@@ -306,6 +306,23 @@ def _round(search: Search, step: Step) -> Round:
         _rms(search, samples, step.theta) for samples in [search.samples, *search.acceptance.others]
     )
     return Round(step, fit, np.max(others, axis=0) if others else None)
+
+
+def _as_refitted(rounds: list[Round], before: tuple[Gap, ...], after: tuple[Gap, ...]) -> tuple[Round, ...]:
+    """Return the steps with the gaps of the refits at the baseline and from the last change on.
+
+    The search fits by inverse dynamics, so that its gaps differ a little from those of the result.
+    """
+    changes = [k for k, r in enumerate(rounds) if r.step.added or r.step.dropped]
+    last = max(changes, default=0)
+    out = []
+    for k, r in enumerate(rounds):
+        if 0 < k < last:
+            out.append(r)
+            continue
+        fit, *others = ((before if k == 0 and last > 0 else after)[j].force.rms for j in range(len(after)))
+        out.append(replace(r, fit=fit, validation=np.max(others, axis=0) if others else None))
+    return tuple(out)
 
 
 def _rms(search: Search, samples: cand.CandidateSamples, theta: np.ndarray) -> np.ndarray:

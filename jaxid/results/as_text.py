@@ -26,6 +26,13 @@ if TYPE_CHECKING:
 
 # Stands in tables in place of a standard deviation.
 UNIDENTIFIABLE = "not identifiable from this log"
+# Name of the noise floor in the table of gaps, and what it is.
+FLOOR = "noise floor"
+_FLOOR_WORDS = "noise floor: RMS force that the sensors' noise alone leaves in the band of the filter"
+_EVIDENCE_WORDS = (
+    "evidence: gain in log-likelihood on stretches of the log that a fit did not use, in nats (natural "
+    "logarithm): e to that power is the odds in favour"
+)
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
@@ -54,7 +61,7 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
         ["gap", "fit", "validation", "unit"],
         ["force", _number(gap["fit"]), _number(gap["validation"]), joined(gap["unit"])],
         ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
-        ["noise floor", _number(gap["noise_floor"]), "", joined(gap["unit"])],
+        [FLOOR, _number(gap["noise_floor"]), "", joined(gap["unit"])],
         [
             "simulated position",
             _number(simulation["fit"]),
@@ -83,7 +90,7 @@ def identification_table(result: Identification) -> str:
     ]
     gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
     notes = _notes(results.notes(session, estimate))
-    return "\n".join([*result.findings, "", head, "", parameters, *below, "", gap, *notes])
+    return "\n".join([*result.findings, "", head, "", parameters, *below, "", gap, _FLOOR_WORDS, *notes])
 
 
 def identification_summary(result: Identification) -> str:
@@ -140,18 +147,24 @@ def discovery_table(result: Discovery) -> str:
         others = ", ".join(s.candidate.label for s in effect.alternatives)
         alternatives = f"; not distinguishable from {others} in this log" if others else ""
         lines.append(f"effect:  {effect.label} (evidence {effect.score.evidence:.0f} nats{alternatives})")
+    lines += [_EVIDENCE_WORDS] if result.effects else []
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
 
     parameters = aligned(parameter_rows(result.after, results.derived(result.session, result.after)))
     lines += ["", aligned(step_rows(content)), "", parameters, *_unidentifiable(result.after), ""]
 
     gap = content["gap"]
-    lines.append(
-        f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {joined(gap['unit'])} "
-        f"(noise floor {_number(gap['noise_floor'])}); simulated position "
+    position = (
         f"{_number(gap['simulation']['before'])} -> {_number(gap['simulation']['after'])} "
         f"{joined(gap['simulation']['unit'])}"
     )
+    if result.judgement.drifted:
+        position = "drifts off in open loop, see above"
+    lines.append(
+        f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {joined(gap['unit'])} "
+        f"({FLOOR} {_number(gap['noise_floor'])}); simulated position {position}"
+    )
+    lines.append(_FLOOR_WORDS)
     return "\n".join([*lines, *_notes(content["notes"])])
 
 

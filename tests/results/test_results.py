@@ -179,6 +179,7 @@ def test_discover_adds_nothing_where_nothing_is_missing(folder, capsys):
     assert found["gap"]["on"] == "fit"
     (step,) = found["steps"]
     assert step["validation"] is None
+    assert step["fit"] == found["gap"]["before"] == found["gap"]["after"]
     assert step["fit"] < 1.5 * found["gap"]["noise_floor"]
     near_truth(found["parameters"])
     assert ran.out.startswith("verdict: nothing_missing\n")

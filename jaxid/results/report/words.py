@@ -19,10 +19,13 @@ from jaxid.results.report.numbers import (
     pretty_unit,
     scaled_unit,
     short,
+    usual_unit,
     with_std,
 )
 
 _MOST_INTERVALS = 12
+# Ratio of a gap to the measured signal beyond which its number says nothing.
+_MOST_RELATIVE = 10.0
 # Name of the gap in position.
 SIMULATED = "simulated position"
 # Weights up to this are omitted from the text of a combination.
@@ -86,7 +89,8 @@ def answer(data: ReportData) -> str:
         openings = {}
     opening = openings.get(data.verdict or "")
     first = data.findings[0] if data.findings else "The declared model was fitted to the log"
-    lines = [opening, first] if opening else [first]
+    # The finding on a model that a search left as it was says the same.
+    lines = [opening, first] if opening and (data.verdict == "found" or not data.findings) else [first]
 
     # One line for each quantity, of two joints at most one each: the table below has the other logs.
     rows = [r for r in _gap_rows(data) if is_number(r.after)]
@@ -374,7 +378,7 @@ def _gap_cells(row: GapRow) -> list[str]:
     ratio = ABSENT
     if after is not None and floor is not None and is_number(after) and is_number(floor) and floor > 0:
         ratio = f"{after / floor:.2f}"
-    return [row.quantity, row.log, *texts, ratio, percent(row.relative)]
+    return [row.quantity, row.log, *texts, ratio, _relative(row.relative, 1.0, most=_MOST_RELATIVE)]
 
 
 def _expanded(row: ParameterRow) -> list[ParameterRow]:
@@ -388,14 +392,22 @@ def _expanded(row: ParameterRow) -> list[ParameterRow]:
     ]
 
 
+def _relative(part: float | None, whole: float | None, most: float = 1.0) -> str:
+    """Write a part as a percentage; beyond `most` the number says nothing."""
+    if is_number(part) and is_number(whole) and abs(part) > most * abs(whole):
+        return f"over {100 * most:g} %"
+    return percent(part, whole)
+
+
 def _parameter_line(row: ParameterRow) -> dict:
-    value, std = with_std(row.value, row.std) if row.identifiable else (ABSENT, ABSENT)
-    relative = percent(row.std, row.value) if row.identifiable else ABSENT
+    scale, unit = usual_unit(row.unit, row.value, row.std)
+    sizes = [x / scale if is_number(x) else x for x in (row.value, row.std)]
+    value, std = with_std(*sizes) if row.identifiable else (ABSENT, ABSENT)
     return {
         "name": row.name,
         "value": value,
         "std": std,
-        "relative": relative,
-        "unit": pretty_unit(row.unit),
+        "relative": _relative(row.std, row.value) if row.identifiable else ABSENT,
+        "unit": unit,
         "identifiable": row.identifiable and is_number(row.value),
     }

@@ -9,7 +9,7 @@ import numpy as np
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
-from jaxid.model.unknowns import REFERENCE, Free, effect_name
+from jaxid.model.unknowns import REFERENCE, Free
 from jaxid.results.report.numbers import plain, pretty_unit, with_std
 from jaxid.session import Session
 
@@ -21,8 +21,6 @@ _NOTHING = 1e-3
 _AT_BOUND = 1e-6
 # Standard deviations by which an inertia must be below the least one that is possible.
 _SIGMAS = 3.0
-# Kind of the effect that adds inertia.
-_ADDED = "added_mass"
 # Parameters of a link that enter its inertia about the axis of its joint.
 _AXIAL = ("mass", "first_moment_x", "first_moment_y", "inertia_zz")
 
@@ -61,7 +59,7 @@ def remarks_on(session: Session, estimate: Estimate) -> list[Remark]:
             or _undetermined(f, value, std)
         )
         out += [remark] if remark else []
-    return [*_unreal_links(estimate), *_below_zero(estimate), *out]
+    return [*_unreal_links(estimate), *out]
 
 
 def undetermined(estimate: Estimate) -> list[str]:
@@ -176,21 +174,6 @@ def _undetermined(f: Free, value: float, std: float) -> Remark | None:
     return Remark(
         f.name, f"{text}: its standard deviation exceeds the value, so the log does not determine it"
     )
-
-
-def _below_zero(estimate: Estimate) -> list[Remark]:
-    """Question a joint whose total inertia is not positive, because an added mass is too negative."""
-    machine = estimate.machine
-    own = machine.plant.own_inertia()
-    total = None if own is None else np.atleast_1d(np.asarray(own, dtype=float)).copy()
-    if total is None:
-        return []
-    added = [e for e in machine.plant.effects if e.kind == _ADDED and e.port < len(total)]
-    for effect in added:
-        total[effect.port] += float(np.asarray(getattr(effect, "mass", 0.0)))
-    names = [f"{effect_name(machine.plant, e)}.mass" for e in added if total[e.port] <= 0]
-    text = "leaves its joint no positive inertia"
-    return [Remark(name, f"{name} {text}", impossible=True) for name in dict.fromkeys(names)]
 
 
 def _unreal_links(estimate: Estimate) -> list[Remark]:

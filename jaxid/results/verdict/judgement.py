@@ -21,6 +21,10 @@ _OF_THE_ORDER = 0.5
 _DRIFTED = 0.1
 # Ratio of gap to noise beyond which the ratio says more than the colour.
 _CLEARLY = 1.3
+# A residual beyond this many times the measured force is told without a number.
+_FAR = 10.0
+# A model that leaves this part of the force explains nothing: the log's columns are in doubt first.
+_NOTHING = 0.9
 # Most sentences on single values; further ones are counted.
 _MOST = 6
 
@@ -78,7 +82,13 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
         findings += [_capital(text) for text in against[1:]]
     if not identified:
         findings.append("This log determines none of the unknowns.")
-    findings += _completeness_words(session, residuals, complete, search)
+    worst = max((float(np.nanmax(g.force.relative, initial=0.0)) for g in gaps), default=0.0)
+    doubtful = bool(against) and worst >= _NOTHING
+    if doubtful:
+        findings.append(
+            "Check first that the columns of position and force are the right ones, with sign, unit and gain."
+        )
+    findings += _completeness_words(session, residuals, complete, None if doubtful else search or "none")
     others = [r for r in remarks if r not in impossible]
     findings += _remark_words(others)
     drifted = _drifted(session, gaps)
@@ -110,9 +120,10 @@ def _large_gaps(session: Session, gaps: Sequence[Gap], residuals: Sequence[Resid
         for joint, relative in enumerate(gap.force.relative):
             if np.isfinite(relative) and relative >= _OF_THE_ORDER and (gap.name, joint) not in noise:
                 where = _place(session, gap.name, joint)
-                out.append(
-                    (relative, f"it leaves {percent(relative)} of the measured force unexplained{where}.")
-                )
+                much = f"leaves {percent(relative)} of the measured force unexplained"
+                if relative > _FAR:
+                    much = f"is off by more than {_FAR:g} times the measured force"
+                out.append((relative, f"it {much}{where}."))
     return [text for _, text in sorted(out, key=lambda entry: -entry[0])]
 
 
@@ -165,11 +176,10 @@ def _drifted(session: Session, gaps: Sequence[Gap]) -> list[str]:
 def _completeness_words(
     session: Session, residuals: Sequence[Residual], complete: bool | None, search: str | None
 ) -> list[str]:
-    """Return the sentences on the completeness of the model."""
+    """Return the sentences on the completeness of the model; `search` is "none" if one may help."""
     if complete:
-        return [
-            "The model is complete for this log: what it leaves has the size and the colour of the noise."
-        ]
+        with_it = "With what was found the" if search == "found" else "The"
+        return [f"{with_it} model is complete for this log: what it leaves has the size and colour of noise."]
     if complete is None:
         reason = next((r.reason for r in residuals if r.complete is None), "")
         if not reason and search == "nothing_missing":
@@ -179,7 +189,7 @@ def _completeness_words(
         ]
     worst = max((r for r in residuals if r.complete is False), key=_severity)
     what = {
-        "found": "The model is still incomplete",
+        "found": "With what was found the model is still incomplete",
         "unexplained": "The model is incomplete, and no known effect explains it",
     }.get(search or "", "The model is incomplete")
     lines = [f"{what}: {_residual_words(session, worst)}."]
@@ -187,8 +197,8 @@ def _completeness_words(
         "The standard deviations are of noise only: the values fit best by this model, and the machine's may "
         "differ by more."
     )
-    if search is None:
-        lines.append("`jaxid discover` searches for what is missing.")
+    if search == "none":
+        lines.append("The command jaxid discover searches for what is missing.")
     return lines
 
 
