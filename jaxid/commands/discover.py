@@ -199,7 +199,14 @@ def _with_break_away(
     plant, free = free_effect(machine.plant, effect, machine.units)
     theta = np.append(estimate.theta, b.level)
     machine = machine.with_plant(plant, machine.parameters.extended(free)).with_estimate(theta)
-    new = replace(estimate, machine=machine, theta=theta, precision=estimate.precision.beside(b.std))
+    beside = estimate.std_misspecified
+    new = replace(
+        estimate,
+        machine=machine,
+        theta=theta,
+        precision=estimate.precision.beside(b.std),
+        std_misspecified=None if beside is None else np.append(beside, np.nan),
+    )
     score = Score(c, 0, np.array([b.level]), b.evidence)
     found = NamedEffect(c.kind, c.label, plant.place(c.port), (free[0].name,), score, ())
     return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)

@@ -22,6 +22,7 @@ from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.force_balance import ForceData, _size, force_residual, sharpened
 
@@ -122,6 +123,7 @@ def inverse_dynamics_steps(
         residual=np.where(rows, e, np.nan),
         samples=int(rows.sum()),
         steps=int(fit.steps),
+        std_misspecified=std_under_misspecification(jacobian, e, rows),
     )
 
 

@@ -27,6 +27,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import assess, full_hessian
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
@@ -277,6 +278,7 @@ def output_error_steps(
         samples=int(counts.sum()),
         steps=int(minimum.steps),
         notes=notes_of(machine, numerics, log, on, minimiser),
+        std_misspecified=std_under_misspecification(jacobian[..., active], e, counts)[:p],
     )
 
 

@@ -51,4 +51,5 @@ def _findings(result: FitResult) -> str:
 
 def _parameters(result: FitResult, caption: str) -> str:
     derived = as_json.derived(result.session, result.estimate)
-    return html_table(as_text.parameter_rows(result.estimate, derived), caption)
+    incomplete = result.model_complete is False
+    return html_table(as_text.parameter_rows(result.estimate, derived, incomplete=incomplete), caption)

@@ -26,6 +26,12 @@ if TYPE_CHECKING:
 
 # Stands in tables in place of a standard deviation.
 UNIDENTIFIABLE = "not identifiable from this log"
+# Head of the standard deviations that hold for an incomplete model, and what they are.
+INCOMPLETE = "std of the best fit"
+_INCOMPLETE_WORDS = (
+    f"{INCOMPLETE}: scatter over logs of this kind, about the values with which this model fits them best; "
+    "those are not the machine's"
+)
 # Name of the noise floor in the table of gaps, and what it is.
 FLOOR = "noise floor"
 _FLOOR_WORDS = "noise floor: RMS force that the sensors' noise alone leaves in the band of the filter"
@@ -42,14 +48,23 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def parameter_rows(estimate: Estimate, derived: Sequence[Derived] = ()) -> list[list[str]]:
-    """Return a header, and value, standard deviation and unit of every parameter and derived quantity."""
-    rows = [["parameter", "value", "std", "unit"]]
+def parameter_rows(
+    estimate: Estimate, derived: Sequence[Derived] = (), *, incomplete: bool = False
+) -> list[list[str]]:
+    """Return a header, and value, standard deviation and unit of every parameter and derived quantity.
+
+    With an incomplete model the deviations that hold then stand in a column of their own.
+    """
+    beside = estimate.std_misspecified if incomplete else None
+    rows = [["parameter", "value", "std", *([] if beside is None else [INCOMPLETE]), "unit"]]
     free = estimate.machine.parameters.free
-    for f, value, std, ok in zip(free, estimate.theta, estimate.std, estimate.identifiable, strict=True):
+    for k, f in enumerate(free):
+        value, std, ok = estimate.theta[k], estimate.std[k], estimate.identifiable[k]
         shown = with_std(value, std) if ok else ("-", UNIDENTIFIABLE)
-        rows.append([f.name, *shown, f.unit])
-    rows += [[d.name, *with_std(d.value, d.std), d.unit] for d in derived if np.isfinite(d.std)]
+        more = [] if beside is None else [with_std(value, beside[k])[1] if ok else "-"]
+        rows.append([f.name, *shown, *more, f.unit])
+    more = [] if beside is None else ["-"]
+    rows += [[d.name, *with_std(d.value, d.std), *more, d.unit] for d in derived if np.isfinite(d.std)]
     return rows
 
 
@@ -71,6 +86,14 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
     ]
 
 
+def _parameters_text(result: FitResult) -> str:
+    """Return the table of parameters, with a line below it if the model is incomplete."""
+    derived = results.derived(result.session, result.estimate)
+    incomplete = result.model_complete is False
+    rows = parameter_rows(result.estimate, derived, incomplete=incomplete)
+    return aligned(rows) + (f"\n{_INCOMPLETE_WORDS}" if INCOMPLETE in rows[0] else "")
+
+
 def _number(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(_number(v) for v in value)
@@ -81,7 +104,7 @@ def identification_table(result: Identification) -> str:
     """Return the text that `identify` prints."""
     session, estimate = result.session, result.estimate
     head = f"{estimate.method}: {estimate.message}, {estimate.samples} samples"
-    parameters = aligned(parameter_rows(estimate, results.derived(session, estimate)))
+    parameters = _parameters_text(result)
     below = [
         *_identifiable_combinations(estimate.details.get("directions", [])),
         *_unidentifiable(estimate),
@@ -150,7 +173,7 @@ def discovery_table(result: Discovery) -> str:
     lines += [_EVIDENCE_WORDS] if result.effects else []
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
 
-    parameters = aligned(parameter_rows(result.after, results.derived(result.session, result.after)))
+    parameters = _parameters_text(result)
     lines += ["", aligned(step_rows(content)), "", parameters, *_unidentifiable(result.after), ""]
 
     gap = content["gap"]

@@ -16,7 +16,7 @@ from jaxid.results.verdict import judge
 from jaxid.results.verdict.absurd import remarks_on
 from jaxid.results.verdict.completeness import cumulated_excess, residuals_of
 from jaxid.session import open_session
-from tests.support.slow_axis import DECLARED, STRIBECK, slow_axis
+from tests.support.slow_axis import DECLARED, STRIBECK, drag_axis, slow_axis
 from truth.axis.cases import case_text, write_case
 
 
@@ -208,3 +208,34 @@ def test_a_ripple_finer_than_the_encoder_is_impossible(tmp_path):
     assert remark.text == (
         "cogging.period = 1.00 × 10⁻⁷ m is shorter than two counts of the encoder, 2.00 × 10⁻⁶ m"
     )
+
+
+def test_an_incomplete_model_has_a_deviation_that_holds_for_the_best_fit(missing, complete, tmp_path):
+    """Beside the other, with the words that go with it; a complete model needs none."""
+    k = missing.estimate.names.index("coulomb_friction.level")
+    written = json.loads((missing.save(tmp_path / "a") / "result.json").read_text())
+    entry = written["parameters"]["coulomb_friction.level"]
+    assert entry["std_misspecified"] == missing.estimate.std_misspecified[k] > 0
+    assert "std of the best fit" in str(missing)
+    assert "σ of the best fit" in (tmp_path / "a" / "report.html").read_text()
+
+    written = json.loads((complete.save(tmp_path / "b") / "result.json").read_text())
+    assert all("std_misspecified" not in entry for entry in written["parameters"].values())
+    assert "of the best fit" not in str(complete) + (tmp_path / "b" / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_spread_over_motions_of_a_model_without_drag(tmp_path):
+    """Under quadratic drag that the model lacks the deviation for noise is a quarter of the spread."""
+    theta, plain, beside = [], [], []
+    for seed in range(1, 41):
+        setup = drag_axis(seed)
+        path = write_case(tmp_path, case_text(setup, DECLARED, closed=False))
+        session = open_session(path, columns(setup), align_hold=True)
+        estimate = inverse_dynamics(session.machine, session.fit.data)
+        theta.append(estimate.theta[1])
+        plain.append(estimate.std[1])
+        beside.append(estimate.std_misspecified[1])
+    spread = np.std(theta, ddof=1)
+    assert np.sqrt(np.mean(np.square(plain))) < 0.4 * spread
+    assert 0.7 < np.sqrt(np.mean(np.square(beside))) / spread < 1.3

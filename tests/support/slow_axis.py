@@ -1,5 +1,7 @@
 """Logs of a ball-screw axis that also moves slowly, with or without a Stribeck term, by the exact stepper."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from truth.axis.machines import Setup, moves
@@ -32,3 +34,20 @@ def slow_axis(seed: int, *, duration: float = 8.0, stribeck: float = 1.0, noise:
     loop = Loop(kind="cascade_pd", kp=40.0, kv=72.0, velocity_average=2, limit=20.0, reference=reference)
     sensor = Sensor(position_resolution=1e-6, position_noise=3e-7 * noise, force_noise=0.03 * noise)
     return Setup(machine, loop, sensor, rate=1000.0, duration=duration, seed=seed)
+
+
+def drag_axis(seed: int, duration: float = 16.0) -> Setup:
+    """Return the axis under quadratic drag in place of the Stribeck term, with moves of random speed."""
+    random = np.random.default_rng(seed)
+    points, speeds, end = [0.0], [], 0.0
+    while end < duration:
+        speed = min(random.lognormal(np.log(0.08), 0.6), 0.3)
+        length = speed * random.uniform(0.6, 1.4)
+        points.append(points[-1] + (-1) ** len(speeds) * length)
+        speeds.append(speed)
+        end += length / speed + speed / 0.8 + 0.05
+    reference = moves(np.arange(round(1000 * duration)) / 1000, points, [*speeds, 0.1], 0.8, rest=0.05)
+    setup = slow_axis(seed, duration=duration)
+    effects = {**dict(DECLARED), "quadratic_drag": {"coefficient": 2000.0}}
+    machine = Machine(inertia=TRUTH[0], actuator_gain=226.19, effects=effects)
+    return replace(setup, machine=machine, loop=replace(setup.loop, reference=reference))

@@ -53,7 +53,7 @@ def identification_report(result: Identification) -> str:
             statistics=tuple(below),
             history=history_of(result.estimate),
             **_judged(result),
-            **_common(session, result.estimate, content["notes"]),
+            **_common(session, result.estimate, content["notes"], incomplete=result.model_complete is False),
         )
     )
 
@@ -77,7 +77,7 @@ def discovery_report(result: Discovery) -> str:
             views=views(result),
             converged=result.converged,
             **_judged(result),
-            **_common(session, result.after, content["notes"]),
+            **_common(session, result.after, content["notes"], incomplete=result.model_complete is False),
         )
     )
 
@@ -129,11 +129,11 @@ def _judged(result: Identification | Discovery) -> dict:
     }
 
 
-def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
+def _common(session: Session, estimate: Estimate, notes: Sequence[str], *, incomplete: bool) -> dict:
     return {
         "case_name": session.case.name,
         "log_name": Path(session.fit.log.source).name,
-        "parameters": _rows(estimate),
+        "parameters": _rows(estimate, incomplete=incomplete),
         "derived": _derived(session, estimate),
         "units": units_of(session),
         "notes": tuple(notes),
@@ -162,18 +162,16 @@ def _units_at(session: Session, joint: int) -> dict[str, str]:
     }
 
 
-def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
-    rows = zip(
-        estimate.machine.parameters.free,
-        estimate.theta,
-        estimate.std,
-        estimate.identifiable,
-        strict=True,
-    )
-    return tuple(
-        ParameterRow(f.name, float(v) if ok else None, float(s) if ok else None, f.unit, bool(ok))
-        for f, v, s, ok in rows
-    )
+def _rows(estimate: Estimate, *, incomplete: bool) -> tuple[ParameterRow, ...]:
+    """Return the parameters; of an incomplete model with the deviations that hold for it."""
+    beside = estimate.std_misspecified if incomplete else None
+    out = []
+    for k, f in enumerate(estimate.machine.parameters.free):
+        ok = bool(estimate.identifiable[k])
+        value, std = (float(x[k]) if ok else None for x in (estimate.theta, estimate.std))
+        more = None if beside is None or not ok or not np.isfinite(beside[k]) else float(beside[k])
+        out.append(ParameterRow(f.name, value, std, f.unit, ok, more))
+    return tuple(out)
 
 
 def _derived(session: Session, estimate: Estimate) -> tuple[ParameterRow, ...]:

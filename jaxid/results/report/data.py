@@ -89,13 +89,17 @@ class SearchStep:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter; `value` and `std` are None if it is not identifiable."""
+    """One parameter; `value` and `std` are None if it is not identifiable.
+
+    `std_misspecified` is the deviation that holds for an incomplete model; None: not shown.
+    """
 
     name: str
     value: float | None
     std: float | None
     unit: str
     identifiable: bool = True
+    std_misspecified: float | None = None
 
 
 class WherePlot(NamedTuple):

@@ -392,6 +392,13 @@ def _expanded(row: ParameterRow) -> list[ParameterRow]:
     ]
 
 
+def _misspecified(row: ParameterRow, scale: float) -> str | None:
+    """Write the deviation that holds for an incomplete model; None if there is none."""
+    if not is_number(row.std_misspecified) or not is_number(row.value):
+        return None
+    return with_std(row.value / scale, row.std_misspecified / scale)[1]
+
+
 def _relative(part: float | None, whole: float | None, most: float = 1.0) -> str:
     """Write a part as a percentage; beyond `most` the number says nothing."""
     if is_number(part) and is_number(whole) and abs(part) > most * abs(whole):
@@ -408,6 +415,7 @@ def _parameter_line(row: ParameterRow) -> dict:
         "value": value,
         "std": std,
         "relative": _relative(row.std, row.value) if row.identifiable else ABSENT,
+        "misspecified": _misspecified(row, scale),
         "unit": unit,
         "identifiable": row.identifiable and is_number(row.value),
     }

@@ -194,8 +194,8 @@ def _completeness_words(
     }.get(search or "", "The model is incomplete")
     lines = [f"{what}: {_residual_words(session, worst)}."]
     lines.append(
-        "The standard deviations are of noise only: the values fit best by this model, and the machine's may "
-        "differ by more."
+        "The standard deviations count noise only: the values are those that fit best in this model, and the "
+        "machine's may differ by more."
     )
     if search == "none":
         lines.append("The command jaxid discover searches for what is missing.")
