@@ -84,6 +84,13 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
         gap: Its gap in force.
         fitted: Whether the machine was fitted to this log.
     """
+    joints = np.flatnonzero(np.isfinite(gap.rms)).tolist()
+    force = run.data.at_kept(run.data.force - run.data.force.mean(axis=0))
+    size = float(np.sqrt(np.mean(force**2))) if force.size else 0.0
+    if size == 0:
+        reason = "the log has no force to compare with"
+        return [Residual(run.name, k, None, float(gap.rms[k]), np.nan, reason=reason) for k in joints]
+
     stated = machine.sensor.force_noise is not None
     most = high_band_force_noise(run.log, run.data)
     levels = [None] if stated else [share * most for share in _SHARES]
@@ -91,11 +98,12 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
     whitened = [_whitened(colour, run, gap) for colour in colours]
     floors = [_floor(machine, run, level) for level in levels]
 
-    force = run.data.at_kept(run.data.force - run.data.force.mean(axis=0))
-    numerics = _NUMERICS * NUMERICS * float(np.sqrt(np.mean(force**2)))
+    # A joint of an arm may have a thousandth of another's torque; a joint without a drive has none.
+    sizes = np.sqrt(np.mean(gap.measured**2, axis=0))
+    numerics = _NUMERICS * NUMERICS * np.where(sizes > 0, sizes, size)
     least = _EXCESS if fitted else _EXCESS_ELSEWHERE
     out = []
-    for joint in np.flatnonzero(np.isfinite(gap.rms)).tolist():
+    for joint in joints:
         tests = [cumulated_excess(z[joint]) for z in whitened]
         best = int(np.argmin([excess for excess, *_ in tests]))
         excess, count, power = tests[best]
@@ -108,7 +116,7 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
             excess=excess,
             limit=max(least, float(np.sqrt(-0.5 * np.log(_RARELY) / max(count, 1)))),
             systematic=systematic_rms(whitened[best][joint], colours[best][joint]),
-            numerics=numerics,
+            numerics=float(numerics[joint]),
         )
         loud = power > _LOUDER**2 + _SCATTER / np.sqrt(max(count, 1))
         out.append(_decided(found, count, loud=loud, stated=stated))
