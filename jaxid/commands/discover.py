@@ -159,7 +159,7 @@ def explore(
         verdict,
         None if verdict == "nothing_missing" else where,
         effects,
-        tuple(_round(search, s) for s in steps),
+        _as_refitted([_round(search, s) for s in steps], old, new),
         before,
         after,
         old,
@@ -203,7 +203,14 @@ def _with_break_away(
     plant, free = free_effect(machine.plant, effect, machine.units)
     theta = np.append(estimate.theta, b.level)
     machine = machine.with_plant(plant, machine.parameters.extended(free)).with_estimate(theta)
-    new = replace(estimate, machine=machine, theta=theta, precision=estimate.precision.beside(b.std))
+    beside = estimate.std_misspecified
+    new = replace(
+        estimate,
+        machine=machine,
+        theta=theta,
+        precision=estimate.precision.beside(b.std),
+        std_misspecified=None if beside is None else np.append(beside, np.nan),
+    )
     score = Score(c, 0, np.array([b.level]), b.evidence)
     found = NamedEffect(c.kind, c.label, plant.place(c.port), (free[0].name,), score, ())
     return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
@@ -327,6 +334,23 @@ def _round(search: Search, step: Step) -> Round:
         _rms(search, samples, step.theta) for samples in [search.samples, *search.acceptance.others]
     )
     return Round(step, fit, np.max(others, axis=0) if others else None)
+
+
+def _as_refitted(rounds: list[Round], before: tuple[Gap, ...], after: tuple[Gap, ...]) -> tuple[Round, ...]:
+    """Return the steps with the gaps of the refits at the baseline and from the last change on.
+
+    The search fits by inverse dynamics, so that its gaps differ a little from those of the result.
+    """
+    changes = [k for k, r in enumerate(rounds) if r.step.added or r.step.dropped]
+    last = max(changes, default=0)
+    out = []
+    for k, r in enumerate(rounds):
+        if 0 < k < last:
+            out.append(r)
+            continue
+        fit, *others = ((before if k == 0 and last > 0 else after)[j].force.rms for j in range(len(after)))
+        out.append(replace(r, fit=fit, validation=np.max(others, axis=0) if others else None))
+    return tuple(out)
 
 
 def _rms(search: Search, samples: cand.CandidateSamples, theta: np.ndarray) -> np.ndarray:

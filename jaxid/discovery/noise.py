@@ -24,7 +24,9 @@ _POINTS = 1024
 _FILLINGS = 2
 
 
-def sensor_colour(machine: Machine, log: Log, data: Prepared) -> tuple[NoiseModel, ...]:
+def sensor_colour(
+    machine: Machine, log: Log, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None
+) -> tuple[NoiseModel, ...]:
     """Model the noise that the sensors cause in the balance at the kept samples, by joint.
 
     Position noise enters with the square of the frequency and spans four decades in power. A short residual
@@ -36,12 +38,11 @@ def sensor_colour(machine: Machine, log: Log, data: Prepared) -> tuple[NoiseMode
         machine: The machine; its parameters enter through the impedance only.
         log: The log before preparation.
         data: The same log, prepared.
+        force_noise: Standard deviation of the logged force in its units, (m,), if the case states none; None:
+            that of its high band.
     """
-    force_noise = None
-    if machine.sensor.force_noise is None:
-        force_noise = signals.high_band_std(log.force)
-        if data.recipe.median:
-            force_noise = force_noise / signals.median_noise(data.recipe.median)
+    if machine.sensor.force_noise is None and force_noise is None:
+        force_noise = high_band_force_noise(log, data)
     f, power = noise_density(machine, log, data, force_noise)
     step = data.recipe.decimation
     rate = log.rate_hz / step
@@ -54,6 +55,12 @@ def sensor_colour(machine: Machine, log: Log, data: Prepared) -> tuple[NoiseMode
         folded = _folded(np.interp(grid, f, density), step) + numerics / (rate / 2)
         models.append(NoiseModel.of_density(folded, rate, _ORDER))
     return tuple(models)
+
+
+def high_band_force_noise(log: Log, data: Prepared) -> Float[np.ndarray, " m"]:
+    """Estimate the standard deviation of the logged force from its high band, in its units, (m,)."""
+    force_noise = signals.high_band_std(log.force)
+    return force_noise / signals.median_noise(data.recipe.median) if data.recipe.median else force_noise
 
 
 def _folded(density: np.ndarray, step: int) -> np.ndarray:

@@ -63,7 +63,7 @@ class Cogging(Effect):
 
     amplitude: Array = parameter("force", "positive", "A")
     period: Array = parameter("position", "positive", "pitch of the ripple")
-    phase: Array = parameter("1", "free", "rad, at q = 0")
+    phase: Array = parameter("angle", "free", "of the ripple at q = 0")
 
     def act(self, x: Signals, state: None) -> Action:
         return Action(force=-self.amplitude * jnp.cos(2 * jnp.pi * x.y / self.period + self.phase))

@@ -29,6 +29,8 @@ class Estimate:
         steps: Number of evaluations of the Jacobian.
         notes: Remarks for a user on how the fit was done.
         details: Further results of the method, by their key in `result.json`.
+        std_misspecified: Standard deviations of the values that fit best, which hold even if the model is
+            incomplete, (p,), see `jaxid.numerics.misspecified`; None if the method has none.
     """
 
     method: str
@@ -42,6 +44,7 @@ class Estimate:
     steps: int = 1
     notes: tuple[str, ...] = field(default=())
     details: Mapping[str, Any] = field(default_factory=dict)
+    std_misspecified: Float[np.ndarray, " p"] | None = None
 
     @property
     def names(self) -> list[str]:

@@ -22,6 +22,7 @@ from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.force_balance import ForceData, _size, force_residual, sharpened
 
@@ -29,6 +30,8 @@ from jaxid.simulation.force_balance import ForceData, _size, force_residual, sha
 _UNDAMPED = 1e-10
 # Factors on the guess of a shape parameter for additional starts.
 _SHAPES = (0.3, 3.0)
+# Dimensions of parameters of which such factors are no sizes.
+_NO_SHAPES = ("1", "angle")
 # Shares of the dry friction that additional starts put on joints without an encoder.
 _SHARES = (0.2, 0.5, 0.8)
 
@@ -120,6 +123,7 @@ def inverse_dynamics_steps(
         residual=np.where(rows, e, np.nan),
         samples=int(rows.sum()),
         steps=int(fit.steps),
+        std_misspecified=std_under_misspecification(jacobian, e, rows),
     )
 
 
@@ -177,7 +181,7 @@ def shape_starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
         if f.path[0] != "effects":
             continue
         info = _info(machine.plant, f)
-        if info is not None and not carries_force(info) and info.dimension != "1" and theta[k] > 0:
+        if info is not None and not carries_force(info) and info.dimension not in _NO_SHAPES and theta[k] > 0:
             out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _SHAPES]
     return out
 

@@ -28,6 +28,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess, full_hessian, hessian_notes
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
@@ -295,6 +296,7 @@ def output_error_steps(
         steps=int(minimum.steps),
         notes=(*notes_of(machine, numerics, log, on, minimiser), *remarks),
         details={"profiles": profiles} if profile else {},
+        std_misspecified=std_under_misspecification(jacobian[..., active], e, counts)[:p],
     )
 
 

@@ -86,6 +86,7 @@ class Scales:
     def natural(self, dimension: str) -> float:
         """Return the size at which a parameter of this dimension would explain all of the force."""
         base = {
+            "angle": 1.0,
             "force": self.force,
             "position": self.position,
             "time": self.position / self.velocity,

@@ -30,10 +30,10 @@ class Units:
         """Turn a dimension such as "force*time/position" into a label such as "N s/m".
 
         Args:
-            dimension: Product of force, position, time and inertia.
+            dimension: Product of force, position, time and inertia; "1", or "angle" for a phase.
             motion: Motion of a joint that differs from the others; None: that of the machine.
         """
-        labels = dict(_LABELS[motion or self.motion])
+        labels = dict(_LABELS[motion or self.motion]) | {"angle": "rad"}
         if self.position is not None or self.force is not None:
             labels["position"] = self.position or labels["position"]
             labels["force"] = self.force or labels["force"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import TYPE_CHECKING
 
 from jaxid.results import as_json, as_text
@@ -20,14 +21,15 @@ def identification_html(result: Identification) -> str:
     estimate = result.estimate
     head = f"{estimate.method}: {estimate.message}, {estimate.samples} samples"
     gap = as_text.gap_rows(result.session, result.gaps, result.noise_floor)
-    return _parameters(result, head) + html_table(gap)
+    return _findings(result) + _parameters(result, head) + html_table(gap)
 
 
 def discovery_html(result: Discovery) -> str:
     """Return the verdict, the parameters and the steps of a discovery."""
     effects = f": {', '.join(e.label for e in result.effects)}" if result.effects else ""
     steps = as_text.step_rows(as_json.discovery_json(result))
-    return _parameters(result, f"{result.verdict.replace('_', ' ')}{effects}") + html_table(steps)
+    caption = f"{result.verdict.replace('_', ' ')}{effects}"
+    return _findings(result) + _parameters(result, caption) + html_table(steps)
 
 
 def check_html(result: Check) -> str:
@@ -40,6 +42,14 @@ def study_html(result: Study) -> str:
     return html_table(as_text.study_rows(result), as_text.study_summary(result).splitlines()[0])
 
 
+def _findings(result: FitResult) -> str:
+    """Return the findings as a list, the first as a paragraph above it."""
+    first, *others = (escape(finding) for finding in result.findings)
+    below = "".join(f"<li>{text}</li>" for text in others)
+    return f"<p><b>{first}</b></p>" + (f"<ul>{below}</ul>" if below else "")
+
+
 def _parameters(result: FitResult, caption: str) -> str:
     derived = as_json.derived(result.session, result.estimate)
-    return html_table(as_text.parameter_rows(result.estimate, derived), caption)
+    incomplete = result.model_complete is False
+    return html_table(as_text.parameter_rows(result.estimate, derived, incomplete=incomplete), caption)

@@ -25,11 +25,20 @@ if TYPE_CHECKING:
     from jaxid.gap import Gap
     from jaxid.model.plant import Plant
     from jaxid.model.unknowns import Free
+    from jaxid.results.result import FitResult
     from jaxid.session import Session
 
 
-def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return value, standard deviation, unit and identifiability by name, and plant lists as lists."""
+def parameters_json(
+    estimate: Estimate, names: Sequence[str] | None = None, *, incomplete: bool = False
+) -> dict[str, Any]:
+    """Return value, standard deviation, unit and identifiability by name, and plant lists as lists.
+
+    Args:
+        estimate: The estimate.
+        names: Names of the parameters to return; None: all.
+        incomplete: Whether the model is incomplete, so that the deviations that hold then stand beside.
+    """
     out: dict[str, Any] = {}
     plant = estimate.machine.plant
     rows = zip(
@@ -39,7 +48,9 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
         estimate.identifiable,
         strict=True,
     )
-    for f, value, std, told in rows:
+    known_more = {"std_misspecified": estimate.std_misspecified} if incomplete else {}
+    more = {key: std for key, std in known_more.items() if std is not None}
+    for k, (f, value, std, told) in enumerate(rows):
         if names is not None and f.name not in names:
             continue
         entry = {
@@ -47,12 +58,15 @@ def parameters_json(estimate: Estimate, names: Sequence[str] | None = None) -> d
             "std": float(std) if told else None,
             "unit": f.unit,
             "identifiable": bool(told),
+            **{key: float(s[k]) if told and np.isfinite(s[k]) else None for key, s in more.items()},
         }
         if f.index is None:
             out[f.name] = entry
             continue
         listed = out.setdefault(_key(f), _known(np.asarray(leaf(plant, f.path)), f.unit))
-        for key in ("value", "std", "identifiable"):
+        for key in more:
+            listed.setdefault(key, np.full(np.shape(listed["value"]), None).tolist())
+        for key in ("value", "std", "identifiable", *more):
             *row, at = np.atleast_1d(f.index)
             (listed[key][row[0]] if row else listed[key])[at] = entry[key]
     return out
@@ -154,6 +168,16 @@ def derived_json(session: Session, estimate: Estimate) -> dict[str, Any]:
     return {"derived": entries} if entries else {}
 
 
+def judgement_json(result: FitResult) -> dict[str, Any]:
+    """Return the verdict on the model, with its reasons, as keys of result.json and discovery.json."""
+    judgement = result.judgement
+    return {
+        "model_complete": judgement.model_complete,
+        "explains_log": judgement.explains,
+        "findings": list(judgement.findings),
+    }
+
+
 def identification_json(result: Identification) -> dict[str, Any]:
     """Return the content of result.json."""
     estimate = result.estimate
@@ -161,8 +185,9 @@ def identification_json(result: Identification) -> dict[str, Any]:
         "method": estimate.method,
         "converged": estimate.converged,
         "message": estimate.message,
+        **judgement_json(result),
         "samples": estimate.samples,
-        "parameters": parameters_json(estimate),
+        "parameters": parameters_json(estimate, incomplete=result.model_complete is False),
         **derived_json(result.session, estimate),
         "covariance": covariance_of(estimate).json(),
         "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
@@ -247,6 +272,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
     return {
         "verdict": result.verdict,
         "converged": result.converged,
+        **judgement_json(result),
         "where": where_json(result),
         "effects": [effect_json(e, result.after) for e in result.effects],
         "experiments": [proposal_json(p, machine) for p in result.proposals],
@@ -273,7 +299,11 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
                 "after": _worst(after[judged], "simulation.rms"),
             },
         },
-        "parameters": {k: v for k, v in parameters_json(result.after).items() if k in declared},
+        "parameters": {
+            k: v
+            for k, v in parameters_json(result.after, incomplete=result.model_complete is False).items()
+            if k in declared
+        },
         **derived_json(result.session, result.after),
         "covariance": covariance_of(result.after).json(),
         "unidentifiable": [{"combination": c} for c in result.after.precision.unidentifiable],

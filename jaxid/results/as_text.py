@@ -29,6 +29,19 @@ if TYPE_CHECKING:
 _PARTIAL = 6
 # Stands in tables in place of a standard deviation.
 UNIDENTIFIABLE = "not identifiable from this log"
+# Head of the standard deviations that hold for an incomplete model, and what they are.
+INCOMPLETE = "std of the best fit"
+_INCOMPLETE_WORDS = (
+    f"{INCOMPLETE}: scatter over logs of this kind, about the values with which this model fits them best; "
+    "those are not the machine's"
+)
+# Name of the noise floor in the table of gaps, and what it is.
+FLOOR = "noise floor"
+_FLOOR_WORDS = "noise floor: RMS force that the sensors' noise alone leaves in the band of the filter"
+_EVIDENCE_WORDS = (
+    "evidence: gain in log-likelihood on stretches of the log that a fit did not use, in nats (natural "
+    "logarithm): e to that power is the odds in favour"
+)
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
@@ -38,14 +51,23 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def parameter_rows(estimate: Estimate, derived: Sequence[Derived] = ()) -> list[list[str]]:
-    """Return a header, and value, standard deviation and unit of every parameter and derived quantity."""
-    rows = [["parameter", "value", "std", "unit"]]
+def parameter_rows(
+    estimate: Estimate, derived: Sequence[Derived] = (), *, incomplete: bool = False
+) -> list[list[str]]:
+    """Return a header, and value, standard deviation and unit of every parameter and derived quantity.
+
+    With an incomplete model the deviations that hold then stand in a column of their own.
+    """
+    beside = estimate.std_misspecified if incomplete else None
+    rows = [["parameter", "value", "std", *([] if beside is None else [INCOMPLETE]), "unit"]]
     free = estimate.machine.parameters.free
-    for f, value, std, ok in zip(free, estimate.theta, estimate.std, estimate.identifiable, strict=True):
+    for k, f in enumerate(free):
+        value, std, ok = estimate.theta[k], estimate.std[k], estimate.identifiable[k]
         shown = with_std(value, std) if ok else ("-", UNIDENTIFIABLE)
-        rows.append([f.name, *shown, f.unit])
-    rows += [[d.name, *with_std(d.value, d.std), d.unit] for d in derived if np.isfinite(d.std)]
+        more = [] if beside is None else [with_std(value, beside[k])[1] if ok else "-"]
+        rows.append([f.name, *shown, *more, f.unit])
+    more = [] if beside is None else ["-"]
+    rows += [[d.name, *with_std(d.value, d.std), *more, d.unit] for d in derived if np.isfinite(d.std)]
     return rows
 
 
@@ -57,7 +79,7 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
         ["gap", "fit", "validation", "unit"],
         ["force", _number(gap["fit"]), _number(gap["validation"]), joined(gap["unit"])],
         ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
-        ["noise floor", _number(gap["noise_floor"]), "", joined(gap["unit"])],
+        [FLOOR, _number(gap["noise_floor"]), "", joined(gap["unit"])],
         [
             "simulated position",
             _number(simulation["fit"]),
@@ -65,6 +87,14 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
             joined(simulation["unit"]),
         ],
     ]
+
+
+def _parameters_text(result: FitResult) -> str:
+    """Return the table of parameters, with a line below it if the model is incomplete."""
+    derived = results.derived(result.session, result.estimate)
+    incomplete = result.model_complete is False
+    rows = parameter_rows(result.estimate, derived, incomplete=incomplete)
+    return aligned(rows) + (f"\n{_INCOMPLETE_WORDS}" if INCOMPLETE in rows[0] else "")
 
 
 def _number(value: Any) -> str:
@@ -77,7 +107,7 @@ def identification_table(result: Identification) -> str:
     """Return the text that `identify` prints."""
     session, estimate = result.session, result.estimate
     head = f"{estimate.method}: {estimate.message}, {estimate.samples} samples"
-    parameters = aligned(parameter_rows(estimate, results.derived(session, estimate)))
+    parameters = _parameters_text(result)
     below = [
         *_identifiable_combinations(estimate.details.get("directions", [])),
         *_unidentifiable(estimate),
@@ -86,21 +116,26 @@ def identification_table(result: Identification) -> str:
         *(_minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []),
     ]
     gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
-    return "\n".join([head, "", parameters, *below, "", gap, *_notes(results.notes(session, estimate))])
+    notes = _notes(results.notes(session, estimate))
+    return "\n".join([*result.findings, "", head, "", parameters, *below, "", gap, _FLOOR_WORDS, *notes])
 
 
 def identification_summary(result: Identification) -> str:
     """Return an identification in a few lines."""
     estimate = result.estimate
     head = f"Identification of {result.session.case.name} by {estimate.method}: {estimate.message}"
-    return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
+    return "\n".join([head, *_indented(result), *lines_of(result.parameters), _gap_line(result)])
+
+
+def _indented(result: FitResult) -> list[str]:
+    return [f"  {finding}" for finding in result.findings]
 
 
 def discovery_summary(result: Discovery) -> str:
     """Return a discovery in a few lines."""
     effects = ": " + ", ".join(e.label for e in result.effects) if result.effects else ""
     head = f"Discovery in {result.session.case.name}: {result.verdict.replace('_', ' ')}{effects}"
-    return "\n".join([head, *lines_of(result.parameters), _gap_line(result)])
+    return "\n".join([head, *_indented(result), *lines_of(result.parameters), _gap_line(result)])
 
 
 def _gap_line(result: FitResult) -> str:
@@ -132,25 +167,31 @@ def _minimal(content: dict[str, Any]) -> list[str]:
 def discovery_table(result: Discovery) -> str:
     """Return the text that `discover` prints."""
     content = results.discovery_json(result)
-    lines = [f"verdict: {result.verdict}"]
+    lines = [f"verdict: {result.verdict}", *[f"finding: {finding}" for finding in result.findings]]
     if content["where"]:
         lines.append(f"where:   {content['where']['text']}")
     for effect in result.effects:
         others = ", ".join(s.candidate.label for s in effect.alternatives)
         alternatives = f"; not distinguishable from {others} in this log" if others else ""
         lines.append(f"effect:  {effect.label} (evidence {effect.score.evidence:.0f} nats{alternatives})")
+    lines += [_EVIDENCE_WORDS] if result.effects else []
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
 
-    parameters = aligned(parameter_rows(result.after, results.derived(result.session, result.after)))
+    parameters = _parameters_text(result)
     lines += ["", aligned(step_rows(content)), "", parameters, *_unidentifiable(result.after), ""]
 
     gap = content["gap"]
-    lines.append(
-        f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {joined(gap['unit'])} "
-        f"(noise floor {_number(gap['noise_floor'])}); simulated position "
+    position = (
         f"{_number(gap['simulation']['before'])} -> {_number(gap['simulation']['after'])} "
         f"{joined(gap['simulation']['unit'])}"
     )
+    if result.judgement.drifted:
+        position = "drifts off in open loop, see above"
+    lines.append(
+        f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {joined(gap['unit'])} "
+        f"({FLOOR} {_number(gap['noise_floor'])}); simulated position {position}"
+    )
+    lines.append(_FLOOR_WORDS)
     return "\n".join([*lines, *_notes(content["notes"])])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
-from jaxid.results.report.numbers import pretty_unit, with_std
+from jaxid.results.report.numbers import pretty_unit, usual_unit, with_std
 
 if TYPE_CHECKING:
     import pandas
@@ -43,7 +43,8 @@ class Parameter:
     def __str__(self) -> str:
         if not self.identifiable:
             return f"not identifiable [{self.unit}]"
-        return f"{' ± '.join(with_std(self.value, self.std))} {self.unit}"
+        scale, unit = usual_unit(self.unit, self.value, self.std)
+        return f"{' ± '.join(with_std(self.value / scale, self.std / scale))} {unit}".rstrip()
 
 
 class ParameterTable(Mapping[str, Parameter]):

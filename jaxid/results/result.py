@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from jaxid.estimators.estimate import Estimate
     from jaxid.gap import Gap
     from jaxid.results.parameters import Covariance, ParameterTable, Residuals
+    from jaxid.results.verdict import Judgement
     from jaxid.session import Session
 
 
@@ -37,6 +39,24 @@ class FitResult:
     def converged(self) -> bool:
         """The flag of the solver's convergence."""
         return self.estimate.converged
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """The verdict on the model, with its reasons."""
+        from jaxid.results.verdict import judge
+
+        search = getattr(self, "verdict", None)
+        return judge(self.session, self.estimate, self.gaps, search)
+
+    @property
+    def model_complete(self) -> bool | None:
+        """True if the model leaves nothing but the sensors' noise; None if that cannot be decided."""
+        return self.judgement.model_complete
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """The verdict on this result in sentences, the most important first."""
+        return self.judgement.findings
 
     @property
     def parameters(self) -> ParameterTable:

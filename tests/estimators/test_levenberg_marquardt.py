@@ -96,6 +96,22 @@ def test_running_out_of_steps_is_told():
     assert int(minimum.steps) == 2
 
 
+def test_a_fit_that_is_right_has_converged_even_if_its_steps_run_out():
+    """Within a hundredth of a standard deviation of the minimum, not before."""
+    data = DATA + 0.05 * np.random.default_rng(1).standard_normal(len(DATA))
+    whole = fit(unknowns(), data)
+    curvature = np.asarray(whole.jacobian[:, :3].T @ whole.jacobian[:, :3])
+    variance = 2 * float(whole.cost) / len(DATA)
+    ends = [fit(unknowns(), data, max_steps=k, tolerance=0.0) for k in (4, 8, int(whole.steps) - 1)]
+    off = [np.asarray(end.theta - whole.theta)[:3] for end in ends]
+    distance = np.array([np.sqrt(x @ curvature @ x / variance) for x in off])
+    converged = np.array([bool(end.converged) for end in ends])
+    assert converged[-1]
+    assert not converged[0]
+    np.testing.assert_array_less(distance[converged], 0.02)
+    np.testing.assert_array_less(0.005, distance[~converged])
+
+
 def test_a_start_that_is_not_finite_is_told():
     minimum = jax.jit(lambda: fit(unknowns(), DATA * jnp.nan))()
     assert not bool(minimum.converged)

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from jaxid.estimators import METHODS
+from jaxid.results.parameters import Parameter
 from jaxid.results.report import CandidateScore, LogView, SearchStep
 from jaxid.results.report.curves import binned_mean, envelope
-from jaxid.results.report.numbers import plain, pretty_unit, scaled_unit, with_std
+from jaxid.results.report.data import ParameterRow
+from jaxid.results.report.numbers import plain, pretty_unit, scaled_unit, usual_unit, with_std
 from jaxid.results.report.plots import plot_candidates, plot_fit, plot_residual_against
 from jaxid.results.report.study import _answer
 from jaxid.results.report.study_plots import _look, plot_coverage, plot_errors
-from jaxid.results.report.words import GapRow, _gaps_words
+from jaxid.results.report.words import GapRow, _gap_words, _gaps_words, _parameter_line
 
 
 def _view(**changes):
@@ -117,6 +119,26 @@ def test_many_joints_in_one_sentence():
     )
     small = [GapRow("force, joint 1", "fit", "N", after=x) for x in (0.003, 0.001, 0.002)]
     assert _gaps_words("force", small).endswith("is 1.00–3.00 mN (RMS)")
+
+
+def test_a_gap_that_grows_rises_and_one_that_reads_the_same_stays():
+    change = lambda before, after: _gap_words(GapRow("force", "fit", "N", before, after))
+    assert change(4.96, 0.3).endswith("falls from 4.96 N to 0.300 N (RMS)")
+    assert change(0.3, 4.96).endswith("rises from 0.300 N to 4.96 N (RMS)")
+    assert change(0.30001, 0.3).endswith("stays at 0.300 N (RMS)")
+    rows = [GapRow("force, joint 1", "fit", "N", 1.0, x) for x in (3.0, 1.0, 2.0)]
+    assert " rises from 1.00 N to " in _gaps_words("force", rows)
+
+
+def test_usual_units_with_the_digits_of_the_deviation():
+    line = _parameter_line(ParameterRow("cogging.period", 0.02000002, 2.3e-7, "m"))
+    assert (line["value"], line["std"], line["unit"]) == ("20.00002", "0.00023", "mm")
+    line = _parameter_line(ParameterRow("input_delay.delay", 0.0094503, 9.3e-7, "s"))
+    assert (line["value"], line["std"], line["unit"]) == ("9.45030", "0.00093", "ms")
+    assert _parameter_line(ParameterRow("offset", 0.001, 0.11, "N"))["relative"] == "over 100 %"
+    assert usual_unit("m", 0.0, 2e-6) == (1e-6, "µm")
+    assert usual_unit("kg m^2", 1e-5, 1e-7) == (1.0, "kg m²")
+    assert str(Parameter("cogging.period", 0.02000002, 2.3e-7, "m")) == "20.00002 ± 0.00023 mm"
 
 
 def _row(estimator, **numbers):

@@ -106,12 +106,14 @@ def test_identify(folder, capsys, method):
     words = [] if method == "output_error" else ["--method", method]
     ran = run(capsys, "identify", case, log, "--validate", second, *words, folder=folder / method)
     assert (ran.status, ran.err) == (0, "")
-    assert ran.out.startswith(f"{method}: converged, ")
+    assert ran.out.startswith("The model is complete for this log: ")
+    assert f"\n\n{method}: converged, " in ran.out
     assert [(p.stat().st_mtime_ns, p.read_bytes()) for p in inputs] == before
     written = [p.name for p in sorted(ran.folder.iterdir())]
     assert written == [".jaxid", "report.html", "result.json"]
     found = ran.json("result.json")
     assert (found["method"], found["converged"], found["unidentifiable"]) == (method, True, [])
+    assert found["model_complete"] is found["explains_log"] is True
     assert 0 < found["samples"] <= 2000
     assert isinstance(found["samples"], int)
     assert {*found["parameters"]} == {*TRUTH}
@@ -177,6 +179,7 @@ def test_discover_adds_nothing_where_nothing_is_missing(folder, capsys):
     assert found["gap"]["on"] == "fit"
     (step,) = found["steps"]
     assert step["validation"] is None
+    assert step["fit"] == found["gap"]["before"] == found["gap"]["after"]
     assert step["fit"] < 1.5 * found["gap"]["noise_floor"]
     near_truth(found["parameters"])
     assert ran.out.startswith("verdict: nothing_missing\n")

@@ -34,7 +34,8 @@ _WHOLE = 1e-2
 _BODY_STEPS = 500
 _BODY_TOLERANCE = 1e-9
 # It has also converged if the cost exceeds a known lower bound by no more than this part of itself, divided
-# by the number of residuals: also a hundredth of a standard deviation.
+# by the number of residuals: also a hundredth of a standard deviation. If the steps have run out, the fall
+# that the whole step predicts must be as small.
 _SURE = 1e-4
 # It has also converged if a step fails to lower the cost with a damping above _STUCK and a predicted fall of
 # at most _ROUGH, with 10^4 samples a tenth of a standard deviation.
@@ -269,7 +270,10 @@ def levenberg_marquardt(
         lambda x, args: on_scale(x), solver, x0, options=options, max_steps=max_steps, throw=False
     )
     # The value equals that of the state, but only the value carries the implicit derivatives.
-    return replace(solution.state, x=solution.value).minimum(transform)
+    minimum = replace(solution.state, x=solution.value).minimum(transform)
+    moves = jnp.ones(x0.size, bool) if active is None else jnp.asarray(active)
+    size = jax.eval_shape(residual, theta).size
+    return replace(minimum, converged=minimum.converged | _at_minimum(solution.state, size, bounds, moves))
 
 
 def descend(
@@ -464,6 +468,19 @@ def _advanced(
         small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
         aux,
     )
+
+
+def _at_minimum(p: Progress, size: int, bounds: tuple[Array, Array], moves: Bool[Array, " p"]) -> Array:
+    """Check that the whole step from the best point would lower the cost by far less than noise.
+
+    A cost that rounding or sticking makes rough may fall a little at every step until the steps run out.
+    """
+    lower, upper = bounds
+    moves = moves & (p.scale * jnp.sqrt(jnp.diag(p.normal)) > p.nothing)
+    pressed = ((p.x <= lower) & (p.gradient > 0)) | ((p.x >= upper) & (p.gradient < 0))
+    change = _step(p.gradient, p.normal, jnp.asarray(0.0), moves & ~pressed)
+    fall = -change @ p.gradient - 0.5 * change @ p.normal @ change
+    return jnp.isfinite(p.cost) & (fall >= 0) & (fall <= _SURE / size * p.cost)
 
 
 def _step(gradient: Array, normal: Array, damping: Array, free: Bool[Array, " p"]) -> Array:

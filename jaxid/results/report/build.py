@@ -53,7 +53,8 @@ def identification_report(result: Identification) -> str:
             coefficients=tuple(rows),
             statistics=tuple(below),
             history=history_of(result.estimate),
-            **_common(session, result.estimate, content["notes"]),
+            **_judged(result),
+            **_common(session, result.estimate, content["notes"], incomplete=result.model_complete is False),
         )
     )
 
@@ -76,7 +77,8 @@ def discovery_report(result: Discovery) -> str:
             experiments=tuple(_experiment(p, session) for p in result.proposals),
             views=views(result),
             converged=result.converged,
-            **_common(session, result.after, content["notes"]),
+            **_judged(result),
+            **_common(session, result.after, content["notes"], incomplete=result.model_complete is False),
         )
     )
 
@@ -117,11 +119,22 @@ def history_of(estimate: Estimate) -> HistoryView | None:
     )
 
 
-def _common(session: Session, estimate: Estimate, notes: Sequence[str]) -> dict:
+def _judged(result: Identification | Discovery) -> dict:
+    judgement = result.judgement
+    return {
+        "findings": judgement.findings,
+        "model_complete": judgement.model_complete,
+        "explains": judgement.explains,
+        "identified": judgement.identified,
+        "drifted": judgement.drifted,
+    }
+
+
+def _common(session: Session, estimate: Estimate, notes: Sequence[str], *, incomplete: bool) -> dict:
     return {
         "case_name": session.case.name,
         "log_name": Path(session.fit.log.source).name,
-        "parameters": _rows(estimate),
+        "parameters": _rows(estimate, incomplete=incomplete),
         "precision": precision_content(estimate),
         "derived": _derived(session, estimate),
         "units": units_of(session),
@@ -151,18 +164,16 @@ def _units_at(session: Session, joint: int) -> dict[str, str]:
     }
 
 
-def _rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
-    rows = zip(
-        estimate.machine.parameters.free,
-        estimate.theta,
-        estimate.std,
-        estimate.identifiable,
-        strict=True,
-    )
-    return tuple(
-        ParameterRow(f.name, float(v) if ok else None, float(s) if ok else None, f.unit, bool(ok))
-        for f, v, s, ok in rows
-    )
+def _rows(estimate: Estimate, *, incomplete: bool) -> tuple[ParameterRow, ...]:
+    """Return the parameters; of an incomplete model with the deviations that hold for it."""
+    beside = estimate.std_misspecified if incomplete else None
+    out = []
+    for k, f in enumerate(estimate.machine.parameters.free):
+        ok = bool(estimate.identifiable[k])
+        value, std = (float(x[k]) if ok else None for x in (estimate.theta, estimate.std))
+        more = None if beside is None or not ok or not np.isfinite(beside[k]) else float(beside[k])
+        out.append(ParameterRow(f.name, value, std, f.unit, ok, more))
+    return tuple(out)
 
 
 def _derived(session: Session, estimate: Estimate) -> tuple[ParameterRow, ...]:

@@ -89,13 +89,17 @@ class SearchStep:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter; `value` and `std` are None if it is not identifiable."""
+    """One parameter; `value` and `std` are None if it is not identifiable.
+
+    `std_misspecified` is the deviation that holds for an incomplete model; None: not shown.
+    """
 
     name: str
     value: float | None
     std: float | None
     unit: str
     identifiable: bool = True
+    std_misspecified: float | None = None
 
 
 class WherePlot(NamedTuple):
@@ -197,6 +201,11 @@ class ReportData:
         history: History of a recursive estimate; None for any other.
         precision: Content of the section on precision, see `jaxid.results.precision.precision_content`; None
             without parameters.
+        findings: What to know about the result, in sentences, the most important first.
+        model_complete: Whether the model leaves nothing but noise; None if that is not known.
+        explains: Whether the model explains the log at all.
+        identified: Whether the log determines at least one parameter.
+        drifted: Whether the simulated position measures nothing, because an open-loop run drifts.
     """
 
     title: str
@@ -223,3 +232,8 @@ class ReportData:
     within_prior: Mapping | None = None
     history: HistoryView | None = None
     precision: Mapping | None = None
+    findings: tuple[str, ...] = ()
+    model_complete: bool | None = None
+    explains: bool = True
+    identified: bool = True
+    drifted: bool = False

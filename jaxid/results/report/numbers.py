@@ -112,6 +112,21 @@ def scaled_unit(unit: str, values: Iterable) -> tuple[float, str]:
     return 1.0, pretty_unit(unit)
 
 
+def usual_unit(unit: str, value: object, std: object = None) -> tuple[float, str]:
+    """Choose a prefix for a parameter, as `scaled_unit` does; seconds take one too.
+
+    Args:
+        unit: An SI label; any other is kept as it is.
+        value: The estimate; if it is zero, its standard deviation decides.
+        std: Its standard deviation.
+    """
+    size = value if is_number(value) and value else std
+    if not is_number(size) or not size or unit not in {*_SCALED, "s"}:
+        return 1.0, pretty_unit(unit)
+    scale, prefix = next(((s, p) for s, p in _PREFIXES if abs(size) >= 0.1 * s), _PREFIXES[-1])
+    return scale, pretty_unit(prefix + unit)
+
+
 def _fixed(value: float, places: int) -> str:
     text = f"{round(value, places):.{max(places, 0)}f}"
     if float(text) == 0.0:

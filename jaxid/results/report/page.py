@@ -41,6 +41,7 @@ def render(data: ReportData) -> str:
         verdict=tables.verdict_words(data),
         verdict_class=tables.verdict_class(data),
         answer=tables.answer(data),
+        findings=[tables.unbroken(finding) for finding in data.findings[1:]],
         gap=tables.gap_table(data),
         parameters=tables.parameter_lines((*data.parameters, *data.derived)),
         effects=tables.effect_entries(data.effects),

@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from jaxid.model.interface import PLACES
 from jaxid.results.report.data import ParameterRow, ReportData, SearchStep
 from jaxid.results.report.numbers import (
@@ -17,10 +19,15 @@ from jaxid.results.report.numbers import (
     pretty_unit,
     scaled_unit,
     short,
+    usual_unit,
     with_std,
 )
 
 _MOST_INTERVALS = 12
+# Ratio of a gap to the measured signal beyond which its number says nothing.
+_MOST_RELATIVE = 10.0
+# Name of the gap in position.
+SIMULATED = "simulated position"
 # Weights up to this are omitted from the text of a combination.
 SLIGHT = 0.1
 
@@ -41,11 +48,18 @@ class GapRow:
 def verdict_words(data: ReportData) -> str:
     """Return the verdict in plain words, such as "found: coulomb_friction"."""
     if data.verdict == "found":
-        return "found: " + ", then ".join(_named(e, data.effects) for e in data.effects)
+        found = "found: " + ", then ".join(_named(e, data.effects) for e in data.effects)
+        return found if data.explains else f"{found}; the log is not explained"
     if data.verdict is not None:
         return {"nothing_missing": "nothing is missing"}.get(data.verdict, data.verdict)
     if data.converged is False:
         return "did not converge"
+    if not data.explains:
+        return "does not explain the log"
+    if data.parameters and not data.identified:
+        return "nothing identified"
+    if data.model_complete is False:
+        return "the model is incomplete"
     known = sum(row.identifiable for row in data.parameters)
     count = str(known) if known == len(data.parameters) else f"{known} of {len(data.parameters)}"
     return f"{count} parameter{'' if len(data.parameters) == 1 else 's'} identified"
@@ -55,7 +69,9 @@ def verdict_class(data: ReportData) -> str:
     """Name the badge's style: "good", "open" or "bad"."""
     if data.converged is False:
         return "bad"
-    if data.verdict == "unexplained":
+    if not data.explains:
+        return "bad"
+    if data.verdict == "unexplained" or data.model_complete is False or not data.identified:
         return "open"
     if data.verdict is None and not all(row.identifiable for row in data.parameters):
         return "open"
@@ -69,10 +85,16 @@ def answer(data: ReportData) -> str:
         "nothing_missing": "The residual of the declared model is sensor noise",
         "unexplained": "Model and log disagree, and no known effect explains it",
     }
-    lines = [openings.get(data.verdict or "", "The declared model was fitted to the log")]
+    if data.verdict == "found" and not data.explains:
+        openings = {}
+    opening = openings.get(data.verdict or "")
+    first = data.findings[0] if data.findings else "The declared model was fitted to the log"
+    # The finding on a model that a search left as it was says the same.
+    lines = [opening, first] if opening and (data.verdict == "found" or not data.findings) else [first]
 
     # One line for each quantity, of two joints at most one each: the table below has the other logs.
     rows = [r for r in _gap_rows(data) if is_number(r.after)]
+    rows = [r for r in rows if not (data.drifted and r.quantity.startswith(SIMULATED))]
     groups: dict[str, list[GapRow]] = {}
     for row in (r for r in rows if r.log == rows[0].log):
         groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
@@ -258,9 +280,17 @@ def _variable_unit(data: ReportData, variable: str | None) -> str:
 
 def _gap_words(row: GapRow) -> str:
     _, log, before, after, *_ = _gap_cells(row)
-    fall = f"falls from {before} to {after}" if row.before is not None else f"is {after}"
+    fall = _change(before, after, row.before, row.after) if row.before is not None else f"is {after}"
     floor = f", at a noise floor of {_gap_cells(row)[4]}" if is_number(row.floor) else ""
     return f"The {row.quantity} residual on the {log} log {fall} (RMS){floor}"
+
+
+def _change(before: str, after: str, old: float | None, new: float | None) -> str:
+    """Return a change in words; a number that reads the same before and after stays."""
+    if before == after:
+        return f"stays at {after}"
+    rises = old is not None and new is not None and new > old
+    return f"{'rises' if rises else 'falls'} from {before} to {after}"
 
 
 def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
@@ -274,7 +304,11 @@ def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
         return f"{'–'.join(ends)} {unit}".strip() if ends else ""
 
     before, after, floor = (span([getattr(r, k) for r in rows]) for k in ("before", "after", "floor"))
-    fall = f"falls from {before} to {after}" if before else f"is {after}"
+    sizes = [
+        float(np.sqrt(np.sum(np.square([x for r in rows if is_number(x := getattr(r, k))]))))
+        for k in ("before", "after")
+    ]
+    fall = _change(before, after, *sizes) if before else f"is {after}"
     over = f", at noise floors of {floor}" if floor else ""
     return f"The {quantity} residual of the {len(rows)} joints on the {rows[0].log} log {fall} (RMS){over}"
 
@@ -283,7 +317,7 @@ def _gap_rows(data: ReportData) -> list[GapRow]:
     gap = data.gap
     motion = gap.get("simulation") or {}
     force = {"quantity": "force", "unit": gap.get("unit"), "floor": gap.get("noise_floor")}
-    position = {"quantity": "simulated position", "unit": motion.get("unit")}
+    position = {"quantity": SIMULATED, "unit": motion.get("unit")}
     if "before" in gap or "after" in gap:
         log = gap.get("on") or "fit"
         rows = _by_joint(log=log, before=gap.get("before"), after=gap.get("after"), **force)
@@ -344,7 +378,7 @@ def _gap_cells(row: GapRow) -> list[str]:
     ratio = ABSENT
     if after is not None and floor is not None and is_number(after) and is_number(floor) and floor > 0:
         ratio = f"{after / floor:.2f}"
-    return [row.quantity, row.log, *texts, ratio, percent(row.relative)]
+    return [row.quantity, row.log, *texts, ratio, _relative(row.relative, 1.0, most=_MOST_RELATIVE)]
 
 
 def _expanded(row: ParameterRow) -> list[ParameterRow]:
@@ -358,14 +392,30 @@ def _expanded(row: ParameterRow) -> list[ParameterRow]:
     ]
 
 
+def _misspecified(row: ParameterRow, scale: float) -> str | None:
+    """Write the deviation that holds for an incomplete model; None if there is none."""
+    if not is_number(row.std_misspecified) or not is_number(row.value):
+        return None
+    return with_std(row.value / scale, row.std_misspecified / scale)[1]
+
+
+def _relative(part: float | None, whole: float | None, most: float = 1.0) -> str:
+    """Write a part as a percentage; beyond `most` the number says nothing."""
+    if is_number(part) and is_number(whole) and abs(part) > most * abs(whole):
+        return f"over {100 * most:g} %"
+    return percent(part, whole)
+
+
 def _parameter_line(row: ParameterRow) -> dict:
-    value, std = with_std(row.value, row.std) if row.identifiable else (ABSENT, ABSENT)
-    relative = percent(row.std, row.value) if row.identifiable else ABSENT
+    scale, unit = usual_unit(row.unit, row.value, row.std)
+    sizes = [x / scale if is_number(x) else x for x in (row.value, row.std)]
+    value, std = with_std(*sizes) if row.identifiable else (ABSENT, ABSENT)
     return {
         "name": row.name,
         "value": value,
         "std": std,
-        "relative": relative,
-        "unit": pretty_unit(row.unit),
+        "relative": _relative(row.std, row.value) if row.identifiable else ABSENT,
+        "misspecified": _misspecified(row, scale),
+        "unit": unit,
         "identifiable": row.identifiable and is_number(row.value),
     }

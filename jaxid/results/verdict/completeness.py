@@ -1,0 +1,196 @@
+"""Tests of a force residual against the sensors' noise: its colour by a cumulated periodogram, and its size.
+
+The residual is whitened by the spectrum that the sensors' noise has in it. If the model is complete, the
+result is white; missing physics follows the motion and so adds power at low frequencies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.discovery.evidence import Whitener
+from jaxid.discovery.noise import NUMERICS, high_band_force_noise, sensor_colour
+from jaxid.gap import ForceGap, noise_density
+from jaxid.machine import Machine
+from jaxid.numerics.precision import NoiseModel
+from jaxid.session import OpenedLog
+
+# Part of the half sampling rate of the kept samples that holds the band of the filter, see
+# `jaxid.logs.prepare.A_PERIOD`. Beyond it the filtered residual is rounding and errors of numerics.
+_BAND = 0.8
+# A systematic part below this many `NUMERICS` of the force may be an error of filtering and integration.
+_NUMERICS = 2.0
+# Fewer frequencies than this in the band show no colour.
+_FEWEST = 20
+# Excess of the cumulated periodogram over a white one that counts, as a part of the power: on the fitted log,
+# and on others, whose residual also holds the error of the parameters.
+_EXCESS, _EXCESS_ELSEWHERE = 0.05, 0.1
+# Probability that the periodogram of white noise exceeds the limit; there is one test for each joint and log.
+_RARELY = 1e-3
+# Factor in RMS by which a residual of the right colour may exceed the noise, which is known to a few tenths,
+# and standard deviations of its scatter beyond that.
+_LOUDER, _SCATTER = 1.3, 4.0
+# Parts of the high band of the logged force that may be noise of its reading. In a loop the rest is the
+# controller's answer to the encoder's noise, which really acts.
+_SHARES = (1.0, 0.3, 0.1, 0.03, 0.0)
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Comparison of one joint's force residual on one log with the noise.
+
+    Args:
+        log: Name of the log.
+        joint: Index of the joint, 0-based.
+        complete: Whether the residual is noise; None if that cannot be decided.
+        rms: RMS of the residual [N or N m].
+        floor: RMS that the noise leaves in the band [N or N m]; NaN if the noise is not known.
+        excess: Largest excess of the cumulated periodogram over that of noise, as a part of the power.
+        limit: Excess that noise alone exceeds once in a thousand logs.
+        systematic: RMS of the part at low frequencies that is not noise [N or N m].
+        numerics: RMS that errors of filtering and integration may have [N or N m].
+        reason: Reason why `complete` is None; empty if it is not.
+    """
+
+    log: str
+    joint: int
+    complete: bool | None
+    rms: float
+    floor: float
+    excess: float = 0.0
+    limit: float = 1.0
+    systematic: float = 0.0
+    numerics: float = 0.0
+    reason: str = ""
+
+    @property
+    def coloured(self) -> bool:
+        """True if the residual has clearly more power at low frequencies than the noise."""
+        return self.excess > self.limit and self.systematic > self.numerics
+
+
+def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: bool = True) -> list[Residual]:
+    """Compare the force residual of each joint that moves with the sensors' noise.
+
+    Force noise that the case does not state is at most the high band of the logged force; of all levels up to
+    there the one under which the residual is most like noise counts.
+
+    Args:
+        machine: The fitted machine.
+        run: The log.
+        gap: Its gap in force.
+        fitted: Whether the machine was fitted to this log.
+    """
+    joints = np.flatnonzero(np.isfinite(gap.rms)).tolist()
+    force = run.data.at_kept(run.data.force - run.data.force.mean(axis=0))
+    size = float(np.sqrt(np.mean(force**2))) if force.size else 0.0
+    if size == 0:
+        reason = "the log has no force to compare with"
+        return [Residual(run.name, k, None, float(gap.rms[k]), np.nan, reason=reason) for k in joints]
+
+    stated = machine.sensor.force_noise is not None
+    most = high_band_force_noise(run.log, run.data)
+    levels = [None] if stated else [share * most for share in _SHARES]
+    colours = [sensor_colour(machine, run.log, run.data, level) for level in levels]
+    whitened = [_whitened(colour, run, gap) for colour in colours]
+    floors = [_floor(machine, run, level) for level in levels]
+
+    # A joint of an arm may have a thousandth of another's torque; a joint without a drive has none.
+    sizes = np.sqrt(np.mean(gap.measured**2, axis=0))
+    numerics = _NUMERICS * NUMERICS * np.where(sizes > 0, sizes, size)
+    least = _EXCESS if fitted else _EXCESS_ELSEWHERE
+    out = []
+    for joint in joints:
+        tests = [cumulated_excess(z[joint]) for z in whitened]
+        best = int(np.argmin([excess for excess, *_ in tests]))
+        excess, count, power = tests[best]
+        found = Residual(
+            log=run.name,
+            joint=joint,
+            complete=True,
+            rms=float(gap.rms[joint]),
+            floor=float(floors[best][joint]),
+            excess=excess,
+            limit=max(least, float(np.sqrt(-0.5 * np.log(_RARELY) / max(count, 1)))),
+            systematic=systematic_rms(whitened[best][joint], colours[best][joint]),
+            numerics=float(numerics[joint]),
+        )
+        loud = power > _LOUDER**2 + _SCATTER / np.sqrt(max(count, 1))
+        out.append(_decided(found, count, loud=loud, stated=stated))
+    return out
+
+
+def _decided(found: Residual, count: int, *, loud: bool, stated: bool) -> Residual:
+    """Return the comparison with its decision; `loud` says that the residual exceeds the noise."""
+    if found.rms <= found.numerics:
+        return found
+    if count < _FEWEST:
+        return replace(found, complete=None, reason="the log has too few samples in motion")
+    if found.coloured or (loud and stated):
+        return replace(found, complete=False)
+    if loud:
+        reason = (
+            "the residual is louder than the noise of the logged force seems, and [sensor] does not state it"
+        )
+        return replace(found, complete=None, reason=reason, floor=np.nan)
+    return found
+
+
+def cumulated_excess(z: Float[np.ndarray, " row"]) -> tuple[float, int, float]:
+    """Return the largest excess of a series' cumulated periodogram over a white one in the filter's band.
+
+    Of a white series the excess stays below sqrt(-ln(p) / 2 m) with probability 1 - p, m being the number of
+    frequencies.
+
+    Args:
+        z: Whitened residual, (row,).
+
+    Returns:
+        The excess as a part of the power, the number of frequencies, and the mean power in the band.
+
+    Source:
+        Bartlett (1955), An Introduction to Stochastic Processes; Durbin (1969), Biometrika 56, 1-15; the
+        one-sided limit is that of Kolmogorov and Smirnov.
+    """
+    power = np.abs(np.fft.rfft(z))[1:] ** 2
+    power = power[: int(_BAND * len(power))]
+    count, total = len(power), float(power.sum())
+    if count == 0 or total <= 0:
+        return 0.0, count, 0.0
+    excess = np.max(np.cumsum(power) / total - np.arange(1, count + 1) / count)
+    return float(excess), count, total / count / len(z)
+
+
+def systematic_rms(z: Float[np.ndarray, " row"], noise: NoiseModel) -> float:
+    """Return the RMS of what a residual holds beyond its noise at low frequencies, in the residual's unit.
+
+    Args:
+        z: Whitened residual, (row,).
+        noise: Model of the noise by which it was whitened.
+    """
+    power = np.abs(np.fft.rfft(z))[1:] ** 2 / len(z)
+    band = int(_BAND * len(power))
+    beyond = power[:band] - 1.0
+    end = int(np.argmax(np.cumsum(power[:band] - np.mean(power[:band])))) + 1
+    density = noise.density(len(z))[1 : band + 1]
+    return float(np.sqrt(max(2 * np.sum((beyond * density)[:end]) / len(z), 0.0)))
+
+
+def _whitened(
+    colour: tuple[NoiseModel, ...], run: OpenedLog, gap: ForceGap
+) -> list[Float[np.ndarray, " row"]]:
+    """Return the whitened residual of each joint; samples beside a gap follow each other."""
+    e, moving = np.nan_to_num(gap.residual), run.data.moving
+    return [
+        Whitener((colour[k],), moving[:, [k]])(e[:, [k], None])[:, 0] if moving[:, k].any() else np.zeros(0)
+        for k in range(e.shape[1])
+    ]
+
+
+def _floor(machine: Machine, run: OpenedLog, level: np.ndarray | None) -> Float[np.ndarray, " n"]:
+    """Return the RMS force that the noise leaves in the band [N or N m], by joint."""
+    f, power = noise_density(machine, run.log, run.data, level)
+    return np.sqrt(np.trapezoid(power, f, axis=0))

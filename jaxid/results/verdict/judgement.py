@@ -1,0 +1,228 @@
+"""The verdict on a fit, from its parameters, its gaps and the noise, and its findings as sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxid.estimators.estimate import Estimate
+from jaxid.gap import Gap
+from jaxid.results.report.numbers import percent, plain, scaled_unit
+from jaxid.results.verdict.absurd import Remark, remarks_on, undetermined
+from jaxid.results.verdict.completeness import Residual, residuals_of
+from jaxid.session import OpenedLog, Session
+
+# A force residual of this part of the measured force, or a distance of the simulated position of this part of
+# the motion's standard deviation, is of the order of the motion itself.
+_OF_THE_ORDER = 0.5
+# An open-loop run that is off by this part of the motion has drifted away.
+_DRIFTED = 0.1
+# Ratio of gap to noise beyond which the ratio says more than the colour.
+_CLEARLY = 1.3
+# A residual beyond this many times the measured force is told without a number.
+_FAR = 10.0
+# A model that leaves this part of the force explains nothing: the log's columns are in doubt first.
+_NOTHING = 0.9
+# Most sentences on single values; further ones are counted.
+_MOST = 6
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict on a fit.
+
+    Args:
+        model_complete: Whether the model leaves nothing but noise; None if that cannot be decided.
+        explains: Whether the model explains the log at all.
+        identified: Whether the log determines at least one parameter.
+        findings: The reasons as sentences, the most important first.
+        drifted: Whether an open-loop simulation drifts away from a log; its position then measures nothing.
+        residuals: Comparison of each joint's force residual with the noise.
+    """
+
+    model_complete: bool | None
+    explains: bool
+    identified: bool
+    findings: tuple[str, ...]
+    drifted: bool
+    residuals: tuple[Residual, ...]
+
+
+def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str | None = None) -> Judgement:
+    """Judge a fit.
+
+    Args:
+        session: Case and logs.
+        estimate: Parameters and their precision.
+        gaps: Gaps of the fitted machine, the fitted log first.
+        search: Verdict of a search for missing effects; None without one.
+    """
+    residuals = tuple(
+        found
+        for k, (run, gap) in enumerate(zip(session.runs, gaps, strict=True))
+        for found in residuals_of(run.machine(estimate.machine), run, gap.force, fitted=k == 0)
+    )
+    complete = _complete(residuals)
+    if search == "nothing_missing" and complete is False:
+        complete = None
+
+    remarks = remarks_on(session, estimate)
+    blind = undetermined(estimate)
+    identified = len(blind) < len(estimate.names) or not estimate.names
+    against = [*_large_gaps(session, gaps, residuals), *_left(session, gaps)]
+    # A guess may be far off; only beside a residual that is not noise does that question the model.
+    impossible = [r for r in remarks if r.impossible] if complete is not True else []
+    against += [f"{r.text}." for r in impossible]
+
+    findings = [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
+    if against:
+        findings.append(f"This model does not explain the log: {against[0]}")
+        findings += [_capital(text) for text in against[1:]]
+    if not identified:
+        findings.append("This log determines none of the unknowns.")
+    worst = max((float(np.nanmax(g.force.relative, initial=0.0)) for g in gaps), default=0.0)
+    doubtful = bool(against) and worst >= _NOTHING
+    if doubtful:
+        findings.append(
+            "Check first that the columns of position and force are the right ones, with sign, unit and gain."
+        )
+    findings += _completeness_words(session, residuals, complete, None if doubtful else search or "none")
+    others = [r for r in remarks if r not in impossible]
+    findings += _remark_words(others)
+    drifted = _drifted(session, gaps)
+    findings += drifted
+    return Judgement(complete, not against, identified, tuple(findings), bool(drifted), residuals)
+
+
+def _complete(residuals: Sequence[Residual]) -> bool | None:
+    """Return False if any residual is more than noise, None if any is undecided or there is none."""
+    decided = [r.complete for r in residuals]
+    if False in decided:
+        return False
+    return None if None in decided or not decided else True
+
+
+def _place(session: Session, log: str, joint: int) -> str:
+    """Return the place of a number in words: joint and log, where there are several."""
+    joints = int(np.sum(session.fit.log.measured))
+    at = f" at joint {joint + 1}" if joints > 1 else ""
+    on = f" on the log {log}" if log != session.fit.name else ""
+    return at + on
+
+
+def _large_gaps(session: Session, gaps: Sequence[Gap], residuals: Sequence[Residual]) -> list[str]:
+    """Return sentences on residuals of the order of the measured force."""
+    noise = {(r.log, r.joint) for r in residuals if r.complete}
+    out = []
+    for gap in gaps:
+        for joint, relative in enumerate(gap.force.relative):
+            if np.isfinite(relative) and relative >= _OF_THE_ORDER and (gap.name, joint) not in noise:
+                where = _place(session, gap.name, joint)
+                much = f"leaves {percent(relative)} of the measured force unexplained"
+                if relative > _FAR:
+                    much = f"is off by more than {_FAR:g} times the measured force"
+                out.append((relative, f"it {much}{where}."))
+    return [text for _, text in sorted(out, key=lambda entry: -entry[0])]
+
+
+def _left(session: Session, gaps: Sequence[Gap]) -> list[str]:
+    """Return sentences on simulated loops that leave the log."""
+    out = []
+    for run, gap in zip(session.runs, gaps, strict=True):
+        if not _looped(session, run):
+            continue
+        on = "" if run.name == session.fit.name else f" on the log {run.name}"
+        if gap.simulation is None:
+            out.append(f"the simulated loop diverges{on}.")
+            continue
+        off = _off(run, gap)
+        worst = int(np.argmax(off))
+        if off[worst] >= _OF_THE_ORDER:
+            text = f"the simulated loop leaves it, by {percent(off[worst])} of the motion"
+            out.append(f"{text}{_place(session, run.name, worst)}.")
+    return out
+
+
+def _looped(session: Session, run: OpenedLog) -> bool:
+    """Check that a log is simulated in its loop."""
+    machine = session.machine
+    known = run.log.reference is not None or machine.unknown_reference is not None
+    return machine.controller is not None and known
+
+
+def _off(run: OpenedLog, gap: Gap) -> np.ndarray:
+    """Return the RMS distance of a simulation over the standard deviation of the motion, by joint."""
+    assert gap.simulation is not None, "the simulation of this gap has run"
+    spread = np.std(run.log.filled, axis=0)
+    off = np.nan_to_num(gap.simulation.rms / np.where(spread > 0, spread, np.inf))
+    return np.where(run.log.measured, off, 0.0)
+
+
+def _drifted(session: Session, gaps: Sequence[Gap]) -> list[str]:
+    """Return a sentence on open-loop simulations that drift away from their log."""
+    for run, gap in zip(session.runs, gaps, strict=True):
+        if _looped(session, run):
+            continue
+        if gap.simulation is None or np.max(_off(run, gap)) >= _DRIFTED:
+            return [
+                "The simulated position is no measure here: without a controller the simulation runs in open "
+                "loop, where any small error of the force decides when friction sticks and grows with time."
+            ]
+    return []
+
+
+def _completeness_words(
+    session: Session, residuals: Sequence[Residual], complete: bool | None, search: str | None
+) -> list[str]:
+    """Return the sentences on the completeness of the model; `search` is "none" if one may help."""
+    if complete:
+        with_it = "With what was found the" if search == "found" else "The"
+        return [f"{with_it} model is complete for this log: what it leaves has the size and colour of noise."]
+    if complete is None:
+        reason = next((r.reason for r in residuals if r.complete is None), "")
+        if not reason and search == "nothing_missing":
+            reason = "the residual is not quite noise, and no known effect accounts for it"
+        return [
+            f"Whether the model is complete is not known: {reason or 'the log has no samples in motion'}."
+        ]
+    worst = max((r for r in residuals if r.complete is False), key=_severity)
+    what = {
+        "found": "With what was found the model is still incomplete",
+        "unexplained": "The model is incomplete, and no known effect explains it",
+    }.get(search or "", "The model is incomplete")
+    lines = [f"{what}: {_residual_words(session, worst)}."]
+    lines.append(
+        "The standard deviations count noise only: the values are those that fit best in this model, and the "
+        "machine's may differ by more."
+    )
+    if search == "none":
+        lines.append("The command jaxid discover searches for what is missing.")
+    return lines
+
+
+def _severity(r: Residual) -> float:
+    return r.rms / r.floor if np.isfinite(r.floor) and r.floor > 0 else r.excess
+
+
+def _residual_words(session: Session, r: Residual) -> str:
+    """Return in words how a residual differs from noise."""
+    scale, unit = scaled_unit(session.machine.unit("force", r.joint), [r.rms, r.floor])
+    where = _place(session, r.log, r.joint)
+    ratio = r.rms / r.floor if np.isfinite(r.floor) and r.floor > 0 else np.nan
+    sizes = f"{plain(r.rms / scale)} {unit}"
+    if np.isfinite(ratio) and ratio > _CLEARLY:
+        noise = f"{plain(r.floor / scale)} {unit} that the sensors' noise leaves"
+        return f"the force gap of {sizes}{where} is {plain(ratio, 2)} times the {noise}"
+    return f"the force gap of {sizes}{where} follows the motion, which noise does not"
+
+
+def _remark_words(remarks: Sequence[Remark]) -> list[str]:
+    lines = [f"{r.text}." for r in remarks[:_MOST]]
+    return lines + ([f"{len(remarks) - _MOST} more values are in question."] if len(remarks) > _MOST else [])
+
+
+def _capital(text: str) -> str:
+    """Begin a sentence with a capital, unless it begins with the name of a parameter."""
+    return text[0].upper() + text[1:] if text.startswith(("it ", "the ")) else text
