@@ -22,6 +22,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples
 from jaxid.simulation.law import noise_free_command, reading_noise
@@ -345,6 +346,7 @@ def _estimate(
         converged=converged,
         message="converged" if converged else f"no convergence within {steps} steps",
         residual=np.where(counts, z, np.nan),
+        std_misspecified=std_under_misspecification(jacobian, z, counts),
         samples=int(counts.sum()),
         steps=steps,
         notes=tuple(notes),
