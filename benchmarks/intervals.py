@@ -76,7 +76,7 @@ def flexible_axis(seed: int, loop: str, sensor: str) -> tuple[str, dict[str, np.
     count = flexible_axes.COUNT
     read = Sensor(position_resolution=count, position_noise=count, force_noise=0.05)
     law = {"kp": 40.0, "kv": 320.0, "velocity_average": 2}
-    pulses = {"level": 4.0, "on": 0.012, "off": 0.119, "start": 0.25}
+    pulses = {"level": 4.0, "on": 0.012, "off": 0.119, "start": 0.2505}
     run = flexible_axes.record(
         flexible_axes.machine(**true),
         duration=SAMPLES / 1000.0,

@@ -36,6 +36,7 @@ from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect
 from jaxid.session import Session, open_session
 from jaxid.simulation.force_balance import ForceData
+from jaxid.simulation.sensor_noise import force_noise
 from jaxid.simulation.solvers import SOLVERS
 from jaxid.simulation.step_size import TooStiffError
 
@@ -313,7 +314,14 @@ def _refit_innovations(session: Session, start: Estimate) -> Estimate:
     """Refit by prediction error from the force-domain fit; keep the latter if the force gap grows."""
     machine, run = session.machine, session.fit
     rest = np.asarray(run.data.recipe.rest_velocity)
-    estimate = prediction_error(machine, run.log, start=start.theta, alone=True, rest_velocity=rest)
+    estimate = prediction_error(
+        machine,
+        run.log,
+        start=start.theta,
+        rest_velocity=rest,
+        command_noise=force_noise(machine, run.data),
+        alone=True,
+    )
     if not estimate.converged:
         note = f"prediction error: {estimate.message}; the parameters are those of inverse dynamics"
         return replace(start, notes=(*start.notes, note))

@@ -85,11 +85,11 @@ def _output_error(
 
 def _doubts_of_output_error(session: Session) -> list[str]:
     """Return why the standard deviations of output error may be too small on a log, a sentence each."""
-    from jaxid.simulation.law import reading_noise
+    from jaxid.simulation.sensor_noise import force_noise
 
     machine, log = session.machine, session.fit.log
     if machine.controller is None:
-        noise = reading_noise(log)
+        noise = force_noise(machine, session.fit.data)
         if np.any(noise > 1e-3 * np.std(log.force, axis=0)):
             return [
                 "an open-loop simulation takes the logged force as exact, but it holds noise of about "
@@ -148,17 +148,18 @@ def _within_prior(
 def _prediction_error(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.prediction_error import prediction_error_steps
+    from jaxid.simulation.sensor_noise import force_noise
 
     machine, run = session.machine, session.fit
     first = yield from inverse_dynamics_steps(machine, run.data)
-    start = first.theta if first.all_identified else None
     return (
         yield from prediction_error_steps(
             machine,
             run.log,
-            start=start,
+            start=first.theta if first.all_identified else None,
             numerics=numerics,
             rest_velocity=np.asarray(run.data.recipe.rest_velocity),
+            command_noise=force_noise(machine, run.data),
         )
     )
 

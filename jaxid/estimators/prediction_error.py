@@ -25,7 +25,7 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples
-from jaxid.simulation.law import noise_free_command, reading_noise
+from jaxid.simulation.law import noise_free_command
 from jaxid.simulation.replay import Numerics, exact_numerics
 from jaxid.simulation.sensor_noise import position_noise
 
@@ -130,6 +130,7 @@ def prediction_error(
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     rest_velocity: np.ndarray | None = None,
+    command_noise: np.ndarray | None = None,
     alone: bool = False,
 ) -> Estimate:
     """Fit the unknowns, the noise of the force and the noise of the readings by maximum likelihood.
@@ -146,6 +147,8 @@ def prediction_error(
         numerics: Settings of the integration; None: exact sticking and the steps that the plant needs.
         rest_velocity: Speed below which a sample of a machine with dry friction does not count, unless the
             force is free of noise, (n,) [m/s or rad/s]; None: all samples count.
+        command_noise: Standard deviation with which the command was read, (m,), whose bias is removed; None:
+            it was logged exactly.
         alone: Whether `start` is the only start, because it is known to be near the optimum.
 
     Returns:
@@ -159,7 +162,13 @@ def prediction_error(
     """
     return run_alone(
         prediction_error_steps(
-            machine, log, start=start, numerics=numerics, rest_velocity=rest_velocity, alone=alone
+            machine,
+            log,
+            start=start,
+            numerics=numerics,
+            rest_velocity=rest_velocity,
+            command_noise=command_noise,
+            alone=alone,
         )
     )
 
@@ -171,6 +180,7 @@ def prediction_error_steps(
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     rest_velocity: np.ndarray | None = None,
+    command_noise: np.ndarray | None = None,
     alone: bool = False,
 ) -> Steps[Estimate]:
     """Run `prediction_error` as a generator of solve requests."""
@@ -235,14 +245,19 @@ def prediction_error_steps(
         steps += int(scored.steps)
 
     read = np.zeros(len(force))
-    if applied is None:
-        x, read = yield from _corrected_steps(log, problem, scored, theta, floor)
+    if applied is None and command_noise is not None and np.any(command_noise > 0):
+        x, read = yield from _corrected_steps(log, problem, scored, theta, floor, command_noise)
         theta = np.clip(transform.outward(x), *bounds)
     return _estimate(machine, log, np.asarray(theta), scored, counts, applied is not None, read, steps)
 
 
 def _corrected_steps(
-    log: Log, problem: tuple, scored: Scored, theta: Array, floor: np.ndarray
+    log: Log,
+    problem: tuple,
+    scored: Scored,
+    theta: Array,
+    floor: np.ndarray,
+    command_noise: np.ndarray,
 ) -> Steps[tuple[np.ndarray, np.ndarray]]:
     """Remove the bias by noise with which the command was read; return the estimates and the noise.
 
@@ -257,13 +272,14 @@ def _corrected_steps(
         scored: The fit.
         theta: Its estimates, (p,).
         floor: Lower bounds of the logarithms of the noise.
+        command_noise: Noise with which the command was read, (m,).
 
     Source:
         Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
     """
     kalman, p, drives = problem[0], len(theta), log.force.shape[1]
     x = np.asarray(scored.x)
-    read = np.minimum(reading_noise(log), np.exp(x[p : p + drives]))
+    read = np.minimum(command_noise, np.exp(x[p : p + drives]))
     noise = x[p:].copy()
     noise[:drives] += 0.5 * np.log1p((read / np.exp(noise[:drives])) ** 2)
 
