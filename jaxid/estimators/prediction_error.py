@@ -41,6 +41,8 @@ _FLOORS = (1e-2, 1e-3, 1e-4)
 _MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
 # Noise of the force, as a part of it, below which sticking is certain.
 _QUIET = 1e-3
+# Steps of the last fit of such a log for each one before.
+_FINER = 4
 # Pairs of simulated noise for the correction of the bias by noise of the command's reading.
 _PAIRS = 4
 # Eigenvalue of the scaled information, relative to the largest, below which a direction is not corrected.
@@ -238,7 +240,9 @@ def prediction_error_steps(
 
     # Without noise of the force it is known when a joint sticks, and samples at rest count too.
     if slow is not None and applied is not None and np.all(np.exp(noise[: len(force)]) < _QUIET * force):
-        kalman = make_filter(machine, driven, numerics)
+        # So precise a fit shows the error of a step in which a joint comes to rest.
+        finer = replace(numerics, substeps=_FINER * numerics.substeps)
+        kalman = make_filter(machine, driven, finer)
         counts = np.asarray(kalman.used)[:: kalman.every][:, measured]
         problem = (kalman, parameters.places, machine.plant, counts, transform, bounds, high)
         theta, scored = yield SolveRequest(_fit, (*problem, floor, theta, noise, np.asarray(_STEPS)))
