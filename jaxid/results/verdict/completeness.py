@@ -96,7 +96,8 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
     levels = [None] if stated else [share * most for share in _SHARES]
     colours = [sensor_colour(machine, run.log, run.data, level) for level in levels]
     whitened = [_whitened(colour, run, gap) for colour in colours]
-    floors = [_floor(machine, run, level) for level in levels]
+    # The number that is printed is that of the tables, whatever level explains the residual best.
+    floor = _floor(machine, run)
 
     # A joint of an arm may have a thousandth of another's torque; a joint without a drive has none.
     sizes = np.sqrt(np.mean(gap.measured**2, axis=0))
@@ -112,7 +113,7 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
             joint=joint,
             complete=True,
             rms=float(gap.rms[joint]),
-            floor=float(floors[best][joint]),
+            floor=float(floor[joint]),
             excess=excess,
             limit=max(least, float(np.sqrt(-0.5 * np.log(_RARELY) / max(count, 1)))),
             systematic=systematic_rms(whitened[best][joint], colours[best][joint]),
@@ -190,7 +191,7 @@ def _whitened(
     ]
 
 
-def _floor(machine: Machine, run: OpenedLog, level: np.ndarray | None) -> Float[np.ndarray, " n"]:
+def _floor(machine: Machine, run: OpenedLog) -> Float[np.ndarray, " n"]:
     """Return the RMS force that the noise leaves in the band [N or N m], by joint."""
-    f, power = noise_density(machine, run.log, run.data, level)
+    f, power = noise_density(machine, run.log, run.data)
     return np.sqrt(np.trapezoid(power, f, axis=0))
