@@ -305,6 +305,8 @@ def _held_against(
     """
     log, data = opened.log, opened.data
     declared = balance_fits(machine, data)[0]
+    if not declared.finite:
+        return [], None, np.zeros(log.force.shape[1])
     gain = None
     if case.actuator.transmission is None:
         gain = np.broadcast_to(case.actuator.gain, (case.plant.drives,)).tolist()

@@ -53,6 +53,12 @@ class BalanceFit:
         """Names of the unknowns, and of the undeclared forces."""
         return [f.name for f in self.unknowns] + [f"potential {k}" for k in range(self.potential.shape[2])]
 
+    @property
+    def finite(self) -> bool:
+        """True if the balance exists at every sample that counts; it does not at some singular guesses."""
+        parts = (self.columns, self.known, self.potential, self.force)
+        return all(bool(np.all(np.isfinite(x[self.counts]))) for x in parts)
+
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Return columns and force to explain, at the samples that count, joints in parts of their force."""
         every = np.concatenate([self.columns, self.potential], axis=2) / self.scale[:, None]

@@ -227,6 +227,7 @@ def assess(
     scale: Float[np.ndarray, " p"],
     hessian: Float[np.ndarray, "p p"] | None = None,
     crossed: bool = False,
+    solved: Float[np.ndarray, "p p"] | None = None,
 ) -> Precision:
     """Return the precision of a least-squares fit under coloured noise, with its unidentifiable directions.
 
@@ -239,6 +240,8 @@ def assess(
         scale: Natural size of each parameter, (p,), which decides whether its column counts as zero.
         hessian: Full Hessian of half the sum of squares, for the covariance by `hessian_covariance`, (p, p).
             It is not used if it is not positive definite; `kind` of the result says which matrix was.
+        solved: Matrix of the equations that gave the estimate, (p, p), if it is not J'J, as with weights or
+            instruments.
         crossed: Whether the columns of the residual have common noise, such as a reading and the command
             that a loop computes from it; otherwise they count as independent.
 
@@ -252,7 +255,7 @@ def assess(
     norm = np.linalg.norm(flat, axis=0)
     dead = norm * np.abs(scale) <= 1e-9 * signal
     norm = np.where(dead, 1.0, norm)
-    normal = flat.T @ flat / np.outer(norm, norm)
+    normal = (flat.T @ flat if solved is None else solved) / np.outer(norm, norm)
     normal[dead] = 0.0
     normal[:, dead] = 0.0
     meat = np.zeros_like(normal)

@@ -254,7 +254,7 @@ def test_a_class_that_refuses_the_true_values(tmp_path, capsys, monkeypatch, com
     write(tmp_path, source(PARAMETER, act("Action(force=-self.pressure * x.yd)"), check), "mine.py")
     write(tmp_path, more(SIMULATED))
     monkeypatch.chdir(tmp_path)
-    told = "mine.py: Wind.__check_init__ fails (AssertionError: too much, line 14); correct mine.py"
+    told = "mine.py: Wind.__check_init__ fails (ValueError: too much, line 14); correct mine.py"
     refused(capsys, tmp_path, command, "case.toml", *COMMANDS[command], told=told)
 
 

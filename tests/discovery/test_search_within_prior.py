@@ -23,10 +23,9 @@ def logged(data: int, *, noise: float, resolution: float = 0.0, tone: float = 0.
     return Log(time=made["t"], **{k: x[:, None] for k, x in columns.items()}, source=f"data {data}")
 
 
-def case(folder, data: int, *, whole: bool = False, guess=None, resolution: float = 0.0):
+def case(folder, data: int, *, whole: bool = False, resolution: float = 0.0):
     """Without what of the table's friction is not Coulomb's or viscous, or with it; guesses 50 % off."""
-    guess = guess or (None if whole else stages.drawn(4))
-    text = stages.text(data, guess=guess, resolution=resolution, more=PRIOR)
+    text = stages.text(data, guess=None if whole else stages.drawn(4), resolution=resolution, more=PRIOR)
     if not whole:
         start = text.index('[[effects]]\nkind = "velocity_hysteresis"')
         text = text[:start] + text[text.index("[actuator]") :]
@@ -60,10 +59,9 @@ def test_what_a_quiet_log_shows_is_named(tmp_path):
 
 @pytest.mark.parametrize("resolution", [0.0, pytest.param(stages.COUNT, marks=pytest.mark.slow)])
 def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolution):
-    """Data 2, guesses 50 % off: no sample is faster than its rest, so that no balance of forces is there."""
+    """Data 2: no sample is faster than its rest, and there is no balance of forces to look at."""
     log = logged(2, noise=0.01, resolution=resolution)
-    guess = stages.drawn(4, data=2)
-    found = jaxid.discover(case(tmp_path, 2, whole=True, guess=guess, resolution=resolution), log)
+    found = jaxid.discover(case(tmp_path, 2, resolution=resolution), log)
     assert (found.verdict, found.effects, found.where) == ("nothing_missing", (), None)
     (only,) = found.rounds
     assert len(only.step.scores) > 10

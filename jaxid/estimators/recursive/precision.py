@@ -57,7 +57,7 @@ def precision_of(
     jacobian = root[..., None] * weighted
     signal = float(np.linalg.norm(root**2 * rows.force))
     natural = np.where(machine.parameters.guess == 0, 1.0, machine.parameters.guess)
-    precision = assess(names, jacobian, e, counts, signal, natural, flat.T @ flat)
+    precision = assess(names, jacobian, e, counts, signal, natural, solved=flat.T @ flat)
 
     inflation = _inflation(jacobian, e, counts)
     covariance = history.covariance[-1] * np.outer(inflation, inflation)
