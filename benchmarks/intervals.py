@@ -101,7 +101,7 @@ MACHINES: dict[str, tuple[Callable, tuple[str, ...]]] = {
 CELLS = [f"{m}/{loop}/{s}" for m, (_, loops) in MACHINES.items() for loop in loops for s in SENSORS]
 
 
-def run_chunk(cell: str, method: str | None, seeds: list[int]) -> list[dict[str, Any]]:
+def run_chunk(cell: str, method: str | None, seeds: list[int], commit: str) -> list[dict[str, Any]]:
     """Return a record for each seed: deviations of the printed values over their std, or the failure."""
     machine, loop, sensor = cell.split("/")
     cases, logs, truths = [], [], []
@@ -118,7 +118,8 @@ def run_chunk(cell: str, method: str | None, seeds: list[int]) -> list[dict[str,
         seconds = (time.perf_counter() - begin) / len(seeds)
     records = []
     for seed, fit, true in zip(seeds, fits, truths, strict=True):
-        record: dict[str, Any] = {"cell": cell, "asked": method or "chosen", "seed": seed, "seconds": seconds}
+        record: dict[str, Any] = {"cell": cell, "asked": method or "chosen", "seed": seed}
+        record |= {"seconds": seconds, "commit": commit}
         if isinstance(fit, Exception):
             record |= {"failed": str(fit)}
         elif not fit.converged:
@@ -134,18 +135,19 @@ def run_chunk(cell: str, method: str | None, seeds: list[int]) -> list[dict[str,
     return records
 
 
-def table(records: list[dict[str, Any]], commit: str) -> str:
+def table(records: list[dict[str, Any]]) -> str:
     """Return the table of all cells as Markdown."""
     lines = [
         "# Intervals of `identify` on logs of the exact steppers",
         "",
-        f"Written by `python -m benchmarks.intervals` on {date.today()}, commit {commit}.",
+        f"Written by `python -m benchmarks.intervals` on {date.today()}.",
         "Of the values that are printed: the share of 95 % intervals that hold the truth, with the 99 %",
         "range of so many Bernoulli draws at 95 %, and the largest deviation in standard deviations.",
         "Truth, motion and noise are drawn in each run.",
         "",
-        "| cell | method | runs | failed | values | 95 % holds | range | largest | not printed | s a fit |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| cell | method | runs | failed | values | 95 % holds | range | largest | not printed | s a fit "
+        "| commit |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in records:
@@ -160,10 +162,11 @@ def table(records: list[dict[str, Any]], commit: str) -> str:
         share = [100 * x / max(z.size, 1) for x in (low, high)]
         blind = sum(r.get("not_identifiable", 0) for r in of)
         largest = f"{np.abs(z).max():.1f}" if z.size else "-"
+        commits = ", ".join(sorted({r["commit"] for r in of}))
         seconds = np.median([r["seconds"] for r in of])
         lines.append(
             f"| {cell} | {name} | {len(of)} | {failed} | {z.size} | {hold} | "
-            f"{share[0]:.1f}-{share[1]:.1f} % | {largest} | {blind} | {seconds:.2f} |"
+            f"{share[0]:.1f}-{share[1]:.1f} % | {largest} | {blind} | {seconds:.2f} | {commits} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -191,12 +194,12 @@ def main() -> int:
         for cell in options.cell or CELLS:
             missing = [s for s in range(options.runs) if (cell, method or "chosen", s) not in done]
             for at in range(0, len(missing), CHUNK):
-                new = run_chunk(cell, method, missing[at : at + CHUNK])
+                new = run_chunk(cell, method, missing[at : at + CHUNK], commit)
                 with stored.open("a") as file:
                     file.writelines(json.dumps(r) + "\n" for r in new)
                 records += new
                 print(f"{cell} {method or 'chosen'}: {at + len(new)} of {len(missing)}", file=sys.stderr)
-    text = table(records, commit)
+    text = table(records)
     (options.o / "intervals.md").write_text(text)
     print(text)
     return 0
