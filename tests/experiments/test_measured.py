@@ -81,11 +81,23 @@ def test_output_error_sees_the_hold_that_the_published_recipe_does_not(emps):
             assert fitted.value(name) == pytest.approx(seen.value(name), rel=0.02), (on, name)
     assert seen.gaps[1].force.relative[0] < 0.045
     # The published values are of the recipe without the hold: output error is off them by more than 2 %.
-    fitted = jaxid.identify(emps / "emps_recipe.toml", log)
+    fitted = jaxid.identify(emps / "emps_recipe.toml", log, method="output_error")
     off = {name: fitted.value(name) / value - 1 for name, value in PUBLISHED.items()}
     assert abs(off["inertia"]) < 0.01
     assert 0.02 < off["viscous_friction.coefficient"] < 0.035
     assert -0.03 < off["coulomb_friction.level"] < -0.015
+
+
+@needs_data
+def test_the_chosen_method_agrees_with_the_published_values_of_emps(emps):
+    result = jaxid.identify(emps / "emps_recipe.toml", emps / "DATA_EMPS.mat")
+    assert result.estimate.method == "prediction_error"
+    assert result.converged
+    for name, value in PUBLISHED.items():
+        assert result.value(name) == pytest.approx(value, rel=0.02), name
+        std = result.parameters[name].std
+        assert std is not None
+        assert abs(result.value(name) - value) < 1.96 * std
 
 
 @needs_data
