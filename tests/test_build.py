@@ -79,7 +79,7 @@ def test_names_units_and_places(tmp_path):
         "cogging#2.period",
         "cogging#2.phase",
     ]
-    assert [f.unit for f in free] == ["kg", "N s/m", "N", "m", "1"]
+    assert [f.unit for f in free] == ["kg", "N s/m", "N", "m", "rad"]
     assert free[0].lower == 10.0
     assert free[0].true == 95.0
 

@@ -34,7 +34,7 @@ def files(tmp_path, sound):
         ("simulate a -o b.npz", "the log is written as CSV; end its name in .csv"),
         ("simulate a -o nowhere/b.csv", "has no such folder; make the folder first"),
         ("simulate a -o folder.csv", "folder.csv: is a folder"),
-        ("identify a b --method output", "choose one of output_error, within_prior, inverse_dynamics"),
+        ("identify a b --method output", "choose one of output_error, prediction_error, within_prior"),
         ("identify a b --solver tsit6", "solver 'tsit6' is not known; did you mean 'tsit5'?"),
         (
             "identify a b --solver tsit5 --method algebraic",
