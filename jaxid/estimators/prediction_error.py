@@ -23,7 +23,7 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
-from jaxid.numerics.precision import Precision, assess
+from jaxid.numerics.precision import FISHER, Precision, assess
 from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples
 from jaxid.simulation.law import noise_free_command
 from jaxid.simulation.replay import Numerics, exact_numerics
@@ -342,6 +342,7 @@ def _estimate(
     scale = np.where(theta != 0, theta, 1.0)
     effect = np.linalg.norm((jacobian * scale).reshape(-1, len(theta)), axis=0)
     precision = assess(names, jacobian, z, counts, float(np.max(effect, initial=0.0)), scale)
+    precision = replace(precision, kind=FISHER)
     precision = widened(precision, np.einsum("tk,tkp->tp", z, jacobian), jacobian)
 
     noise = np.exp(np.asarray(scored.x)[len(theta) :])
@@ -354,8 +355,8 @@ def _estimate(
         )
     if min(p_values) < _REJECTS:
         notes.append(
-            "the innovations are not white: the model or the noise is incomplete, and the standard "
-            "deviations are those of the coloured innovations"
+            "the innovations are not white (rounding, coloured noise or an incomplete model): the standard "
+            "deviations are widened accordingly"
         )
     converged = bool(scored.converged) and bool(np.all(np.isfinite(theta)))
     return Estimate(

@@ -30,12 +30,14 @@ _COMMON = 40
 # Kinds of covariance in results, and in words where its numbers come from.
 GAUSS_NEWTON, FULL_HESSIAN = "gauss_newton", "full_hessian"
 POSTERIOR, LAPLACE, ROUNDING = "posterior_draws", "laplace", "simulated_rounding"
+FISHER = "fisher_information"
 KINDS = {
     GAUSS_NEWTON: "the Gauss-Newton matrix and the colour of the residual",
     FULL_HESSIAN: "the full Hessian and the colour of the residual",
     POSTERIOR: "draws from the posterior and the colour of the residual",
     LAPLACE: "the Gauss-Newton matrix with the prior, and the colour of the residual",
     ROUNDING: "simulated rounding of the readings",
+    FISHER: "the Fisher information of the innovations, widened where these are coloured",
 }
 
 
