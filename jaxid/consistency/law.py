@@ -31,6 +31,16 @@ _NOISY = 2.0
 _AVERAGES = (1, 2, 3, 4)
 # A longer law is named only if it leaves less than this part of what a shorter one leaves.
 _BETTER = 0.7
+# First ticks at which the memory of the law is not known.
+_SETTLING = 20
+# Largest autocorrelation of the difference between the logged command and that of the law, at lags 1 to 5, at
+# which it counts as noise of the reading; and the largest such noise, as a part of the command.
+_WHITE, _LAGS, _NOISE = 0.1, 5, 0.5
+# Standard deviation of normal noise over its median size, and the largest ratio of the difference's standard
+# deviation to that which its median implies.
+_NORMAL, _OUTLIERS = 1.4826, 1.2
+# A difference below this part of the command is rounding.
+_ROUNDED = 1e-6
 # Laws without a model of the plant.
 _PLAIN = (CascadePD, PD, PID, FrictionCompensation)
 
@@ -43,11 +53,13 @@ class Replayed:
         command: Command of the law at the samples of the log, (time, m).
         relative: 2-norm of the difference over that of the logged command, by drive.
         exact: Whether the law reproduces every command up to noise.
+        every: Number of the law's ticks per sample of the log.
     """
 
     command: Float[np.ndarray, "time m"]
     relative: Float[np.ndarray, " m"]
     exact: bool
+    every: int
 
 
 @dataclass(frozen=True)
@@ -88,7 +100,7 @@ def replayed_law(machine: Machine, log: Log) -> Replayed | None:
         made = made if controller.limit is None else np.clip(made, -controller.limit, controller.limit)
     size = np.maximum(np.linalg.norm(log.force, axis=0), 1e-300)
     relative = np.linalg.norm(log.force - made, axis=0) / size
-    return Replayed(made, relative, bool(np.all(relative < _EXACT)) and every == 1)
+    return Replayed(made, relative, bool(np.all(relative < _EXACT)) and every == 1, every)
 
 
 def _at_ticks(
@@ -200,3 +212,40 @@ def _fitted_laws(machine: Machine, log: Log, drive: int) -> Iterator[tuple[int, 
         if kp > 0 and ki > 0 and kd > 0:
             text = f"kind = 'pid' with kp = {kp:.4g}, ki = {ki:.4g}, kd = {kd:.4g}"
             yield 3, _Fitted(text + more, remaining)
+
+
+def noise_free_command(machine: Machine, log: Log) -> Float[np.ndarray, "time m"] | None:
+    """Return the command of the law if the logged one is the same but for white noise of its reading.
+
+    The applied command is then known without that noise.
+
+    Args:
+        machine: The machine with its controller.
+        log: The log.
+
+    Returns:
+        The command, (time, m); None if the law cannot be computed, if the log is slower than the loop, or if
+        the law does not explain the logged command.
+    """
+    replayed = replayed_law(machine, log)
+    if replayed is None or replayed.every > 1 or log.samples < 10 * _SETTLING:
+        return None
+    command = replayed.command
+    if not np.all(np.isfinite(command)):
+        return None
+    off = (log.force - command)[_SETTLING:]
+    size, noise = np.std(log.force, axis=0), np.sqrt(np.mean(off**2, axis=0))
+    if np.any(noise > _NOISE * size):
+        return None
+    if np.all(noise <= _ROUNDED * size):
+        return command
+    # A law that is right but for a few ticks, such as a pulse that begins a tick later, leaves outliers.
+    middle = _NORMAL * np.median(np.abs(off), axis=0)
+    if np.any(noise > _OUTLIERS * middle):
+        return None
+    # The mean counts too: an integral that began elsewhere, or a disturbance, is no noise.
+    power = np.maximum(np.sum(off**2, axis=0), 1e-300)
+    correlation = [np.sum(off[k:] * off[:-k], axis=0) / power for k in range(1, _LAGS + 1)]
+    if np.max(np.abs(correlation)) > _WHITE:
+        return None
+    return np.concatenate([log.force[:_SETTLING], command[_SETTLING:]])

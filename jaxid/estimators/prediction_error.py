@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.common.scoring import Scored, maximise_likelihood
@@ -25,7 +26,6 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import FISHER, Precision, assess
 from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples
-from jaxid.simulation.law import noise_free_command
 from jaxid.simulation.replay import Numerics, exact_numerics
 from jaxid.simulation.sensor_noise import position_noise
 
@@ -53,76 +53,46 @@ _BLOCKS = 40
 _LAGS, _REJECTS = 20, 1e-3
 
 
+class _Problem(NamedTuple):
+    """A likelihood.
+
+    Args:
+        kalman: Filter of the log.
+        places: Places of the unknowns in the plant.
+        plant: The plant.
+        counts: Mask of the innovations that count, (time, k).
+        transform: Scale of the unknowns in the solver.
+        bounds: Bounds on the unknowns, (p,) each.
+        low, high: Bounds on the logarithms of the noise, of the force and then of the readings, (m + k,).
+    """
+
+    kalman: KalmanFilter
+    places: tuple
+    plant: Plant
+    counts: Array
+    transform: Transform
+    bounds: tuple[Array, Array]
+    low: Array
+    high: Array
+
+
 @eqx.filter_jit
-def _score(
-    kalman: KalmanFilter,
-    places: tuple,
-    plant: Plant,
-    counts: Array,
-    transform: Transform,
-    bounds: tuple[Array, Array],
-    high: Array,
-    low: Array,
-    theta: Array,
-    noise: Array,
-) -> tuple[Array, Array]:
-    """Return gradient and information at a point, on the scale of the solver."""
-    outputs, start, lower, upper = _on_scale(
-        kalman, places, plant, transform, bounds, high, low, theta, noise
-    )
-    at = maximise_likelihood(outputs, counts, start, lower, upper, 1)
-    rows, logs = (a.reshape(-1, start.size) for a in (at.mean, at.log_variance))
-    return at.gradient, rows.T @ rows + 0.5 * logs.T @ logs
-
-
-def _on_scale(
-    kalman: KalmanFilter,
-    places: tuple,
-    plant: Plant,
-    transform: Transform,
-    bounds: tuple[Array, Array],
-    high: Array,
-    low: Array,
-    theta: Array,
-    noise: Array,
-) -> tuple[Callable[[Array], tuple[Array, Array]], Array, Array, Array]:
-    """Return innovations and variances on the scale of the solver, the start, and the bounds."""
+def _fit(problem: _Problem, theta: Array, noise: Array, max_steps: Array) -> Scored:
+    """Maximise a likelihood from physical values and logarithms of the noise; one step only evaluates it."""
+    kalman, transform = problem.kalman, problem.transform
     p, m = theta.size, kalman.command.shape[1]
 
     def outputs(x: Array) -> tuple[Array, Array]:
-        fitted = scatter(places, plant, transform.outward(x[:p]))
+        fitted = scatter(problem.places, problem.plant, transform.outward(x[:p]))
         return kalman(fitted, jnp.exp(x[p : p + m]), jnp.exp(x[p + m :]))
 
-    limits = transform.bounds(*(jnp.asarray(b) for b in bounds))
-    lower, upper = (jnp.concatenate([a, b]) for a, b in zip(limits, (low, high), strict=True))
-    return outputs, jnp.concatenate([transform.inward(theta), noise]), lower, upper
-
-
-@eqx.filter_jit
-def _fit(
-    kalman: KalmanFilter,
-    places: tuple,
-    plant: Plant,
-    counts: Array,
-    transform: Transform,
-    bounds: tuple[Array, Array],
-    high: Array,
-    low: Array,
-    theta: Array,
-    noise: Array,
-    max_steps: Array,
-) -> tuple[Array, Scored]:
-    """Return the physical values of the unknowns, and the fit with derivatives by them."""
-    p = theta.size
-    outputs, start, lower, upper = _on_scale(
-        kalman, places, plant, transform, bounds, high, low, theta, noise
+    limits = transform.bounds(*(jnp.asarray(b) for b in problem.bounds))
+    lower, upper = (
+        jnp.concatenate([of_unknowns, of_noise])
+        for of_unknowns, of_noise in zip(limits, (problem.low, problem.high), strict=True)
     )
-    scored = maximise_likelihood(outputs, counts, start, lower, upper, max_steps)
-
-    found = transform.outward(scored.x[:p])
-    flat = scored.mean[..., :p].reshape(-1, p)
-    physical = transform.physical(flat, found).reshape(*counts.shape, p)
-    return found, eqx.tree_at(lambda s: s.mean, scored, physical)
+    start = jnp.concatenate([transform.inward(theta), noise])
+    return maximise_likelihood(outputs, problem.counts, start, lower, upper, max_steps)
 
 
 def prediction_error(
@@ -208,60 +178,62 @@ def prediction_error_steps(
     stroke = np.maximum(np.ptp(log.filled, axis=0), 1e-300)
     reading = np.maximum(position_noise(machine, log), 1e-9 * stroke)[measured]
     noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
-    high = np.log(np.concatenate([_MOST * force, _READING_RANGE[1] * reading]))
     floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
     transform, bounds = Transform.of(parameters), parameters.bounds
-    problem = (kalman, parameters.places, machine.plant, counts, transform, bounds, high)
+    problem = _Problem(
+        kalman=kalman,
+        places=parameters.places,
+        plant=machine.plant,
+        counts=counts,
+        transform=transform,
+        bounds=bounds,
+        low=floors[0],
+        high=np.log(np.concatenate([_MOST * force, _READING_RANGE[1] * reading])),
+    )
 
     # Beside another method's start the guesses matter for shapes only, whose likelihood has several maxima.
+    p, m, steps = len(parameters.free), len(force), 0
     shapes = [] if alone else shape_starts(machine, parameters.guess)
     starts = [parameters.guess, *shapes] if shapes or start is None else []
     if start is not None:
-        starts.insert(0, np.clip(start, *parameters.bounds))
-    theta, steps = starts[0], 0
-    trials = []
-    if len(starts) > 1:
-        for at in starts:
-            trials.append(
-                (yield SolveRequest(_fit, (*problem, floors[0], at, noise, np.asarray(_SCREENING))))
-            )
-        costs = [np.nan_to_num(float(s.cost), nan=np.inf) for _, s in trials]
-        theta, scored = trials[int(np.argmin(costs))]
-        noise, steps = scored.x[len(theta) :], _SCREENING * len(starts)
+        starts.insert(0, np.clip(start, *bounds))
+    theta, trials = starts[0], []
+    for at in starts if len(starts) > 1 else ():
+        trials.append((yield SolveRequest(_fit, (problem, at, noise, np.asarray(_SCREENING)))))
+    if trials:
+        best = min(trials, key=lambda trial: np.nan_to_num(float(trial.cost), nan=np.inf))
+        theta, noise = np.asarray(transform.outward(best.x[:p])), best.x[p:]
+        steps = sum(int(trial.steps) for trial in trials)
 
-    scored, floor = None, floors[0]
+    scored = None
     for floor in floors:
-        theta, scored = yield SolveRequest(_fit, (*problem, floor, theta, noise, np.asarray(_STEPS)))
-        noise, steps = scored.x[len(theta) :], steps + int(scored.steps)
-        above = np.asarray(noise)[: len(force)] > floor[: len(force)] + 1e-3
-        if np.all(above) or not np.isfinite(float(scored.cost)):
+        problem = problem._replace(low=floor)
+        scored = yield SolveRequest(_fit, (problem, theta, noise, np.asarray(_STEPS)))
+        theta, noise = np.asarray(transform.outward(scored.x[:p])), np.asarray(scored.x[p:])
+        steps += int(scored.steps)
+        if np.all(noise[:m] > floor[:m] + 1e-3) or not np.isfinite(float(scored.cost)):
             break
     assert scored is not None, "there is at least one floor"
 
     # Without noise of the force it is known when a joint sticks, and samples at rest count too.
-    if slow is not None and applied is not None and np.all(np.exp(noise[: len(force)]) < _QUIET * force):
+    if slow is not None and applied is not None and np.all(np.exp(noise[:m]) < _QUIET * force):
         # So precise a fit shows the error of a step in which a joint comes to rest.
         finer = replace(numerics, substeps=_FINER * numerics.substeps)
         kalman = make_filter(machine, driven, finer)
         counts = np.asarray(kalman.used)[:: kalman.every][:, measured]
-        problem = (kalman, parameters.places, machine.plant, counts, transform, bounds, high)
-        theta, scored = yield SolveRequest(_fit, (*problem, floor, theta, noise, np.asarray(_STEPS)))
-        steps += int(scored.steps)
+        problem = problem._replace(kalman=kalman, counts=counts)
+        scored = yield SolveRequest(_fit, (problem, theta, noise, np.asarray(_STEPS)))
+        theta, steps = np.asarray(transform.outward(scored.x[:p])), steps + int(scored.steps)
 
-    read = np.zeros(len(force))
+    read = np.zeros(m)
     if applied is None and command_noise is not None and np.any(command_noise > 0):
-        x, read = yield from _corrected_steps(log, problem, scored, theta, floor, command_noise)
+        x, read = yield from _corrected_steps(problem, scored, theta, command_noise)
         theta = np.clip(transform.outward(x), *bounds)
-    return _estimate(machine, log, np.asarray(theta), scored, counts, applied is not None, read, steps)
+    return _estimate(machine, problem, theta, scored, by_law=applied is not None, read=read, steps=steps)
 
 
 def _corrected_steps(
-    log: Log,
-    problem: tuple,
-    scored: Scored,
-    theta: Array,
-    floor: np.ndarray,
-    command_noise: np.ndarray,
+    problem: _Problem, scored: Scored, theta: np.ndarray, command_noise: np.ndarray
 ) -> Steps[tuple[np.ndarray, np.ndarray]]:
     """Remove the bias by noise with which the command was read; return the estimates and the noise.
 
@@ -271,34 +243,35 @@ def _corrected_steps(
     scoring, is subtracted. Pairs of opposite noise cancel in first order.
 
     Args:
-        log: The log.
-        problem: Arguments of `_fit`.
+        problem: The likelihood.
         scored: The fit.
         theta: Its estimates, (p,).
-        floor: Lower bounds of the logarithms of the noise.
         command_noise: Noise with which the command was read, (m,).
+
+    Returns:
+        The estimates on the scale of the solver, (p,), and the noise for which they were corrected, (m,).
 
     Source:
         Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
     """
-    kalman, p, drives = problem[0], len(theta), log.force.shape[1]
+    kalman, p, drives = problem.kalman, len(theta), problem.kalman.command.shape[1]
     x = np.asarray(scored.x)
     read = np.minimum(command_noise, np.exp(x[p : p + drives]))
     noise = x[p:].copy()
     noise[:drives] += 0.5 * np.log1p((read / np.exp(noise[:drives])) ** 2)
 
     def at(command: np.ndarray) -> SolveRequest:
-        shifted = (eqx.tree_at(lambda k: k.command, kalman, command), *problem[1:])
-        return SolveRequest(_score, (*shifted, floor, theta, noise))
+        shifted = problem._replace(kalman=eqx.tree_at(lambda k: k.command, kalman, command))
+        return SolveRequest(_fit, (shifted, theta, noise, np.asarray(1)))
 
     command, every = np.asarray(kalman.command), kalman.every
-    information = np.asarray((yield at(command))[1])
+    information = np.asarray((yield at(command)).information)
     rng, gradients = np.random.default_rng(0), []
     for _ in range(_PAIRS):
         more = read * rng.standard_normal((len(command[::every]), drives))
         more = np.repeat(more, every, axis=0)[: len(command)]
         for sign in (1.0, -1.0):
-            gradients.append(np.asarray((yield at(command + sign * more))[0]))
+            gradients.append(np.asarray((yield at(command + sign * more)).gradient))
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information / np.outer(size, size), rcond=_BLIND, hermitian=True)
     shift = -inverse @ (np.mean(gradients, axis=0) / size) / size
@@ -315,10 +288,10 @@ def slides(machine: Machine, log: Log) -> bool:
 
 def _estimate(
     machine: Machine,
-    log: Log,
+    problem: _Problem,
     theta: np.ndarray,
     scored: Scored,
-    counts: np.ndarray,
+    *,
     by_law: bool,
     read: np.ndarray,
     steps: int,
@@ -326,16 +299,20 @@ def _estimate(
     """Return the estimate of a fit, with its precision, its noise and a test of its innovations.
 
     Args:
-        machine, log: The machine at its guesses, and its log.
+        machine: The machine at its guesses.
+        problem: The likelihood.
         theta: Estimates, (p,).
         scored: The fit.
-        counts: Mask of the innovations that count, (time, k).
         by_law: Whether the command was computed by the declared law.
         read: Noise with which the command was read, (m,).
         steps: Evaluations of all fits.
     """
-    names, drives = machine.parameters.names, log.force.shape[1]
-    z, jacobian = np.asarray(scored.z), np.asarray(scored.mean)
+    names, counts, drives = machine.parameters.names, np.asarray(problem.counts), len(read)
+    p, z = len(theta), np.asarray(scored.z)
+    # The slopes are those at the optimum, before the correction.
+    fitted = problem.transform.outward(scored.x[:p])
+    rows = problem.transform.physical(scored.mean[..., :p].reshape(-1, p), fitted)
+    jacobian = np.asarray(rows).reshape(*z.shape, p)
 
     # An unknown is identifiable if its standard deviation changes the innovations less than the largest
     # effect of any unknown does.

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.consistency.law import noise_free_command
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.scoring import maximise_likelihood
 from jaxid.estimators.prediction_error import whiteness
 from jaxid.session import open_session
-from jaxid.simulation.law import noise_free_command
 from truth.axis.cases import case_text
 from truth.axis.machines import EMPS_ACCELERATION, EMPS_LOOP, Setup, emps_like, moves
 from truth.axis.stepper import Sensor

@@ -48,6 +48,12 @@ class Scored(eqx.Module):
         """True if the likelihood is finite and can rise no further."""
         return self.done & jnp.isfinite(self.cost) & (self.damping < _STUCK)
 
+    @property
+    def information(self) -> Float[Array, "p p"]:
+        """Fisher's information on the unknowns, (p, p)."""
+        rows, logs = (a.reshape(-1, self.x.size) for a in (self.mean, self.log_variance))
+        return rows.T @ rows + 0.5 * logs.T @ logs
+
 
 class _Trial(eqx.Module):
     best: Scored
