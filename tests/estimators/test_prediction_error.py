@@ -11,8 +11,10 @@ import jaxid
 from jaxid.consistency.law import noise_free_command
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.scoring import maximise_likelihood
-from jaxid.estimators.prediction_error import whiteness
+from jaxid.estimators.prediction_error import whiteness, widened
+from jaxid.numerics.precision import Precision
 from jaxid.session import open_session
+from jaxid.simulation.kalman import readings_used, slow_samples, smooth_steps
 from truth.axis.cases import case_text
 from truth.axis.machines import EMPS_ACCELERATION, EMPS_LOOP, Setup, emps_like, moves
 from truth.axis.stepper import Sensor
@@ -92,7 +94,7 @@ def test_innovations_of_a_complete_model_are_white_and_of_another_not(fits, tmp_
 
 
 def test_noise_of_the_command_does_not_bias_the_inertia(tmp_path):
-    # Noise of 0.6 of a command of 1.2 (RMS): the filter alone is off by a tenth.
+    # The noise is half as large as the command: without the correction the mean is off by many deviations.
     files = [opened(tmp_path, seed, closed=False, force_noise=0.6) for seed in range(1, LOGS + 1)]
     cases, logs = zip(*files, strict=True)
     fits = jaxid.identify_many(cases, logs, method="prediction_error", lanes=LOGS)
@@ -173,3 +175,38 @@ def test_whiteness_is_uniform_for_white_noise_and_small_for_coloured():
     assert 0.02 < np.mean(p < 0.05) < 0.09
     coloured = np.convolve(rng.standard_normal(500), [1.0, 0.5])
     assert whiteness(coloured) < 1e-6
+
+
+def test_errors_that_last_for_a_block_widen_the_deviations():
+    rng = np.random.default_rng(2)
+    blocks, length = 40, 50
+    jacobian = np.ones((blocks * length, 1, 1))
+    z = np.repeat(rng.standard_normal(blocks), length)[:, None]
+    white = Precision(np.full((1, 1), 1 / z.size), np.ones(1, bool), [], np.ones(1))
+    got = widened(white, z, jacobian).std[0]
+    # The mean of 40 independent blocks, however many samples each has.
+    assert got == pytest.approx(1 / np.sqrt(blocks), rel=4 / np.sqrt(2 * blocks))
+    assert widened(white, 1e-3 * z, jacobian).std[0] == white.std[0]
+
+
+def test_slow_readings_of_a_coarse_encoder_are_thinned(tmp_path):
+    path, log = opened(tmp_path, 4, closed=False, position_resolution=2e-5, position_noise=1e-6)
+    session = open_session(path, log)
+    measured = session.fit.log
+    used = readings_used(session.machine, measured)[:, 0]
+    speed = np.abs(smooth_steps(measured))[:, 0] / 2e-5
+    assert used[speed > 1.0].all()
+    between = (speed > 0.1) & (speed < 0.9)
+    assert used[between].sum() == pytest.approx(speed[between].sum(), rel=0.15)
+    # With noise of half a count each rounding error is new.
+    dithered = dataclasses.replace(session.machine.sensor, position_noise=np.asarray(1e-5))
+    assert readings_used(dataclasses.replace(session.machine, sensor=dithered), measured).all()
+
+
+def test_samples_at_rest_and_at_reversals_are_slow(tmp_path):
+    path, log = opened(tmp_path, 5, closed=False)
+    measured = open_session(path, log).fit.log
+    velocity = np.gradient(log["ref"], 1e-3)
+    slow = slow_samples(measured, np.array([5e-3]))[:, 0]
+    assert slow[np.abs(velocity) < 1e-4].mean() > 0.9
+    assert not slow[np.abs(velocity) > 0.04].any()
