@@ -82,7 +82,7 @@ def _built(cls: type[Effect], scales: Scales, port: int, where: str) -> list[Eff
     try:
         starts, neutral = cls.starts(scales), cls.neutral(scales)
         for lower, upper in cls.limits(scales).values():
-            float(lower), float(upper)
+            _ = float(lower), float(upper)
         effects = [cls(**values, port=port) for values in (neutral, *starts)]
     except Exception as error:
         what = f"cannot be built at its neutral values or its starts ({one_line(error)})"

@@ -58,7 +58,7 @@ class Inertial(eqx.Module):
 
     @property
     def gyroscope(self) -> bool:
-        """Whether it is a gyroscope."""
+        """True for a gyroscope."""
         return self.kind == "gyroscope"
 
 
@@ -85,7 +85,7 @@ class InertialSensors(eqx.Module):
 
     @property
     def accelerates(self) -> bool:
-        """Whether there are accelerometers."""
+        """True if there are accelerometers."""
         return any(s.kind == "accelerometer" for s in self.sensors)
 
     def read(

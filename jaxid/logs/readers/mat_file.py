@@ -54,7 +54,7 @@ class Variable:
 
     @property
     def numeric(self) -> bool:
-        """Whether it is a matrix of real numbers."""
+        """True for a matrix of real numbers."""
         return self.kind in _NUMBERS.values()
 
     @property
