@@ -37,7 +37,7 @@ class Choice(NamedTuple):
 def choose_method(session: Session, asked: str | None = None) -> Choice:
     """Choose the method for a session whose method is not stated.
 
-    `docs/methods.md` says how often the intervals of the chosen method hold, as far as that has been measured.
+    `docs/methods.md` says how often intervals of the chosen method hold, as far as that is measured.
 
     Args:
         session: Case and logs.
