@@ -155,7 +155,8 @@ def open_session(
             machine = replace(machine, hold=hold)
             own = [v["name"] for v in case.tables.get("validation", []) if "hold" in v]
             opened = [run if run.name in own else _under(hold, run, machine) for run in opened]
-        opened[0] = replace(opened[0], data=replace(opened[0].data, force_noise=noise))
+        # The other logs are of the same sensors.
+        opened = [replace(run, data=replace(run.data, force_noise=noise)) for run in opened]
     return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged)
 
 
@@ -176,6 +177,7 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
     needed = 0 if held else enough(machine)
     name = Path(measured.source).stem
     run = _run(name, measured, machine, session.recipe, needed, machine.disturbance)
+    run = replace(run, data=replace(run.data, force_noise=session.fit.data.force_noise))
     return run if run.log.hold == machine.hold else _under(machine.hold, run, machine)
 
 
