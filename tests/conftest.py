@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 
 import jaxid as jaxid
+from tests.support.outcomes import pytest_addoption, pytest_configure
+
+__all__ = ["pytest_addoption", "pytest_configure"]
 
 os.environ["JAXID_CACHE"] = "off"
 
