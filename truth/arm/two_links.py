@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 
 @dataclass(frozen=True)
@@ -45,45 +46,131 @@ class TwoLinks:
             "inertia_zz[2]": self.i2 + self.m2 * (self.x2**2 + self.y2**2),
         }
 
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """The values that the equations of motion take."""
+        names = (
+            "inertia_zz[1]",
+            "first_moment_x[1]",
+            "first_moment_x[2]",
+            "first_moment_y[2]",
+            "inertia_zz[2]",
+        )
+        links = (*(self.base[name] for name in names), self.length, self.gravity)
+        return tuple(map(float, (*links, *self.viscous, *self.coulomb, *self.shaft, self.width)))
+
     def acceleration(self, q1, q2, v1, v2, u1, u2):
-        """Return the accelerations of both joints, from Lagrange's equations as textbooks print them."""
-        b, g, cos, sin, tanh = self.base, self.gravity, math.cos, math.sin, math.tanh
-        px, py, l = b["first_moment_x[2]"], b["first_moment_y[2]"], self.length
-        c, s = cos(q2), sin(q2)
-        couple = l * (px * c - py * s)
-        bend = l * (px * s + py * c)
-        m22 = b["inertia_zz[2]"]
-        m12, m11 = m22 + couple, b["inertia_zz[1]"] + m22 + 2.0 * couple
-        w2 = g * (px * cos(q1 + q2) - py * sin(q1 + q2))
-        w1 = g * b["first_moment_x[1]"] * cos(q1) + w2
-        f1 = self.viscous[0] * v1 + self.coulomb[0] * tanh(v1 / self.width)
-        f2 = self.viscous[1] * v2 + self.coulomb[1] * tanh(v2 / self.width)
-        viscous, coulomb, inertia = self.shaft
-        fs = viscous * (v1 + v2) + coulomb * tanh((v1 + v2) / self.width)
-        f1, f2, m11, m12, m22 = f1 + fs, f2 + fs, m11 + inertia, m12 + inertia, m22 + inertia
-        r1 = u1 - w1 - f1 + bend * (2.0 * v1 * v2 + v2 * v2)
-        r2 = u2 - w2 - f2 - bend * v1 * v1
-        det = m11 * m22 - m12 * m12
-        return (m22 * r1 - m12 * r2) / det, (m11 * r2 - m12 * r1) / det
+        """Return the accelerations of both joints."""
+        return acceleration(self.constants, q1, q2, v1, v2, u1, u2)
 
     def advance(self, x, u, h, steps):
         """Advance x = (q1, q2, v1, v2) by `steps` classical Runge-Kutta steps of h [s] at constant torque."""
+        return advance(self.constants, tuple(map(float, x)), tuple(map(float, u)), float(h), int(steps))
 
-        def rate(x):
-            return (x[2], x[3], *self.acceleration(*x, *u))
 
-        def moved(x, k, h):
-            return tuple(a + h * b for a, b in zip(x, k, strict=True))
+@njit(cache=True)
+def acceleration(constants, q1, q2, v1, v2, u1, u2):
+    """Return the accelerations of both joints, from Lagrange's equations as textbooks print them."""
+    zz1, mx1, px, py, m22, l, g, b1, b2, d1, d2, viscous, coulomb, inertia, width = constants
+    c, s = math.cos(q2), math.sin(q2)
+    couple = l * (px * c - py * s)
+    bend = l * (px * s + py * c)
+    m12, m11 = m22 + couple, zz1 + m22 + 2.0 * couple
 
-        for _ in range(steps):
-            k1 = rate(x)
-            k2 = rate(moved(x, k1, 0.5 * h))
-            k3 = rate(moved(x, k2, 0.5 * h))
-            k4 = rate(moved(x, k3, h))
-            x = tuple(
-                a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True)
-            )
-        return x
+    w2 = g * (px * math.cos(q1 + q2) - py * math.sin(q1 + q2))
+    w1 = g * mx1 * math.cos(q1) + w2
+    fs = viscous * (v1 + v2) + coulomb * math.tanh((v1 + v2) / width)
+    f1 = b1 * v1 + d1 * math.tanh(v1 / width) + fs
+    f2 = b2 * v2 + d2 * math.tanh(v2 / width) + fs
+    m11, m12, m22 = m11 + inertia, m12 + inertia, m22 + inertia
+
+    r1 = u1 - w1 - f1 + bend * (2.0 * v1 * v2 + v2 * v2)
+    r2 = u2 - w2 - f2 - bend * v1 * v1
+    det = m11 * m22 - m12 * m12
+    return (m22 * r1 - m12 * r2) / det, (m11 * r2 - m12 * r1) / det
+
+
+@njit(cache=True)
+def _rate(constants, x, u):
+    a1, a2 = acceleration(constants, x[0], x[1], x[2], x[3], u[0], u[1])
+    return x[2], x[3], a1, a2
+
+
+@njit(cache=True)
+def _moved(x, k, h):
+    return x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3]
+
+
+@njit(cache=True)
+def advance(constants, x, u, h, steps):
+    """Advance x = (q1, q2, v1, v2) by `steps` classical Runge-Kutta steps of h [s] at constant torque."""
+    for _ in range(steps):
+        k1 = _rate(constants, x, u)
+        k2 = _rate(constants, _moved(x, k1, 0.5 * h), u)
+        k3 = _rate(constants, _moved(x, k2, 0.5 * h), u)
+        k4 = _rate(constants, _moved(x, k3, h), u)
+        for k, weight in ((k1, 1.0), (k2, 2.0), (k3, 2.0), (k4, 1.0)):
+            x = _moved(x, k, h / 6 * weight)
+    return x
+
+
+@njit(cache=True)
+def _run(constants, x, command, reference, gains, noise, resolution, rate, steps):
+    """Run a sampled PD loop on the readings, with a command that is added to it."""
+    positions, commands = np.zeros(noise.shape), np.zeros(noise.shape)
+    for t in range(len(noise)):
+        for j in range(2):
+            reading = x[j] + noise[t, j]
+            if resolution > 0:
+                reading = round(reading / resolution) * resolution
+            positions[t, j] = reading
+            before = max(t - 1, 0)
+            error, last = reference[t, j] - reading, reference[before, j] - positions[before, j]
+            commands[t, j] = command[t, j] + gains[0, j] * error + gains[1, j] * (error - last) * rate
+        x = advance(constants, x, (commands[t, 0], commands[t, 1]), 1.0 / rate / steps, steps)
+    return positions, commands
+
+
+def run_sampled(
+    arm: TwoLinks,
+    *,
+    rate: float,
+    start: np.ndarray,
+    command: np.ndarray | None = None,
+    reference: np.ndarray | None = None,
+    kp: tuple[float, float] = (0.0, 0.0),
+    kd: tuple[float, float] = (0.0, 0.0),
+    resolution: float = 0.0,
+    noise: float = 0.0,
+    force_noise: float = 0.0,
+    seed: int = 0,
+) -> dict[str, np.ndarray]:
+    """Run the arm from rest at `start` under a command, a PD loop on its readings, or both.
+
+    The loop is u = kp (r - y) + kd (r - y)', with backward differences; resolution and noise of a reading
+    in rad, of the logged torque in N m.
+
+    Returns:
+        The columns t, q1, q2, u1, u2.
+    """
+    given = command if reference is None else reference
+    assert given is not None, "an arm needs a command or a reference"
+    none, rng = np.zeros(given.shape), np.random.default_rng(seed)
+    reading, steps = noise * rng.standard_normal(given.shape), round(20_000 / rate)
+    position, torque = _run(
+        arm.constants,
+        (float(start[0]), float(start[1]), 0.0, 0.0),
+        none if command is None else command,
+        none if reference is None else reference,
+        np.array([kp, kd]),
+        reading,
+        resolution,
+        rate,
+        steps,
+    )
+    torque = torque + force_noise * rng.standard_normal(given.shape)
+    times = np.arange(len(given)) / rate
+    return dict(zip(("t", "q1", "q2", "u1", "u2"), (times, *position.T, *torque.T), strict=True))
 
 
 def unknown_reference(times, seed):
