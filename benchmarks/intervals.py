@@ -8,13 +8,11 @@ the table DIR/intervals.md from all of them.
 """
 
 import argparse
-import dataclasses
 import json
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -23,82 +21,11 @@ import numpy as np
 from scipy.stats import binom
 
 import jaxid
-from truth.axis.cases import case_text
-from truth.axis.machines import EMPS_LOOP, Setup, emps_like, moves, multisine
-from truth.axis.stepper import Loop, Sensor
-from truth.chain import flexible_axes
+from benchmarks.interval_machines import LOOPS, MACHINES, SENSORS
 
 HERE = Path(__file__).parent / "results"
 CHUNK = 10
-LOOPS, SENSORS = ("open", "known", "unknown"), ("stated", "not stated")
-SAMPLES = 2500
-
-
-def axis(seed: int, loop: str, sensor: str) -> tuple[str, dict[str, np.ndarray], dict[str, float]]:
-    """Return case, columns and truth of a slide of 95 kg: trapezoids in a loop, or a multisine of force."""
-    rng = np.random.default_rng([1, seed])
-    base = emps_like()
-    scale = rng.uniform(0.8, 1.2, 3).tolist()
-    true = {
-        "inertia": 95.1 * scale[0],
-        "viscous_friction.coefficient": 203.5 * scale[1],
-        "coulomb_friction.level": 20.39 * scale[2],
-    }
-    effects = {
-        "viscous_friction": {"coefficient": true["viscous_friction.coefficient"]},
-        "coulomb_friction": {"level": true["coulomb_friction.level"]},
-    }
-    machine = dataclasses.replace(base.machine, inertia=true["inertia"], effects=effects)
-    t = np.arange(SAMPLES) / 1000.0
-    if loop == "open":
-        force = multisine(t, [0.8, 1.9, 3.7, 6.1], 3.0 * rng.uniform(0.9, 1.1), seed)
-        law = Loop(kind="open_loop", input=force)
-    else:
-        speeds = np.array([0.05, 0.3, 0.13, 0.2]) * rng.uniform(0.8, 1.2, 4)
-        reference = moves(
-            t, np.array([0.0, 0.02, 0.12, 0.05]) * rng.uniform(0.9, 1.1), speeds, 1.7, rest=0.03
-        )
-        law = dataclasses.replace(EMPS_LOOP, reference=reference)
-    read = Sensor(position_resolution=1e-6, position_noise=0.7e-6, force_noise=0.05)
-    setup = Setup(machine, law, read, rate=1000.0, duration=SAMPLES / 1000.0, seed=seed)
-    run = setup.run()
-    text = case_text(setup, list(effects.items()), sensor=sensor == "stated", closed=loop == "known")
-    return text, {"t": run["t"], "q": run["position"], "u": run["force"], "ref": run["reference"]}, true
-
-
-def flexible_axis(seed: int, loop: str, sensor: str) -> tuple[str, dict[str, np.ndarray], dict[str, float]]:
-    """Return case, columns and truth of the ball-screw axis of Janot et al., with both encoders."""
-    rng = np.random.default_rng([2, seed])
-    true = {name: float(value * rng.uniform(0.85, 1.15)) for name, value in flexible_axes.TRUTH.items()}
-    t = np.arange(SAMPLES) / 1000.0
-    speeds = np.array([0.08, 0.2, 0.13, 0.25]) * rng.uniform(0.8, 1.2, 4)
-    reference = moves(t, (0.0, 0.12, 0.05, 0.1), speeds, 1.5, 0.05)
-    count = flexible_axes.COUNT
-    read = Sensor(position_resolution=count, position_noise=count, force_noise=0.05)
-    law = {"kp": 40.0, "kv": 320.0, "velocity_average": 2}
-    pulses = {"level": 4.0, "on": 0.012, "off": 0.119, "start": 0.2505}
-    run = flexible_axes.record(
-        flexible_axes.machine(**true),
-        duration=SAMPLES / 1000.0,
-        reference=reference,
-        pulses=pulses,
-        law=law,
-        sensor=read,
-        seed=seed,
-    )
-    text = flexible_axes.text(pulses=pulses, law=law, sensor=read)
-    if loop == "unknown":
-        text = text[: text.index("[controller]")] + text[text.index("[sensor]") :]
-    if sensor == "not stated":
-        text = text[: text.index("[sensor]")]
-    return text, flexible_axes.columns(run), true
-
-
-MACHINES: dict[str, tuple[Callable, tuple[str, ...]]] = {
-    "axis": (axis, LOOPS),
-    "flexible_axis": (flexible_axis, ("known", "unknown")),
-}
-CELLS = [f"{m}/{loop}/{s}" for m, (_, loops) in MACHINES.items() for loop in loops for s in SENSORS]
+CELLS = [f"{machine}/{loop}/{sensor}" for machine in MACHINES for loop in LOOPS for sensor in SENSORS]
 
 
 def run_chunk(cell: str, method: str | None, seeds: list[int], commit: str) -> list[dict[str, Any]]:
@@ -107,7 +34,7 @@ def run_chunk(cell: str, method: str | None, seeds: list[int], commit: str) -> l
     cases, logs, truths = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for seed in seeds:
-            text, log, true = MACHINES[machine][0](seed, loop, sensor)
+            text, log, true = MACHINES[machine](seed, loop, sensor)
             path = Path(folder) / f"{seed}.toml"
             path.write_text(text)
             cases.append(path)
@@ -125,12 +52,13 @@ def run_chunk(cell: str, method: str | None, seeds: list[int], commit: str) -> l
         elif not fit.converged:
             record |= {"method": fit.method, "failed": fit.message}
         else:
-            z = {
-                name: (value - true[name]) / std
-                for name, value, std, ok in zip(fit.names, fit.theta, fit.std, fit.identifiable, strict=True)
-                if ok
-            }
+            columns = zip(fit.names, fit.theta, fit.std, fit.identifiable, strict=True)
+            printed = {name: (value - true[name], std) for name, value, std, ok in columns if ok}
+            z = {name: error / std for name, (error, std) in printed.items()}
             record |= {"method": fit.method, "z": z, "not_identifiable": len(fit.names) - len(z)}
+            record["error"] = {name: error for name, (error, _) in printed.items()}
+            if "least_std" in fit.details:
+                record["bound"] = fit.details["least_std"]
         records.append(record)
     return records
 

@@ -124,7 +124,8 @@ def prediction_error(
         alone: Whether `start` is the only start, because it is known to be near the optimum.
 
     Returns:
-        The estimate. Its covariance is that of the likelihood, widened if the innovations are coloured.
+        The estimate. Its covariance is that of the likelihood, widened if the innovations are coloured. If
+        the case states the true values, `least_std` of the details is the bound of Cramer and Rao there.
 
     Raises:
         InputError: If too few readings count.
@@ -229,7 +230,16 @@ def prediction_error_steps(
     if applied is None and command_noise is not None and np.any(command_noise > 0):
         x, read = yield from _corrected_steps(problem, scored, theta, command_noise)
         theta = np.clip(transform.outward(x), *bounds)
-    return _estimate(machine, problem, theta, scored, by_law=applied is not None, read=read, steps=steps)
+    estimate = _estimate(machine, problem, theta, scored, by_law=applied is not None, read=read, steps=steps)
+
+    true = [free.true for free in parameters.free]
+    if None not in true and estimate.converged:
+        truth = np.array(true, dtype=np.float64)
+        there = yield SolveRequest(_fit, (problem, truth, noise, np.asarray(1)))
+        bound = _precision(parameters.names, problem, truth, there).std
+        values = dict(zip(parameters.names, bound.tolist(), strict=True))
+        estimate = replace(estimate, details={**estimate.details, "least_std": values})
+    return estimate
 
 
 def _corrected_steps(
@@ -308,18 +318,9 @@ def _estimate(
         steps: Evaluations of all fits.
     """
     names, counts, drives = machine.parameters.names, np.asarray(problem.counts), len(read)
-    p, z = len(theta), np.asarray(scored.z)
-    # The slopes are those at the optimum, before the correction.
-    fitted = problem.transform.outward(scored.x[:p])
-    rows = problem.transform.physical(scored.mean[..., :p].reshape(-1, p), fitted)
-    jacobian = np.asarray(rows).reshape(*z.shape, p)
-
-    # An unknown is identifiable if its standard deviation changes the innovations less than the largest
-    # effect of any unknown does.
-    scale = np.where(theta != 0, theta, 1.0)
-    effect = np.linalg.norm((jacobian * scale).reshape(-1, len(theta)), axis=0)
-    precision = assess(names, jacobian, z, counts, float(np.max(effect, initial=0.0)), scale)
-    precision = replace(precision, kind=FISHER)
+    z = np.asarray(scored.z)
+    jacobian = _slopes(problem, scored, len(theta))
+    precision = _precision(names, problem, theta, scored)
     precision = widened(precision, np.einsum("tk,tkp->tp", z, jacobian), jacobian)
 
     noise = np.exp(np.asarray(scored.x)[len(theta) :])
@@ -354,6 +355,27 @@ def _estimate(
             "whiteness": {"lags": _LAGS, "p": p_values},
         },
     )
+
+
+def _slopes(problem: _Problem, scored: Scored, p: int) -> Float[np.ndarray, "time k p"]:
+    """Return the derivatives of the innovations, over their standard deviations, by the p unknowns in SI."""
+    # The slopes are those at the optimum, before the correction.
+    fitted = problem.transform.outward(scored.x[:p])
+    rows = problem.transform.physical(scored.mean[..., :p].reshape(-1, p), fitted)
+    return np.asarray(rows).reshape(*scored.z.shape, p)
+
+
+def _precision(names: list[str], problem: _Problem, theta: np.ndarray, scored: Scored) -> Precision:
+    """Return the precision by Fisher's information of the innovations."""
+    counts, jacobian = np.asarray(problem.counts), _slopes(problem, scored, len(theta))
+
+    # An unknown is identifiable if its standard deviation changes the innovations less than the largest
+    # effect of any unknown does.
+    scale = np.where(theta != 0, theta, 1.0)
+    effect = np.linalg.norm((jacobian * scale).reshape(-1, len(theta)), axis=0)
+    largest = float(np.max(effect, initial=0.0))
+    precision = assess(names, jacobian, np.asarray(scored.z), counts, largest, scale)
+    return replace(precision, kind=FISHER)
 
 
 def widened(

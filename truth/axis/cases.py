@@ -36,6 +36,7 @@ def case_text(
     orientation: str = "horizontal",
     sensor: bool = True,
     closed: bool = True,
+    true: bool = False,
 ) -> str:
     """Return the case of a setup, its guesses off by a factor.
 
@@ -48,20 +49,25 @@ def case_text(
         orientation: Of the plant.
         sensor: Tell what the sensor is.
         closed: Tell what the controller is.
+        true: State the true values beside the guesses.
     """
     machine, factor = setup.machine, [off, 1.0 / off]
     inertia = machine.inertia
+
+    def entry(guess: float, value: float) -> str:
+        return f"{{ guess = {guess!r}, true = {value!r} }}" if true else f"{{ guess = {guess!r} }}"
+
     lines = [
         "[plant]",
         'kind = "axis"',
         f'motion = "{motion}"',
         f'orientation = "{orientation}"',
         "[plant.parameters]",
-        f"inertia = {inertia!r}" if inertia_known else f"inertia = {{ guess = {inertia / off!r} }}",
+        f"inertia = {inertia!r}" if inertia_known else f"inertia = {entry(inertia / off, inertia)}",
     ]
     for k, (kind, values) in enumerate(declared):
         lines += ["[[effects]]", f'kind = "{kind}"']
-        lines += [f"{n} = {{ guess = {v * factor[k % 2]!r} }}" for n, v in values.items()]
+        lines += [f"{n} = {entry(v * factor[k % 2], v)}" for n, v in values.items()]
     lines += ["[actuator]", f"gain = {machine.actuator_gain!r}", "[log]", 'time = "t"']
     lines += ['position = "q"', 'force = "u"']
     lines += _loop_lines(setup) if closed and setup.loop.kind != "open_loop" else []

@@ -123,6 +123,7 @@ def text(
     accelerometer: bool = False,
     joints: tuple[int, ...] = (1, 2),
     effects: str = "",
+    true: dict[str, float] = TRUTH,
 ) -> str:
     """Return the case file: all of the axis unknown except what is given as known.
 
@@ -135,11 +136,12 @@ def text(
         offset: Whether the second encoder has an unknown one.
         joints: With friction.
         effects: More of them, as text.
+        true: True values of what is unknown.
     """
     known = known or {}
 
     def entry(name: str) -> str:
-        return repr(known[name]) if name in known else f"{{ guess = {guess[name]}, true = {TRUTH[name]} }}"
+        return repr(known[name]) if name in known else f"{{ guess = {guess[name]}, true = {true[name]} }}"
 
     of_plant = ("motor_inertia", "load_inertia", "stiffness", "damping")
     lines = ["[plant]", 'kind = "flexible_axis"', "[plant.parameters]"]
