@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 # Samples beyond which a filter over the whole log takes too long for a default.
 _LONG = 400_000
-# Joints of an arm up to which a filter is fast enough.
-_FEW = 2
 
 
 class Choice(NamedTuple):
@@ -67,8 +65,8 @@ def choose_method(session: Session, asked: str | None = None) -> Choice:
         return Choice(
             "output_error", "the log is slower than the loop, whose command changes between samples"
         )
-    if plant.coupled and len(log.measured) > _FEW:
-        return Choice("inverse_dynamics", "a filter along the log of an arm takes long")
+    if not plant.filters_fast:
+        return Choice("inverse_dynamics", "a filter along the log of such a plant takes long")
     if log.samples > _LONG:
         return Choice("inverse_dynamics", f"a filter along {log.samples} samples takes long")
 

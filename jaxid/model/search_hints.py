@@ -30,6 +30,11 @@ class SearchHints(Drives):
         """True if `discover` designs experiments by default; for coupled joints that compiles for minutes."""
         return not self.coupled
 
+    @property
+    def filters_fast(self) -> bool:
+        """True if `identify` and `discover` may choose a Kalman filter; along coupled joints it takes minutes."""
+        return not self.coupled or self.joints <= 2
+
     @classmethod
     def bodies(cls, joints: int) -> int:
         """Return the number of ports that are called joints, those of rigidly geared parts included."""

@@ -207,6 +207,11 @@ class FiveBar(WithLinks):
         return jnp.concatenate([q, jnp.stack([np.pi - turn[1], between, np.pi + turn[0]]), at.tool])
 
     @property
+    def filters_fast(self) -> bool:
+        # The loop is closed anew at every step, which takes many minutes along a log.
+        return False
+
+    @property
     def gearing(self) -> Array | float:
         return 1.0 if self.reduction is None else self.reduction
 

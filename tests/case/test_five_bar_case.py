@@ -8,6 +8,7 @@ import pytest
 from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
+from jaxid.estimators.choice import choose_method
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.recursive.estimate import recursive_steps
 from jaxid.experiment_design.in_loop import _DesignProblem
@@ -78,6 +79,12 @@ def opened(folder, text, log):
 @pytest.fixture(scope="module")
 def session(log, tmp_path_factory):
     return opened(tmp_path_factory.mktemp("case"), PLANT + UNKNOWN + LOG, log)
+
+
+def test_no_filter_is_chosen_for_a_loop_that_is_closed_at_every_step(session):
+    choice = choose_method(session)
+    assert choice.method == "inverse_dynamics"
+    assert "filter" in choice.reason
 
 
 def recursive(machine, data):
