@@ -32,7 +32,7 @@ class SearchHints(Drives):
 
     @property
     def filters_fast(self) -> bool:
-        """True if `identify` and `discover` may choose a Kalman filter; along coupled joints it takes minutes."""
+        """True if a Kalman filter may be chosen by default; along coupled joints it takes minutes."""
         return not self.coupled or self.joints <= 2
 
     @classmethod
