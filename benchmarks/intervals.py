@@ -71,12 +71,14 @@ def table(records: list[dict[str, Any]]) -> str:
         f"Written by `python -m benchmarks.intervals` on {date.today()}.",
         "Of the values that are printed: the share of 95 % intervals that hold the truth, with the 99 %",
         "range of so many Bernoulli draws at 95 %, and the largest deviation in standard deviations.",
-        "Truth, motion and noise are drawn in each run.",
+        "Truth, motion and noise are drawn in each run. Efficiency is the bound of Cramer and Rao, by the",
+        "innovations of the Kalman filter at the truth, over the mean squared error.",
         "",
-        "| cell | method | runs | failed | values | 95 % holds | range | largest | not printed | s a fit "
-        "| commit |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| cell | method | runs | failed | values | 95 % holds | range | largest | efficiency | not printed "
+        "| s a fit | commit |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
+    bounds = {(r["cell"], r["seed"]): r["bound"] for r in records if "bound" in r}
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in records:
         groups.setdefault((record["cell"], record["asked"]), []).append(record)
@@ -90,11 +92,21 @@ def table(records: list[dict[str, Any]]) -> str:
         share = [100 * x / max(z.size, 1) for x in (low, high)]
         blind = sum(r.get("not_identifiable", 0) for r in of)
         largest = f"{np.abs(z).max():.1f}" if z.size else "-"
+        ratios = np.array(
+            [
+                error / bound[name]
+                for r in of
+                if (bound := bounds.get((r["cell"], r["seed"])))
+                for name, error in r.get("error", {}).items()
+            ]
+        )
+        efficiency = f"{1 / np.mean(ratios**2):.2f}" if ratios.size else "-"
         commits = ", ".join(sorted({r["commit"] for r in of}))
         seconds = np.median([r["seconds"] for r in of])
         lines.append(
             f"| {cell} | {name} | {len(of)} | {failed} | {z.size} | {hold} | "
-            f"{share[0]:.1f}-{share[1]:.1f} % | {largest} | {blind} | {seconds:.2f} | {commits} |"
+            f"{share[0]:.1f}-{share[1]:.1f} % | {largest} | {efficiency} | {blind} | "
+            f"{seconds:.2f} | {commits} |"
         )
     return "\n".join(lines) + "\n"
 
