@@ -344,12 +344,19 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
     need_likelihood(method, session.case)
     if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
+    if method == "within_prior":
+        steps = METHODS[method]
+    else:
+        from jaxid.estimators.common.shapes import seen_shapes
+
+        # A prior says something about every shape; other methods know what the log shows.
+        steps = lambda *args, **kwargs: seen_shapes(METHODS[method](*args, **kwargs))
     if not session.case.identification.physically_consistent:
-        return METHODS[method](session, **options)
+        return steps(session, **options)
     from jaxid.estimators.common.consistency import need_bodies, with_links
 
     need_consistent(method, session.case)
-    return with_links(METHODS[method](need_bodies(session), **options))
+    return with_links(steps(need_bodies(session), **options))
 
 
 def need_likelihood(method: str, case: Case) -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Bool
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import DAMPING, Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -28,10 +29,6 @@ from jaxid.simulation.force_balance import ForceData, _size, force_residual, sha
 
 # Damping of the solver if the balance is linear in all unknowns: a single step then solves it.
 _UNDAMPED = 1e-10
-# Factors on the guess of a shape parameter for additional starts.
-_SHAPES = (0.3, 3.0)
-# Dimensions of parameters of which such factors are no sizes.
-_NO_SHAPES = ("1", "angle")
 # Shares of the dry friction that additional starts put on joints without an encoder.
 _SHARES = (0.2, 0.5, 0.8)
 
@@ -168,22 +165,6 @@ def _number(free: Free) -> int:
     number = free.path[1]
     assert isinstance(number, int), "the path of an effect's parameter goes through its number"
     return number
-
-
-def shape_starts(machine: Machine, theta: np.ndarray) -> list[np.ndarray]:
-    """Return a start with each shape (a width, a lag, a period) smaller, and one with it larger.
-
-    Linear unknowns are solved in one step from any start. But if a shape starts far off, the strength of its
-    effect may fall to zero, and the shape then has no slope.
-    """
-    out: list[np.ndarray] = []
-    for k, f in enumerate(machine.parameters.free):
-        if f.path[0] != "effects":
-            continue
-        info = _info(machine.plant, f)
-        if info is not None and not carries_force(info) and info.dimension not in _NO_SHAPES and theta[k] > 0:
-            out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _SHAPES]
-    return out
 
 
 def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> list[np.ndarray]:

@@ -16,8 +16,8 @@ from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.common.scoring import Scored, maximise_likelihood
+from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import shape_starts
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
@@ -227,7 +227,7 @@ def prediction_error_steps(
         theta, steps = np.asarray(transform.outward(scored.x[:p])), steps + int(scored.steps)
 
     read = np.zeros(m)
-    if applied is None and command_noise is not None and np.any(command_noise > 0):
+    if bool(scored.converged) and applied is None and command_noise is not None and np.any(command_noise > 0):
         x, read = yield from _corrected_steps(problem, scored, theta, command_noise)
         theta = np.clip(transform.outward(x), *bounds)
     estimate = _estimate(machine, problem, theta, scored, by_law=applied is not None, read=read, steps=steps)
@@ -282,6 +282,9 @@ def _corrected_steps(
         more = np.repeat(more, every, axis=0)[: len(command)]
         for sign in (1.0, -1.0):
             gradients.append(np.asarray((yield at(command + sign * more)).gradient))
+    if not np.all(np.isfinite(information)) or not np.all(np.isfinite(gradients)):
+        return x[:p], np.zeros(drives)
+
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information / np.outer(size, size), rcond=_BLIND, hermitian=True)
     shift = -inverse @ (np.mean(gradients, axis=0) / size) / size

@@ -110,7 +110,9 @@ def maximise_likelihood(
     def advance(s: _Trial) -> _Trial:
         cost, gradient, normal, arrays = evaluate(s.trial)
         was = s.best
-        better, first = cost < was.cost, ~jnp.isfinite(was.cost)
+        # A shape that a log does not show may run to a value at which the likelihood has no slope.
+        sound = jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
+        better, first = (cost < was.cost) & sound, ~jnp.isfinite(was.cost)
         gain = (was.cost - cost) / jnp.maximum(s.predicted, 1e-300)
         little = better & ~first & (was.cost - cost < _TOLERANCE)
 

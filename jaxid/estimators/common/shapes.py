@@ -1,0 +1,83 @@
+"""Shapes of effects: a velocity, a lag, a period, which do not enter the balance linearly."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxid.estimators.estimate import Estimate
+from jaxid.machine import Machine
+from jaxid.model.effect import carries_force
+from jaxid.model.parameter import parameters_of
+
+# Factors of a shape in the starts that differ by it.
+_FACTORS = (0.3, 3.0)
+# Dimensions of parameters of which such factors are no sizes.
+_NO_SIZES = ("1", "angle")
+
+
+def shapes(machine: Machine) -> Bool[np.ndarray, " p"]:
+    """Return the mask of the unknowns that are a shape of an effect."""
+    found = []
+    for free in machine.parameters.free:
+        number = free.effect
+        if number is None:
+            found.append(False)
+            continue
+        info = parameters_of(type(machine.plant.effects[number]))[str(free.path[-1])]
+        found.append(not carries_force(info) and info.dimension not in _NO_SIZES)
+
+    return np.asarray(found, dtype=bool)
+
+
+def shape_starts(machine: Machine, theta: Float[np.ndarray, " p"]) -> list[np.ndarray]:
+    """Return a start with each shape smaller, and one with it larger.
+
+    Linear unknowns are solved in one step from any start. But if a shape starts far off, the strength of its
+    effect may fall to zero, and the shape then has no slope.
+    """
+    out: list[np.ndarray] = []
+    for k in np.flatnonzero(shapes(machine) & (theta > 0)):
+        out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _FACTORS]
+    return out
+
+
+def without_unseen_shapes(estimate: Estimate) -> Estimate:
+    """Return the estimate with the unknowns of an effect not identifiable if its shape is not.
+
+    A shape that the log does not show ends anywhere. The standard deviation of the strength then holds for
+    that value of the shape only.
+    """
+    free, seen = estimate.machine.parameters.free, estimate.identifiable
+    if estimate.theta.size == 0 or seen.all():
+        return estimate
+
+    blind = shapes(estimate.machine) & ~seen
+    unseen = {f.effect for f, b in zip(free, blind, strict=True) if b}
+    depends = np.asarray([ok and f.effect in unseen for f, ok in zip(free, seen, strict=True)])
+    if not depends.any():
+        return estimate
+
+    precision = estimate.precision
+    covariance = precision.covariance.copy()
+    covariance[depends], covariance[:, depends] = np.nan, np.nan
+    names = [f.name for f, d in zip(free, depends, strict=True) if d]
+    precision = replace(
+        precision,
+        covariance=covariance,
+        identifiable=seen & ~depends,
+        unidentifiable=[*precision.unidentifiable, *({name: 1.0} for name in names)],
+    )
+    note = (
+        f"{', '.join(names)}: not identifiable without the shape of the effect, which the log does not show"
+    )
+    return replace(estimate, precision=precision, notes=(*estimate.notes, note))
+
+
+def seen_shapes(steps: Generator[Any, Any, Estimate]) -> Generator[Any, Any, Estimate]:
+    """Run the steps of a fit, and apply `without_unseen_shapes` to its estimate."""
+    return without_unseen_shapes((yield from steps))
