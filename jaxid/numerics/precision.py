@@ -31,6 +31,8 @@ _COMMON = 40
 GAUSS_NEWTON, FULL_HESSIAN = "gauss_newton", "full_hessian"
 POSTERIOR, LAPLACE, ROUNDING = "posterior_draws", "laplace", "simulated_rounding"
 FISHER = "fisher_information"
+# Matrices that a full Hessian stands in place of, in words.
+_PLAIN = {GAUSS_NEWTON: "the Gauss-Newton matrix", FISHER: "Fisher's information"}
 KINDS = {
     GAUSS_NEWTON: "the Gauss-Newton matrix and the colour of the residual",
     FULL_HESSIAN: "the full Hessian and the colour of the residual",
@@ -198,6 +200,15 @@ class Precision:
         """Standard deviations, (p,); NaN for parameters that are not identifiable."""
         return np.sqrt(np.diag(self.covariance))
 
+    def widened(self, factor: Float[np.ndarray, " p"]) -> Precision:
+        """Return the precision with each standard deviation multiplied by a factor, (p,)."""
+        white = self.equivalent_variance
+        return replace(
+            self,
+            covariance=self.covariance * np.outer(factor, factor),
+            equivalent_variance=None if white is None else white * factor**2,
+        )
+
     def first(self, names: list[str]) -> Precision:
         """Return the precision of the first parameters, which have these names, without the nuisances."""
         p = len(names)
@@ -325,6 +336,33 @@ def hessian_covariance(
     return curved @ (directions.T @ meat @ directions) @ curved.T, curvature
 
 
+def profiled_out(
+    hessian: Float[np.ndarray, "q q"], kept: Bool[np.ndarray, " q"]
+) -> Float[np.ndarray, "p p"] | None:
+    """Return the Hessian of a cost that is minimised over all unknowns but the kept ones, (p, p).
+
+    It is the Schur complement of the block of the others. With that block positive definite, it is positive
+    definite if and only if the whole Hessian is.
+
+    Args:
+        hessian: Hessian over all unknowns at a minimum, (q, q).
+        kept: Mask of the p kept unknowns, (q,).
+
+    Returns:
+        The Hessian; None if the block of the others is not positive definite, or a number is not finite.
+    """
+    if not np.all(np.isfinite(hessian)):
+        return None
+    own, others, between = (hessian[np.ix_(a, b)] for a, b in ((kept, kept), (~kept, ~kept), (~kept, kept)))
+    if not others.size:
+        return own
+    try:
+        half = scipy.linalg.solve_triangular(np.linalg.cholesky(others), between, lower=True)
+    except np.linalg.LinAlgError:
+        return None
+    return own - half.T @ half
+
+
 def held(directions: Float[np.ndarray, "p k"]) -> Bool[np.ndarray, " p"]:
     """Return the mask of unknowns that occur in unidentifiable orthonormal directions, (p,)."""
     return np.linalg.norm(directions, axis=1) > _NEGLIGIBLE
@@ -363,8 +401,14 @@ def _signed(v: np.ndarray) -> np.ndarray:
     return v if first > 0 else -v
 
 
-def hessian_notes(precision: Precision, asked: bool) -> list[str]:
-    """Return the note that says which matrix the covariance comes from, if the full Hessian was asked for."""
+def hessian_notes(precision: Precision, asked: bool, plain: str = GAUSS_NEWTON) -> list[str]:
+    """Return the note that says which matrix the covariance comes from, if the full Hessian was asked for.
+
+    Args:
+        precision: Precision of the unknowns.
+        asked: Whether the full Hessian was asked for.
+        plain: Kind of the covariance without it.
+    """
     if not asked:
         return []
     if precision.curvature is None:
@@ -375,7 +419,7 @@ def hessian_notes(precision: Precision, asked: bool) -> list[str]:
             "the full Hessian is not positive definite and was not used; the covariance comes from "
             f"{KINDS[precision.kind]}"
         ]
-    return [f"the full Hessian is {low:.3g} to {high:.3g} times the Gauss-Newton matrix, by direction"]
+    return [f"the full Hessian is {low:.3g} to {high:.3g} times {_PLAIN[plain]}, by direction"]
 
 
 def full_hessian(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxid.numerics.misspecified import std_under_misspecification
-from jaxid.numerics.precision import assess
+from jaxid.numerics.misspecified import block_covariance, std_under_misspecification, widening
+from jaxid.numerics.precision import Precision, assess
 
 MOVES, SAMPLES = 48, 40  # of one log: moves, and samples a move
 
@@ -64,3 +64,41 @@ def test_directions_that_the_log_does_not_hold_and_short_logs():
     scaled = std_under_misspecification(jacobian / 1e3, residual, counts)[0]
     assert scaled == pytest.approx(1e3 * one)
     assert np.all(np.isnan(std_under_misspecification(jacobian[:20], residual[:20], counts[:20])))
+
+
+def test_errors_that_last_for_a_block_widen_the_deviations():
+    rng = np.random.default_rng(2)
+    blocks, length = 40, 50
+    jacobian = np.ones((blocks * length, 1, 1))
+    z = np.repeat(rng.standard_normal(blocks), length)[:, None]
+    counts = np.ones(z.shape, bool)
+    white = Precision(np.full((1, 1), 1 / z.size), np.ones(1, bool), [], np.ones(1))
+    got = white.std * widening(white, jacobian, z, counts)
+    # The mean of 40 independent blocks, however many samples each has.
+    assert got[0] == pytest.approx(1 / np.sqrt(blocks), rel=4 / np.sqrt(2 * blocks))
+    assert widening(white, jacobian, 1e-3 * z, counts)[0] == 1.0
+    assert widening(white, jacobian[:79], z[:79], counts[:79])[0] == 1.0
+    unseen = Precision(np.full((1, 1), np.nan), np.zeros(1, bool), [], np.ones(1))
+    assert widening(unseen, jacobian, z, counts)[0] == 1.0
+
+
+def test_one_sandwich_for_both():
+    """Blocks of two regressors against the formulas: with all rows, and by fits without each block."""
+    rng = np.random.default_rng(3)
+    samples, edges = 90, np.array([20, 50, 70])
+    x = rng.standard_normal((samples, 1, 2)) * [1.0, 1e4]
+    beta, noise = np.array([2.0, 3e-4]), np.cumsum(rng.standard_normal(samples))
+    y = x[:, 0] @ beta + noise
+    counts = rng.random(samples) < 0.8
+    best = np.linalg.lstsq(x[counts, 0], y[counts])[0]
+    residual = x[:, 0] @ best - y
+    given = (x, residual[:, None], counts[:, None], edges)
+    parts = np.split(np.arange(samples), edges)
+    scores = np.array([x[k, 0].T @ (residual * counts)[k] for k in parts])
+    inverse = np.linalg.inv(x[counts, 0].T @ x[counts, 0])
+    np.testing.assert_allclose(block_covariance(*given), inverse @ (scores.T @ scores) @ inverse, rtol=1e-9)
+
+    without = [counts & ~np.isin(np.arange(samples), k) for k in parts]
+    fits = np.array([np.linalg.lstsq(x[k, 0], y[k])[0] for k in without])
+    off = fits - fits.mean(axis=0)
+    np.testing.assert_allclose(block_covariance(*given, left_out=True), 0.75 * off.T @ off, rtol=1e-8)
