@@ -42,7 +42,7 @@ WHEN = {
 # Further entries of [study] estimators: the search, and the estimate of an adaptive controller.
 DISCOVER, IN_LOOP = "discover", "in_loop"
 # Methods that maximise a likelihood, so that it has a Hessian and profiles.
-LIKELIHOOD_METHODS = ("output_error", "within_prior")
+LIKELIHOOD_METHODS = ("output_error", "prediction_error", "within_prior")
 # Signals of a simulated loop that output error compares with the log.
 OUTPUTS = ("position", "force", "both")
 # Methods that output error may take its start from.

@@ -145,12 +145,18 @@ def _within_prior(
     )
 
 
-def _prediction_error(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
+def _prediction_error(
+    session: Session,
+    *,
+    numerics: Numerics | None = None,
+    hessian: bool | None = None,
+    profile: Sequence[str] | None = None,
+) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.prediction_error import prediction_error_steps
     from jaxid.simulation.sensor_noise import force_noise
 
-    machine, run = session.machine, session.fit
+    machine, run, demands = session.machine, session.fit, session.case.identification
     first = yield from inverse_dynamics_steps(machine, run.data)
     return (
         yield from prediction_error_steps(
@@ -160,6 +166,8 @@ def _prediction_error(session: Session, *, numerics: Numerics | None = None) -> 
             numerics=numerics,
             rest_velocity=np.asarray(run.data.recipe.rest_velocity),
             command_noise=force_noise(machine, run.data),
+            hessian=demands.hessian if hessian is None else hessian,
+            profile=demands.profile if profile is None else profile,
         )
     )
 

@@ -32,7 +32,7 @@ class Choice(NamedTuple):
         return {"value": self.method, "reason": self.reason}
 
 
-def choose_method(session: Session, asked: str | None = None) -> Choice:
+def choose_method(session: Session, asked: str | None = None, *, curvature: bool = False) -> Choice:
     """Choose the method for a session whose method is not stated.
 
     `docs/methods.md` says how often intervals of the chosen method hold, as far as that is measured.
@@ -40,14 +40,13 @@ def choose_method(session: Session, asked: str | None = None) -> Choice:
     Args:
         session: Case and logs.
         asked: An option of `output_error` that the user gave, such as "solver"; None: none.
+        curvature: Whether the user asked for a Hessian or a profile, which only a likelihood has.
     """
     case, machine, log = session.case, session.machine, session.fit.log
     plant, controller = machine.plant, machine.controller
 
     if asked is not None:
         return Choice("output_error", f"{asked} is an option of it")
-    if case.within_prior is None and (case.identification.hessian or case.identification.profile):
-        return Choice("output_error", "[identification] asks for a Hessian or a profile, which it gives")
     if "output_error" in case.tables and case.within_prior is None:
         return Choice("output_error", "the case has a table [output_error]")
     if case.fits_within_prior(None):
@@ -65,10 +64,17 @@ def choose_method(session: Session, asked: str | None = None) -> Choice:
         return Choice(
             "output_error", "the log is slower than the loop, whose command changes between samples"
         )
+    long = ""
     if not plant.filters_fast:
-        return Choice("inverse_dynamics", "a filter along the log of such a plant takes long")
-    if log.samples > _LONG:
-        return Choice("inverse_dynamics", f"a filter along {log.samples} samples takes long")
+        long = "a filter along the log of such a plant takes long"
+    elif log.samples > _LONG:
+        long = f"a filter along {log.samples} samples takes long"
+    if long and (curvature or case.identification.hessian or case.identification.profile):
+        return Choice(
+            "output_error", f"{long}, and inverse_dynamics has no likelihood with a Hessian or profile"
+        )
+    if long:
+        return Choice("inverse_dynamics", long)
 
     how = "open loop and feedback are one case" if controller is None else "the log holds the command"
     if not np.all(log.measured):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,26 +11,25 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from jaxid.arrays import Array
 from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Transform
-from jaxid.estimators.common.scoring import Scored, maximise_likelihood
+from jaxid.estimators.common.profile import need_names
+from jaxid.estimators.common.scoring import Scored
 from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.innovations import STEPS, Innovations, fit, hessian_steps, profile_steps
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.model.plant import Plant
-from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.misspecified import std_under_misspecification
-from jaxid.numerics.precision import FISHER, Precision, assess
-from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples
+from jaxid.numerics.misspecified import std_under_misspecification, widening
+from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, assess, hessian_notes
+from jaxid.simulation.kalman import make_filter, slow_samples
 from jaxid.simulation.replay import Numerics, exact_numerics
 from jaxid.simulation.sensor_noise import position_noise
 
-# Evaluations of a fit, and those that show which start is the best one.
-_STEPS, _SCREENING = 80, 12
+# Evaluations that show which start is the best one.
+_SCREENING = 12
 # Noise of the force at the start, as a part of the force; a large one makes a wrong model possible.
 _FORCE_NOISE = 0.1
 # Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow
@@ -47,52 +46,8 @@ _FINER = 4
 _PAIRS = 4
 # Eigenvalue of the scaled information, relative to the largest, below which a direction is not corrected.
 _BLIND = 1e-10
-# Blocks whose scores give the least variance of the estimates.
-_BLOCKS = 40
 # Lags of the test of whiteness, and the probability at which it rejects.
 _LAGS, _REJECTS = 20, 1e-3
-
-
-class _Problem(NamedTuple):
-    """A likelihood.
-
-    Args:
-        kalman: Filter of the log.
-        places: Places of the unknowns in the plant.
-        plant: The plant.
-        counts: Mask of the innovations that count, (time, k).
-        transform: Scale of the unknowns in the solver.
-        bounds: Bounds on the unknowns, (p,) each.
-        low, high: Bounds on the logarithms of the noise, of the force and then of the readings, (m + k,).
-    """
-
-    kalman: KalmanFilter
-    places: tuple
-    plant: Plant
-    counts: Array
-    transform: Transform
-    bounds: tuple[Array, Array]
-    low: Array
-    high: Array
-
-
-@eqx.filter_jit
-def _fit(problem: _Problem, theta: Array, noise: Array, max_steps: Array) -> Scored:
-    """Maximise a likelihood from physical values and logarithms of the noise; one step only evaluates it."""
-    kalman, transform = problem.kalman, problem.transform
-    p, m = theta.size, kalman.command.shape[1]
-
-    def outputs(x: Array) -> tuple[Array, Array]:
-        fitted = scatter(problem.places, problem.plant, transform.outward(x[:p]))
-        return kalman(fitted, jnp.exp(x[p : p + m]), jnp.exp(x[p + m :]))
-
-    limits = transform.bounds(*(jnp.asarray(b) for b in problem.bounds))
-    lower, upper = (
-        jnp.concatenate([of_unknowns, of_noise])
-        for of_unknowns, of_noise in zip(limits, (problem.low, problem.high), strict=True)
-    )
-    start = jnp.concatenate([transform.inward(theta), noise])
-    return maximise_likelihood(outputs, problem.counts, start, lower, upper, max_steps)
 
 
 def prediction_error(
@@ -104,6 +59,8 @@ def prediction_error(
     rest_velocity: np.ndarray | None = None,
     command_noise: np.ndarray | None = None,
     alone: bool = False,
+    hessian: bool = False,
+    profile: Sequence[str] = (),
 ) -> Estimate:
     """Fit the unknowns, the noise of the force and the noise of the readings by maximum likelihood.
 
@@ -122,13 +79,17 @@ def prediction_error(
         command_noise: Standard deviation with which the command was read, (m,), whose bias is removed; None:
             it was logged exactly.
         alone: Whether `start` is the only start, because it is known to be near the optimum.
+        hessian: Whether the covariance uses the observed information in place of Fisher's; see
+            `jaxid.numerics.precision.hessian_covariance`.
+        profile: Names of the unknowns whose profile likelihood is computed; see
+            `jaxid.estimators.common.profile`.
 
     Returns:
         The estimate. Its covariance is that of the likelihood, widened if the innovations are coloured. If
         the case states the true values, `least_std` of the details is the bound of Cramer and Rao there.
 
     Raises:
-        InputError: If too few readings count.
+        InputError: If too few readings count, or a name in `profile` is not known.
 
     Source:
         Ljung (1999), System Identification, chapter 7; Astrom (1980), Automatica 16, for the innovations.
@@ -142,6 +103,8 @@ def prediction_error(
             rest_velocity=rest_velocity,
             command_noise=command_noise,
             alone=alone,
+            hessian=hessian,
+            profile=profile,
         )
     )
 
@@ -155,8 +118,11 @@ def prediction_error_steps(
     rest_velocity: np.ndarray | None = None,
     command_noise: np.ndarray | None = None,
     alone: bool = False,
+    hessian: bool = False,
+    profile: Sequence[str] = (),
 ) -> Steps[Estimate]:
     """Run `prediction_error` as a generator of solve requests."""
+    need_names(profile, machine.parameters.names)
     numerics = numerics or exact_numerics(machine, log)
     parameters, measured = machine.parameters, list(log.measured)
     applied = noise_free_command(machine, log)
@@ -181,7 +147,7 @@ def prediction_error_steps(
     noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
     floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
     transform, bounds = Transform.of(parameters), parameters.bounds
-    problem = _Problem(
+    problem = Innovations(
         kalman=kalman,
         places=parameters.places,
         plant=machine.plant,
@@ -200,7 +166,7 @@ def prediction_error_steps(
         starts.insert(0, np.clip(start, *bounds))
     theta, trials = starts[0], []
     for at in starts if len(starts) > 1 else ():
-        trials.append((yield SolveRequest(_fit, (problem, at, noise, np.asarray(_SCREENING)))))
+        trials.append((yield SolveRequest(fit, (problem, at, noise, np.asarray(_SCREENING)))))
     if trials:
         best = min(trials, key=lambda trial: np.nan_to_num(float(trial.cost), nan=np.inf))
         theta, noise = np.asarray(transform.outward(best.x[:p])), best.x[p:]
@@ -209,7 +175,7 @@ def prediction_error_steps(
     scored = None
     for floor in floors:
         problem = problem._replace(low=floor)
-        scored = yield SolveRequest(_fit, (problem, theta, noise, np.asarray(_STEPS)))
+        scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(STEPS)))
         theta, noise = np.asarray(transform.outward(scored.x[:p])), np.asarray(scored.x[p:])
         steps += int(scored.steps)
         if np.all(noise[:m] > floor[:m] + 1e-3) or not np.isfinite(float(scored.cost)):
@@ -223,7 +189,7 @@ def prediction_error_steps(
         kalman = make_filter(machine, driven, finer)
         counts = np.asarray(kalman.used)[:: kalman.every][:, measured]
         problem = problem._replace(kalman=kalman, counts=counts)
-        scored = yield SolveRequest(_fit, (problem, theta, noise, np.asarray(_STEPS)))
+        scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(STEPS)))
         theta, steps = np.asarray(transform.outward(scored.x[:p])), steps + int(scored.steps)
 
     read = np.zeros(m)
@@ -235,15 +201,22 @@ def prediction_error_steps(
     true = [free.true for free in parameters.free]
     if None not in true and estimate.converged:
         truth = np.array(true, dtype=np.float64)
-        there = yield SolveRequest(_fit, (problem, truth, noise, np.asarray(1)))
+        there = yield SolveRequest(fit, (problem, truth, noise, np.asarray(1)))
         bound = _precision(parameters.names, problem, truth, there).std
         values = dict(zip(parameters.names, bound.tolist(), strict=True))
         estimate = replace(estimate, details={**estimate.details, "least_std": values})
-    return estimate
+    if hessian:
+        estimate = yield from _by_hessian(estimate, problem, scored)
+    if not profile:
+        return estimate
+    profiles, notes = yield from profile_steps(problem, machine, theta, scored, estimate.precision, profile)
+    return replace(
+        estimate, notes=(*estimate.notes, *notes), details={**estimate.details, "profiles": profiles}
+    )
 
 
 def _corrected_steps(
-    problem: _Problem, scored: Scored, theta: np.ndarray, command_noise: np.ndarray
+    problem: Innovations, scored: Scored, theta: np.ndarray, command_noise: np.ndarray
 ) -> Steps[tuple[np.ndarray, np.ndarray]]:
     """Remove the bias by noise with which the command was read; return the estimates and the noise.
 
@@ -272,7 +245,7 @@ def _corrected_steps(
 
     def at(command: np.ndarray) -> SolveRequest:
         shifted = problem._replace(kalman=eqx.tree_at(lambda k: k.command, kalman, command))
-        return SolveRequest(_fit, (shifted, theta, noise, np.asarray(1)))
+        return SolveRequest(fit, (shifted, theta, noise, np.asarray(1)))
 
     command, every = np.asarray(kalman.command), kalman.every
     information = np.asarray((yield at(command)).information)
@@ -301,7 +274,7 @@ def slides(machine: Machine, log: Log) -> bool:
 
 def _estimate(
     machine: Machine,
-    problem: _Problem,
+    problem: Innovations,
     theta: np.ndarray,
     scored: Scored,
     *,
@@ -321,10 +294,8 @@ def _estimate(
         steps: Evaluations of all fits.
     """
     names, counts, drives = machine.parameters.names, np.asarray(problem.counts), len(read)
-    z = np.asarray(scored.z)
-    jacobian = _slopes(problem, scored, len(theta))
-    precision = _precision(names, problem, theta, scored)
-    precision = widened(precision, np.einsum("tk,tkp->tp", z, jacobian), jacobian)
+    z, jacobian = np.asarray(scored.z), _slopes(problem, scored)
+    plain = _precision(names, problem, theta, scored)
 
     noise = np.exp(np.asarray(scored.x)[len(theta) :])
     p_values = [whiteness(e[c]) for e, c in zip(z.T, counts.T, strict=True)]
@@ -344,7 +315,7 @@ def _estimate(
         method="prediction_error",
         machine=machine.with_estimate(theta),
         theta=theta,
-        precision=precision,
+        precision=plain.widened(widening(plain, jacobian, z, counts)),
         converged=converged,
         message="converged" if converged else f"no convergence within {steps} steps",
         residual=np.where(counts, z, np.nan),
@@ -360,57 +331,61 @@ def _estimate(
     )
 
 
-def _slopes(problem: _Problem, scored: Scored, p: int) -> Float[np.ndarray, "time k p"]:
-    """Return the derivatives of the innovations, over their standard deviations, by the p unknowns in SI."""
+def _by_hessian(estimate: Estimate, problem: Innovations, scored: Scored) -> Steps[Estimate]:
+    """Replace Fisher's information in the covariance by the full Hessian, if that is positive definite.
+
+    Args:
+        estimate: Estimate with its precision by Fisher's information.
+        problem: The likelihood.
+        scored: The fit.
+    """
+    full = yield from hessian_steps(problem, scored)
+    if full is None:
+        precision = replace(estimate.precision, curvature=np.full(2, np.nan))
+    else:
+        names, theta = estimate.names, estimate.theta
+        # Errors that outlast their colour's model widen both by the same factors.
+        plain, curved = (_precision(names, problem, theta, scored, h) for h in (None, full))
+        jacobian, z, counts = _slopes(problem, scored), np.asarray(scored.z), np.asarray(problem.counts)
+        precision = curved.widened(widening(plain, jacobian, z, counts))
+    notes = hessian_notes(precision, True, FISHER)
+    return replace(estimate, precision=precision, notes=(*estimate.notes, *notes))
+
+
+def _slopes(problem: Innovations, scored: Scored) -> Float[np.ndarray, "time k p"]:
+    """Return the derivatives of the innovations, over their standard deviations, by the unknowns in SI."""
+    p = problem.bounds[0].size
     # The slopes are those at the optimum, before the correction.
     fitted = problem.transform.outward(scored.x[:p])
     rows = problem.transform.physical(scored.mean[..., :p].reshape(-1, p), fitted)
     return np.asarray(rows).reshape(*scored.z.shape, p)
 
 
-def _precision(names: list[str], problem: _Problem, theta: np.ndarray, scored: Scored) -> Precision:
-    """Return the precision by Fisher's information of the innovations."""
-    counts, jacobian = np.asarray(problem.counts), _slopes(problem, scored, len(theta))
+def _precision(
+    names: list[str],
+    problem: Innovations,
+    theta: np.ndarray,
+    scored: Scored,
+    hessian: Float[np.ndarray, "p p"] | None = None,
+) -> Precision:
+    """Return the precision by Fisher's information of the innovations, or by the observed one.
+
+    Args:
+        names: Names of the unknowns.
+        problem: The likelihood.
+        theta: Estimates, (p,).
+        scored: The fit.
+        hessian: Observed information, which is used if it is positive definite, (p, p); None: not known.
+    """
+    counts, jacobian = np.asarray(problem.counts), _slopes(problem, scored)
 
     # An unknown is identifiable if its standard deviation changes the innovations less than the largest
     # effect of any unknown does.
     scale = np.where(theta != 0, theta, 1.0)
     effect = np.linalg.norm((jacobian * scale).reshape(-1, len(theta)), axis=0)
     largest = float(np.max(effect, initial=0.0))
-    precision = assess(names, jacobian, np.asarray(scored.z), counts, largest, scale)
-    return replace(precision, kind=FISHER)
-
-
-def widened(
-    precision: Precision, scores: Float[np.ndarray, "time p"], jacobian: Float[np.ndarray, "time k p"]
-) -> Precision:
-    """Return the precision with standard deviations at least as large as the scores of long blocks imply.
-
-    Rounding of a steady motion, and an incomplete model, leave errors that last longer than any innovation
-    model remembers. The sum of the scores over a block has their whole variance.
-
-    Args:
-        precision: Precision by the model of the innovations.
-        scores: Derivative of the log-likelihood of each sample, (time, p).
-        jacobian: Derivative of the innovations over their standard deviations, (time, k, p).
-
-    Source:
-        White (1982), Econometrica 50; blocks for dependent samples after Kunsch (1989), Annals of
-        Statistics 17.
-    """
-    keep = precision.identifiable
-    if not keep.any() or len(scores) < 2 * _BLOCKS:
-        return precision
-    rows = jacobian[..., keep].reshape(-1, keep.sum())
-    size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-    inverse = np.linalg.pinv((rows / size).T @ (rows / size), rcond=1e-12, hermitian=True)
-    sums = np.array([part.sum(axis=0) for part in np.array_split(scores[:, keep] / size, _BLOCKS)])
-    blocked = inverse @ (sums.T @ sums) @ inverse / np.outer(size, size)
-    factor = np.ones(len(keep))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.sqrt(np.diag(blocked)) / precision.std[keep]
-    factor[keep] = np.where(np.isfinite(ratio), np.maximum(ratio, 1.0), 1.0)
-    return replace(precision, covariance=precision.covariance * np.outer(factor, factor))
+    precision = assess(names, jacobian, np.asarray(scored.z), counts, largest, scale, hessian)
+    return replace(precision, kind=FULL_HESSIAN if precision.kind == FULL_HESSIAN else FISHER)
 
 
 def whiteness(z: Float[np.ndarray, " time"], lags: int = _LAGS) -> float:

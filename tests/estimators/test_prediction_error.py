@@ -11,8 +11,7 @@ import jaxid
 from jaxid.consistency.law import noise_free_command
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.scoring import maximise_likelihood
-from jaxid.estimators.prediction_error import whiteness, widened
-from jaxid.numerics.precision import Precision
+from jaxid.estimators.prediction_error import whiteness
 from jaxid.session import open_session
 from jaxid.simulation.kalman import readings_used, slow_samples, smooth_steps
 from truth.axis.cases import case_text
@@ -176,18 +175,6 @@ def test_whiteness_is_uniform_for_white_noise_and_small_for_coloured():
     assert 0.02 < np.mean(p < 0.05) < 0.09
     coloured = np.convolve(rng.standard_normal(500), [1.0, 0.5])
     assert whiteness(coloured) < 1e-6
-
-
-def test_errors_that_last_for_a_block_widen_the_deviations():
-    rng = np.random.default_rng(2)
-    blocks, length = 40, 50
-    jacobian = np.ones((blocks * length, 1, 1))
-    z = np.repeat(rng.standard_normal(blocks), length)[:, None]
-    white = Precision(np.full((1, 1), 1 / z.size), np.ones(1, bool), [], np.ones(1))
-    got = widened(white, z, jacobian).std[0]
-    # The mean of 40 independent blocks, however many samples each has.
-    assert got == pytest.approx(1 / np.sqrt(blocks), rel=4 / np.sqrt(2 * blocks))
-    assert widened(white, 1e-3 * z, jacobian).std[0] == white.std[0]
 
 
 def test_slow_readings_of_a_coarse_encoder_are_thinned(tmp_path):

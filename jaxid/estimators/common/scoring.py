@@ -16,6 +16,8 @@ from jaxid.arrays import Array
 _TOLERANCE = 1e-5
 # Damping at the start, and the largest one, relative to the diagonal of the information.
 _DAMPING, _STUCK = 1e-3, 1e12
+# Numbers that the second derivatives may hold at a time, over all directions: 64 MB in each array.
+_AT_A_TIME = 8_000_000
 
 
 class Scored(eqx.Module):
@@ -164,3 +166,33 @@ def maximise_likelihood(
     first = _Trial(start, jnp.eye(p), x, jnp.asarray(0.0), jnp.asarray(2.0))
     end = jax.lax.while_loop(lambda s: ~s.best.done & (s.best.steps < max_steps), advance, first)
     return end.best
+
+
+def observed_information(
+    outputs: Callable[[Float[Array, " p"]], tuple[Float[Array, "time k"], Float[Array, "time k"]]],
+    counts: Bool[Array, "time k"],
+    x: Float[Array, " p"],
+) -> Float[Array, "p p"]:
+    """Return the observed information: the second derivative of the negative log-likelihood, (p, p).
+
+    It is differentiated forward twice, so that no step of a filter is kept in memory. A long log takes its
+    directions in several passes.
+
+    Args:
+        outputs: Residuals and their variances as functions of the unknowns.
+        counts: Mask of the residuals that count.
+        x: Unknowns.
+
+    Source:
+        Efron and Hinkley (1978), Biometrika 65, 457-482.
+    """
+
+    def cost(x: Array) -> Array:
+        e, variance = outputs(x)
+        return 0.5 * jnp.sum(jnp.where(counts, e**2 / variance + jnp.log(variance), 0.0))
+
+    def column(direction: Array) -> Array:
+        return jax.jvp(jax.jacfwd(cost), (x,), (direction,))[1]
+
+    together = max(1, _AT_A_TIME // max(counts.size * x.size, 1))
+    return jax.lax.map(column, jnp.eye(x.size), batch_size=min(together, x.size))
