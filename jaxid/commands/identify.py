@@ -18,6 +18,7 @@ from jaxid.estimators.choice import choose_method, with_choice
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.loop_noise import with_loop_noise
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.names import METHODS, OUTPUTS, SOLVERS, USER_METHODS
@@ -135,10 +136,11 @@ def identify(
         )
     choice = None
     if method is None:
-        choice = choose_method(session, next(iter(options), None))
+        asked = next((name for name in options if name not in ("hessian", "profile")), None)
+        choice = choose_method(session, asked, curvature=bool(hessian or profile))
         method = choice.method
     progress(f"fitting by {method}")
-    estimate = run_alone(steps_of(method, session, **options), _gaps_of(session))
+    estimate = run_alone(_tested(method, session, options), _gaps_of(session))
     if choice is not None:
         estimate = with_choice(estimate, choice)
     progress("simulating")
@@ -184,11 +186,20 @@ def identify_many(
 
     def steps(case: Case, log: LogLike) -> Steps[Estimate]:
         session = open_session(case, log, method=method)
-        choice = choose_method(session) if method is None else None
-        estimate = yield from steps_of(method or choose_method(session).method, session)
-        return estimate if choice is None else with_choice(estimate, choice)
+        if method is not None:
+            return (yield from _tested(method, session, {}))
+        choice = choose_method(session)
+        return with_choice((yield from _tested(choice.method, session, {})), choice)
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
+
+
+def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[Estimate]:
+    """Fit by a method; beside inverse dynamics, test whether noise in a known loop biases it."""
+    estimate = yield from steps_of(method, session, **options)
+    if method != "inverse_dynamics":
+        return estimate
+    return (yield from with_loop_noise(session, estimate))
 
 
 def _check_method(method: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.estimators.common.endogeneity import endogeneity
-from jaxid.estimators.common.rerun import Rerun, best_step, settled, span
+from jaxid.estimators.common.rerun import Rerun, best_step, lost, settled, span
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import force_precision, inverse_dynamics_steps
 from jaxid.logs.log import Log
@@ -26,9 +26,6 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics
 
-# An open-loop run whose RMS distance from the log exceeds this part of the log's standard deviation
-# gives no useful instruments.
-_LOST = 0.5
 _MOST_STEPS = 30
 _HALVINGS = 8
 
@@ -141,7 +138,7 @@ def _search(
     basis = None
     for step in range(1, _MOST_STEPS + 1):
         run = yield from rerun.steps(theta, own_command=True)
-        if not rerun.looped and (run is None or _lost(run, rerun.log)) and step == 1:
+        if not rerun.looped and (run is None or lost(run, rerun.log)) and step == 1:
             raise InputError(
                 "the simulation from the measured force loses the log, and makes no instruments",
                 where=rerun.log.source,
@@ -166,9 +163,3 @@ def _search(
         if done:
             return _Found(theta, e, columns, basis, "converged", step)
     return _Found(theta, e, columns, basis, f"no convergence within {_MOST_STEPS} steps", _MOST_STEPS)
-
-
-def _lost(run: Prepared, log: Log) -> bool:
-    """Check that a simulated motion has drifted too far from the measured one."""
-    off = np.sqrt(np.mean((run.q - log.filled) ** 2, axis=0))
-    return bool(np.any(off > _LOST * np.std(log.filled, axis=0)))

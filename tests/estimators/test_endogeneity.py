@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from jaxid.commands.identify import identify_many
+from jaxid.estimators import _start, loop_noise
 from jaxid.estimators.common.endogeneity import endogeneity
+from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.estimators.loop_noise import with_loop_noise
+from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import NoiseModel
+from jaxid.session import open_session
 from tests.estimators.test_simulated_motion import COULOMB, VISCOUS, WIDE
 from tests.support.axis_log import log_of
+from tests.support.cli_setup import place, recorded, run
 from truth.axis.cases import case_text, write_case
 from truth.axis.machines import emps_like
 from truth.axis.stepper import Sensor
@@ -62,22 +68,74 @@ def test_the_bias_is_that_of_least_squares():
     assert content["bias_in_std"]["inertia"] == pytest.approx(float(result.bias[0]))
 
 
-def exact_logs(folder, noise: float, force: float, more: str, runs: int):
+def exact_logs(
+    folder, noise: float, force: float, more: str, runs: int, method: str = "instrumental_variable"
+):
     sensor = Sensor(position_resolution=1e-12, position_noise=noise, force_noise=force)
     setup = dataclasses.replace(emps_like(0, duration=4.0), sensor=sensor)
     case = write_case(folder, case_text(setup, (VISCOUS, COULOMB)) + more)
     logs = [log_of(dataclasses.replace(setup, seed=k)) for k in range(runs)]
-    return [e.details["durbin_wu_hausman"] for e in identify_many(case, logs, method="instrumental_variable")]
+    return [e.details["durbin_wu_hausman"] for e in identify_many(case, logs, method=method)]
 
 
 @pytest.mark.slow
-def test_size_and_power_on_the_exact_axis(tmp_path):
+@pytest.mark.parametrize("method", ["instrumental_variable", "inverse_dynamics"])
+def test_size_and_power_on_the_exact_axis(tmp_path, method):
     """In its loop: readings without noise, and a micrometre of it through a filter that is far too wide."""
-    exact = exact_logs(tmp_path, 0.0, 0.1, "", 100)
+    exact = exact_logs(tmp_path, 0.0, 0.1, "", 100, method)
     # Never above the size; spikes at the reversals make it smaller.
     assert np.mean([r["biased"] for r in exact]) <= 0.1
     assert np.median([r["p_value"] for r in exact]) > 0.35
     assert exact[0]["text"].startswith("least squares is not biased by noise in the loop")
-    noisy = exact_logs(tmp_path, 1e-6, 2e-3, WIDE, 20)
+    noisy = exact_logs(tmp_path, 1e-6, 2e-3, WIDE, 20, method)
     assert all(r["biased"] and r["bias_in_std"]["inertia"] < -3 for r in noisy)
     assert all("most by -" in r["text"] and "in inertia" in r["text"] for r in noisy)
+
+
+def test_it_stands_beside_inverse_dynamics_in_a_known_loop(tmp_path, capsys):
+    case, log = place(tmp_path / "loop", recorded())
+    ran = run(capsys, "identify", case, log, "--method", "inverse_dynamics", folder=tmp_path / "out")
+    assert ran.status == 0
+    assert "Durbin-Wu-Hausman test: chi-squared" in ran.out
+    assert ran.json("result.json")["durbin_wu_hausman"]["degrees_of_freedom"] > 0
+
+
+def test_instruments_of_one_simulation_find_what_iterated_ones_find(tmp_path):
+    noisy = (1e-6, 2e-3, WIDE, 1)
+    (one,) = exact_logs(tmp_path, *noisy, "inverse_dynamics")
+    (iterated,) = exact_logs(tmp_path, *noisy)
+    assert one["biased"]
+    assert one["bias_in_std"]["inertia"] < -3
+    # The scatter of the statistic is sqrt(2 (3 + 2 * 234)) = 31; a bias matters from one deviation on.
+    assert one["statistic"] == pytest.approx(iterated["statistic"], abs=10)
+    assert one["bias_in_std"] == pytest.approx(iterated["bias_in_std"], abs=0.1)
+
+
+@pytest.fixture
+def loop(tmp_path):
+    """A log in its loop."""
+    setup = emps_like(0, duration=4.0)
+    return open_session(write_case(tmp_path, case_text(setup, (VISCOUS, COULOMB))), log_of(setup))
+
+
+def tested(session, **changes):
+    """Whether an estimate of inverse dynamics is tested, with other parts of the machine."""
+    machine = dataclasses.replace(session.machine, **changes)
+    estimate = inverse_dynamics(session.machine, session.fit.data)
+    assert estimate.all_identified
+    found = run_alone(with_loop_noise(dataclasses.replace(session, machine=machine), estimate))
+    return "durbin_wu_hausman" in found.details
+
+
+def test_it_needs_a_loop_that_stays_at_the_log(loop):
+    assert tested(loop)
+    assert not tested(loop, controller=None)
+    law = loop.machine.controller
+    assert not tested(loop, controller=dataclasses.replace(law, kp=law.kp / 1000))
+
+
+def test_starts_of_other_methods_are_not_tested(loop, monkeypatch):
+    monkeypatch.setattr(loop_noise, "endogeneity", lambda *of: pytest.fail("tested"))
+    assert run_alone(_start(loop)) is not None
+    with pytest.raises(pytest.fail.Exception):
+        tested(loop)

@@ -20,6 +20,9 @@ from jaxid.simulation.replay import Numerics, Replay, exact_numerics, make_repla
 
 # A simulated position this many times larger than the measured one has diverged.
 _RUNAWAY = 1e3
+# A run whose RMS distance from the log exceeds this part of the log's standard deviation gives no useful
+# instruments.
+_LOST = 0.5
 # Singular values of the scaled columns below this part of the largest count as zero.
 _ROUNDING = 1e-6
 # A fit has converged if a step is smaller than this part of a standard deviation for a white residual.
@@ -94,6 +97,12 @@ class Rerun:
         return replace(
             prepare(run, self.machine.gain, self.data.recipe), hold=self.data.hold, steps=self.data.steps
         )
+
+
+def lost(run: Prepared, log: Log) -> bool:
+    """Check that a simulated motion has drifted too far from the measured one."""
+    off = np.sqrt(np.mean((run.q - log.filled) ** 2, axis=0))
+    return bool(np.any(off > _LOST * np.std(log.filled, axis=0)))
 
 
 @eqx.filter_jit
