@@ -118,7 +118,7 @@ def loop(tmp_path):
     return open_session(write_case(tmp_path, case_text(setup, (VISCOUS, COULOMB))), log_of(setup))
 
 
-def tested(session, **changes):
+def is_tested(session, **changes):
     """Whether an estimate of inverse dynamics is tested, with other parts of the machine."""
     machine = dataclasses.replace(session.machine, **changes)
     estimate = inverse_dynamics(session.machine, session.fit.data)
@@ -128,14 +128,14 @@ def tested(session, **changes):
 
 
 def test_it_needs_a_loop_that_stays_at_the_log(loop):
-    assert tested(loop)
-    assert not tested(loop, controller=None)
+    assert is_tested(loop)
+    assert not is_tested(loop, controller=None)
     law = loop.machine.controller
-    assert not tested(loop, controller=dataclasses.replace(law, kp=law.kp / 1000))
+    assert not is_tested(loop, controller=dataclasses.replace(law, kp=law.kp / 1000))
 
 
 def test_starts_of_other_methods_are_not_tested(loop, monkeypatch):
     monkeypatch.setattr(loop_noise, "endogeneity", lambda *of: pytest.fail("tested"))
     assert run_alone(_start(loop)) is not None
     with pytest.raises(pytest.fail.Exception):
-        tested(loop)
+        is_tested(loop)
