@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.interpolate
 import scipy.signal
 from jaxtyping import Float
 
@@ -24,6 +23,7 @@ from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
+from jaxid.simulation.reference_course import reference_at
 from jaxid.simulation.solvers import AdaptiveStep
 from jaxid.simulation.step_size import needed_steps
 
@@ -174,10 +174,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     elif every == 1:
         reference, times = log.reference, log.time
     else:
-        # Akima's cubic reproduces a ramp of speed exactly and does not ring at a step. A line between samples
-        # ten ticks apart is wrong by a hundredth of a millimetre at 0.8 m/s^2, and an inertia then by 10 %.
-        curve = scipy.interpolate.Akima1DInterpolator(log.time, log.reference, axis=0)
-        reference, times = curve(np.minimum(ticks, log.time[-1])), ticks
+        reference, times = reference_at(log.time, log.reference, ticks, machine.reference_hold), ticks
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"),
