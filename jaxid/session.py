@@ -20,6 +20,7 @@ from jaxid.consistency.reference_hold import (
     reference_hold_setting,
 )
 from jaxid.consistency.sign import sign_findings
+from jaxid.consistency.weight import weight_findings
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log, with_load
@@ -361,6 +362,7 @@ def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bo
     findings += law_findings(machine, log, replayed, confirmed=confirmed)
     raise_on_error(findings)
 
+    findings += weight_findings(machine, log, declared)
     made = replayed.command if replayed is not None and replayed.exact else None
     noise = estimated_force_noise(machine, log, data, declared, made)
     findings += noise_findings(machine, log, data, declared, noise)
