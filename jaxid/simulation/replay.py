@@ -28,7 +28,7 @@ from jaxid.simulation.solvers import AdaptiveStep
 from jaxid.simulation.step_size import needed_steps
 
 # Ticks of past command that a loop keeps for a delay at least, and at most.
-_SHORTEST_MEMORY, _LONGEST_MEMORY = 12, 1536
+_SHORTEST_MEMORY, LONGEST_MEMORY = 12, 1536
 # The memory over the delay at its guess, so that a fit finds a delay so many times as long.
 _LONGER = 2.0
 # Number of first samples in which an error of a loop's start appears, and the factor by which their mean
@@ -400,10 +400,10 @@ def remembered_ticks(machine: Machine, log: Log) -> int:
         if f.effect is not None and effects[f.effect].delays_command() and np.isfinite(f.upper)
     ]
     needed = int(np.ceil(max(_LONGER * delay, *stated, 0.0) / period))
-    if needed > _LONGEST_MEMORY:
+    if needed > LONGEST_MEMORY:
         raise InputError(
             f"a delay of {delay:g} s, which may grow to {needed * period:g} s in a fit, is {needed} ticks of "
-            f"the controller, and a loop keeps at most {_LONGEST_MEMORY}",
+            f"the controller, and a loop keeps at most {LONGEST_MEMORY}",
             where=log.source,
             hint="give the delay a smaller guess or max, or leave out [controller]",
         )
