@@ -74,6 +74,7 @@ def build_machine(case: Case, *, at_truth: bool = False, period: float | None = 
         disturbance=None if case.controller is None else case.controller.disturbance,
         sensor=sensor,
         hold=case.hold,
+        reference_hold=case.reference_hold,
         unknown_reference=unknown_reference,
     )
 

@@ -32,6 +32,7 @@ class Machine:
             of the log; None: nothing is added.
         sensor: Known errors of the measurement.
         hold: Course of the command between samples.
+        reference_hold: Course of a logged reference between samples, where the log is slower than the loop.
         unknown_reference: Reference with unknowns, for logs without a reference; None: it is known.
     """
 
@@ -43,6 +44,7 @@ class Machine:
     disturbance: Disturbance | str | None = None
     sensor: Sensor = Sensor()
     hold: str = "zero_order"
+    reference_hold: str = "band_limited"
     unknown_reference: UnknownReference | None = None
 
     @property

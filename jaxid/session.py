@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
-from jaxid.consistency.balance_fit import balance_fits
-from jaxid.consistency.hold import better_hold, hold_finding
+from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
 from jaxid.consistency.law import law_findings, replayed_law
 from jaxid.consistency.noise import estimated_force_noise, noise_findings
+from jaxid.consistency.reference_hold import (
+    compare_reference_holds,
+    reference_hold_finding,
+    reference_hold_setting,
+)
 from jaxid.consistency.sign import sign_findings
+from jaxid.consistency.weight import weight_findings
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log, with_load
@@ -38,16 +44,20 @@ class OpenedLog:
         log: The log; its force has passed the recipe's running median, if there is one.
         data: The prepared log.
         disturbance: Signal that was added to the controller's command.
+        reference_hold: Course of the reference between samples that is stated for this log only; None: that
+            of the machine.
     """
 
     name: str
     log: Log
     data: Prepared
     disturbance: Disturbance | str | None
+    reference_hold: str | None = None
 
     def machine(self, machine: Machine) -> Machine:
-        """Return a machine with the disturbance of this log."""
-        return replace(machine, disturbance=self.disturbance)
+        """Return a machine with the disturbance of this log, and the course of its reference."""
+        hold = self.reference_hold or machine.reference_hold
+        return replace(machine, disturbance=self.disturbance, reference_hold=hold)
 
 
 @dataclass(frozen=True)
@@ -62,6 +72,7 @@ class Session:
         recipe: Filtering of all logs.
         findings: Warnings on the logs.
         given: The case as it was given, where `case` is that of the joints (see `at_joints`).
+        settings: Choices made from the log, by name: `value` and `reason`.
     """
 
     case: Case
@@ -71,6 +82,7 @@ class Session:
     recipe: Recipe
     findings: tuple[Finding, ...]
     given: Case | None = None
+    settings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def declared(self) -> Case:
@@ -135,7 +147,8 @@ def open_session(
         source = other.source if isinstance(other, Log) else other
         measured = read(source, entry.columns)
         findings += _check(case, measured, machine, short)
-        opened.append(_run(entry.name, measured, machine, recipe, needed, entry.disturbance))
+        run = _run(entry.name, measured, machine, recipe, needed, entry.disturbance)
+        opened.append(replace(run, reference_hold=entry.columns.reference_hold))
         names.add(entry.name)
     for extra in validate:
         measured = read(extra, whole=True)
@@ -147,17 +160,20 @@ def open_session(
         opened.append(_run(name, measured, machine, recipe, needed, disturbance))
     machine = _scaled(machine, opened[0].data)
     need_finite_effects(machine.plant, opened[0].data, fit.source)
+    settings = {}
     if not short:
         free_hold = not isinstance(log, Log) and "hold" not in case.tables.get("log", {})
-        doubts, hold, noise = _held_against(as_logged, machine, opened[0], free_hold)
-        findings += doubts
-        if hold is not None:
-            machine = replace(machine, hold=hold)
+        held = _held_against(as_logged, machine, opened[0], free_hold)
+        findings += held.findings
+        settings = held.settings
+        machine = replace(machine, reference_hold=held.reference_hold)
+        if held.hold is not None:
+            machine = replace(machine, hold=held.hold)
             own = [v["name"] for v in case.tables.get("validation", []) if "hold" in v]
-            opened = [run if run.name in own else _under(hold, run, machine) for run in opened]
+            opened = [run if run.name in own else _under(held.hold, run, machine) for run in opened]
         # The other logs are of the same sensors.
-        opened = [replace(run, data=replace(run.data, force_noise=noise)) for run in opened]
-    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged)
+        opened = [replace(run, data=replace(run.data, force_noise=held.force_noise)) for run in opened]
+    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged, settings)
 
 
 def open_another(session: Session, log: LogLike) -> OpenedLog:
@@ -287,9 +303,26 @@ def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]
     return findings
 
 
-def _held_against(
-    case: Case, machine: Machine, opened: OpenedLog, free_hold: bool
-) -> tuple[list[Finding], str | None, np.ndarray]:
+@dataclass(frozen=True)
+class _Held:
+    """Result of `_held_against`.
+
+    Args:
+        findings: Warnings.
+        hold: Hold of the force to take in place of the log's; None: the log's.
+        reference_hold: Course of the reference between samples.
+        force_noise: Estimated noise of the force, in units of the command, (m,).
+        settings: Choices made from the log; see `Session`.
+    """
+
+    findings: list[Finding]
+    hold: str | None
+    reference_hold: str
+    force_noise: np.ndarray
+    settings: dict[str, dict[str, str]]
+
+
+def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bool) -> _Held:
     """Hold a prepared log against its case.
 
     Args:
@@ -298,40 +331,58 @@ def _held_against(
         opened: The log.
         free_hold: Whether the hold of the force is to be chosen, because the case does not state it.
 
-    Returns:
-        Warnings; the hold to take in place of the log's (None: the log's), and the estimated noise of its
-        force, in units of the command, (m,).
-
     Raises:
         InputError: If the log contradicts the case.
     """
     log, data = opened.log, opened.data
     declared = balance_fits(machine, data)[0]
     if not declared.finite:
-        return [], None, np.zeros(log.force.shape[1])
+        return _Held([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
     gain = None
     if case.actuator.transmission is None:
         gain = np.broadcast_to(case.actuator.gain, (case.plant.drives,)).tolist()
     findings = sign_findings(machine, log, data, declared, gain)
     raise_on_error(findings)
 
-    hold, better = None, better_hold(machine, log, data, declared)
+    hold, better, settings = None, better_hold(machine, log, data, declared), {}
     if better is not None:
         findings.append(hold_finding(log, *better, machine.unit("force"), used=free_hold))
         if free_hold:
             hold = better[0]
+            settings["hold"] = hold_setting(log.hold, *better, machine.unit("force"))
             opened = _under(hold, opened, machine)
             log, data = opened.log, opened.data
             declared = balance_fits(machine, data)[0]
 
+    confirmed = False
+    if case.columns.reference is not None:
+        machine, doubts, setting, confirmed = _with_reference_hold(case, machine, opened, declared)
+        findings, settings = [*findings, *doubts], settings | setting
     replayed = replayed_law(machine, log)
-    findings += law_findings(machine, log, replayed)
+    findings += law_findings(machine, log, replayed, confirmed=confirmed)
     raise_on_error(findings)
 
+    findings += weight_findings(machine, log, declared)
     made = replayed.command if replayed is not None and replayed.exact else None
     noise = estimated_force_noise(machine, log, data, declared, made)
     findings += noise_findings(machine, log, data, declared, noise)
-    return findings, hold, noise
+    return _Held(findings, hold, machine.reference_hold, noise, settings)
+
+
+def _with_reference_hold(
+    case: Case, machine: Machine, opened: OpenedLog, declared: BalanceFit
+) -> tuple[Machine, list[Finding], dict[str, dict[str, str]], bool]:
+    """Return the machine with its reference's course, warnings, settings, and if the law is confirmed."""
+    compared = compare_reference_holds(machine, opened.log, opened.data, declared)
+    if compared is None:
+        return machine, [], {}, False
+    stated, unit = case.columns.reference_hold is not None, machine.unit("force")
+    findings = reference_hold_finding(opened.log, compared, machine.reference_hold, unit, stated=stated)
+    if compared.best is not None and not stated:
+        machine = replace(machine, reference_hold=compared.best)
+    setting = reference_hold_setting(compared, machine.reference_hold, unit, stated=stated)
+    confirmed = machine.reference_hold in compared.confirmed
+    return machine, findings, {"reference_hold": setting}, confirmed
 
 
 def _under(hold: str, opened: OpenedLog, machine: Machine) -> OpenedLog:

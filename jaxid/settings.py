@@ -76,6 +76,11 @@ class LogTable:
         columns("drive"), f"{_COLUMN} of the command, one a drive", required=True
     )
     hold: str = key(choice(HOLDS), "course of the command between samples", default=HOLDS[0])
+    reference_hold: str | None = key(
+        choice(HOLDS),
+        "course of the reference between samples, for a log slower than its loop",
+        note="chosen from the log",
+    )
     unwrap: bool | float = key(
         flag_or_positive,
         "whether positions and references start anew after a turn, or the size of a turn",

@@ -187,6 +187,12 @@ class Case:
         return HOLDS[0] if self.log is None else self.log.hold
 
     @property
+    def reference_hold(self) -> str:
+        """Course of a logged reference between samples; a smooth curve where the case states none."""
+        stated = None if self.log is None else self.log.reference_hold
+        return HOLDS[2] if stated is None else stated
+
+    @property
     def columns(self) -> LogTable:
         """The [log] table of a case that must have one.
 

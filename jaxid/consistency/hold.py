@@ -53,23 +53,33 @@ def better_hold(
     now, then = (
         np.asarray(measured(machine.plant, ForceData.of(replace(data, hold=h)))) for h in (data.hold, held)
     )
-    wider = _with_friction(fit)
+    wider = with_friction(fit)
     residuals = [wider.fit(bounded=False)[1]]
     moved = replace(wider, known=wider.known + now - then)
     residuals.append(moved.fit(bounded=False)[1])
 
-    parts = [np.where(fit.counts, e / fit.scale, 0.0) ** 2 for e in residuals]
-    gain = [piece.sum() for piece in np.array_split(parts[0] - parts[1], _STRETCHES)]
-    error = np.std(gain, ddof=1) / np.sqrt(len(gain))
-    sure = np.mean(gain) > _SURE * error
     gaps = np.array([fit.rms(e) for e in residuals])
     driven = [int(j) for j in machine.plant.driven(machine.plant.joints)]
     least = driven[int(np.argmin(gaps[1, driven] / np.maximum(gaps[0, driven], 1e-300)))]
-    total = np.sqrt(parts[1].sum() / max(parts[0].sum(), 1e-300))
-    evidence = -_independent(residuals[1], fit) * np.log(max(total, 1e-300))
-    if not sure or not total < _CLEARLY or not evidence > _EVIDENCE:
-        return None
-    return other, gaps[:, least]
+    return (other, gaps[:, least]) if clearly_better(residuals[1], residuals[0], fit) else None
+
+
+def clearly_better(
+    residual: Float[np.ndarray, "kept n"], other: Float[np.ndarray, "kept n"], fit: BalanceFit
+) -> bool:
+    """Check that a force residual is smaller than another one: by a tenth, throughout the log, and surely.
+
+    Args:
+        residual: The residual that may be smaller.
+        other: The residual that it is compared with.
+        fit: Balance of the log, for its counts and scales.
+    """
+    less, more = (np.where(fit.counts, e / fit.scale, 0.0) ** 2 for e in (residual, other))
+    gain = [piece.sum() for piece in np.array_split(more - less, _STRETCHES)]
+    error = np.std(gain, ddof=1) / np.sqrt(len(gain))
+    total = np.sqrt(less.sum() / max(more.sum(), 1e-300))
+    evidence = -_independent(residual, fit) * np.log(max(total, 1e-300))
+    return bool(np.mean(gain) > _SURE * error and total < _CLEARLY and evidence > _EVIDENCE)
 
 
 def _independent(residual: np.ndarray, fit: BalanceFit) -> float:
@@ -83,7 +93,7 @@ def _independent(residual: np.ndarray, fit: BalanceFit) -> float:
     return total
 
 
-def _with_friction(fit: BalanceFit) -> BalanceFit:
+def with_friction(fit: BalanceFit) -> BalanceFit:
     """Return the balance with a viscous and a Coulomb friction of every joint among the undeclared forces."""
     joints = fit.velocity.shape[1]
     more = np.zeros((*fit.velocity.shape, 2 * joints))
@@ -113,3 +123,18 @@ def hold_finding(log: Log, other: str, gaps: np.ndarray, unit: str, *, used: boo
         if other == "zero_order":
             hint = f"set hold = '{other}' in [log] if each force is held until the next sample"
     return Finding("warning", what, f"{log.source}, force", hint)
+
+
+def hold_setting(before: str, other: str, gaps: np.ndarray, unit: str) -> dict[str, str]:
+    """Return the entry of `settings` in result.json for a hold that was chosen from the log.
+
+    Args:
+        before: The default hold.
+        other: The chosen hold.
+        gaps: Force gaps under the default and under the chosen hold.
+        unit: Unit of the gaps.
+    """
+    return {
+        "value": other,
+        "reason": f"it leaves a force gap of {gaps[1]:.3g} {unit}, '{before}' {gaps[0]:.3g} {unit}",
+    }

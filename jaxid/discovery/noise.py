@@ -58,7 +58,12 @@ def sensor_colour(
 
 
 def high_band_force_noise(log: Log, data: Prepared) -> Float[np.ndarray, " m"]:
-    """Estimate the standard deviation of the logged force from its high band, in its units, (m,)."""
+    """Estimate the standard deviation of the logged force from its high band, in its units, (m,).
+
+    It is an upper bound of the noise that `jaxid.simulation.sensor_noise.force_noise` returns: in a loop it
+    also holds the controller's answer to the noise of its encoder. That really acts, but a search must not
+    take it for the colour of an effect.
+    """
     force_noise = signals.high_band_std(log.force)
     return force_noise / signals.median_noise(data.recipe.median) if data.recipe.median else force_noise
 

@@ -32,6 +32,7 @@ from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess, full_hessian, hessian_notes
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
+    LONGEST_MEMORY,
     Numerics,
     Replay,
     exact_numerics,
@@ -227,6 +228,7 @@ def output_error_steps(
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
     machine = machine if start is None else machine.with_estimate(start)
+    chosen = numerics is None
     numerics = numerics or choose_numerics(machine, log)
     replay = make_replay(machine, log, numerics)
     replay = with_fitted_start(replay, machine.plant, log)
@@ -241,6 +243,12 @@ def output_error_steps(
         minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active), solver))
         problem = (*problem[:5], minimum.theta, *problem[6:])
     minimum = yield SolveRequest(_fit, (*problem, active, solver))
+    while chosen and _forgets(machine, numerics, np.asarray(minimum.theta)[:p]):
+        # Beyond the past commands that are kept a longer delay has no effect: keep more, and go on.
+        numerics = replace(numerics, longest_delay=2 * numerics.longest_delay)
+        longer = make_replay(machine, log, numerics)
+        problem = (longer, *problem[1:5], minimum.theta, *problem[6:])
+        minimum = yield SolveRequest(_fit, (*problem, active, solver))
     if on == "both":
         problem = _problem(machine.with_estimate(np.asarray(minimum.theta)[:p]), replay, log, nuisance, on)
         e = yield SolveRequest(_residual, (*problem[:6], on))
@@ -295,7 +303,7 @@ def output_error_steps(
         samples=int(counts.sum()),
         steps=int(minimum.steps),
         notes=(*notes_of(machine, numerics, log, on, minimiser), *remarks),
-        details={"profiles": profiles} if profile else {},
+        details=({"profiles": profiles} if profile else {}) | kept_delay(machine, numerics),
         std_misspecified=std_under_misspecification(jacobian[..., active], e, counts)[:p],
     )
 
@@ -367,6 +375,22 @@ def _profiles(
             "profiles: the residual counts as Gaussian, and its colour as a constant factor of the variance"
         )
     return profiles, notes
+
+
+def _forgets(machine: Machine, numerics: Numerics, theta: np.ndarray) -> bool:
+    """Check that a fitted delay reaches the end of the past commands, and that a loop can keep more."""
+    if machine.controller is None or not 0 < numerics.longest_delay <= LONGEST_MEMORY // 2:
+        return False
+    fitted = machine.with_estimate(theta).plant
+    delay = float(np.max(np.asarray(fitted.command_delays(machine.gain.size))))
+    return bool(delay >= (numerics.longest_delay - 1) * machine.controller.period)
+
+
+def kept_delay(machine: Machine, numerics: Numerics) -> dict[str, float]:
+    """Return the longest delay that a simulated loop has, `longest_delay` [s]; empty without any delay."""
+    if machine.controller is None or not numerics.longest_delay:
+        return {}
+    return {"longest_delay": numerics.longest_delay * machine.controller.period}
 
 
 def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:

@@ -59,6 +59,11 @@ class FitResult:
         return self.judgement.findings
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """The choices made from case and log, by name: `value` and `reason`."""
+        return {**self.session.settings, **self.estimate.details.get("settings", {})}
+
+    @property
     def parameters(self) -> ParameterTable:
         """The parameters by name: `result.parameters["inertia"].value`, `.std`, `.unit`."""
         from jaxid.results.parameters import ParameterTable

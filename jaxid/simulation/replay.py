@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.interpolate
 import scipy.signal
 from jaxtyping import Float
 
@@ -24,11 +23,12 @@ from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
+from jaxid.simulation.reference_course import reference_at
 from jaxid.simulation.solvers import AdaptiveStep
 from jaxid.simulation.step_size import needed_steps
 
 # Ticks of past command that a loop keeps for a delay at least, and at most.
-_SHORTEST_MEMORY, _LONGEST_MEMORY = 12, 1536
+_SHORTEST_MEMORY, LONGEST_MEMORY = 12, 1536
 # The memory over the delay at its guess, so that a fit finds a delay so many times as long.
 _LONGER = 2.0
 # Number of first samples in which an error of a loop's start appears, and the factor by which their mean
@@ -174,10 +174,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     elif every == 1:
         reference, times = log.reference, log.time
     else:
-        # Akima's cubic reproduces a ramp of speed exactly and does not ring at a step. A line between samples
-        # ten ticks apart is wrong by a hundredth of a millimetre at 0.8 m/s^2, and an inertia then by 10 %.
-        curve = scipy.interpolate.Akima1DInterpolator(log.time, log.reference, axis=0)
-        reference, times = curve(np.minimum(ticks, log.time[-1])), ticks
+        reference, times = reference_at(log.time, log.reference, ticks, machine.reference_hold), ticks
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"),
@@ -403,10 +400,10 @@ def remembered_ticks(machine: Machine, log: Log) -> int:
         if f.effect is not None and effects[f.effect].delays_command() and np.isfinite(f.upper)
     ]
     needed = int(np.ceil(max(_LONGER * delay, *stated, 0.0) / period))
-    if needed > _LONGEST_MEMORY:
+    if needed > LONGEST_MEMORY:
         raise InputError(
             f"a delay of {delay:g} s, which may grow to {needed * period:g} s in a fit, is {needed} ticks of "
-            f"the controller, and a loop keeps at most {_LONGEST_MEMORY}",
+            f"the controller, and a loop keeps at most {LONGEST_MEMORY}",
             where=log.source,
             hint="give the delay a smaller guess or max, or leave out [controller]",
         )

@@ -28,10 +28,17 @@ def test_the_friction_of_the_table_is_named_both_ways(tmp_path):
 
 @pytest.mark.slow
 def test_a_limit_that_all_of_the_force_exceeds_is_taken_out_again(tmp_path):
-    """At the level of the friction it leaves no force, nor any need of an inertia: 47 rad off in the loop."""
+    """At the level of the friction it leaves no force, nor any need of an inertia: 47 rad off in the loop.
+
+    One way only the friction that is missing cannot be found: it passes for inertia, 2.2 times the true one.
+    """
     found = jaxid.discover(*stages.long_case(tmp_path, stages.one_way()))
-    assert "saturation[1]" not in {e.label for e in found.effects}
-    after = dict(zip(found.after.names, found.after.theta, strict=True))
-    assert 1e-5 < after["motor_inertia"] < 5e-5
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert found.model_complete is False
+    assert found.after.value("motor_inertia") == pytest.approx(
+        2.2 * stages.TRUTH[1]["motor_inertia"], rel=0.1
+    )
     before, after = (g[0].simulation.rms[0] for g in (found.gaps_before, found.gaps_after))
-    assert after <= before < 5e-3
+    assert after == before < 3e-3
+    before, after = (g[0].force.rms[0] for g in (found.gaps_before, found.gaps_after))
+    assert after == before > 8 * found.noise_floor[0]

@@ -80,7 +80,7 @@ def test_chosen_band_holds_the_motion_and_not_the_noise():
 
 
 @pytest.mark.xfail(
-    strict=True, reason="the band ends at the first gap between lines, not at the highest line"
+    strict=True, reason="the band ends at 6.5 Hz, in the gap below the line at 8 Hz: see docs/case_file.md"
 )
 def test_chosen_band_reaches_the_highest_line_across_gaps():
     recipe = choose_recipe(log_of(multisine([0.5, 1.7, 3.1, 8.0]), noise=1e-4))

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from jaxid.errors import InputError
+from jaxid.estimators.output_error import choose_numerics, output_error
 from jaxid.gap import simulated
+from jaxid.results.verdict.absurd import remarks_on
 from jaxid.session import Session, open_session
 from jaxid.simulation.replay import remembered_ticks
 from truth.axis.cases import case_text
@@ -56,3 +58,31 @@ def test_a_delay_that_no_loop_can_keep_is_refused():
     session = opened({"guess": 1.0})
     with pytest.raises(InputError, match=r"a delay of 1 s.*2000 ticks.*at most 1536"):
         remembered_ticks(session.machine, session.fit.log)
+
+
+@pytest.fixture(scope="module")
+def guessed_short() -> Session:
+    """A case whose guess of the delay, 1 ms, makes a loop keep 12 ticks of the 30.5 that it needs."""
+    return opened({"guess": 0.001})
+
+
+def test_a_fit_that_reaches_the_end_of_the_memory_goes_on_with_more(guessed_short):
+    session = guessed_short
+    fit = output_error(session.machine, session.fit.log)
+    assert fit.converged
+    assert fit.details["longest_delay"] == pytest.approx(0.048)
+    assert fit.value("input_delay.delay") == pytest.approx(DELAY, abs=1e-5)
+    assert not [r for r in remarks_on(session, fit) if "delay" in r.name]
+
+
+def test_a_delay_at_the_end_of_the_memory_is_a_value_at_a_bound(guessed_short):
+    """Twelve ticks, stated: the log seems not to determine a delay that is longer."""
+    session = guessed_short
+    numerics = dataclasses.replace(choose_numerics(session.machine, session.fit.log), longest_delay=12)
+    fit = output_error(session.machine, session.fit.log, numerics=numerics)
+    assert fit.value("input_delay.delay") > 0.011
+    (remark,) = [r for r in remarks_on(session, fit) if "delay" in r.name]
+    assert remark.text == (
+        "input_delay.delay is at the longest delay that this fit could simulate, 0.0120 s (12 ticks of the "
+        "controller): give it a larger guess or max"
+    )

@@ -23,6 +23,7 @@ from jaxid.sensors.encoder import Sensor
 from jaxid.session import Session
 from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.loops import Drive, needed_substeps
+from jaxid.simulation.replay import remembered_ticks
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError, needed_steps
 
@@ -46,8 +47,6 @@ _SMOOTH = 4
 _ORDER = 20
 # Number of alternatives of one effect for which an experiment is sought, until one suffices.
 _RIVALS = 2
-# Samples of past command that a loop keeps for a delay, as in a replay.
-_DELAYS = 12
 # A tour accelerates as the log did at most; sines reach this factor of it.
 _HARDER = 2.0
 
@@ -180,13 +179,13 @@ def _experiment(session: Session, search: Search, pair: Pair) -> tuple[Pair, Exp
     """Return the rivals with a sign smooth enough for a design, and how the experiment runs in it."""
     machine, log, data = session.machine, session.fit.log, session.fit.data
     tick = machine.hold_period or log.period
-    delayed = any(e.delays_command() for e in pair.plant.effects)
+    rivals = [machine.with_plant(pair.model(k), machine.parameters) for k in range(2)]
     hold = machine.hold if machine.controller is None else "zero_order"
     drive = Drive(
         jnp.asarray(machine.gain),
         tick,
         "linear" if hold == "band_limited" else hold,
-        longest_delay=_DELAYS if delayed and machine.controller is not None else 0,
+        longest_delay=max(remembered_ticks(rival, log) for rival in rivals),
     )
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = jnp.asarray(log.position[picks]), jnp.asarray(log.force[picks] * machine.gain)

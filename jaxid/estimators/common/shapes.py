@@ -16,6 +16,8 @@ from jaxid.model.parameter import parameters_of
 
 # Factors of a shape in the starts that differ by it.
 _FACTORS = (0.3, 3.0)
+# Changes of the guess of a phase for additional starts [rad].
+_THIRDS = (2 * np.pi / 3, 4 * np.pi / 3)
 # Dimensions of parameters of which such factors are no sizes.
 _NO_SIZES = ("1", "angle")
 
@@ -43,6 +45,22 @@ def shape_starts(machine: Machine, theta: Float[np.ndarray, " p"]) -> list[np.nd
     out: list[np.ndarray] = []
     for k in np.flatnonzero(shapes(machine) & (theta > 0)):
         out += [np.where(np.arange(len(theta)) == k, factor * theta, theta) for factor in _FACTORS]
+    return out
+
+
+def phase_starts(machine: Machine, theta: Float[np.ndarray, " p"]) -> list[np.ndarray]:
+    """Return starts with each phase moved by a third and by two thirds of a turn.
+
+    Along many periods the cost has a narrow valley around the true one. A start at that period whose phase is
+    wrong by more than a quarter turn lowers the amplitude first, and then leaves the valley.
+    """
+    out: list[np.ndarray] = []
+    for k, f in enumerate(machine.parameters.free):
+        if f.effect is None:
+            continue
+        info = parameters_of(type(machine.plant.effects[f.effect]))[str(f.path[-1])]
+        if info.dimension == "angle":
+            out += [np.where(np.arange(len(theta)) == k, theta + turn, theta) for turn in _THIRDS]
     return out
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import choose_numerics, notes_of
+from jaxid.estimators.output_error import choose_numerics, kept_delay, notes_of
 from jaxid.estimators.within_prior.evaluations import BLOCK, DRAWS, linearise, precompile_residuals_at
 from jaxid.estimators.within_prior.multistart import (
     fit_from_many_starts,
@@ -156,7 +156,7 @@ def within_prior_steps(
         notes += _quantisation_notes(drawn, precision is not None, more)
 
     notes = (*notes_of(machine, numerics, log, on, minimiser), *notes)
-    return _estimate(machine, fit, whole, notes, details | multistart)
+    return _estimate(machine, fit, whole, notes, details | multistart | kept_delay(machine, numerics))
 
 
 def _quantisation_notes(drawn: bool, identifiable: bool, more: Sequence[str]) -> list[str]:

@@ -33,11 +33,13 @@ class Remark:
         name: Name of the parameter in results.
         text: The remark as a sentence without its full stop.
         impossible: Whether no machine has such a value.
+        contradicts: Whether it contradicts a value that the case declares, however small the residual is.
     """
 
     name: str
     text: str
     impossible: bool = False
+    contradicts: bool = False
 
 
 def remarks_on(session: Session, estimate: Estimate) -> list[Remark]:
@@ -46,8 +48,11 @@ def remarks_on(session: Session, estimate: Estimate) -> list[Remark]:
     declared = {f.name: f for f in session.machine.parameters.free}
     bounds = dict(zip(declared, zip(*session.machine.parameters.bounds, strict=True), strict=True))
     known = _known_inertias(estimate)
-    out = []
+    out = _beyond_memory(session, estimate)
+    beyond = {r.name for r in out}
     for k, f in enumerate(estimate.machine.parameters.free):
+        if f.name in beyond:
+            continue
         if not estimate.identifiable[k] or not np.isfinite(estimate.theta[k]) or f.path[0] == REFERENCE:
             continue
         value, std, info = float(estimate.theta[k]), float(estimate.std[k]), _info(estimate.machine.plant, f)
@@ -155,6 +160,28 @@ def _at_bound(f: Free, value: float, lower: float, upper: float) -> Remark | Non
     return None
 
 
+def _beyond_memory(session: Session, estimate: Estimate) -> list[Remark]:
+    """Remark on delays that ran to the end of the past commands that the simulated loop kept.
+
+    Beyond that end the delay has no effect, so that the log seems not to determine it.
+    """
+    end, controller = estimate.details.get("longest_delay"), session.machine.controller
+    if end is None or controller is None:
+        return []
+    effects, out = estimate.machine.plant.effects, []
+    for f, value in zip(estimate.machine.parameters.free, estimate.theta, strict=True):
+        if f.effect is None or not effects[f.effect].delays_command():
+            continue
+        # The end weighs in from one tick before.
+        if value >= end - controller.period:
+            text = (
+                f"{f.name} is at the longest delay that this fit could simulate, {_with_unit(end, f.unit)} "
+                f"({round(end / controller.period)} ticks of the controller): give it a larger guess or max"
+            )
+            out.append(Remark(f.name, text))
+    return out
+
+
 def _far_off(f: Free, value: float) -> Remark | None:
     if f.sign != "positive" or f.guess <= 0 or value <= 0:
         return None
@@ -189,10 +216,12 @@ def _unreal_links(estimate: Estimate) -> list[Remark]:
         turning = next((n for n in own if n.startswith("inertia_zz")), None)
         if turning is None or not all(estimate.identifiable[names[n]] for n in own):
             continue
+        declared = own == [turning]
         mass, x, y, inertia = (float(np.asarray(getattr(plant, n))[link]) for n in _AXIAL)
         least = (x**2 + y**2) / mass if mass > 0 else 0.0
         if inertia + _SIGMAS * float(estimate.std[names[turning]]) < least:
             unit = machine.parameters.free[names[turning]].unit
             text = f"{turning} = {_with_unit(inertia, unit)} is below {_with_unit(least, unit)}, the inertia"
-            out.append(Remark(turning, f"{text} of the link's mass at its centre of mass", impossible=True))
+            text = f"{text} of the link's {'declared ' if declared else ''}mass at its centre of mass"
+            out.append(Remark(turning, text, impossible=True, contradicts=declared))
     return out

@@ -76,7 +76,10 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
     impossible = [r for r in remarks if r.impossible] if complete is not True else []
     against += [f"{r.text}." for r in impossible]
 
+    contrary = [r for r in remarks if r.contradicts and r not in impossible]
+
     findings = [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
+    findings += [f"The fit contradicts the case: {r.text}." for r in contrary]
     if against:
         findings.append(f"This model does not explain the log: {against[0]}")
         findings += [_capital(text) for text in against[1:]]
@@ -89,7 +92,7 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
             "Check first that the columns of position and force are the right ones, with sign, unit and gain."
         )
     findings += _completeness_words(session, residuals, complete, None if doubtful else search or "none")
-    others = [r for r in remarks if r not in impossible]
+    others = [r for r in remarks if r not in (*impossible, *contrary)]
     findings += _remark_words(others)
     drifted = _drifted(session, gaps)
     findings += drifted
