@@ -76,7 +76,7 @@ def widening(
         return factor
     # Blocks of equal time.
     edges = np.array([part[0] for part in np.array_split(np.arange(len(residual)), _BLOCKS)[1:]])
-    covariance = block_covariance(jacobian[..., keep], residual, counts, edges)
+    covariance = block_covariance(jacobian[..., keep], residual, counts, edges, left_out=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(np.diag(covariance)) / precision.std[keep]
     factor[keep] = np.where(np.isfinite(ratio), np.maximum(ratio, 1.0), 1.0)
