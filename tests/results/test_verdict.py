@@ -11,10 +11,10 @@ import jaxid
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.gap import force_gap
-from jaxid.numerics.precision import Precision
+from jaxid.numerics.precision import NoiseModel, Precision
 from jaxid.results.verdict import judge
 from jaxid.results.verdict.absurd import remarks_on
-from jaxid.results.verdict.completeness import cumulated_excess, residuals_of
+from jaxid.results.verdict.completeness import cumulated_excess, residuals_of, systematic_rms
 from jaxid.session import open_session
 from tests.support.slow_axis import DECLARED, STRIBECK, drag_axis, slow_axis
 from truth.axis.cases import case_text, write_case
@@ -85,6 +85,11 @@ def test_white_rows_exceed_the_limit_as_rarely_as_is_said():
     assert np.mean([power for *_, power in tests]) == pytest.approx(1.0, abs=0.01)
     slow = np.convolve(random.standard_normal(409), np.ones(10) / 10, "valid")
     assert cumulated_excess(slow)[0] > 0.5
+
+
+@pytest.mark.parametrize("samples", [1, 2, 4])
+def test_so_few_samples_have_no_systematic_part(samples):
+    assert systematic_rms(np.ones(samples), NoiseModel.fit(np.ones(40), np.ones(40, bool))) == 0.0
 
 
 def test_an_incomplete_model_is_said_first(missing):

@@ -174,6 +174,8 @@ def systematic_rms(z: Float[np.ndarray, " row"], noise: NoiseModel) -> float:
     """
     power = np.abs(np.fft.rfft(z))[1:] ** 2 / len(z)
     band = int(_BAND * len(power))
+    if band == 0:
+        return 0.0
     beyond = power[:band] - 1.0
     end = int(np.argmax(np.cumsum(power[:band] - np.mean(power[:band])))) + 1
     density = noise.density(len(z))[1 : band + 1]
