@@ -17,7 +17,9 @@ from jaxid.case.reference import info_of
 from jaxid.case.tables import ON_LINE
 from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS, Controller, check_drives
+from jaxid.effects.friction import BackEmf
 from jaxid.errors import InputError
+from jaxid.logs.drive import Drives, drives_of
 from jaxid.machine import Machine
 from jaxid.model.parameter import ParameterInfo, as_array, parameters_of
 from jaxid.model.plant import Plant
@@ -59,8 +61,7 @@ def build_machine(case: Case, *, at_truth: bool = False, period: float | None = 
         raise InputError(what, where=f"{case.where}, [actuator]", hint=hint)
     plant, free = _plant(case, at_truth)
     unknown_reference, more = _unknown_reference(case, at_truth, plant)
-    gain = np.asarray(case.actuator.gain, dtype=np.float64) * np.asarray(plant.gearing)
-    gain = np.broadcast_to(gain, (case.plant.drives,)).copy()
+    gain = drives_of_case(case, plant).gain * np.asarray(plant.gearing)
     controller = _controller(case, period, gain)
     sensor = _sensor(case, controller, plant)
     if controller is not None and "renewal" in controller.of_machine and sensor.inertial is not None:
@@ -169,7 +170,28 @@ def _plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
             plant, more = _with_effect(plant, entry, at, case, at_truth)
             free += more
     _check_weights(plant, case)
-    return plant, free
+    return _with_back_emf(plant, case), free
+
+
+def motions_of(case: Case, plant: Plant) -> tuple[str, ...]:
+    """Return "linear" or "rotary" for each joint."""
+    return tuple(plant.motion(j) or case.plant.units.motion for j in range(plant.joints))
+
+
+def drives_of_case(case: Case, plant: Plant) -> Drives:
+    """Return the drives of [actuator]."""
+    motions = motions_of(case, plant)
+    driven = tuple(motions[j] for j in plant.driven(plant.joints)[: case.plant.drives])
+    return drives_of(case.actuator, case.log, driven, case.where)
+
+
+def _with_back_emf(plant: Plant, case: Case) -> Plant:
+    """Return the plant with the damping of drives whose voltage is the command."""
+    damping = drives_of_case(case, plant).damping
+    for joint, coefficient in zip(plant.driven(plant.joints), damping, strict=False):
+        if coefficient:
+            plant = plant.with_effect(BackEmf(port=joint, coefficient=as_array(float(coefficient))))
+    return plant
 
 
 def _check_weights(plant: Plant, case: Case) -> None:

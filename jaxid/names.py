@@ -94,3 +94,23 @@ ORIENTATIONS = ("horizontal", "vertical")
 # Kinds of inertial sensors, and the axes that they may read.
 INERTIAL_KINDS = ("gyroscope", "accelerometer")
 AXES = ("x", "y", "z")
+# Separators of text tables, in order of preference if a header has equally many of two (a blank stands for
+# one or more of them), and decimal signs.
+SEPARATORS = (";", "\t", ",", "|", " ")
+DECIMALS = (".", ",")
+# Quantities of a log that have units, or whose sign may be turned.
+UNIT_OF = (
+    "time",
+    "position",
+    "velocity",
+    "acceleration",
+    "force",
+    "reference",
+    "load_position",
+    "load_acceleration",
+)
+SIGN_OF = UNIT_OF[1:]
+# Sides of a gear at which an angle may be measured.
+SIDES = ("load", "motor")
+# Ways to resample: lines between readings, or cubic splines.
+RESAMPLINGS = ("linear", "band_limited")

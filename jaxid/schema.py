@@ -517,6 +517,26 @@ def either_text(read: Reader) -> Reader:
     )
 
 
+def by_quantity(read: Reader, quantities: Iterable[str]) -> Reader:
+    """Return the reader of an inline table with a value, or a list by column, for quantities of a log."""
+    read_list = several(read)
+
+    def read_either(value: Any, spot: Spot) -> Any:
+        return read_list(value, spot) if is_list(value) else read(value, spot)
+
+    one = Reader(read_either, either(read.schema, read_list.schema))
+    return inline({name: Key(one) for name in quantities})
+
+
+def _sign(value: Any, spot: Spot) -> float:
+    if isinstance(value, bool) or value not in (1, -1):
+        raise spot.refuse(value, "is no sign", "give 1 or -1")
+    return float(value)
+
+
+# 1 or -1.
+sign = Reader(_sign, {"enum": [1, -1]})
+
 # True or false, or a positive number.
 flag_or_positive = Reader(
     lambda value, spot: (_flag if isinstance(value, bool) else number("positive"))(value, spot),

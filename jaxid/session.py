@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxid.build import build_machine
+from jaxid.build import build_machine, drives_of_case, make_plant, motions_of
 from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
@@ -26,6 +26,7 @@ from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log, with_load
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
+from jaxid.logs.units import Frame
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
@@ -228,7 +229,8 @@ def _read(case: Case, log: LogLike, *, columns: LogTable | None = None, whole: b
     if not isinstance(log, Log):
         columns = case.columns if columns is None else columns
         columns = replace(columns, rows=None) if whole else columns
-        log = as_log(log, columns, joints=joints if load is None else None, drives=drives)
+        frame = _frame(case)
+        log = as_log(log, columns, joints=joints if load is None else None, drives=drives, frame=frame)
         return with_load(_without_gears(case, log), load, joints)
     log = with_load(log, load, joints)
     for name, width in (("position", joints), ("force", drives), ("reference", drives)):
@@ -241,6 +243,19 @@ def _read(case: Case, log: LogLike, *, columns: LogTable | None = None, whole: b
                 hint=f"give one column a {what}, in the order of the {what}s",
             )
     return _without_gears(case, log)
+
+
+def _frame(case: Case) -> Frame:
+    """Return the machine behind the columns of a log, for the conversion of their units."""
+    units = case.plant.units
+    labels = {"position": units.position, "force": units.force}
+    plant = make_plant(case)
+    return Frame(
+        motions=motions_of(case, plant),
+        driven=plant.driven(plant.joints),
+        actuator=case.actuator,
+        labels={name: label for name, label in labels.items() if label is not None},
+    )
 
 
 def at_joints(case: Case) -> Case:
@@ -340,7 +355,7 @@ def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bo
         return _Held([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
     gain = None
     if case.actuator.transmission is None:
-        gain = np.broadcast_to(case.actuator.gain, (case.plant.drives,)).tolist()
+        gain = drives_of_case(case, machine.plant).gain.tolist()
     findings = sign_findings(machine, log, data, declared, gain)
     raise_on_error(findings)
 

@@ -6,11 +6,13 @@ A default of None means that the log, the machine or the method decides, as the 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from jaxid.names import (
     AXES,
     CRITERIA,
+    DECIMALS,
     DERIVATIVES,
     DISCOVER,
     HOLDS,
@@ -19,8 +21,13 @@ from jaxid.names import (
     METHODS,
     MINIMISERS,
     OUTPUTS,
+    RESAMPLINGS,
+    SEPARATORS,
+    SIDES,
+    SIGN_OF,
     SOLVERS,
     STARTS,
+    UNIT_OF,
     USER_METHODS,
 )
 from jaxid.schema import (
@@ -28,6 +35,7 @@ from jaxid.schema import (
     Spot,
     by_drive,
     by_joint,
+    by_quantity,
     choice,
     columns,
     flag,
@@ -37,6 +45,7 @@ from jaxid.schema import (
     odd,
     rows,
     several,
+    sign,
     span,
     square_matrix,
     stretch,
@@ -58,6 +67,31 @@ class Actuator:
     gain: ByJoint = key(
         by_drive(number("nonzero")), "known force per unit of the logged command", default=1.0
     )
+    torque_constant: ByJoint | None = key(
+        by_drive(number("positive")), "torque of the motor per current", unit="N m/A", note="gain is stated"
+    )
+    gear_ratio: ByJoint | None = key(
+        by_drive(number("nonzero")), "turns of the motor for one of the load or of the screw", note="1"
+    )
+    lead: ByJoint | None = key(
+        by_drive(number("positive")), "way of a sliding joint for one turn of its screw", unit="m/rev"
+    )
+    efficiency: ByJoint | None = key(
+        by_drive(number("positive")), "force behind the gear over that without losses", note="1"
+    )
+    resistance: ByJoint | None = key(
+        by_drive(number("positive")),
+        "resistance of the winding, for a logged voltage",
+        unit="ohm",
+    )
+    back_emf: ByJoint | None = key(
+        by_drive(number("nonnegative")),
+        "voltage per speed of the motor",
+        unit="V s/rad",
+        note="torque_constant",
+    )
+    rated: ByJoint | None = key(by_drive(number("positive")), "current that is 100 %", unit="A")
+    supply: ByJoint | None = key(by_drive(number("positive")), "voltage of a duty cycle of 100 %", unit="V")
     transmission: tuple[tuple[float, ...], ...] | None = key(
         square_matrix(),
         "R, rows of numbers, for logs of motors that move several joints: joint = R^-1 motor",
@@ -75,7 +109,32 @@ class LogTable:
     force: str | tuple[str, ...] = key(
         columns("drive"), f"{_COLUMN} of the command, one a drive", required=True
     )
-    hold: str = key(choice(HOLDS), "course of the command between samples", default=HOLDS[0])
+    hold: str | None = key(
+        choice(HOLDS), "course of the command between samples", note="zero_order or linear, as the log shows"
+    )
+    units: Mapping[str, str | tuple[str, ...]] | None = key(
+        by_quantity(text, UNIT_OF),
+        "units of the columns, converted to SI: one for a quantity, or a list by column",
+        note="SI, or as the file states",
+    )
+    sign: Mapping[str, float | tuple[float, ...]] | None = key(
+        by_quantity(sign, SIGN_OF), "1 or -1 for a quantity, or a list by column: it is multiplied", note="1"
+    )
+    counts_per_revolution: ByJoint | None = key(
+        by_joint(number("positive")), "counts of the encoder in a turn", note="the unit count is not used"
+    )
+    position_at: str = key(
+        choice(SIDES), "side of the gear at which angles of the log were measured", default=SIDES[0]
+    )
+    resample: float | None = key(
+        number("positive"),
+        "rate to which all columns are resampled",
+        unit="Hz",
+        note="uneven or unequal samples are, at the rate of the slowest column",
+    )
+    resample_method: str | None = key(
+        choice(RESAMPLINGS), "lines or cubic splines between readings", note=RESAMPLINGS[0]
+    )
     reference_hold: str | None = key(
         choice(HOLDS),
         "course of the reference between samples, for a log slower than its loop",
@@ -86,6 +145,12 @@ class LogTable:
         "whether positions and references start anew after a turn, or the size of a turn",
         unit="position",
         default=False,
+    )
+    separator: str | None = key(
+        choice(SEPARATORS), "sign between the cells of a text table", note="found in the file, and reported"
+    )
+    decimal: str | None = key(
+        choice(DECIMALS), "decimal sign of a text table", note="found in the file, and reported"
     )
     rows: tuple[int, int] | None = key(rows, "first row and end, 0-based, half open", note="all rows")
     velocity: str | tuple[str, ...] | None = key(

@@ -27,6 +27,7 @@ from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError, suggest
 from jaxid.logs.log import log_table
+from jaxid.logs.units import parse_unit
 from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
 from jaxid.names import DISCOVER, HOLDS
@@ -49,6 +50,8 @@ from jaxid.settings import (
     WithinPrior,
 )
 
+# Kinds of units that convert to the SI units of a machine.
+_MECHANICAL = ("length", "angle", "force", "torque")
 # Name of a case that is a dict, in messages and results.
 UNNAMED = "case"
 
@@ -184,7 +187,7 @@ class Case:
     @property
     def hold(self) -> str:
         """Course of the command between samples."""
-        return HOLDS[0] if self.log is None else self.log.hold
+        return HOLDS[0] if self.log is None or self.log.hold is None else self.log.hold
 
     @property
     def reference_hold(self) -> str:
@@ -311,6 +314,8 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
 
     # Keys that are sound by themselves may contradict each other.
     _check_transmission(case, root)
+    _check_drive(case, tables, root)
+    _check_labels(case, root)
     _check_preprocess(tables.get("preprocess", {}), root)
     _check_recursive(tables.get("recursive", {}), root)
     check_kinds(case.own_effects, root)
@@ -382,6 +387,44 @@ def _check_transmission(case: Case, root: Spot) -> None:
     if gears:
         hint = "keep transmission if the log is of the motors' angles, else the other"
         raise spot.fault(f"and {gears[0]} of [plant.parameters] are both given", hint)
+
+
+def _check_drive(case: Case, tables: Mapping[str, Any], root: Spot) -> None:
+    """Refuse a drive that is described twice, and words on it that convert nothing."""
+    given, spot = tables.get("actuator", {}), root.under("[actuator]")
+    if case.actuator.torque_constant is not None:
+        for key in ("gain", "transmission"):
+            if key in given:
+                hint = "keep gain, the force for the logged command, or torque_constant"
+                raise spot.at(key).fault("does not go with torque_constant", hint)
+    else:
+        for key in ("gear_ratio", "lead"):
+            if key in given and "gain" not in given:
+                hint = "state gain (ratio times efficiency for a logged motor torque) or torque_constant"
+                raise spot.at(key).fault("leaves open what the logged command is", hint)
+    if case.log is not None and case.log.counts_per_revolution is not None and case.log.units is not None:
+        given = case.log.units.values()
+        texts = [text for unit in given for text in ((unit,) if isinstance(unit, str) else unit)]
+        if "count" not in {unit.kind for unit in map(parse_unit, texts) if unit is not None}:
+            hint = 'add units = { position = "count" }, or leave it out'
+            raise root.under("[log]").at("counts_per_revolution").fault("converts nothing", hint)
+
+
+def _check_labels(case: Case, root: Spot) -> None:
+    """Refuse labels of [plant] units that look as if they converted: mm, deg, kN."""
+    for quantity in ("position", "force"):
+        label = getattr(case.plant.units, quantity)
+        unit = None if label is None else parse_unit(label)
+        mechanical = (
+            unit is not None and unit.kind in ("length", "angle", "force", "torque") and unit.factor != 1.0
+        )
+        if mechanical and unit is not None and unit.per == 0:
+            hint = f'state [log] units = {{ {quantity} = "{label}" }}, which converts; results are in SI'
+            raise (
+                root.under("[plant]")
+                .at(f"units.{quantity}")
+                .refuse(label, "is a label, and converts nothing", hint)
+            )
 
 
 def _within_prior(tables: Mapping[str, Any], settings: OutputError, root: Spot) -> WithinPrior | None:

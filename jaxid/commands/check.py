@@ -85,7 +85,7 @@ class Check:
 
     def json(self) -> dict[str, Any]:
         """Return the content of check.json."""
-        from jaxid.results.as_json import one_or_list, recipe_json
+        from jaxid.results.as_json import one_or_list, readings_json, recipe_json
 
         session, log = self.session, self.session.fit.log
         sensor = session.machine.sensor
@@ -113,6 +113,7 @@ class Check:
                     "force": "estimated" if sensor.force_noise is None else "stated",
                 },
             },
+            "settings": {**session.settings, **readings_json(session)},
             "preprocess": recipe_json(session),
             "noise_floor": self.noise_floor,
             "parameters": {

@@ -24,6 +24,25 @@ class ViscousFriction(Effect):
         return Action(force=-self.coefficient * x.yd)
 
 
+@register("back_emf")
+class BackEmf(Effect):
+    """-c v: what the back-EMF takes off the force of a drive whose voltage is the command.
+
+    `[actuator]` with torque_constant and resistance adds it, known. Viscous friction looks the same, and
+    one of the two must be known.
+
+    Source:
+        The equations of a permanent-magnet DC motor without inductance: c = k_t k_e / R.
+    """
+
+    on_request = True
+
+    coefficient: Array = parameter("force*time/position", "nonnegative", "c, drag per velocity")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.coefficient * x.yd)
+
+
 @register("coulomb_friction")
 class CoulombFriction(Effect):
     """-F sign v, set-valued at rest; F is `level`, or `friction_coefficient` times normal force."""

@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.logs.log import Log, read_log
 from jaxid.logs.readers.array_files import Columns, pick_columns
 from jaxid.logs.readers.rows import Rows
+from jaxid.logs.units import Frame
 from jaxid.settings import LogTable
 
 
@@ -26,7 +27,12 @@ LogLike = Log | str | Path | Table
 
 
 def as_log(
-    log: LogLike, columns: LogTable | Mapping[str, Any], *, joints: int | None = 1, drives: int | None = None
+    log: LogLike,
+    columns: LogTable | Mapping[str, Any],
+    *,
+    joints: int | None = 1,
+    drives: int | None = None,
+    frame: Frame | None = None,
 ) -> Log:
     """Return a log, in memory or from a file, with the same checks.
 
@@ -36,6 +42,7 @@ def as_log(
             as a column if it has a name.
         joints: Number of positions expected; None takes what there is.
         drives: Number of forces and references expected; None: no more than positions.
+        frame: The machine, for the conversion of units, see `jaxid.logs.log.read_log`.
 
     Raises:
         InputError: If the table is of no known kind, or a key, a column, a value or the time base is unsound.
@@ -43,13 +50,13 @@ def as_log(
     if isinstance(log, Log):
         return log
     if isinstance(log, str | Path):
-        return read_log(log, columns, joints=joints, drives=drives)
+        return read_log(log, columns, joints=joints, drives=drives, frame=frame)
     name, known = _arrays(log)
 
     def read(source: Path, names: list[str], rows: Rows | None) -> Columns:
         return pick_columns(source, known, list(dict.fromkeys(names)), rows)
 
-    return read_log(name, columns, joints=joints, drives=drives, read=read)
+    return read_log(name, columns, joints=joints, drives=drives, frame=frame, read=read)
 
 
 def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:

@@ -1,6 +1,6 @@
 """Measured logs: the columns that a case names, checked and in SI units."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
-from jaxid.logs.readers import read_columns
+from jaxid.logs.readers import read_table
 from jaxid.logs.readers.array_files import Columns
 from jaxid.logs.readers.rows import Rows
-from jaxid.logs.timebase import sound_time
+from jaxid.logs.readers.table import Assumed, Table
+from jaxid.logs.resample import Readings, readings_of, resampled
+from jaxid.logs.timebase import TimeBase, time_base
+from jaxid.logs.units import Frame, converted
 from jaxid.logs.wrap import joined
-from jaxid.names import HOLDS, OPTIONAL_COLUMNS
+from jaxid.names import HOLDS, OPTIONAL_COLUMNS, RESAMPLINGS
 from jaxid.schema import Spot, read_settings
 from jaxid.settings import LogTable
 
@@ -45,6 +48,8 @@ class Log:
         hold: Shape of the command between samples, one of `HOLDS`.
         rows: Rows of the file, 0-based and half open; (0, 0) means all.
         source: Origin of the log, for messages.
+        assumed: Everything that was assumed to read it.
+        table: The `[log]` table by which it was read; None: it was not read from a file.
     """
 
     time: Column
@@ -59,6 +64,8 @@ class Log:
     hold: str = "zero_order"
     rows: tuple[int, int] = (0, 0)
     source: str = "log"
+    assumed: tuple[Assumed, ...] = ()
+    table: LogTable | None = None
 
     def __post_init__(self):
         """Copy the arrays, make them read-only and check that they fit together.
@@ -88,6 +95,11 @@ class Log:
     def samples(self) -> int:
         """Number of samples."""
         return self.time.size
+
+    @property
+    def resampled(self) -> bool:
+        """True if the samples are not the rows of the file."""
+        return any(a.setting in ("resample", "doubled_rows") for a in self.assumed)
 
     @property
     def measured(self) -> tuple[bool, ...]:
@@ -176,16 +188,21 @@ def read_log(
     *,
     joints: int | None = 1,
     drives: int | None = None,
-    read: Callable[[Path, list[str], Rows | None], Columns] = read_columns,
+    frame: Frame | None = None,
+    read: Callable[[Path, list[str], Rows | None], Columns] | None = None,
 ) -> Log:
     """Read a log, and refuse one that no estimator could use.
 
+    Columns are converted to SI units, and uneven or unequal samples are resampled to one rate; all of this
+    stands in `assumed` of the log.
+
     Args:
-        path: A `.csv`, `.npz`, `.mat` or `.parquet` file.
+        path: The file; its suffix, or `format` of the table, determines the reader.
         columns: The `[log]` table of a case: names of columns by quantity; `sample_rate` [Hz] if there is no
-            time; `hold` and `rows`.
+            time; `hold`, `rows`, `units` and how to resample.
         joints: Expected number of positions; None accepts any.
         drives: Expected number of forces and references; None: at most as many as positions.
+        frame: The machine, on which the conversion of units depends; None: nothing is known of it.
         read: Function that reads named columns, for a source other than a file.
 
     Returns:
@@ -198,20 +215,105 @@ def read_log(
     table = log_table(columns)
     names = _names(table)
     _check_distinct(names)
-    data, rows = read(path, [name for group in names.values() for name in group], table.rows)
-    _check_finite(data, rows[0], path)
+    wanted = [name for group in names.values() for name in group]
+    content = read_table(path, wanted, table.rows, table) if read is None else read(path, wanted, table.rows)
+    content = content if isinstance(content, Table) else Table(*content)
+    data, rows = content.columns, content.rows
+    _check_finite(data, rows[0], path, content.sparse if table.resample is None else set(data) - {table.time})
 
-    groups = {key: np.concatenate([data[name] for name in group], axis=1) for key, group in names.items()}
+    groups = {
+        key: data[group[0]] if len(group) == 1 else np.concatenate([data[name] for name in group], axis=1)
+        for key, group in names.items()
+    }
     _check_widths(groups, names, joints, drives, path)
-    samples = rows[1] - rows[0]
-    if samples < MINIMUM_SAMPLES:
-        hint = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
-        raise InputError(f"is too short: {samples} samples", where=str(path), hint=hint)
-    time = _time(groups.pop("time", None), table, rows, path)
+    if rows[1] - rows[0] < MINIMUM_SAMPLES:
+        raise _too_short(rows[1] - rows[0], path)
     if table.unwrap:
+        # A turn is one of the column's unit.
         position, reference = joined(groups["position"], groups.get("reference"), table.unwrap)
         groups |= {"position": position} | ({} if reference is None else {"reference": reference})
-    return Log(time=time, hold=table.hold, rows=rows, source=str(path), **groups)
+    frame = Frame() if frame is None else frame
+    groups, units = converted(groups, names, content.units, table, frame, str(path))
+    time, groups, rows, timing = _at_one_rate(groups, table, rows, path)
+    if time.size < MINIMUM_SAMPLES:
+        raise _too_short(time.size, path)
+    return Log(
+        time=time,
+        hold=HOLDS[0] if table.hold is None else table.hold,
+        rows=rows,
+        source=str(path),
+        assumed=(*content.assumed, *units, *timing),
+        table=table,
+        **groups,
+    )
+
+
+def _too_short(samples: int, path: Path) -> InputError:
+    hint = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
+    return InputError(f"is too short: {samples} samples", where=str(path), hint=hint)
+
+
+def _at_one_rate(
+    groups: dict[str, np.ndarray], table: LogTable, rows: Rows, path: Path
+) -> tuple[np.ndarray, dict[str, np.ndarray], Rows, list[Assumed]]:
+    """Bring all columns to one rate.
+
+    Returns:
+        Time, columns by quantity, rows of the file, and everything that was assumed.
+    """
+    column = groups.pop("time", None)
+    where = str(path) if column is None else f"{path}, column '{table.time}'"
+    if column is None:
+        assert table.sample_rate is not None, "`log_table` refuses a log without time and rate"
+        stamps = np.arange(*rows) / table.sample_rate
+        base = TimeBase(stamps, np.arange(stamps.size), 1.0 / table.sample_rate, True, 0, ())
+    else:
+        stamps = column[:, 0]
+        repeats = np.all([np.all(v[1:] == v[:-1], axis=1) for v in groups.values()], axis=0)
+        base = time_base(stamps, rows[0], where, repeats)
+        _check_rate(base.time, table, where)
+    first, end = base.rows
+    kept = (rows[0] + first, rows[0] + end)
+    whole = all(np.isfinite(values).all() for values in groups.values())
+    plain = base.time.size == stamps.size
+    used = groups if plain else {name: base.of_samples(values) for name, values in groups.items()}
+    if whole and base.even and table.resample is None:
+        return base.time, used, kept, list(base.assumed)
+
+    own = {name: readings_of(base.time, values, name, str(path)) for name, values in used.items()}
+    time, made, said = resampled(
+        own,
+        rate=table.resample,
+        period=base.period,
+        method=RESAMPLINGS[0] if table.resample_method is None else table.resample_method,
+        held=table.hold == "zero_order",
+        where=str(path),
+    )
+    return time, made, kept, [*base.assumed, *_of_rare(own, base), *said]
+
+
+def _of_rare(own: Mapping[str, list[Readings]], base: TimeBase) -> list[Assumed]:
+    """Return words on columns that have no reading in some rows."""
+    said = []
+    for name, columns in own.items():
+        absent = base.time.size - min(c.time.size for c in columns)
+        if absent:
+            rate = 1 / max(c.period for c in columns)
+            what = f"it has none in {absent} of {base.time.size} rows, and {rate:.4g} readings a second"
+            said.append(Assumed("readings", name, what))
+    return said
+
+
+def _check_rate(time: np.ndarray, table: LogTable, where: str) -> None:
+    """Refuse a sampling rate that is not that of the time column."""
+    rate = table.sample_rate
+    if rate is None:
+        return
+    logged = (time.size - 1) / (time[-1] - time[0])
+    if abs(logged / rate - 1) > 0.01:
+        what = f"the time column gives {logged:.6g} Hz, but sample_rate is {rate:.6g} Hz"
+        hint = "remove one of them; is time in seconds?"
+        raise InputError(what, where=where, hint=hint)
 
 
 _LOG = Spot("", "[log]")
@@ -251,8 +353,11 @@ def _check_distinct(names: dict[str, list[str]]) -> None:
             raise InputError(f"{one} and {other} are the same column", where="[log]", hint=hint)
 
 
-def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
-    """Refuse columns with values that are NaN, infinite, or too large for their squares to be finite."""
+def _check_finite(data: dict[str, np.ndarray], first: int, path: Path, sparse: Set[str]) -> None:
+    """Refuse columns with values that are NaN, infinite, or too large for their squares to be finite.
+
+    NaN is no reading in the columns of `sparse`.
+    """
     for name, values in data.items():
         where = f"{path}, column '{name}'"
         large = np.flatnonzero(np.any((np.abs(values) > _LARGEST) & np.isfinite(values), axis=1))
@@ -261,11 +366,13 @@ def _check_finite(data: dict[str, np.ndarray], first: int, path: Path) -> None:
             raise InputError(
                 what, where=where, hint="correct or remove the row, or exclude it by rows = [first, end]"
             )
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        sound = np.isfinite(values) | (np.isnan(values) if name in sparse else False)
+        bad = np.flatnonzero(~sound.all(axis=1))
         if not bad.size:
             continue
         kind = "NaN" if np.isnan(values[bad[0]]).any() else "infinite"
-        hint = "exclude these rows by rows = [first, end], or interpolate before"
+        hint = "exclude these rows by rows = [first, end]"
+        hint += ", or set resample = <Hz> to interpolate across them" if kind == "NaN" else ""
         what = f"{bad.size} row(s) are NaN or infinite, the first is row {first + bad[0]} ({kind})"
         raise InputError(what, where=where, hint=hint)
 
@@ -295,21 +402,3 @@ def _check_widths(
             hint = f"name one column for each {what}, in the order of the {what}s"
             count = drive_count if what == "drive" else needed
             raise InputError(f"{width} column(s), expected {count}", where=where, hint=hint)
-
-
-def _time(
-    column: np.ndarray | None, table: LogTable, rows: tuple[int, int], path: Path
-) -> Float[np.ndarray, " samples"]:
-    """Return the time of the samples, from the time column or the sampling rate."""
-    rate = table.sample_rate
-    if column is None:
-        assert rate is not None, "`log_table` refuses a log without time and rate"
-        return np.arange(*rows) / rate
-    where = f"{path}, column '{table.time}'"
-    time = sound_time(column[:, 0], rows[0], where)
-    logged = (time.size - 1) / (time[-1] - time[0])
-    if rate is not None and abs(logged / rate - 1) > 0.01:
-        what = f"the time column gives {logged:.6g} Hz, but sample_rate is {rate:.6g} Hz"
-        hint = "remove one of them; is time in seconds?"
-        raise InputError(what, where=where, hint=hint)
-    return time

@@ -200,6 +200,22 @@ def identification_json(result: Identification) -> dict[str, Any]:
     }
 
 
+def readings_json(session: Session) -> dict[str, Any]:
+    """Return how each log was read, under `logs`; empty if nothing was assumed."""
+    logs = {run.name: [a.json() for a in run.log.assumed] for run in session.runs if run.log.assumed}
+    return {"logs": logs} if logs else {}
+
+
+def reading_lines(session: Session) -> list[str]:
+    """Return a line for everything that was assumed to read each log."""
+    named = len(session.runs) > 1
+    return [
+        f"log{' ' + run.name if named else ''}: {assumed}"
+        for run in session.runs
+        for assumed in run.log.assumed
+    ]
+
+
 def recipe_json(session: Session) -> dict[str, Any]:
     """Return the settings of the filter, chosen or stated."""
     r = session.recipe

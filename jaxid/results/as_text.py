@@ -117,7 +117,9 @@ def identification_table(result: Identification) -> str:
     ]
     gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
     notes = _notes(results.notes(session, estimate))
-    return "\n".join([*result.findings, "", head, "", parameters, *below, "", gap, _FLOOR_WORDS, *notes])
+    seen = results.reading_lines(session)
+    lines = [*result.findings, "", *seen, head, "", parameters, *below, "", gap, _FLOOR_WORDS, *notes]
+    return "\n".join(lines)
 
 
 def identification_summary(result: Identification) -> str:
@@ -192,7 +194,7 @@ def discovery_table(result: Discovery) -> str:
         f"({FLOOR} {_number(gap['noise_floor'])}); simulated position {position}"
     )
     lines.append(_FLOOR_WORDS)
-    return "\n".join([*lines, *_notes(content["notes"])])
+    return "\n".join([*lines, *_notes(content["notes"]), *results.reading_lines(result.session)])
 
 
 def step_rows(content: Mapping[str, Any]) -> list[list[str]]:
@@ -267,8 +269,9 @@ def check_table(result: Check) -> str:
     rows = check_rows(content)
     combinations = _unidentifiable_lines([c["combination"] for c in content["unidentifiable"]])
     table = ["", aligned(rows)] if len(rows) > 1 else []
+    seen = results.reading_lines(result.session)
     return "\n".join(
-        ["the log is sound", head, how, noise, *table, *combinations, *_notes(content["warnings"])]
+        [*seen, "the log is sound", head, how, noise, *table, *combinations, *_notes(content["warnings"])]
     )
 
 

@@ -60,8 +60,11 @@ class FitResult:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The choices made from case and log, by name: `value` and `reason`."""
-        return {**self.session.settings, **self.estimate.details.get("settings", {})}
+        """The choices made from case and log, by name: `value` and `reason`; and how each log was read."""
+        from jaxid.results.as_json import readings_json
+
+        chosen = {**self.session.settings, **self.estimate.details.get("settings", {})}
+        return {**chosen, **readings_json(self.session)}
 
     @property
     def parameters(self) -> ParameterTable:

@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
-from jaxid.logs.readers import read_columns
+from jaxid.logs.readers import read_columns, read_table
+from jaxid.logs.units import time_factor
 from jaxid.settings import Disturbance
 
 # A disturbance switches at start + k (on + off). The tick at that instant still has the old value, and a
@@ -29,7 +30,7 @@ def disturbance_at(
     Args:
         disturbance: A square wave, the name of a column, or None for zero.
         times: Times of the ticks on the clock of the log [s].
-        log: Log whose file has the column; the values are held between its samples.
+        log: Log whose file has the column; the values are held between its rows.
 
     Returns:
         The disturbance at each tick, in units of the command.
@@ -53,11 +54,27 @@ def _column(name: str, times: np.ndarray, log: Log | None) -> np.ndarray:
     if log is None:
         hint = "give { level, on, off, start } instead"
         raise InputError("a column needs a log that contains it", where=where, hint=hint)
-    values = read_columns(log.source, [name], log.rows)[0][name]
+    rows, values = _rows_of(name, log)
     if not np.isfinite(values).all():
         row = log.rows[0] + int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         hint = "correct that row, or cut it out with rows"
         raise InputError(f"row {row} is not a number", where=f"{log.source}, {where}", hint=hint)
     # A tick at the time of a sample belongs to this sample, however its time is rounded.
-    held = np.searchsorted(log.time, times + 1e-3 * log.period, side="right") - 1
+    held = np.searchsorted(rows, times + 1e-3 * log.period, side="right") - 1
     return values[np.clip(held, 0, len(values) - 1)]
+
+
+def _rows_of(name: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Return a column of a log's file, and the times of its rows [s]."""
+    if log.samples == log.rows[1] - log.rows[0] and not log.resampled:
+        return log.time, read_columns(log.source, [name], log.rows)[0][name]
+    table = log.table
+    assert table is not None, "only a log from a file is resampled"
+    time = [] if table.time is None else [table.time]
+    content = read_table(log.source, [*time, name], table.rows, table)
+    values = content.columns[name]
+    if table.time is None:
+        return np.arange(*content.rows) / (table.sample_rate or 1.0), values
+    stamps = content.columns[table.time] * time_factor(table, content.units.get(table.time, ""))
+    read = np.isfinite(values).all(axis=1) if name in content.sparse else np.full(len(values), True)
+    return stamps[read, 0], values[read]

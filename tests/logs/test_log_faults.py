@@ -29,10 +29,10 @@ def test_folder_is_no_log(tmp_path):
 
 
 def test_unreadable_file(csv_file, monkeypatch):
-    def denied(self):
+    def denied(self, *args):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", denied)
+    monkeypatch.setattr(Path, "open", denied)
     refuse(csv_file, match="cannot be read .*Permission denied.*; check the permissions of the file")
 
 
@@ -44,8 +44,8 @@ def test_empty_file(tmp_path, text):
 
 
 def test_unknown_suffix(tmp_path):
-    (tmp_path / "log.xlsx").write_bytes(b"x")
-    refuse(tmp_path / "log.xlsx", match=r"unknown suffix '.xlsx'; use one of .csv, .npz")
+    (tmp_path / "log.doc").write_bytes(b"x")
+    refuse(tmp_path / "log.doc", match=r"unknown suffix '.doc'; use one of .csv, .txt")
 
 
 def test_binary_file_called_csv(tmp_path):
@@ -108,15 +108,11 @@ def test_cell_that_is_no_number(csv_file):
     refuse(edit(csv_file, 7, "0.007,n/a,1"), match=r"column 'q', row 7 .*'n/a' is not a number; ")
 
 
-def test_empty_cell_and_short_row(csv_file):
-    refuse(edit(csv_file, 7, "0.007,,1"), match="column 'q', row 7 .*the cell is empty")
+def test_short_row(csv_file):
     refuse(edit(csv_file, 7, "0.007"), match="row 7 has 1 cells, the header 3; give one cell for each column")
 
 
-def test_decimal_commas(tmp_path, csv_file):
-    text = csv_file.read_text().replace(",", ";").replace(".", ",")
-    (tmp_path / "comma.csv").write_text(text)
-    refuse(tmp_path / "comma.csv", match="row 0 .*is not a number; write decimals with a point")
+def test_decimal_commas_between_commas(csv_file):
     refuse(edit(csv_file, 7, "0,007,1,2,3"), match="row 7 has 5 cells, the header 3; .*point")
 
 
@@ -153,7 +149,6 @@ def test_number_of_joints(tmp_path):
 @pytest.mark.parametrize(
     ("row", "value", "match"),
     [
-        (60, 0.059, r"column 't': time repeats in row 60 \(0.059 s, then 0.059 s\)"),
         (60, 0.010, "time runs backwards in row 60"),
     ],
 )
@@ -167,25 +162,6 @@ def test_time_with_too_few_digits(tmp_path):
     data = signals()
     data["t"] = np.round(data["t"], 2)
     refuse(write_csv(tmp_path / "log.csv", data), match="time repeats in 179 rows.*sample_rate")
-
-
-def test_gap(tmp_path):
-    data = signals()
-    data["t"][150:] += 0.5
-    path = write_csv(tmp_path / "log.csv", data)
-    refuse(path, match=r"gap.*of 0.501 s after row 149 .*rows = \[0, 150\]")
-    assert read_log(path, {**COLUMNS, "rows": [0, 150]}).samples == 150
-
-
-def test_jitter(tmp_path):
-    data = signals()
-    jitter = np.random.default_rng(1).uniform(-2e-4, 2e-4, ROWS)
-    path = write_csv(tmp_path / "log.csv", {**data, "t": data["t"] + jitter})
-    refuse(path, match="not constant: .* by more than 1 %, the worst by .* %.*; resample")
-    # Half a percent is what clocks do, and one loose row is not the log's fault.
-    read_log(write_csv(path, {**data, "t": data["t"] + jitter / 80}), COLUMNS)
-    data["t"][100] += 2e-4
-    read_log(write_csv(path, data), COLUMNS)
 
 
 def test_rate_and_time_must_agree(csv_file):

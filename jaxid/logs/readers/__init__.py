@@ -1,5 +1,6 @@
 """Named columns of numbers from the file formats that logs come in."""
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,11 +11,20 @@ from jaxid.errors import InputError
 from jaxid.logs.readers.array_files import read_mat, read_npz, read_parquet
 from jaxid.logs.readers.csv_file import read_csv
 from jaxid.logs.readers.rows import Rows
+from jaxid.logs.readers.table import Table
+from jaxid.settings import LogTable
 
-# Each reader: (path, names, rows) -> ({name: (samples, width)}, rows that were read).
-Reader = Callable[[Path, list[str], Rows | None], tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]]
+# Each reader: (path, names, rows) -> ({name: (samples, width)}, rows that were read), or a `Table`. One that
+# has a fourth argument, `settings`, is also given the [log] table.
+Read = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows] | Table
+Reader = Callable[..., Read]
 READERS: dict[str, Reader] = {
     ".csv": read_csv,
+    ".txt": read_csv,
+    ".tsv": read_csv,
+    ".dat": read_csv,
+    ".asc": read_csv,
+    ".lvm": read_csv,
     ".npz": read_npz,
     ".mat": read_mat,
     ".parquet": read_parquet,
@@ -47,7 +57,19 @@ def register_reader(suffix: str, reader: Reader) -> None:
 def read_columns(
     path: str | Path, names: list[str], rows: Rows | None = None
 ) -> tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]:
-    """Read the named columns of a file, unchanged and without regard to their meaning.
+    """Read the named columns of a file, unchanged and without regard to their meaning; see `read_table`.
+
+    Returns:
+        The columns by name, each of shape (samples, width), and the rows in the file.
+    """
+    table = read_table(path, names, rows)
+    return table.columns, table.rows
+
+
+def read_table(
+    path: str | Path, names: list[str], rows: Rows | None = None, settings: LogTable | None = None
+) -> Table:
+    """Read the named columns of a file with everything that was assumed to read them.
 
     A matrix in `.npz` or `.mat` has its samples along the longer side. A name
     like `pos[2]` is its second column.
@@ -56,31 +78,41 @@ def read_columns(
         path: The file; its suffix determines the format.
         names: Names of the columns.
         rows: First row and end, 0-based and half open; None: all. Rows outside are not examined.
+        settings: The `[log]` table, for formats that need more than names; None: nothing is stated.
 
     Returns:
-        The columns by name, each of shape (samples, width), and the rows in the file.
+        The columns by name, with the rows in the file, units and assumptions.
 
     Raises:
         InputError: If the file, a column, a cell or the rows are not there or not numbers.
     """
     path = Path(path)
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
-        hint = f"use one of {', '.join(READERS)}"
-        raise InputError(f"unknown suffix '{path.suffix}'", where=str(path), hint=hint)
     try:
         if not path.exists():
             beside = [p.name for p in path.parent.glob("*" + path.suffix)]
             hint = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
             raise InputError("no such file", where=str(path), hint=hint)
+        reader = _reader_of(path)
         if not path.is_file():
             raise InputError("is not a file", where=str(path), hint="give the path of the log")
         if path.stat().st_size == 0:
             raise InputError("is empty", where=str(path), hint="export the log again")
-        return reader(path, list(dict.fromkeys(names)), rows)
+        wanted = list(dict.fromkeys(names))
+        more = (settings,) if "settings" in inspect.signature(reader).parameters else ()
+        read = reader(path, wanted, rows, *more)
+        return read if isinstance(read, Table) else Table(*read)
     except OSError as error:
         hint = "check the permissions of the file"
         raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
     except MemoryError as error:
         hint = "cut or decimate the log"
         raise InputError("is too large for the memory", where=str(path), hint=hint) from error
+
+
+def _reader_of(path: Path) -> Reader:
+    """Return the reader of a file, by its suffix."""
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        hint = f"use one of {', '.join(READERS)}"
+        raise InputError(f"unknown suffix '{path.suffix}'", where=str(path), hint=hint)
+    return reader
