@@ -354,7 +354,7 @@ def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bo
     if not declared.finite:
         return _Held([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
     gain = None
-    if case.actuator.transmission is None:
+    if case.actuator.transmission is None and case.actuator.torque_constant is None:
         gain = drives_of_case(case, machine.plant).gain.tolist()
     findings = sign_findings(machine, log, data, declared, gain)
     raise_on_error(findings)

@@ -169,12 +169,13 @@ def _wrong_sign(
         f"{which} brakes the motion that it is meant to drive: least squares gives {negative}; with the "
         f"sign turned the force gap falls from {gaps[0][j]:.3g} to {gaps[1][j]:.3g} {unit}"
     )
+    signs = "-1" if not several else str([-1 if k in turned else 1 for k in range(len(driven))])
     if gain is None:
-        hint = "log the negative of it"
+        hint = f"set sign = {{ force = {signs} }} in [log]"
     else:
         signed = [-g if k in turned else g for k, g in enumerate(gain)]
         shown = f"{signed[0]:.6g}" if not several else "[" + ", ".join(f"{g:.6g}" for g in signed) + "]"
-        hint = f"set gain = {shown} in [actuator], or log the negative of the force or of the position"
+        hint = f"set gain = {shown} in [actuator], or sign = {{ force = {signs} }} in [log]"
     return Finding("error", what, f"{log.source}, force", hint)
 
 

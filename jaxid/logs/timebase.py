@@ -18,8 +18,13 @@ _FEW_ROWS = 5
 _MISSING, _GAP = 1.5, 10.0
 # Samples at either end that are cut off rather than joined across a missing one.
 _EDGE = 5
+# Part of the steps that are one period, for stamps that are off in a few rows only.
+_USUAL = 0.9
 # Part of the steps that may be no multiple of the period for it to be taken from all of them.
 _MULTIPLE, _OFF_MULTIPLE = 0.25, 0.05
+# Distance of rounded stamps from an even grid, in units of their last decimal: half of one, and as much for
+# ends that are rounded as well. Equal stamps of readings that differ could else be taken for rounded ones.
+_ROUNDED, _ROUNDED_TWICE = 1.2, 0.6
 # Part of all rows that may have the time of the row before.
 _DOUBLED = 0.2
 
@@ -90,7 +95,8 @@ def time_base(
     doubled = step == 0
     # Rounding makes two stamps equal as well, but not their readings.
     rounded = not doubled.any() or (repeats is not None and not np.any(repeats & doubled))
-    if rounded and np.max(np.abs(time - grid)) <= 1.2 * _decimal_unit(time):
+    room = _ROUNDED_TWICE if doubled.any() else _ROUNDED
+    if rounded and np.max(np.abs(time - grid)) <= room * _decimal_unit(time):
         period = (time[-1] - time[0]) / max(time.size - 1, 1)
         return TimeBase(grid, rows, period, True, 0, ())
 
@@ -153,8 +159,11 @@ def _decimal_unit(time: np.ndarray) -> float:
 
 
 def _period(step: np.ndarray) -> float:
-    """Return the sampling period: the mean step, of which longer ones count as several; else the median."""
+    """Return the sampling period: the step of nearly all samples, or the mean, longer ones as several."""
     median = float(np.median(step))
+    usual = np.abs(step - median) < _JITTER * median
+    if np.mean(usual) > _USUAL:
+        return float(step[usual].mean())
     many = np.round(step / median)
     if np.mean(np.abs(step / median - many) > _MULTIPLE) > _OFF_MULTIPLE:
         return median

@@ -137,10 +137,10 @@ def parse_unit(text: str) -> Unit | None:
     rest = plain[match.end() :] if match and match[1] else plain
     rest = re.sub(r"[ *]+", " ", rest).strip()
     rest = _SPELT.get(rest, rest)
-    over, _, under = rest.partition("/")
+    over, divided, under = rest.partition("/")
     over = _SPELT.get(over.strip(), over.strip())
     per, below = 0, 1.0
-    if under:
+    if divided:
         found = re.fullmatch(r"([a-z]+?)\s*(?:\^?([12]))?", under.strip())
         if found is None or found[1] not in _TIMES:
             return None

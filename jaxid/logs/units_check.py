@@ -5,6 +5,7 @@ and remove noise.
 """
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,8 +23,45 @@ _RPM = 30.0 / math.pi
 _SLOW, _SLOWEST = 0.5, 10.0
 # A period [s] as this one is half a millisecond, written in microseconds.
 _MICRO = 500.0
+# The same in nanoseconds.
+_NANO = 500_000.0
 # Chosen: two columns with a smaller correlation are not the same quantity in two units.
 _SIMILAR = 0.9
+
+
+# Units by their names in these messages.
+_NAMED = {
+    "milliseconds": "ms",
+    "microseconds": "us",
+    "nanoseconds": "ns",
+    "millimetres": "mm",
+    "micrometres": "um",
+    "degrees": "deg",
+    "milliradians": "mrad",
+    "mm/s": "mm/s",
+    "mrad/s": "mrad/s",
+    "degrees/s": "deg/s",
+    "revolutions per minute": "rpm",
+    "revolutions per second": "rev/s",
+    "kilonewtons": "kN",
+    "kN m": "kN m",
+    "encoder counts": "count",
+}
+_LOOKS = re.compile(
+    r"(time|position|velocity|reference|force|torque) (?:looks )?like ([^,:?]+?)(?=,| or | while |\?|$)"
+)
+
+
+def how_to_say(text: str, otherwise: str) -> str:
+    """Return the units that a case states so that a quantity that looks like another unit is converted.
+
+    Args:
+        text: Message with parts such as "position looks like millimetres".
+        otherwise: Hint for a text without such a part.
+    """
+    found = [(q.replace("torque", "force"), _NAMED.get(unit)) for q, unit in _LOOKS.findall(text)]
+    said = [f'units = {{ {quantity} = "{unit}" }}' for quantity, unit in found if unit]
+    return f"if so, say {' or '.join(dict.fromkeys(said))} in [log]" if said else otherwise
 
 
 @dataclass(frozen=True)
@@ -146,7 +184,7 @@ def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: 
     finding = text.format(ratio)
     for slip in slips:
         if slip.matches(ratio, motion, 1.2):
-            hint = "convert all columns to SI units"
+            hint = how_to_say(slip.text, "convert all columns to SI units")
             return [Finding("error", f"{finding}: {slip.text}", where, hint)]
     hint = "check the units of both columns"
     return [Finding("warning", f"{finding}, which should be 1", where, hint)]
@@ -161,9 +199,11 @@ def period_findings(log: Log, path: str) -> list[Finding]:
         return []
     whole = bool(np.all(np.abs(log.time - np.round(log.time)) < 1e-6))
     severity = "error" if log.period > _SLOWEST or whole else "warning"
-    unit = "milliseconds or rows" if log.period < _MICRO else "microseconds"
-    what = f"the sampling period is {log.period:.4g} s: time looks like {unit}"
-    return [Finding(severity, what, f"{path}, time", "give time in seconds, or sample_rate in its place")]
+    unit = "milliseconds" if log.period < _MICRO else "microseconds" if log.period < _NANO else "nanoseconds"
+    rows = " or rows" if unit == "milliseconds" else ""
+    what = f"the sampling period is {log.period:.4g} s: time looks like {unit}{rows}"
+    hint = how_to_say(f"time looks like {unit}", "give time in seconds")
+    return [Finding(severity, what, f"{path}, time", f"{hint}, or give sample_rate in its place")]
 
 
 def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list[Finding]:
@@ -183,7 +223,10 @@ def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list
         span = float(np.ptp(q))
         if span >= 100 and np.all(q == np.round(q)):
             what = f"position holds whole numbers only, {span:.0f} in all: encoder counts?"
-            hint = "convert position to " + ("m" if motions[joint - 1] == "linear" else "rad")
+            hint = (
+                'say units = { position = "count" } and counts_per_revolution in [log], or the size of one, '
+            )
+            hint += 'count, units = { position = "0.5 um" }'
             findings.append(Finding("error", what, where, hint))
         elif finding := _magnitude(q, log.period, motions[joint - 1], where):
             findings.append(finding)
@@ -201,15 +244,15 @@ def _magnitude(q: np.ndarray, period: float, motion: str, where: str) -> Finding
         value, limit, absurd = (span, 50.0, 1e4) if span > 50.0 else (speed, 100.0, 1e5)
         what = f"a stroke of {span:.4g} m" if span > 50.0 else f"a speed of {speed:.4g} m/s"
         unit = "millimetres" if span < 1e4 else "micrometres"
-        hint = "convert position to m"
     else:
         # Chosen: 1e4 rad/s is 95 000 rpm.
         value, limit, absurd = speed, 1e4, 1e6
         what = f"a speed of {speed:.4g} rad/s"
-        unit, hint = "degrees", "convert position to rad"
+        unit = "degrees"
     if value <= limit:
         return None
     severity = "error" if value > absurd else "warning"
+    hint = how_to_say(f"position looks like {unit}", "convert position to SI units")
     return Finding(severity, f"{what}: position looks like {unit}", where, hint)
 
 
@@ -263,7 +306,8 @@ def _judge_inertia(rough: float | None, guess: float, span: float, motion: str, 
         spread = 2.0 if slip.severity == "warning" else 5.0
         if slip.matches(rough / guess, motion, spread):
             what = f"the log implies an inertia of about {rough:.2g}, the guess is {guess:.3g}"
-            hint = "convert the log to SI units, check actuator.gain, or correct the guess"
+            hint = how_to_say(slip.text, "convert the log to SI units")
+            hint += "; else check actuator.gain, or correct the guess"
             # A guess may be wrong by a factor of 57; an angle of more than 20 indicates degrees.
             sure = slip.severity == "error" or (slip.motion == "rotary" and span > 20.0)
             return Finding("error" if sure else "warning", f"{what}: {slip.text}", where, hint)
