@@ -146,6 +146,10 @@ class LogTable:
         unit="position",
         default=False,
     )
+    format: str | None = key(
+        text, "format of the file, as csv or mcap, where its suffix does not say", note="by the suffix"
+    )
+    episode: int | None = key(whole(0), "episode of a LeRobot dataset", note="the only one")
     separator: str | None = key(
         choice(SEPARATORS), "sign between the cells of a text table", note="found in the file, and reported"
     )

@@ -224,9 +224,9 @@ def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list
         if span >= 100 and np.all(q == np.round(q)):
             what = f"position holds whole numbers only, {span:.0f} in all: encoder counts?"
             hint = (
-                'say units = { position = "count" } and counts_per_revolution in [log], or the size of one, '
+                'say units = { position = "count" } and counts_per_revolution in [log], '
+                'or the size of a count: units = { position = "0.5 um" }'
             )
-            hint += 'count, units = { position = "0.5 um" }'
             findings.append(Finding("error", what, where, hint))
         elif finding := _magnitude(q, log.period, motions[joint - 1], where):
             findings.append(finding)

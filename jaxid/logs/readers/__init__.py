@@ -7,11 +7,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.errors import InputError
+from jaxid.errors import InputError, suggest
 from jaxid.logs.readers.array_files import read_mat, read_npz, read_parquet
 from jaxid.logs.readers.csv_file import read_csv
+from jaxid.logs.readers.excel_file import read_excel
+from jaxid.logs.readers.hdf5_file import read_hdf5
+from jaxid.logs.readers.lerobot import INFO, read_lerobot, root_of
+from jaxid.logs.readers.ros_bag import read_ros
 from jaxid.logs.readers.rows import Rows
 from jaxid.logs.readers.table import Table
+from jaxid.logs.readers.tdms_file import read_tdms
 from jaxid.settings import LogTable
 
 # Each reader: (path, names, rows) -> ({name: (samples, width)}, rows that were read), or a `Table`. One that
@@ -28,8 +33,21 @@ READERS: dict[str, Reader] = {
     ".npz": read_npz,
     ".mat": read_mat,
     ".parquet": read_parquet,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
+    ".hdf": read_hdf5,
+    ".xlsx": read_excel,
+    ".xlsm": read_excel,
+    ".tdms": read_tdms,
+    ".mcap": read_ros,
+    ".db3": read_ros,
+    ".bag": read_ros,
 }
-_OF_JAXID = frozenset(READERS)
+# Folders that are one log, by a file that is in them.
+FOLDERS: dict[str, Reader] = {
+    "metadata.yaml": read_ros,
+    INFO: read_lerobot,
+}
 
 
 def register_reader(suffix: str, reader: Reader) -> None:
@@ -92,10 +110,8 @@ def read_table(
             beside = [p.name for p in path.parent.glob("*" + path.suffix)]
             hint = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
             raise InputError("no such file", where=str(path), hint=hint)
-        reader = _reader_of(path)
-        if not path.is_file():
-            raise InputError("is not a file", where=str(path), hint="give the path of the log")
-        if path.stat().st_size == 0:
+        reader = _reader_of(path, None if settings is None else settings.format)
+        if path.is_file() and path.stat().st_size == 0:
             raise InputError("is empty", where=str(path), hint="export the log again")
         wanted = list(dict.fromkeys(names))
         more = (settings,) if "settings" in inspect.signature(reader).parameters else ()
@@ -109,10 +125,27 @@ def read_table(
         raise InputError("is too large for the memory", where=str(path), hint=hint) from error
 
 
-def _reader_of(path: Path) -> Reader:
-    """Return the reader of a file, by its suffix."""
+def _reader_of(path: Path, stated: str | None) -> Reader:
+    """Return the reader of a log: of the stated format, by a file in its folder, or by its suffix."""
+    if path.is_dir():
+        known = next((reader for file, reader in FOLDERS.items() if (path / file).is_file()), None)
+        if known is not None:
+            return known
+    if not path.is_file():
+        hint = f"give the path of the log, or a folder with {' or '.join(FOLDERS)}"
+        raise InputError("is not a file", where=str(path), hint=hint)
+    if stated is not None:
+        suffix = f".{stated.casefold().removeprefix('.')}"
+        if suffix not in READERS:
+            known_formats = [name.removeprefix(".") for name in READERS]
+            raise InputError(
+                f"format = '{stated}' is unknown", where="[log]", hint=suggest(stated, known_formats)
+            )
+        return READERS[suffix]
+    if path.suffix.lower() == ".parquet" and root_of(path) is not None:
+        return read_lerobot
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        hint = f"use one of {', '.join(READERS)}"
+        hint = f"use one of {', '.join(READERS)}, or say format in [log]"
         raise InputError(f"unknown suffix '{path.suffix}'", where=str(path), hint=hint)
     return reader

@@ -13,8 +13,10 @@ from jaxtyping import Float
 from numpy.lib import format as npy
 
 from jaxid.errors import InputError, suggest
+from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.mat_file import MatFile
 from jaxid.logs.readers.rows import Rows, resolve_rows
+from jaxid.logs.readers.table import Table
 
 Columns = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]
 _INDEXED = re.compile(r"(.+)\[(\d+)\]$")
@@ -27,7 +29,7 @@ def read_npz(path: Path, names: list[str], rows: Rows | None) -> Columns:
     try:
         with zipfile.ZipFile(path) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            wanted = {_base(name, members) for name in names} & set(members)
+            wanted = {base_of(name, members) for name in names} & set(members)
             known = {key: _array(archive, members[key], path) if key in wanted else None for key in members}
     except InputError:
         raise
@@ -44,7 +46,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> np.nd
     """Read an array of an archive, after its declared size and the size of its data."""
     where = f"{path}, variable '{info.filename.removesuffix('.npy')}'"
     # The archive reads no more than this size states, however much its data would expand to.
-    _need_size(info.file_size, where)
+    need_size(info.file_size, where)
     with archive.open(info) as file:
         version = npy.read_magic(file)
         header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
@@ -60,7 +62,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> np.nd
         return npy.read_array(file, allow_pickle=False)
 
 
-def _need_size(size: float, where: str) -> None:
+def need_size(size: float, where: str) -> None:
     """Refuse an array that is larger than any log, before memory is taken for it."""
     if size > _LARGEST:
         what = f"is {size / 2**30:.3g} GiB large"
@@ -71,13 +73,14 @@ def _said(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
-    """Read columns of a MATLAB file up to version 7.2; see `read_columns`."""
+def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns | Table:
+    """Read columns of a MATLAB file; see `read_columns`. One of version 7.3 needs h5py."""
     hint = "is it a MATLAB file? save it again with -v7"
     content = path.read_bytes()
     if content[124:128] in (b"\x00\x02IM", b"\x02\x00MI"):
-        hint = "in MATLAB: save('log.mat', '-v7', ...), or export CSV"
-        raise InputError("is a MATLAB v7.3 (HDF5) file", where=str(path), hint=hint)
+        from jaxid.logs.readers.hdf5_file import read_hdf5
+
+        return read_hdf5(path, names, rows)
     try:
         if content[126:128] not in (b"IM", b"MI"):
             known = _matrices_of_level_4(path, names)
@@ -94,13 +97,13 @@ def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns:
 
 def _matrix(file: MatFile, name: str, names: list[str], path: Path) -> np.ndarray | None:
     """Read a variable of a MATLAB file; None if no column is of it."""
-    if name not in {_base(wanted, file.variables) for wanted in names}:
+    if name not in {base_of(wanted, file.variables) for wanted in names}:
         return None
     variable, where = file.variables[name], f"{path}, variable '{name}'"
     if not variable.numeric:
         hint = "save it as a plain array of real numbers"
         raise InputError(f"is not numeric ({variable.kind})", where=where, hint=hint)
-    _need_size(variable.bytes, where)
+    need_size(variable.bytes, where)
     return file.read(name)
 
 
@@ -112,26 +115,21 @@ def _matrices_of_level_4(path: Path, names: list[str]) -> dict[str, np.ndarray |
     # A variable that cannot be read is a warning of SciPy.
     with warnings.catch_warnings(action="error"):
         shapes = {name: shape for name, shape, _ in whosmat(path)}
-        wanted = {_base(name, shapes) for name in names} & set(shapes)
+        wanted = {base_of(name, shapes) for name in names} & set(shapes)
         for name in wanted:
-            _need_size(8 * math.prod(shapes[name]), f"{path}, variable '{name}'")
+            need_size(8 * math.prod(shapes[name]), f"{path}, variable '{name}'")
         content = loadmat(path, variable_names=sorted(wanted))
     return {name: content.get(name) for name in shapes}
 
 
 def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
     """Read columns of a Parquet file; see `read_columns`. Needs pyarrow."""
-    try:
-        import pyarrow
-        import pyarrow.parquet as parquet
-    except ImportError as error:
-        hint = "pip install pyarrow, or export CSV"
-        raise InputError("Parquet needs pyarrow", where=str(path), hint=hint) from error
+    pyarrow, parquet = need("pyarrow", path, "Parquet"), need("pyarrow.parquet", path, "Parquet")
     try:
         known: dict[str, Any] = dict.fromkeys(parquet.read_schema(path).names)
         wanted = [name for name in names if name in known]
         count = parquet.read_metadata(path).num_rows
-        _need_size(8.0 * count * max(len(wanted), 1), str(path))
+        need_size(8.0 * count * max(len(wanted), 1), str(path))
         table = parquet.read_table(path, columns=wanted)
         known.update({name: table[name].to_numpy() for name in wanted})
     except InputError:
@@ -142,7 +140,7 @@ def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
     return pick_columns(path, known, names, rows)
 
 
-def _base(name: str, known: Mapping[str, Any] | list[str]) -> str:
+def base_of(name: str, known: Mapping[str, Any] | list[str]) -> str:
     """Return the variable of a name like `pos[2]`; a variable with that literal name takes precedence."""
     match = _INDEXED.match(name)
     return match[1] if match and name not in known else name
@@ -183,7 +181,7 @@ def _asarray(values: Any, where: str) -> np.ndarray:
 
 def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray, "samples _"]:
     """Return one column as an array (samples, width) of float64."""
-    base = _base(name, known)
+    base = base_of(name, known)
     if base not in known:
         hint = suggest(base, known)
         raise InputError(f"has no variable '{name}'", where=str(path), hint=hint)

@@ -1,0 +1,86 @@
+"""Columns of HDF5 files, and of the MATLAB files of version 7.3 that are some."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.logs.readers.array_files import base_of, need_size, pick_columns
+from jaxid.logs.readers.extras import need
+from jaxid.logs.readers.rows import Rows
+from jaxid.logs.readers.table import Table
+
+# Attributes in which programs keep the unit of a dataset.
+_UNITS = ("units", "unit", "Unit", "Units", "unit_string")
+
+
+def read_hdf5(path: Path, names: list[str], rows: Rows | None) -> Table:
+    """Read datasets of an HDF5 file; see `read_table`. Needs h5py.
+
+    The name of a dataset is its path, "group/q" or "/group/q", or its last part if no other has the same. A
+    field of a table follows the table's name, "log/q".
+    """
+    h5py = need("h5py", path, "HDF5")
+    try:
+        with h5py.File(path, "r") as file:
+            found = _datasets(file, h5py)
+            aliases = _aliases(found)
+            known: dict[str, Any] = dict.fromkeys(aliases)
+            units = {}
+            for name in names:
+                base = base_of(name, aliases)
+                same = [there for there in found if there.rpartition("/")[2] == base]
+                if base not in aliases and same:
+                    hint = f"write '{same[0]}'"
+                    raise InputError(f"has {len(same)} datasets '{base}'", where=str(path), hint=hint)
+                if base in aliases and known[base] is None:
+                    dataset, field = found[aliases[base]]
+                    need_size(8.0 * dataset.size, f"{path}, dataset '{base}'")
+                    known[base] = dataset[field] if field else dataset[()]
+                    units |= _unit_of(dataset, name)
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        what = f"cannot be read ({error or type(error).__name__})"
+        raise InputError(what, where=str(path), hint="is it an HDF5 file? export it again") from error
+    columns, taken = pick_columns(path, known, names, rows)
+    return Table(columns, taken, units)
+
+
+def _datasets(file: Any, h5py: Any) -> dict[str, tuple[Any, str]]:
+    """Return all datasets by their paths, and the fields of tables, each with its dataset and field."""
+    found: dict[str, tuple[Any, str]] = {}
+
+    def visit(name: str, entry: Any) -> None:
+        if not isinstance(entry, h5py.Dataset) or name.startswith("#"):
+            return
+        fields = entry.dtype.names or ()
+        found.update({f"{name}/{field}": (entry, field) for field in fields} or {name: (entry, "")})
+
+    file.visititems(visit)
+    return found
+
+
+def _aliases(found: Mapping[str, Any]) -> dict[str, str]:
+    """Return the path of each name that stands for one dataset only."""
+    last: dict[str, list[str]] = {}
+    for path in found:
+        last.setdefault(path.rpartition("/")[2], []).append(path)
+    short = {name: paths[0] for name, paths in last.items() if len(paths) == 1}
+    return {**short, **{f"/{path}": path for path in found}, **{path: path for path in found}}
+
+
+def _unit_of(dataset: Any, name: str) -> dict[str, str]:
+    """Return the unit among the attributes of a dataset, by name; empty if there is none."""
+    for key in _UNITS:
+        if key in dataset.attrs:
+            text = dataset.attrs[key]
+            text = text.decode() if isinstance(text, bytes) else text
+            return {name: str(np.ravel(text)[0])} if np.size(text) else {}
+    return {}

@@ -1,0 +1,291 @@
+"""Topics of ROS recordings: rosbag2 (SQLite and MCAP), single MCAP files, and ROS 1 bags.
+
+A column is a field of a topic's messages, "/joint_states.position[elbow]". Each topic has a clock and a rate.
+Times of messages are taken from their headers and led to the clock of the recorder by a line, which takes off
+the offset and the drift between computers, and all but the shortest of the transport's delay.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.errors import InputError, suggest
+from jaxid.logs.readers.array_files import pick_columns
+from jaxid.logs.readers.extras import need
+from jaxid.logs.readers.rows import Rows
+from jaxid.logs.readers.table import Assumed, Table, on_one_time
+
+# Names that `time` may have: of the message's header, or of the recorder.
+HEADER, RECORDED = "header.stamp", "log_time"
+_JOINTS = "sensor_msgs/msg/JointState"
+_VECTORS = ("position", "velocity", "effort")
+_NAME = re.compile(r"(?P<topic>[^.]+)\.(?P<field>[^\[\]]+)(\[(?P<entry>.+)\])?$")
+# Messages whose bytes are read at once.
+_PART = 20_000
+# Offset between two clocks that is worth a word [s], and their drift.
+_OFFSET, _DRIFT = 1e-3, 1e-5
+_NANO = 1e-9
+
+
+@dataclass(frozen=True)
+class _Column:
+    """One wanted column: topic, field of its messages, and entry of an array (empty: all)."""
+
+    topic: str
+    path: str
+    entry: str
+
+
+@dataclass
+class _Topic:
+    """Messages of one topic, as far as they are wanted."""
+
+    columns: dict[str, _Column]
+    recorded: list[float] = field(default_factory=list)
+    stamps: list[float] = field(default_factory=list)
+    values: dict[str, list[np.ndarray]] = field(default_factory=dict)
+
+
+def read_ros(path: Path, names: list[str], rows: Rows | None) -> Table:
+    """Read fields of topics; see `read_table`. Needs rosbags.
+
+    Args:
+        path: Folder of a rosbag2, or a file .mcap, .db3 or .bag.
+        names: Fields, as "/joint_states.position[elbow]" (a joint by its name), "/command.data[2]" (an entry,
+            from 1) or "/imu.angular_velocity.z"; and as time "header.stamp", or "log_time" of the recorder.
+        rows: Rows of the joined topics.
+    """
+    highlevel = need("rosbags.highlevel", path, "a ROS recording")
+    typesys = need("rosbags.typesys", path, "a ROS recording")
+    clocks = [name for name in names if name in (HEADER, RECORDED)]
+    if len(clocks) != 1:
+        hint = f'say time = "{HEADER}" in [log], or "{RECORDED}" for the clock of the recorder'
+        raise InputError(
+            "the time of a message is of its header or of the recorder", where=str(path), hint=hint
+        )
+    wanted = {name: _column(name, path) for name in names if name not in clocks}
+    try:
+        store = typesys.get_typestore(typesys.Stores.LATEST)
+        with highlevel.AnyReader([path], default_typestore=store) as reader:
+            _check_topics(wanted, reader, path)
+            topics = {
+                topic: _read(reader, topic, {n: c for n, c in wanted.items() if c.topic == topic}, path)
+                for topic in dict.fromkeys(c.topic for c in wanted.values())
+            }
+    except (InputError, OSError):
+        raise
+    except Exception as error:
+        # A damaged recording raises errors of a dozen kinds, down to those of SQLite and of the compression.
+        what = f"cannot be read ({str(error) or type(error).__name__})"
+        raise InputError(
+            what, where=str(path), hint="is it a ROS recording? `ros2 bag info` shows"
+        ) from error
+    times, said = _times(topics, clocks[0] == HEADER, path)
+    readings = {
+        name: (times[topic], np.concatenate(of.values[name]))
+        for topic, of in topics.items()
+        for name in of.columns
+    }
+    time, columns = on_one_time(readings)
+    known = {clocks[0]: time, **columns}
+    picked, taken = pick_columns(path, known, names, rows)
+    return Table(picked, taken, {}, tuple(said), frozenset(columns))
+
+
+def _column(name: str, path: Path) -> _Column:
+    match = _NAME.match(name)
+    if match is None:
+        hint = 'write topic, field and entry: "/joint_states.position[elbow]"'
+        raise InputError(f"'{name}' names no field of a topic", where=str(path), hint=hint)
+    return _Column(match["topic"], match["field"], match["entry"] or "")
+
+
+def _check_topics(wanted: Mapping[str, _Column], reader: Any, path: Path) -> None:
+    for column in wanted.values():
+        if column.topic not in reader.topics or not reader.topics[column.topic].msgcount:
+            there = [name for name, info in reader.topics.items() if info.msgcount]
+            raise InputError(
+                f"has no topic '{column.topic}'", where=str(path), hint=suggest(column.topic, there)
+            )
+
+
+def _read(reader: Any, topic: str, columns: dict[str, _Column], path: Path) -> _Topic:
+    """Read the wanted fields of all messages of a topic."""
+    out = _Topic(columns, values={name: [] for name in columns})
+    connections = [c for c in reader.connections if c.topic == topic]
+    for part in _parts(reader.messages(connections=connections)):
+        kind = part[0][0].msgtype
+        out.recorded += [stamp * _NANO for _, stamp, _ in part]
+        quick = kind == _JOINTS and all(c.path in _VECTORS for c in columns.values())
+        if not (quick and reader.is2 and _quickly([raw for _, _, raw in part], out, path)):
+            for connection, _, raw in part:
+                message = reader.deserialize(raw, connection.msgtype)
+                _add(message, out, path)
+    return out
+
+
+def _parts(messages: Iterator[Any]) -> Iterator[list[Any]]:
+    part = []
+    for message in messages:
+        part.append(message)
+        if len(part) == _PART:
+            yield part
+            part = []
+    if part:
+        yield part
+
+
+def _add(message: Any, out: _Topic, path: Path) -> None:
+    """Add the wanted fields of one message."""
+    header = getattr(message, "header", None)
+    stamp = getattr(header, "stamp", None)
+    out.stamps.append(np.nan if stamp is None else stamp.sec + stamp.nanosec * _NANO)
+    for name, column in out.columns.items():
+        value: Any = message
+        for part in column.path.split("."):
+            if not hasattr(value, part):
+                fields = [f for f in getattr(value, "__dataclass_fields__", {}) if not f.startswith("_")]
+                raise InputError(
+                    f"messages of '{column.topic}' have no '{part}'",
+                    where=str(path),
+                    hint=suggest(part, fields),
+                )
+            value = getattr(value, part)
+        joints = [str(joint) for joint in getattr(message, "name", [])] if column.path in _VECTORS else []
+        value = np.atleast_1d(np.asarray(value, dtype=np.float64))
+        value = value if not column.entry else value[[_entry(column, joints, value.size, path)]]
+        out.values[name].append(value[None, :])
+
+
+def _entry(column: _Column, joints: Sequence[str], size: int, path: Path) -> int:
+    """Return the entry of an array, from 0: a joint by its name, or a number from 1."""
+    if column.entry in joints and joints.index(column.entry) < size:
+        return joints.index(column.entry)
+    if column.entry.isdigit() and 1 <= int(column.entry) <= size:
+        return int(column.entry) - 1
+    what = f"'{column.topic}.{column.path}' has no entry '{column.entry}'"
+    hint = suggest(column.entry, joints) if joints and size else f"it has {size}"
+    raise InputError(what, where=str(path), hint=hint)
+
+
+def _quickly(raws: Sequence[bytes], out: _Topic, path: Path) -> bool:
+    """Read joint states of one layout at once; return whether they are of one.
+
+    Messages with the same names have their numbers at the same bytes.
+    """
+    first = bytes(raws[0])
+    layout = _layout(first)
+    if layout is None or any(len(raw) != len(first) for raw in raws):
+        return False
+    joints, starts, sizes, text = layout
+    block = np.frombuffer(b"".join(raws), dtype=np.uint8).reshape(len(raws), len(first))
+    if np.any(block[:, 12:text] != block[0, 12:text]):
+        return False
+    for vector in _VECTORS:
+        # Lengths of the arrays are the same too.
+        at = starts[vector] - 8
+        if np.any(block[:, at : at + 8] != block[0, at : at + 8]) and sizes[vector]:
+            return False
+    order = "<" if first[1] else ">"
+
+    def numbers(kind: str, at: int, count: int) -> np.ndarray:
+        size = np.dtype(kind).itemsize * count
+        return np.ascontiguousarray(block[:, at : at + size]).view(f"{order}{kind}")
+
+    stamps = numbers("i4", 4, 1)[:, 0] + _NANO * numbers("u4", 8, 1)[:, 0].astype(np.float64)
+    for name, column in out.columns.items():
+        values = numbers("f8", starts[column.path], sizes[column.path]).astype(np.float64)
+        if column.entry:
+            values = values[:, [_entry(column, joints, sizes[column.path], path)]]
+        out.values[name].append(values)
+    out.stamps += stamps.tolist()
+    return True
+
+
+def _layout(raw: bytes) -> tuple[list[str], dict[str, int], dict[str, int], int] | None:
+    """Return names, places and lengths of the arrays of a joint state, and the end of its names.
+
+    Source:
+        OMG, "Common Data Representation": numbers stand at multiples of their size, after 4 bytes of header.
+    """
+    order = "<" if raw[1] else ">"
+
+    def count(at: int) -> tuple[int, int]:
+        at = 4 + -(-(at - 4) // 4) * 4
+        return struct.unpack_from(f"{order}I", raw, at)[0], at + 4
+
+    try:
+        length, at = count(12)
+        names, at = count(at + length)
+        joints = []
+        for _ in range(names):
+            length, at = count(at)
+            joints.append(raw[at : at + length].rstrip(b"\0").decode())
+            at += length
+        text, starts, sizes = at, {}, {}
+        for vector in _VECTORS:
+            sizes[vector], at = count(at)
+            # An empty array takes no place, and no alignment.
+            at = 4 + -(-(at - 4) // 8) * 8 if sizes[vector] else at
+            starts[vector] = at
+            at += 8 * sizes[vector]
+    except (struct.error, UnicodeDecodeError):
+        return None
+    return (joints, starts, sizes, text) if at <= len(raw) else None
+
+
+def _times(
+    topics: Mapping[str, _Topic], by_header: bool, path: Path
+) -> tuple[dict[str, np.ndarray], list[Assumed]]:
+    """Return the times of each topic's messages on one clock, from the first of them on [s]."""
+    recorded = {name: np.asarray(of.recorded) for name, of in topics.items()}
+    begin = min(t[0] for t in recorded.values())
+    if not by_header:
+        said = [Assumed("time", RECORDED, "the clock of the recorder, with the delay of the transport")]
+        return {name: t - begin for name, t in recorded.items()}, said
+    times, said, lines = {}, [], {}
+    for name, of in topics.items():
+        stamps = np.asarray(of.stamps)
+        if not np.isfinite(stamps).all() or not stamps.any():
+            reason = (
+                f"messages of {name} have no stamp: the recorder's clock, with the delay of the transport"
+            )
+            said.append(Assumed("time", RECORDED, reason))
+            times[name] = recorded[name] - begin
+            continue
+        lines[name] = _line(stamps, recorded[name])
+        times[name] = stamps
+    if len(lines) == 1 and len(times) == 1:
+        name = next(iter(times))
+        return {name: times[name] - times[name][0]}, said
+    for name, (offset, drift) in lines.items():
+        stamps = times[name]
+        times[name] = stamps + offset + drift * (stamps - stamps[0]) - begin
+        if abs(offset) > _OFFSET or abs(drift) > _DRIFT:
+            reason = (
+                f"stamps of {name} are {offset:+.4g} s from the recorder's clock and drift by "
+                f"{1e6 * drift:+.3g} ppm: a line takes off both"
+            )
+            said.append(Assumed("clock", name, reason))
+    return times, said
+
+
+def _line(stamps: np.ndarray, recorded: np.ndarray) -> tuple[float, float]:
+    """Return offset and drift of the recorder's clock from the stamps: a line below the differences.
+
+    A message is recorded after its stamp, so the smallest delays show the clocks. The line goes through the
+    smallest differences of the first and of the last tenth.
+    """
+    delay = recorded - stamps
+    part = max(stamps.size // 10, 1)
+    first, last = int(np.argmin(delay[:part])), stamps.size - part + int(np.argmin(delay[-part:]))
+    span = stamps[last] - stamps[first]
+    drift = float((delay[last] - delay[first]) / span) if span > 0 and stamps.size > 100 else 0.0
+    return float(delay[first] - drift * (stamps[first] - stamps[0])), drift
