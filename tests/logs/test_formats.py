@@ -18,6 +18,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from jaxid.errors import InputError
 from jaxid.logs.in_memory import as_log
 from jaxid.logs.log import read_log
 from tests.support.written_logs import COLUMNS, refuse
@@ -366,6 +367,51 @@ def test_garbage_is_refused_in_one_line(tmp_path, suffix):
     path.write_bytes(b"this is no such file, whatever it is called" * 10)
     columns = ROS if suffix in ("mcap", "db3", "bag") else COLUMNS
     refuse(path, columns, match="cannot be read")
+
+
+def written(folder: Path, suffix: str) -> tuple[Path, dict]:
+    """Return a sound file of a format, and its columns."""
+    table = {"t": T, "q": Q, "u": U}
+    path = folder / f"sound.{suffix}"
+    if suffix == "h5":
+        with h5py.File(path, "w") as file:
+            for name, values in table.items():
+                file[name] = values
+    elif suffix == "xlsx":
+        workbook(path, [list(table), *zip(T.tolist(), Q.tolist(), U.tolist(), strict=True)])
+    elif suffix == "tdms":
+        with nptdms.TdmsWriter(path) as writer:
+            writer.write_segment([nptdms.ChannelObject("log", name, x) for name, x in table.items()])
+    else:
+        plugin = StoragePlugin.MCAP if suffix == "mcap" else StoragePlugin.SQLITE3
+        bag = write_bag(folder / "bag", plugin, joint_states())
+        return next(p for p in bag.iterdir() if p.suffix == f".{suffix}"), ROS
+    return path, COLUMNS
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("suffix", ["h5", "xlsx", "tdms", "mcap", "db3"])
+def test_a_damaged_file_is_read_or_refused(tmp_path, suffix):
+    sound, columns = written(tmp_path, suffix)
+    content, path = sound.read_bytes(), tmp_path / f"log.{suffix}"
+    outcomes = set()
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        damaged = bytearray(content)
+        for k in random.integers(len(damaged), size=2):
+            damaged[k] = random.integers(256)
+        head = random.integers(min(400, len(damaged)))
+        damaged[head] = random.integers(256)
+        path.write_bytes(damaged[: random.integers(len(damaged))] if seed % 4 == 0 else damaged)
+        try:
+            read_log(path, columns)
+            line = ""
+        except InputError as error:
+            line = str(error)
+        outcomes.add("refused" if line else "read")
+        assert "\n" not in line
+        assert len(line) < 1000
+    assert "refused" in outcomes
 
 
 @pytest.mark.parametrize(

@@ -23,18 +23,19 @@ _HEADER, _BELOW = 50, 5
 def read_excel(path: Path, names: list[str], rows: Rows | None) -> Table:
     """Read columns of the first sheet whose header has them; see `read_table`. Needs openpyxl."""
     openpyxl = need("openpyxl", path, "Excel")
+    book = None
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-    except OSError:
+        return _of_book(book, path, names, rows)
+    except (InputError, OSError):
         raise
     except Exception as error:
-        # A damaged archive raises errors of many kinds.
+        # A damaged archive raises errors of many kinds, also while its rows are read.
         what = f"cannot be read ({str(error) or type(error).__name__})"
         raise InputError(what, where=str(path), hint="is it an .xlsx file? save it again") from error
-    try:
-        return _of_book(book, path, names, rows)
     finally:
-        book.close()
+        if book is not None:
+            book.close()
 
 
 def _of_book(book: Any, path: Path, names: list[str], rows: Rows | None) -> Table:

@@ -48,8 +48,8 @@ class _Topic:
     """Messages of one topic, as far as they are wanted."""
 
     columns: dict[str, _Column]
-    recorded: list[float] = field(default_factory=list)
-    stamps: list[float] = field(default_factory=list)
+    recorded: list[np.ndarray] = field(default_factory=list)
+    stamps: list[np.ndarray] = field(default_factory=list)
     values: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
 
@@ -122,12 +122,14 @@ def _read(reader: Any, topic: str, columns: dict[str, _Column], path: Path) -> _
     connections = [c for c in reader.connections if c.topic == topic]
     for part in _parts(reader.messages(connections=connections)):
         kind = part[0][0].msgtype
-        out.recorded += [stamp * _NANO for _, stamp, _ in part]
+        out.recorded.append(_NANO * np.array([stamp for _, stamp, _ in part], dtype=np.int64))
         quick = kind == _JOINTS and all(c.path in _VECTORS for c in columns.values())
         if not (quick and reader.is2 and _quickly([raw for _, _, raw in part], out, path)):
             for connection, _, raw in part:
                 message = reader.deserialize(raw, connection.msgtype)
                 _add(message, out, path)
+    if not out.recorded:
+        raise InputError(f"no message of '{topic}' can be read", where=str(path), hint="record it again")
     return out
 
 
@@ -146,7 +148,7 @@ def _add(message: Any, out: _Topic, path: Path) -> None:
     """Add the wanted fields of one message."""
     header = getattr(message, "header", None)
     stamp = getattr(header, "stamp", None)
-    out.stamps.append(np.nan if stamp is None else stamp.sec + stamp.nanosec * _NANO)
+    out.stamps.append(np.array([np.nan if stamp is None else stamp.sec + stamp.nanosec * _NANO]))
     for name, column in out.columns.items():
         value: Any = message
         for part in column.path.split("."):
@@ -205,7 +207,7 @@ def _quickly(raws: Sequence[bytes], out: _Topic, path: Path) -> bool:
         if column.entry:
             values = values[:, [_entry(column, joints, sizes[column.path], path)]]
         out.values[name].append(values)
-    out.stamps += stamps.tolist()
+    out.stamps.append(stamps)
     return True
 
 
@@ -245,14 +247,14 @@ def _times(
     topics: Mapping[str, _Topic], by_header: bool, path: Path
 ) -> tuple[dict[str, np.ndarray], list[Assumed]]:
     """Return the times of each topic's messages on one clock, from the first of them on [s]."""
-    recorded = {name: np.asarray(of.recorded) for name, of in topics.items()}
+    recorded = {name: np.concatenate(of.recorded) for name, of in topics.items()}
     begin = min(t[0] for t in recorded.values())
     if not by_header:
         said = [Assumed("time", RECORDED, "the clock of the recorder, with the delay of the transport")]
         return {name: t - begin for name, t in recorded.items()}, said
     times, said, lines = {}, [], {}
     for name, of in topics.items():
-        stamps = np.asarray(of.stamps)
+        stamps = np.concatenate(of.stamps)
         if not np.isfinite(stamps).all() or not stamps.any():
             reason = (
                 f"messages of {name} have no stamp: the recorder's clock, with the delay of the transport"
