@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.logs.clock import clock_findings
 from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
 from jaxid.logs.units_check import (
@@ -70,7 +71,7 @@ def check_log(
         ratios = ratio_findings(log, motion, where, driven)
         # Two columns that disagree by the unit of time say more than the period.
         timed = any(finding.severity == "error" for finding in ratios)
-        findings += ratios if timed else ratios + period_findings(log, where)
+        findings += ratios if timed else [*ratios, *period_findings(log, where), *clock_findings(log, where)]
         label = (units or {}).get("position", "m")
         if label in ("m", "rad"):
             findings += magnitude_findings(log, motion, where)
