@@ -17,7 +17,7 @@ from jaxid.case.reference import info_of
 from jaxid.case.tables import ON_LINE
 from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS, Controller, check_drives
-from jaxid.effects.friction import BackEmf
+from jaxid.effects.friction import BackEmfDamping
 from jaxid.errors import InputError
 from jaxid.logs.drive import Drives, drives_of
 from jaxid.machine import Machine
@@ -190,7 +190,7 @@ def _with_back_emf(plant: Plant, case: Case) -> Plant:
     damping = drives_of_case(case, plant).damping
     for joint, coefficient in zip(plant.driven(plant.joints), damping, strict=False):
         if coefficient:
-            plant = plant.with_effect(BackEmf(port=joint, coefficient=as_array(float(coefficient))))
+            plant = plant.with_effect(BackEmfDamping(port=joint, coefficient=as_array(float(coefficient))))
     return plant
 
 

@@ -110,7 +110,7 @@ FAULTS = {
     "missing column": (lambda g: {k: v for k, v in g.items() if k != "u"}, "'u'"),
     "NaN": (lambda g: _spoilt(g, "q", 700, np.nan), "the first is row 700 (NaN)"),
     "time backwards": (lambda g: _spoilt(g, "t", 700, 0.1), "row 700"),
-    "gap": (lambda g: _without(g, slice(700, 900)), "rows = [700, 1800]"),
+    "gaps": (lambda g: _without(_without(g, slice(40, 300)), slice(80, None)), "is too short: 40 samples"),
     "too short": (lambda g: _without(g, slice(40, None)), "is too short: 40 samples"),
     "nothing moves": (lambda g: _spoilt(g, "q", slice(None), 0.2), "nothing moves"),
     "saturated": (lambda g: g | {"u": 10.0 * np.sign(g["u"])}, "the command is saturated"),

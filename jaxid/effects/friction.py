@@ -24,8 +24,8 @@ class ViscousFriction(Effect):
         return Action(force=-self.coefficient * x.yd)
 
 
-@register("back_emf")
-class BackEmf(Effect):
+@register("back_emf_damping")
+class BackEmfDamping(Effect):
     """-c v: what the back-EMF takes off the force of a drive whose voltage is the command.
 
     `[actuator]` with torque_constant and resistance adds it, known. Viscous friction looks the same, and

@@ -27,6 +27,7 @@ NAMING = {
 }
 # Modules that import the class of an effect, because they add one themselves or ask for its equivalent.
 ADDING = {
+    "build.py": {"BackEmfDamping"},
     "discovery/at_rest/break_away.py": {"StaticFriction"},
     "simulation/step_size.py": {"ViscousFriction"},
     "estimators/minimal/read_back.py": {"ViscousFriction"},

@@ -193,7 +193,7 @@ def test_a_drive_by_its_constants():
         case_with(actuator={**constants, "back_emf": 0.06}, log={"units": {"force": "V"}})
     )
     assert voltage.gain == pytest.approx([0.05 * 20 * 0.8 / 2])
-    assert voltage.plant.effects[-1].kind == "back_emf"
+    assert voltage.plant.effects[-1].kind == "back_emf_damping"
     assert float(voltage.plant.effects[-1].coefficient) == pytest.approx(0.05 * 0.06 * 20**2 * 0.8 / 2)
     duty = build_machine(case_with(actuator={**constants, "supply": 24.0}, log={"units": {"force": "%"}}))
     assert duty.gain == pytest.approx(voltage.gain)

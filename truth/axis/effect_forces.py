@@ -63,7 +63,7 @@ def clip(u: float, limit: float) -> float:
 
 ROWS: dict[str, Row] = {
     "viscous_friction": Row("viscous_friction", {"coefficient": 200.0}, lambda x: x.u - 200.0 * x.v),
-    "back_emf": Row("back_emf", {"coefficient": 150.0}, lambda x: x.u - 150.0 * x.v),
+    "back_emf_damping": Row("back_emf_damping", {"coefficient": 150.0}, lambda x: x.u - 150.0 * x.v),
     "coulomb_friction": Row(*COULOMB, lambda x: x.u - 30.0 * sign(x.v), dry=True),
     "coulomb_friction of mu": Row(
         "coulomb_friction",

@@ -23,6 +23,7 @@ STANDARD_GRAVITY = 9.81  # m/s^2, the case file's default
 # effect -> its parameter -> the kernel's field
 EFFECTS = {
     "viscous_friction": {"coefficient": "viscous"},
+    "back_emf_damping": {"coefficient": "viscous"},
     "coulomb_friction": {"level": "coulomb"},
     "static_friction": {"level": "static"},
     "stribeck_friction": {"level": "stribeck", "velocity": "stribeck_velocity"},
