@@ -10,20 +10,21 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.logs.log import Log, read_log
-from jaxid.logs.readers.array_files import Columns, pick_columns
+from jaxid.logs.readers.array_files import pick_columns
 from jaxid.logs.readers.rows import Rows
+from jaxid.logs.readers.table import Table
 from jaxid.logs.units import Frame
 from jaxid.settings import LogTable
 
 
-class Table(Protocol):
+class NamedColumns(Protocol):
     """Named columns: a DataFrame of pandas or polars, an xarray Dataset, or a dictionary of arrays."""
 
     def __getitem__(self, name: Any, /) -> Any: ...
 
 
 # Every type that a command takes for a log.
-LogLike = Log | str | Path | Table
+LogLike = Log | str | Path | NamedColumns
 
 
 def as_log(
@@ -52,9 +53,10 @@ def as_log(
     if isinstance(log, str | Path):
         return read_log(log, columns, joints=joints, drives=drives, frame=frame)
     name, known = _arrays(log)
+    units = _units(log)
 
-    def read(source: Path, names: list[str], rows: Rows | None) -> Columns:
-        return pick_columns(source, known, list(dict.fromkeys(names)), rows)
+    def read(source: Path, names: list[str], rows: Rows | None) -> Table:
+        return Table(*pick_columns(source, known, list(dict.fromkeys(names)), rows), units)
 
     return read_log(name, columns, joints=joints, drives=drives, frame=frame, read=read)
 
@@ -82,6 +84,12 @@ def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:
     )
 
 
+def _units(log: Any) -> dict[str, str]:
+    """Return the units among the attributes of an xarray Dataset, by the name of the variable."""
+    variables = log.variables.items() if type(log).__module__.partition(".")[0] == "xarray" else ()
+    return {str(name): str(v.attrs["units"]) for name, v in variables if v.attrs.get("units")}
+
+
 def _of_pandas(table: Any) -> dict[str, np.ndarray]:
     """Return the columns of a pandas table, and its index if that has a name."""
     twice = table.columns[table.columns.duplicated()]
@@ -94,6 +102,9 @@ def _of_pandas(table: Any) -> dict[str, np.ndarray]:
 
 def _numbers(values: Any) -> np.ndarray:
     """Return a column as an array, missing entries of pandas' nullable numbers as NaN."""
+    if getattr(values.dtype, "tz", None) is not None:
+        # NumPy knows no time zones; only differences count.
+        return values.to_numpy(dtype="datetime64[ns]")
     if isinstance(values.dtype, np.dtype) or getattr(values.dtype, "kind", "O") not in "fiub":
         return values.to_numpy()
     return values.to_numpy(dtype=np.float64, na_value=np.nan)

@@ -189,7 +189,7 @@ def read_log(
     joints: int | None = 1,
     drives: int | None = None,
     frame: Frame | None = None,
-    read: Callable[[Path, list[str], Rows | None], Columns] | None = None,
+    read: Callable[[Path, list[str], Rows | None], Columns | Table] | None = None,
 ) -> Log:
     """Read a log, and refuse one that no estimator could use.
 

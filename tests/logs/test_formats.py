@@ -440,6 +440,20 @@ def test_the_format_may_be_stated(tmp_path):
     )
 
 
+def test_the_units_of_a_dataset_count():
+    data = xarray.Dataset({"q": ("t", 1e3 * Q, {"units": "mm"}), "u": ("t", U)}, coords={"t": T})
+    assert check(as_log(data, COLUMNS))["units.position"].value == "mm"
+
+
+@pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
+def test_an_index_of_dates_is_time_in_seconds(tmp_path, zone):
+    index = pandas.Timestamp("2024-03-31 00:59:59.8", tz=zone) + pandas.to_timedelta(T, unit="s")
+    frame = pandas.DataFrame({"q": Q, "u": U}, index=index.rename("t"))
+    check(as_log(frame, COLUMNS))
+    frame.to_parquet(tmp_path / "log.parquet")
+    check(read_log(tmp_path / "log.parquet", COLUMNS))
+
+
 def test_tables_in_memory_have_their_units():
     data = xarray.Dataset({"q": ("t", 1e3 * Q), "u": ("t", U)}, coords={"t": T})
     check(as_log(data, {**COLUMNS, "units": {"position": "mm"}}))

@@ -240,3 +240,17 @@ def test_the_export_of_a_plot_program_is_read(measured):
     columns = {"time": "__time", "position": "/joint_states/joint1/position", "force": "/motor/torque"}
     log = read_log(measured / "field" / "empty_cells.csv", columns)
     assert log.rate_hz == pytest.approx(100.0)
+
+
+def test_a_disturbance_keeps_its_times_in_a_resampled_log(tmp_path):
+    """A column of a disturbance is held from the times of its rows on, not from those of the samples."""
+    from jaxid.simulation.disturbance import disturbance_at
+
+    data = signals()
+    keep = np.setdiff1d(np.arange(ROWS), np.arange(50, 54))
+    data = {**data, "d": (data["t"] >= 0.1).astype(float)}
+    columns = {**COLUMNS, "time": "t", "units": {"time": "ms"}}
+    path = write_csv(tmp_path / "log.csv", {n: v[keep] * (1e3 if n == "t" else 1) for n, v in data.items()})
+    log = read_log(path, columns)
+    assert log.samples == ROWS
+    np.testing.assert_array_equal(disturbance_at("d", log.time, log)[:, 0], data["d"])

@@ -179,6 +179,13 @@ def _asarray(values: Any, where: str) -> np.ndarray:
         raise InputError(f"is no array ({_said(error)})", where=where, hint=hint) from error
 
 
+def _seconds(values: np.ndarray) -> np.ndarray:
+    """Return dates as seconds since the first one, and durations as seconds; missing ones as NaN."""
+    since = values - values.ravel()[0] if values.dtype.kind == "M" and values.size else values
+    seconds = since.astype("timedelta64[ns]").astype(np.float64) * 1e-9
+    return np.where(np.isnat(values), np.nan, seconds)
+
+
 def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray, "samples _"]:
     """Return one column as an array (samples, width) of float64."""
     base = base_of(name, known)
@@ -187,6 +194,8 @@ def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray
         raise InputError(f"has no variable '{name}'", where=str(path), hint=hint)
     where = f"{path}, variable '{base}'"
     values = _asarray(known[base], where)
+    if values.dtype.kind in "mM":
+        values = _seconds(values)
     if values.dtype.kind not in "fiub":
         hint = "save it as a plain array of real numbers"
         raise InputError(f"is not numeric ({values.dtype})", where=where, hint=hint)
