@@ -370,7 +370,7 @@ def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bo
             declared = balance_fits(machine, data)[0]
 
     confirmed = False
-    if case.columns.reference is not None:
+    if case.log is not None and case.log.reference is not None:
         machine, doubts, setting, confirmed = _with_reference_hold(case, machine, opened, declared)
         findings, settings = [*findings, *doubts], settings | setting
     replayed = replayed_law(machine, log)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaxid.dynamics.rhs import (
     State,
     acceleration,
     balance_of,
+    inverse,
     mass_of,
     need_apart,
     phi,
@@ -65,9 +67,8 @@ def set_valued_step(
     def at(q: Array, qd: Array, qdd: Array = standing) -> Balance:
         return balance_of(plant, q, qd, qdd, end, t, x.own, none)
 
-    def without() -> tuple[State, tuple[Array, Array], Array, Balance]:
-        """Step without friction; return it, and position, velocity, mass and levels halfway."""
-        free = flow(x)
+    def action(free: State) -> _Answer:
+        """Return the action of friction over the step, given the step without it."""
         # A mass that depends on the position is evaluated halfway, like everything else.
         halfway = 0.5 * (x.q + free.q) if plant.coupled else x.q, 0.5 * (x.qd + free.qd)
 
@@ -76,34 +77,81 @@ def set_valued_step(
             return levels.residual, levels
 
         # The mass does not depend on the velocity: one balance gives it and the levels.
-        return free, halfway, *mass_of(plant, residual, halfway[0])
-
-    def sliding(free: State, halfway: tuple, mass: Array, levels: Balance) -> _Sliding:
-        q, qd = halfway
-        if plant.coupled and qd.size > 1:
+        mass, levels = mass_of(plant, residual, halfway[0])
+        at_rest = at(halfway[0], standing) if moves else levels
+        yielding = mass
+        if plant.coupled and x.qd.size > 1:
             # Because of damping, a force changes a velocity over a step by less than its impulse: a joint at
             # rest would otherwise pull at the others by a force with an error of first order in the step.
-            mass = mass + 0.5 * h * jax.jacfwd(lambda qd: at(q, qd).residual)(qd)
-        return _sliding(plant, x, free, mass, levels, end, t, h)
+            yielding = mass + 0.5 * h * jax.jacfwd(lambda qd: at(halfway[0], qd).residual)(halfway[1])
+        slides = _sliding(plant, x, free, yielding, levels, end, t, h)
+        answer = slides.answer(levels, at_rest)
+        if moves:
+            # Without friction motion begins too fast, and friction that falls with speed is too small.
+            reaction = spread(answer.reaction, ports, none.size)
+            slowed = free.qd + h * solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
+            answer = slides.answer(at(halfway[0], 0.5 * (x.qd + slowed)), at_rest)
+        return answer
 
-    free, halfway, mass, levels = parts = without()
-    if not levels.slides:
-        return free, none
+    def under(answer: _Answer, end_of_step: State, reaction: Array) -> tuple[State, Array]:
+        at_rest = _rest_exactly(end_of_step, answer.stuck, ports)
+        return _turned(x, at_rest, answer, h, ports), reaction
+
+    here = at(x.q, x.qd)
+    ports = here.slides
+    if not ports:
+        return flow(x), none
     levels_at = lambda *motion: [getattr(at(*motion), n) for n in ("dry", "stick", "rising")]
-    moves = depends(lambda qd: levels_at(halfway[0], qd), halfway[1:])
-    at_rest = at(halfway[0], standing) if moves else levels
-    slides = sliding(*parts)
-    # If no level depends on the motion, tangents of all this are needed in few steps only.
-    lean = plant.coupled and not depends(levels_at, halfway)
-    answer = slides.answer(levels, at_rest, (lambda: sliding(*without())) if lean else None)
-    reaction = spread(answer.reaction, levels.slides, none.size)
-    if moves:
-        # Without friction motion begins too fast, and friction that falls with speed is too small.
-        slowed = free.qd + h * solved(mass, jax.vjp(plant.ports, x.q)[1](reaction)[0])
-        answer = slides.answer(at(halfway[0], 0.5 * (x.qd + slowed)), at_rest)
-        reaction = spread(answer.reaction, levels.slides, none.size)
-    end_of_step = _rest_exactly(flow(x, reaction), answer.stuck, levels.slides)
-    return _turned(x, end_of_step, answer, h, levels.slides), reaction
+    moves = depends(lambda qd: levels_at(x.q, qd), (x.qd,))
+    if not plant.coupled or here.rises or depends(levels_at, (x.q, x.qd)):
+        answer = action(flow(x))
+        reaction = spread(answer.reaction, ports, none.size)
+        return under(answer, flow(x, reaction), reaction)
+
+    def general() -> tuple[State, Array]:
+        def once(reaction: Array, _: None) -> tuple[Array, tuple[State, _Answer, Array]]:
+            after = flow(x, reaction)
+            answer = action(after)
+            return spread(answer.reaction, ports, none.size), (after, answer, reaction)
+
+        # The step without friction and that with it as a loop: two copies of an arm compile twice as long.
+        _, (after, answer, reaction) = jax.lax.scan(once, none, length=2)
+        first, last = (functools.partial(_entry, k) for k in range(2))
+        return under(first(answer), last(after), last(reaction))
+
+    # Nearly all steps only drag. No level depends on the motion, so that the step under this reaction can be
+    # taken first; the other steps, and their derivatives, belong to a branch that few samples take.
+    before = _port_speed(plant, x, ports)
+    reaction = spread(-jnp.sign(before) * picked(here.dry, ports), ports, none.size)
+    dragged = flow(x, reaction)
+    after = _port_speed(plant, dragged, ports)
+    # Where a port nears its reversal, the general case decides whether it is within the step.
+    goes_on = jnp.all((before * after > 0.0) & (jnp.abs(after - before) <= jnp.abs(after)))
+    return _unless(goes_on, (dragged, reaction), general)
+
+
+def _entry(k: int, tree: Any) -> Any:
+    return jax.tree.map(lambda a: a[k], tree)
+
+
+def _unless(done: Array, answer: tuple[State, Array], general: Callable[[], tuple]) -> tuple[State, Array]:
+    """Return the answer if it is done, else the general one; a batch leaves that out if all are done."""
+
+    def otherwise() -> tuple[State, Array]:
+        return jax.tree.map(lambda a, b: jnp.where(done, a, b), answer, general())
+
+    return jax.lax.cond(_in_all_lanes(done), lambda: answer, otherwise)
+
+
+@jax.custom_batching.custom_vmap
+def _in_all_lanes(flag: Array) -> Array:
+    """Return a flag; of a batch, whether it is set in all lanes, so that a branch stays one under `vmap`."""
+    return flag
+
+
+@_in_all_lanes.def_vmap
+def _in_all_lanes_of_batch(_: int, batched: list[bool], flag: Array) -> tuple[Array, bool]:
+    return jnp.all(flag, axis=0) if batched[0] else flag, False
 
 
 class _Answer(NamedTuple):
@@ -142,16 +190,8 @@ class _Sliding:
     own: Array
     corner: Array
 
-    def answer(
-        self, levels: Balance, at_rest: Balance, anew: Callable[[], _Sliding] | None = None
-    ) -> _Answer:
-        """Compute the action of friction at given levels, sliding and at rest.
-
-        Args:
-            levels, at_rest: The balances with these levels.
-            anew: Recomputes this object inside the branch that needs it, so that derivatives are computed
-                in that branch alone.
-        """
+    def answer(self, levels: Balance, at_rest: Balance) -> _Answer:
+        """Compute the action of friction at given levels, sliding and at rest."""
         dry = picked(levels.dry, self.ports)
         held = picked(at_rest.dry, self.ports) + picked(at_rest.stick, self.ports)
         if levels.rises:
@@ -165,11 +205,8 @@ class _Sliding:
             general = lambda: _own_reaction(self.own, self.speed, self.before, dry, held)
         else:
             after = self.speed + jnp.sum(self.mobility * drag, axis=1)
-
-            def general() -> _Answer:
-                ports = self if anew is None else anew()
-                assert ports.mobility is not None, "as here, ports accelerate each other"
-                return _shared_reaction(ports.mobility, ports.speed, ports.before, dry, held)
+            shared = (self.mobility, self.speed, self.before, dry, held)
+            general = lambda: _shared_reaction(*shared)
 
         no = jnp.zeros(drag.shape, bool)
         # Nearly all steps only drag. A branch in place of a selection: the general case costs more.
@@ -213,8 +250,12 @@ def _mobility(plant: Plant, mass: Array, q: Array, slides: tuple[int, ...]) -> A
     if mass.ndim == 1 and max(slides) < q.size:
         return picked(1.0 / mass, slides)
     jacobian = jax.jacfwd(lambda q: picked(plant.ports(q), slides))(q)
-    columns = jax.vmap(lambda row: solved(mass, row))(jacobian)
-    return jacobian @ columns.T
+    if mass.ndim == 1 or len(mass) == 1:
+        columns = jax.vmap(lambda row: solved(mass, row))(jacobian)
+    else:
+        columns = jnp.sum(jacobian[:, :, None] * inverse(mass).T, axis=1)
+    # Sums of products: a call to a matrix library would defeat the loop flag.
+    return jnp.sum(jacobian[:, None] * columns, axis=2)
 
 
 def _own_reaction(
@@ -298,16 +339,15 @@ def _shared_reaction(mobility: Array, speed: Array, before: Array, dry: Array, h
     n = speed.size
     own = jnp.diagonal(mobility)
 
-    def sweep(_: Array, at: _Answer) -> _Answer:
-        for i in range(n):
-            remaining = speed[i] + jnp.sum(mobility[i] * at.reaction) - own[i] * at.reaction[i]
-            one = _own_reaction(own[i], remaining, before[i], dry[i], hold[i])
-            at = _Answer(*(whole.at[i].set(entry) for whole, entry in zip(at, one, strict=True)))
-        return at
+    def one(at: _Answer, i: Array) -> tuple[_Answer, None]:
+        remaining = speed[i] + jnp.sum(mobility[i] * at.reaction) - own[i] * at.reaction[i]
+        entries = _own_reaction(own[i], remaining, before[i], dry[i], hold[i])
+        return _Answer(*(a.at[i].set(entry) for a, entry in zip(at, entries, strict=True))), None
 
     no = jnp.zeros(n, bool)
-    # A loop, not twenty copies: those of six joints, differentiated, took a minute and a half to compile.
-    return jax.lax.fori_loop(0, _SWEEPS, sweep, _Answer(jnp.zeros(n), no, no, jnp.ones(n)))
+    start = _Answer(jnp.zeros(n), no, no, jnp.ones(n))
+    # A loop, not a copy for each port and sweep: those of six joints took a minute and a half to compile.
+    return jax.lax.scan(one, start, jnp.tile(jnp.arange(n), _SWEEPS))[0]
 
 
 def _rest_exactly(x: State, stuck: Array, slides: tuple[int, ...]) -> State:

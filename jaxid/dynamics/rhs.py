@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
@@ -60,6 +61,28 @@ def small_solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, "
     return jnp.stack(x)
 
 
+@jax.custom_jvp
+def inverse(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Invert a positive definite matrix by unrolled elimination of whole rows, without pivoting.
+
+    For several right-hand sides it replaces `small_solve`: 0.17 against 0.78 us for seven joints.
+    """
+    unit = np.eye(len(a))
+    rows = jnp.concatenate([a, unit], axis=1)
+    for k in range(len(a)):
+        pivot = rows[k] / rows[k, k]
+        # The row itself loses all but the pivot.
+        rows = rows - (rows[:, k] - unit[k])[:, None] * pivot
+    return rows[:, len(a) :]
+
+
+@inverse.defjvp
+def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    out = inverse(*primals)
+    half = jnp.sum(out[:, :, None] * tangents[0][None], axis=1)
+    return out, -jnp.sum(half[:, :, None] * out[None], axis=1)
+
+
 def acceleration(
     plant: Plant, x: State, u: Array, t: Array, reaction: Array | None = None
 ) -> Float[Array, " n"]:
@@ -72,15 +95,10 @@ def acceleration(
         t: Time from the start of the log [s].
         reaction: Dry-friction force by port from a set-valued step; absent: smoothed.
     """
-
-    def residual(qdd: Array) -> tuple[Array, Balance]:
-        balance = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction)
-        return balance.residual, balance
-
-    mass, rest = mass_of(plant, residual, x.q)
+    mass, rest = _mass_and_rest(plant, x, u, t, reaction)
     if reaction is not None or not rest.rises:
         if plant.coupled:
-            return _implicit(lambda qdd: residual(qdd)[0], solved(mass, -rest.residual))
+            return _coupled_acceleration(plant, x, u, t, reaction)
         return solved(mass, -rest.residual)
     # At zero acceleration the balance contains no friction of growing speed: up to its level, that resists
     # the remaining force.
@@ -94,16 +112,42 @@ def acceleration(
     return (remaining - more) / each
 
 
-def _implicit(residual: Callable[[Array], Array], qdd: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return the accelerations that make an affine residual zero, with derivatives by the implicit function.
+def _mass_and_rest(
+    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None
+) -> tuple[Array, Balance]:
+    """Return the mass, (n, n), or (n,) if diagonal, and the balance at zero acceleration."""
 
-    A tangent then takes one balance instead of those of all columns of the mass: one in place of eight for
-    seven joints, and likewise through the elimination.
+    def residual(qdd: Array) -> tuple[Array, Balance]:
+        balance = balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction)
+        return balance.residual, balance
+
+    return mass_of(plant, residual, x.q)
+
+
+@eqx.filter_custom_jvp
+def _coupled_acceleration(
+    plant: Plant, x: State, u: Array, t: Array, reaction: Array | None
+) -> Float[Array, " n"]:
+    """Solve the balance with derivatives by the implicit function.
+
+    A tangent takes one balance under given accelerations. The inverse of the mass is shared by all tangents;
+    neither it nor the mass is differentiated.
     """
-    none = jnp.zeros_like(qdd)
-    return jax.lax.custom_root(
-        residual, qdd, lambda _, known: known, lambda slope, y: solved(jax.jacfwd(slope)(none), y)
-    )
+    mass, rest = _mass_and_rest(plant, x, u, t, reaction)
+    return -jnp.sum(inverse(mass) * rest.residual, axis=1)
+
+
+@_coupled_acceleration.def_jvp
+def _coupled_acceleration_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    mass, rest = _mass_and_rest(*primals)
+    mobility = inverse(mass)
+    qdd = -jnp.sum(mobility * rest.residual, axis=1)
+
+    def residual(plant: Plant, x: State, u: Array, t: Array, reaction: Array | None) -> Array:
+        return balance_of(plant, x.q, x.qd, qdd, u, t, x.own, reaction).residual
+
+    missing = eqx.filter_jvp(residual, primals, tangents)[1]
+    return qdd, -jnp.sum(mobility * missing, axis=1)
 
 
 def need_apart(plant: Plant, mass: Array, ports: tuple[int, ...]) -> Array:

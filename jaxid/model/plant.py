@@ -46,6 +46,14 @@ class Plant(PlantInterface):
         """True if all ports are joints; else the derivative of `ports` takes half of the compile time."""
         return type(self).ports is PlantInterface.ports
 
+    def prepared(self) -> Self:
+        """Return the same plant with all that depends on its parameters alone computed, for a loop.
+
+        Inside a loop the compiler moves each use of such an expression out of it as another value, and then
+        no longer sees that what follows is the same.
+        """
+        return self
+
     def with_effect(self, effect: Effect) -> Self:
         """Return the plant with one more effect, the last one of its drive."""
         return eqx.tree_at(lambda p: p.effects, self, (*self.effects, effect))

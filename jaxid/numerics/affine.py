@@ -14,6 +14,9 @@ from jaxid.arrays import Array
 
 # How a value depends on the arguments: not at all, affinely, or in any other way.
 _CONSTANT, _AFFINE, _OTHER = range(3)
+# Entries of a vector up to which its product with a matrix is one sum: the compiler hands larger sums, with
+# many columns, to a matrix library, and a chain of ten masses takes three times as long.
+_MOST_AT_ONCE = 6
 # Operations that are affine in all operands together; in the first alone; in any single one of them.
 _SUMS = {
     "add",
@@ -42,7 +45,7 @@ class Affine(eqx.Module):
 
     Args:
         offset: Value at zero arguments, a tree like the result of `f`.
-        matrices: For each output leaf the Jacobians with respect to all input leaves.
+        matrices: For each output leaf the Jacobians with respect to all input leaves, whose axes come first.
     """
 
     offset: Any
@@ -55,10 +58,18 @@ class Affine(eqx.Module):
         out = []
         for leaf, blocks in zip(leaves, self.matrices, strict=True):
             for block, z in zip(blocks, entering, strict=False):
-                # Sums of products: a call to a matrix library would defeat the loop flag.
-                leaf = leaf + jnp.sum(block * z, axis=tuple(range(-z.ndim, 0)))
+                leaf = leaf + _contracted(block, z)
             out.append(leaf)
         return jax.tree.unflatten(treedef, out)
+
+
+def _contracted(block: Array, z: Array) -> Array:
+    """Return the product of a Jacobian, its input axes first, and a leaf, without a call to a library."""
+    if z.ndim != 1 or z.size <= _MOST_AT_ONCE:
+        wide = z.reshape(z.shape + (1,) * (block.ndim - z.ndim))
+        return jnp.sum(block * wide, axis=tuple(range(z.ndim)))
+    terms = [block[k] * z[k] for k in range(z.size)]
+    return sum(terms[1:], terms[0])
 
 
 def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
@@ -85,6 +96,11 @@ def affine(f: Callable, args: tuple, fixed: tuple = ()) -> Affine | None:
 
     places = tuple(range(len(entering)))
     matrices, offset = jax.jacfwd(flat, places, has_aux=True)(*jax.tree.leaves(zeros))
+    # Input axes first: the rows that a product adds up are then contiguous.
+    matrices = [
+        [jnp.moveaxis(block, range(leaf.ndim, block.ndim), range(block.ndim - leaf.ndim)) for block in row]
+        for leaf, row in zip(offset, matrices, strict=True)
+    ]
     return Affine(jax.tree.unflatten(jax.tree.structure(shape), offset), matrices)
 
 

@@ -31,6 +31,10 @@ class Geometry(eqx.Module):
         """
         raise NotImplementedError
 
+    def at_zero(self) -> JointFrames:
+        """Return the same geometry by its frames at zero, so that a loop does not compute them anew."""
+        return JointFrames(self.joints, *self.frames(jnp.zeros(len(self.joints))))
+
     def _check_joints(self) -> None:
         if not self.joints:
             raise ValueError("an arm has at least one joint; give a row for each.")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from jaxid.model.effect import Effect
 from jaxid.model.links import WithLinks
 from jaxid.model.parameter import as_array, parameter
 from jaxid.plants.geometry import Geometry
+from jaxid.plants.rigid_tree import Tree, inverse_dynamics, pseudo_inertia
 
 _FIRST = ("inertia*position", "free")
 _SECOND = ("inertia", "free")
@@ -39,10 +40,11 @@ class SerialArm(WithLinks):
         geometry: Frames of the links, the first one in the base.
         shafts: Ratios by which each shaft turns with the joints, a row of n for each shaft.
         gravity_vector: Acceleration of gravity in the base's frame, (3,) [m/s^2].
+        moments: Pseudo-inertias of the links, (n, 4, 4), as `prepared` computes them from the ten parameters.
 
     Source:
-        Luh, Walker & Paul (1980) for the recursion; Khalil & Kleinfinger (1987) for its form about the
-        origins of modified Denavit-Hartenberg frames, in which it is linear in the parameters.
+        `jaxid.plants.rigid_tree`; Khalil & Kleinfinger (1987) for parameters about the origins of modified
+        Denavit-Hartenberg frames, in which the forces are linear.
     """
 
     kind = "serial_arm"
@@ -68,6 +70,7 @@ class SerialArm(WithLinks):
     geometry: Geometry = eqx.field(kw_only=True)
     shafts: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
     gravity_vector: Array = eqx.field(converter=as_array, default=(0.0, 0.0, -9.81), kw_only=True)
+    moments: Array | None = eqx.field(default=None, kw_only=True)
 
     @property
     def joints(self) -> int:
@@ -111,46 +114,17 @@ class SerialArm(WithLinks):
         return whole, origin
 
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Recursive Newton-Euler: motion from the base out, forces from the tip back.
-
-        One scan each way. Of seven joints, on two CPU cores, compiled for 1000 states: 0.6 s to compile
-        and 2.2 ms to run, against 1.4 s and 1.2 ms unrolled, and 4.1 s and 13 ms as the Lagrangian
-        differentiated. The regressor (its Jacobian in 70 parameters): 88, 111 and 892 ms; the mass matrix
-        of one state: 0.05, 0.13 and 0.08 ms. Scans also keep the compiler from copying one link's motion into
-        every use of it: without, in the base's frame, a run of two joints compiles three times as long.
-        """
-        axes, origins = self.geometry.frames(q)
-        turns = jnp.asarray(self.geometry.revolute)
-        body = (self.mass, self._first_moments(), self._tensors())
-
-        def out(carry: tuple, link: tuple) -> tuple[tuple, tuple]:
-            # Angular velocity and acceleration of the link, and the acceleration of its origin: gravity is
-            # an upward acceleration of the base.
-            w, dw, dv = carry
-            r, p, turn, v, a, (m, ms, tensor) = link
-            dv = _into(r, dv + jnp.cross(dw, p) + jnp.cross(w, jnp.cross(w, p)))
-            w, dw = _into(r, w), _into(r, dw)
-            across = jnp.cross(w, v * _Z)
-            dv = dv + (1.0 - turn) * (2.0 * across + a * _Z)
-            dw = dw + turn * (across + a * _Z)
-            w = w + turn * v * _Z
-            force = m * dv + jnp.cross(dw, ms) + jnp.cross(w, jnp.cross(w, ms))
-            moment = _times(tensor, dw) + jnp.cross(w, _times(tensor, w)) + jnp.cross(ms, dv)
-            return (w, dw, dv), (force, moment)
-
-        def back(carry: tuple, link: tuple) -> tuple[tuple, Array]:
-            r, p, turn, force, moment = link
-            force, moment = carry[0] + force, carry[1] + moment
-            along = turn * moment[2] + (1.0 - turn) * force[2]
-            force = _times(r, force)
-            return (force, _times(r, moment) + jnp.cross(p, force)), along
-
-        rest = jnp.zeros(3)
-        links = (axes, origins, turns, qd, qdd, body)
-        _, (forces, moments) = jax.lax.scan(out, (rest, rest, -self.gravity_vector), links)
-        links = (axes, origins, turns, forces, moments)
-        _, tau = jax.lax.scan(back, (rest, rest), links, reverse=True)
+        """Return the forces of the links, whose derivatives are analytical, and of the rotors."""
+        tree = Tree.chain(self.geometry.joints)
+        moments = self._moments() if self.moments is None else self.moments
+        tau = inverse_dynamics(tree, self.geometry, -self.gravity_vector, moments, q, qd, qdd)
         return tau if self.rotor_inertia is None else tau + self.rotor_inertia * qdd
+
+    def prepared(self) -> SerialArm:
+        return replace(self, geometry=self.geometry.at_zero(), moments=self._moments())
+
+    def _moments(self) -> Float[Array, "n 4 4"]:
+        return pseudo_inertia(self.mass, self._first_moments(), self._tensors())
 
     def _first_moments(self) -> Float[Array, "n 3"]:
         return jnp.stack([self.first_moment_x, self.first_moment_y, self.first_moment_z], axis=-1)
@@ -165,8 +139,3 @@ class SerialArm(WithLinks):
 def _times(matrix: Float[Array, "3 3"], x: Float[Array, " 3"]) -> Float[Array, " 3"]:
     """Multiply a matrix and a vector without a call to a matrix library, since it is used in loops."""
     return jnp.sum(matrix * x, axis=1)
-
-
-def _into(axes: Float[Array, "3 3"], x: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """Return the components of a vector along the axes of a frame."""
-    return jnp.sum(axes * x[:, None], axis=0)

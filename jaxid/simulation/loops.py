@@ -88,7 +88,7 @@ class Drive(eqx.Module):
         if self.solver is not None:
             whole, solver = jnp.asarray(self.period), self.solver
             return lambda x, ends, t: solver(plant, x, ends, t, whole)
-        h = jnp.asarray(self.period / self.substeps)
+        h, plant = jnp.asarray(self.period / self.substeps), plant.prepared()
         flow = affine_flow(plant, x, ends, jnp.zeros(()), h) if self.set_valued else None
 
         def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
