@@ -126,6 +126,8 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     effects, plants = dict(EFFECTS), dict(PLANTS)
     sys.modules[name] = module
+    # A command that refuses a file leaves nothing beside it.
+    writes_none, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
@@ -134,6 +136,7 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
             kind, f"cannot be imported ({one_line(error, path)})", f"correct {path.name}"
         ) from error
     finally:
+        sys.dont_write_bytecode = writes_none
         # The classes that the file registers belong to its case, not to every case.
         EFFECTS.clear()
         EFFECTS.update(effects)

@@ -47,8 +47,13 @@ ELSEWHERE = {
 }
 
 
+# The damping by a drive's voltage is known from its data; as a force it is viscous friction.
+NOT_SEARCHED_FOR = {"back_emf_damping"}
+
+
 def test_every_effect_has_a_case():
-    assert set(SEARCH_CASES) | set(ELSEWHERE) == {k for k in EFFECTS if ":" not in k}
+    searched_for = {k for k in EFFECTS if ":" not in k} - NOT_SEARCHED_FOR
+    assert set(SEARCH_CASES) | set(ELSEWHERE) == searched_for
     assert not set(SEARCH_CASES) & set(ELSEWHERE)
 
 

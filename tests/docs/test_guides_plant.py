@@ -36,7 +36,7 @@ def identified(tmp_path_factory) -> dict:
     The cart-pole is fitted by the quick method here; by the chosen one in a slow test.
     """
     folder, found = tmp_path_factory.mktemp("guide"), {}
-    for path in EXAMPLES.iterdir():
+    for path in EXAMPLES.glob("*.*"):
         shutil.copy(path, folder)
     for name in NAMES:
         log = jaxid.simulate(folder / f"{name}.toml", seed=1)
@@ -144,7 +144,7 @@ def test_each_joint_has_its_typical_velocity(identified):
 
 @pytest.mark.slow
 def test_the_other_commands_take_the_plant(tmp_path, capsys):
-    for path in EXAMPLES.iterdir():
+    for path in EXAMPLES.glob("*.*"):
         shutil.copy(path, tmp_path)
     case, log = tmp_path / "cart_pole.toml", tmp_path / "log.csv"
     text = case.read_text("utf-8")
