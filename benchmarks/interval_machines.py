@@ -151,6 +151,9 @@ def arm(seed: int, loop: str, sensor: str) -> Run:
         coulomb=tuple(draw(2.0, 1.2)),
     )
     true = {n: float(v) for n, v in links.base.items() if n != "first_moment_y[1]"}
+    # The case states the mass of link 2: what it adds to link 1 is no unknown.
+    true["first_moment_x[1]"] = links.m1 * links.x1
+    true["inertia_zz[1]"] = links.i1 + links.m1 * links.x1**2
     true |= {f"viscous_friction[{k}].coefficient": v for k, v in enumerate(links.viscous, start=1)}
     true |= {f"coulomb_friction[{k}].level": v for k, v in enumerate(links.coulomb, start=1)}
 

@@ -27,6 +27,7 @@ from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, assess, he
 from jaxid.simulation.kalman import make_filter, slow_samples
 from jaxid.simulation.replay import Numerics, exact_numerics
 from jaxid.simulation.sensor_noise import position_noise
+from jaxid.simulation.step_size import needed_steps
 
 # Evaluations that show which start is the best one.
 _SCREENING = 12
@@ -123,7 +124,10 @@ def prediction_error_steps(
 ) -> Steps[Estimate]:
     """Run `prediction_error` as a generator of solve requests."""
     need_names(profile, machine.parameters.names)
-    numerics = numerics or exact_numerics(machine, log)
+    if numerics is None:
+        # Guesses that are far off, such as inertias of no possible body, may need many more steps.
+        near = machine if start is None else machine.with_estimate(np.clip(start, *machine.parameters.bounds))
+        numerics = exact_numerics(machine, log, needed_steps(near, log))
     parameters, measured = machine.parameters, list(log.measured)
     applied = noise_free_command(machine, log)
     driven = log if applied is None else replace(log, force=applied)
