@@ -34,11 +34,23 @@ gc.set_threshold(20_000, 20, 20)
 _MAPS, _MANY = Path("/proc/self/maps"), 20_000
 
 
-@pytest.fixture(scope="module", autouse=True)
 def _forget_compiled_code():
-    yield
     if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MANY:
         import jax
 
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _after_each_module():
+    yield
+    _forget_compiled_code()
+
+
+@pytest.fixture(autouse=True)
+def _after_each_slow_test(request):
+    """A hundred searches of one module do not fit either."""
+    yield
+    if request.node.get_closest_marker("slow"):
+        _forget_compiled_code()
