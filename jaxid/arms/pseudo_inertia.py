@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.plants import rigid_tree
 
 # Fields of an arm in the order of the ten parameters.
 TEN = (
@@ -33,15 +34,10 @@ def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
     Source:
         Wensing, Kim & Slotine (2018), IEEE RA-L 3(1). (2.9) of the PA-10 report holds the sums +sum m x y.
     """
-    m, x, y, z, xx, xy, xz, yy, yz, zz = (ten[..., k] for k in range(10))
-    half = 0.5 * (xx + yy + zz)
-    rows = [
-        [half - xx, -xy, -xz, x],
-        [-xy, half - yy, -yz, y],
-        [-xz, -yz, half - zz, z],
-        [x, y, z, m],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    xx, xy, xz, yy, yz, zz = (ten[..., k] for k in range(4, 10))
+    rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    tensor = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return rigid_tree.pseudo_inertia(ten[..., 0], ten[..., 1:4], tensor)
 
 
 def ten_parameters(pseudo: Float[Array, "*n 4 4"]) -> Float[Array, "*n 10"]:

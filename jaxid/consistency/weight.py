@@ -8,11 +8,23 @@ from jaxid.consistency.balance_fit import BalanceFit
 from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.model.plant import Plant
 
 # Standard deviations by which an inertia must be below the least one that is possible.
 _SIGMAS = 5.0
 # Parameters of a link that, with its mass, bound its inertia about the axis of its joint from below.
 _FIXED = ("mass", "first_moment_x", "first_moment_y")
+
+
+def least_inertia(plant: Plant, link: int) -> float:
+    """Return the inertia of a link's mass at its centre of mass, about the axis of its joint [kg m^2].
+
+    Args:
+        plant: An arm.
+        link: Index of the link, from 0.
+    """
+    mass, x, y = (float(np.asarray(getattr(plant, name))[link]) for name in _FIXED)
+    return (x**2 + y**2) / mass if mass > 0 else 0.0
 
 
 def weight_findings(machine: Machine, log: Log, fit: BalanceFit) -> list[Finding]:
@@ -35,8 +47,7 @@ def weight_findings(machine: Machine, log: Log, fit: BalanceFit) -> list[Finding
         turning = f"inertia_zz[{link + 1}]"
         if turning not in names or any(f"{name}[{link + 1}]" in unknown for name in _FIXED):
             continue
-        mass, x, y = (float(np.asarray(getattr(plant, name))[link]) for name in _FIXED)
-        least, k = (x**2 + y**2) / mass if mass > 0 else 0.0, names.index(turning)
+        least, k = least_inertia(plant, link), names.index(turning)
         if not values[k] + _SIGMAS * std[k] < least:
             continue
         unit = machine.unit("inertia", link)

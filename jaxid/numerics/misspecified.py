@@ -110,6 +110,8 @@ def block_covariance(
         169-181, for blocks that are left out (their CR3).
     """
     p, normals, scores = jacobian.shape[-1], [], []
+    if p == 0:
+        return np.zeros((0, 0))
     for j, e, c in zip(*(np.split(x, edges) for x in (jacobian, residual, counts)), strict=True):
         j, e = (j.reshape(-1, p), e.ravel()) if c.all() else (j[c], e[c])
         normals.append(j.T @ j)

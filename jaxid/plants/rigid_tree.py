@@ -65,8 +65,8 @@ class Tree:
 
 
 def pseudo_inertia(
-    mass: Float[Array, " n"], first_moment: Float[Array, "n 3"], inertia: Float[Array, "n 3 3"]
-) -> Float[Array, "n 4 4"]:
+    mass: Float[Array, "*n"], first_moment: Float[Array, "*n 3"], inertia: Float[Array, "*n 3 3"]
+) -> Float[Array, "*n 4 4"]:
     """Return the second moments of the points (r, 1) of each link, linear in its ten parameters.
 
     Args:

@@ -19,7 +19,6 @@ from jaxid.plants.rigid_tree import Tree, inverse_dynamics, pseudo_inertia
 
 _FIRST = ("inertia*position", "free")
 _SECOND = ("inertia", "free")
-_Z = np.array([0.0, 0.0, 1.0])
 
 
 class SerialArm(WithLinks):

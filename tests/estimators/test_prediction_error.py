@@ -9,9 +9,10 @@ import pytest
 
 import jaxid
 from jaxid.consistency.law import noise_free_command
+from jaxid.errors import InputError
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.scoring import maximise_likelihood
-from jaxid.estimators.prediction_error import whiteness
+from jaxid.estimators.prediction_error import prediction_error, whiteness
 from jaxid.session import open_session
 from jaxid.simulation.kalman import readings_used, slow_samples, smooth_steps
 from truth.axis.cases import case_text
@@ -39,7 +40,8 @@ def opened(folder, seed: int, *, closed: bool, sensor: bool = True, **values: fl
     made = setup(seed, **values)
     run = made.run()
     path = folder / f"{seed}{closed}{sensor}.toml"
-    path.write_text(case_text(made, list(made.machine.effects.items()), closed=closed, sensor=sensor))
+    effects = list(made.machine.effects.items())
+    path.write_text(case_text(made, effects, closed=closed, sensor=sensor, true=True))
     return path, {"t": run["t"], "q": run["position"], "u": run["force"], "ref": run["reference"]}
 
 
@@ -53,6 +55,28 @@ def fits(tmp_path_factory):
         cases, logs = zip(*files, strict=True)
         out[closed] = jaxid.identify_many(cases, logs, method="prediction_error", lanes=LOGS)
     return out
+
+
+def test_the_bound_at_the_truth_is_that_of_the_fit(fits):
+    """A fit is near the truth, so that the information there is nearly that of the fit, which may be widened."""
+    for fit in fits[False]:
+        ratio = fit.std / np.array([fit.details["least_std"][name] for name in fit.names])
+        assert np.all((0.9 < ratio) & (ratio < 2.0))
+
+
+def test_steps_are_counted_where_the_fit_starts(tmp_path, monkeypatch):
+    counted = []
+
+    def steps(machine, log):
+        counted.append(float(machine.plant.inertia))
+        raise InputError("enough")
+
+    monkeypatch.setattr("jaxid.estimators.prediction_error.needed_steps", steps)
+    session = open_session(*opened(tmp_path, 1, closed=False))
+    for start in (TRUE, None):
+        with pytest.raises(InputError, match="enough"):
+            prediction_error(session.machine, session.fit.log, start=start)
+    assert counted == [TRUE[0], pytest.approx(TRUE[0] / 1.5)]
 
 
 @pytest.mark.parametrize("closed", [False, True])

@@ -64,6 +64,7 @@ def test_directions_that_the_log_does_not_hold_and_short_logs():
     scaled = std_under_misspecification(jacobian / 1e3, residual, counts)[0]
     assert scaled == pytest.approx(1e3 * one)
     assert np.all(np.isnan(std_under_misspecification(jacobian[:20], residual[:20], counts[:20])))
+    assert std_under_misspecification(jacobian[..., :0], residual, counts).shape == (0,)
 
 
 def test_errors_that_last_for_a_block_widen_the_deviations():
@@ -80,6 +81,23 @@ def test_errors_that_last_for_a_block_widen_the_deviations():
     assert widening(white, jacobian[:79], z[:79], counts[:79])[0] == 1.0
     unseen = Precision(np.full((1, 1), np.nan), np.zeros(1, bool), [], np.ones(1))
     assert widening(unseen, jacobian, z, counts)[0] == 1.0
+
+
+def test_few_blocks_that_hold_all_that_is_known_do_not_look_precise():
+    """Five of forty blocks move the regressor, and the error of each lasts: its own fit hides it."""
+    rng, blocks, length, errors, stds = np.random.default_rng(4), 40, 25, [], []
+    for _ in range(400):
+        level = rng.standard_normal((blocks, 1)) * np.ones(length)
+        x = np.zeros((blocks, length))
+        x[:5] = rng.uniform(0.5, 1.5, (5, 1))
+        best = np.sum(x * level) / np.sum(x**2)
+        jacobian, z = -x.reshape(-1, 1, 1), (level - best * x).reshape(-1, 1)
+        white = Precision(np.full((1, 1), 1 / np.sum(x**2)), np.ones(1, bool), [], np.ones(1))
+        stds.append(white.std[0] * widening(white, jacobian, z, np.ones(z.shape, bool))[0])
+        errors.append(best)
+    assert rms(stds) == pytest.approx(rms(errors), rel=0.25)
+    # Student's distribution with four degrees of freedom holds 88 % within 1.96.
+    assert np.mean(np.abs(np.divide(errors, stds)) < 1.96) > 0.86
 
 
 def test_one_sandwich_for_both():

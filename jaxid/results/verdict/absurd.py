@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxid.consistency.weight import least_inertia
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
@@ -217,8 +218,7 @@ def _unreal_links(estimate: Estimate) -> list[Remark]:
         if turning is None or not all(estimate.identifiable[names[n]] for n in own):
             continue
         declared = own == [turning]
-        mass, x, y, inertia = (float(np.asarray(getattr(plant, n))[link]) for n in _AXIAL)
-        least = (x**2 + y**2) / mass if mass > 0 else 0.0
+        inertia, least = estimate.value(turning), least_inertia(plant, link)
         if inertia + _SIGMAS * float(estimate.std[names[turning]]) < least:
             unit = machine.parameters.free[names[turning]].unit
             text = f"{turning} = {_with_unit(inertia, unit)} is below {_with_unit(least, unit)}, the inertia"
