@@ -58,7 +58,7 @@ def fits(tmp_path_factory):
 
 
 def test_the_bound_at_the_truth_is_that_of_the_fit(fits):
-    """A fit is near the truth, so that the information there is nearly that of the fit, which may be widened."""
+    """A fit is near the truth, so that the information there is nearly its own, which may be widened."""
     for fit in fits[False]:
         ratio = fit.std / np.array([fit.details["least_std"][name] for name in fit.names])
         assert np.all((0.9 < ratio) & (ratio < 2.0))
