@@ -203,7 +203,7 @@ def prediction_error_steps(
     estimate = _estimate(machine, problem, theta, scored, by_law=applied is not None, read=read, steps=steps)
 
     true = [free.true for free in parameters.free]
-    if None not in true and estimate.converged:
+    if true and None not in true and estimate.converged:
         truth = np.array(true, dtype=np.float64)
         there = yield SolveRequest(fit, (problem, truth, noise, np.asarray(1)))
         bound = _precision(parameters.names, problem, truth, there).std
@@ -361,7 +361,7 @@ def _slopes(problem: Innovations, scored: Scored) -> Float[np.ndarray, "time k p
     p = problem.bounds[0].size
     # The slopes are those at the optimum, before the correction.
     fitted = problem.transform.outward(scored.x[:p])
-    rows = problem.transform.physical(scored.mean[..., :p].reshape(-1, p), fitted)
+    rows = problem.transform.physical(scored.mean[..., :p].reshape(scored.z.size, p), fitted)
     return np.asarray(rows).reshape(*scored.z.shape, p)
 
 
@@ -386,7 +386,7 @@ def _precision(
     # An unknown is identifiable if its standard deviation changes the innovations less than the largest
     # effect of any unknown does.
     scale = np.where(theta != 0, theta, 1.0)
-    effect = np.linalg.norm((jacobian * scale).reshape(-1, len(theta)), axis=0)
+    effect = np.linalg.norm((jacobian * scale).reshape(scored.z.size, len(theta)), axis=0)
     largest = float(np.max(effect, initial=0.0))
     precision = assess(names, jacobian, np.asarray(scored.z), counts, largest, scale, hessian)
     return replace(precision, kind=FULL_HESSIAN if precision.kind == FULL_HESSIAN else FISHER)

@@ -1,6 +1,7 @@
 """The likelihood of innovations, on logs of the exact axis, whose physics shares no code with the filter."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +63,19 @@ def test_the_bound_at_the_truth_is_that_of_the_fit(fits):
     for fit in fits[False]:
         ratio = fit.std / np.array([fit.details["least_std"][name] for name in fit.names])
         assert np.all((0.9 < ratio) & (ratio < 2.0))
+
+
+def test_nothing_unknown_leaves_the_noise(tmp_path):
+    path, log = opened(tmp_path, 1, closed=False)
+    path.write_text(re.sub(r"{ guess = \S+, true = (\S+) }", r"\1", path.read_text()))
+    session = open_session(path, log)
+    fit = prediction_error(session.machine, session.fit.log)
+    assert fit.converged
+    assert fit.theta.size == 0
+    assert fit.std_misspecified.size == 0
+    # As simulated, in units of the command and in metres.
+    assert fit.details["noise"]["force"] == pytest.approx([0.1], rel=0.1)
+    assert fit.details["noise"]["position"] == pytest.approx([1e-6], rel=0.1)
 
 
 def test_steps_are_counted_where_the_fit_starts(tmp_path, monkeypatch):
