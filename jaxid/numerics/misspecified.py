@@ -46,7 +46,7 @@ def std_under_misspecification(
     if before[-1] < _STRETCHES * max(p, 1):
         return np.full(p, np.nan)
     edges = np.searchsorted(before, before[-1] * np.arange(1, _STRETCHES) / _STRETCHES)
-    covariance = block_covariance(jacobian, residual, counts, edges, left_out=True)
+    covariance = block_covariance(jacobian, residual, counts, edges)
     few = scipy.stats.t.ppf(0.975, _STRETCHES - 1) / scipy.stats.norm.ppf(0.975)
     return few * np.sqrt(np.diag(covariance))
 
@@ -76,7 +76,7 @@ def widening(
         return factor
     # Blocks of equal time.
     edges = np.array([part[0] for part in np.array_split(np.arange(len(residual)), _BLOCKS)[1:]])
-    covariance = block_covariance(jacobian[..., keep], residual, counts, edges, left_out=True)
+    covariance = block_covariance(jacobian[..., keep], residual, counts, edges)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(np.diag(covariance)) / precision.std[keep]
     factor[keep] = np.where(np.isfinite(ratio), np.maximum(ratio, 1.0), 1.0)
@@ -88,21 +88,18 @@ def block_covariance(
     residual: Float[np.ndarray, "time n"],
     counts: Bool[np.ndarray, "time n"],
     edges: Int[np.ndarray, " blocks-1"],
-    *,
-    left_out: bool = False,
 ) -> Float[np.ndarray, "p p"]:
     """Return the covariance of a least-squares fit by the sandwich whose scores are summed over blocks.
 
-    Each block moves the fit by the inverse of the normal matrix times its score. The covariance is the sum of
-    the squares of these steps.
+    Each block moves the fit by the inverse of the normal matrix without it, times its score, so that few
+    blocks give no covariance that is too small (the jackknife). The covariance is the sum of the squares of
+    these steps.
 
     Args:
         jacobian: Jacobian of the residual, (time, n, p).
         residual: Residual at the fit, (time, n).
         counts: Mask of the samples that count, (time, n).
         edges: First sample of each block but the first, ascending, (blocks - 1,).
-        left_out: Whether the normal matrix of a step is that without its block (the jackknife), so that few
-            blocks give no covariance that is too small.
 
     Source:
         White (1982), Econometrica 50, 1-25, for estimates of incomplete models; Kunsch (1989), Annals of
@@ -119,10 +116,9 @@ def block_covariance(
     whole = np.sum(normals, axis=0)
     size = np.sqrt(np.diag(whole))
     size = np.where(size > 0, size, 1.0)
-    scaled = [(whole - own if left_out else whole) / np.outer(size, size) for own in normals]
+    scaled = [(whole - own) / np.outer(size, size) for own in normals]
     steps = np.stack([_solved(normal, score / size) for normal, score in zip(scaled, scores, strict=True)])
-    if left_out:
-        steps = np.sqrt(1 - 1 / len(steps)) * (steps - steps.mean(axis=0))
+    steps = np.sqrt(1 - 1 / len(steps)) * (steps - steps.mean(axis=0))
     return steps.T @ steps / np.outer(size, size)
 
 
