@@ -27,6 +27,10 @@ _UNEXPLAINED = 0.7
 _ALL_CHOICES = 6
 # Correlation of the force of one unit with the velocity from which an unknown counts as friction.
 _DISSIPATES = 0.6
+# Turns within which a force that depends on the angle alone may do work, and the correlation of force with
+# velocity from which a drive counts as the one that turns its joint.
+_TURNS = 3.0
+_DRIVES = 0.3
 # Correlation from which two columns count as one quantity.
 _EQUAL = 0.999
 # Part of a force that the declared model leaves if the force is not one of this machine.
@@ -41,7 +45,9 @@ def sign_findings(
     A sign counts as wrong if least squares without bounds gives a negative mass or friction by more than
     five standard deviations, and if the opposite sign, with bounds, leaves at most half of the gap. A mean
     power below zero is no proof, because lowering a weight, braking, and a spring push with negative power
-    too: forces that depend on the position only are therefore free in all of these fits.
+    too: forces that depend on the position only are therefore free in all of these fits. A drive that keeps a
+    joint turning is not refused: what varies at one speed is the answer of its controller to disturbances,
+    which opposes the velocity like friction of the wrong sign.
 
     Args:
         machine: The machine at its guesses.
@@ -61,15 +67,18 @@ def sign_findings(
         return followers
     remaining = declared.rms(declared.fit(bounded=True)[1]) / declared.scale
     doubtful = [k for k, j in enumerate(driven) if declared.counts[:, j].any() and remaining[j] > _DOUBTFUL]
+    turning = {k: _turning(machine, data, declared, driven[k]) for k in range(len(driven))}
+    braked = _braked(log, [k for k in turning if turning[k] < -_DRIVES], len(driven))
     if not doubtful:
-        return []
+        return braked
     turned, better = _best_signs(machine, data, declared, driven, doubtful)
     gap, after = (f.rms(f.fit(bounded=True)[1]) for f in (declared, better))
     halved = [k for k in turned if after[driven[k]] <= _HALF * gap[driven[k]]]
+    halved = [k for k in halved if turning[k] < _DRIVES]
     brakes = _brakes(declared, better, [driven[k] for k in halved]) if halved else None
     if brakes is not None:
         return [_wrong_sign(machine, log, halved, driven, gain, (gap, after), brakes)]
-    return _unexplained(machine, log, doubtful, driven, remaining, gap)
+    return [*_unexplained(machine, log, doubtful, driven, remaining, gap), *braked]
 
 
 def _best_signs(
@@ -130,6 +139,50 @@ def _brakes(fit: BalanceFit, better: BalanceFit, joints: Sequence[int]) -> str |
         f"{fit.unknowns[k].name} = {values[k]:.3g} +- {std[k]:.1g} {fit.unknowns[k].unit}".rstrip()
         for k in sorted(named)
     )
+
+
+def _turning(machine: Machine, data: Prepared, fit: BalanceFit, joint: int) -> float:
+    """Return the correlation of force and velocity over several turns in which a joint does not slow down.
+
+    No weight and no spring of such a joint gives or returns work, so that friction alone takes it up: a
+    positive correlation shows that the sign is right, a negative one that it is wrong. A load on a winch is
+    the exception, and must be declared as a weight.
+
+    Args:
+        machine: The machine.
+        data: The prepared log.
+        fit: Its balance with the declared signs.
+        joint: Joint of the drive.
+
+    Returns:
+        The correlation, means not removed; 0 for a joint that moves along a line, carries a declared weight,
+        or makes fewer turns.
+    """
+    if (machine.plant.motion(joint) or machine.units.motion) != "rotary":
+        return 0.0
+    if np.any(np.asarray(machine.plant.port_gravity(np.zeros(machine.plant.joints)))[joint]):
+        return 0.0
+    rows = np.flatnonzero(fit.counts[:, joint])
+    v = fit.velocity[rows, joint]
+
+    # Between these two samples the kinetic energy does not fall.
+    first = int(np.argmin(np.abs(v[: max(len(v) // 4, 1)])))
+    last = int(np.flatnonzero(np.abs(v) >= np.abs(v[first]))[-1])
+    v, u = v[first : last + 1], fit.force[rows, joint][first : last + 1]
+    turns = abs(float(np.sum(v))) * data.period * data.recipe.decimation / (2 * np.pi)
+    size = float(np.linalg.norm(u) * np.linalg.norm(v))
+    return float(u @ v) / size if turns > _TURNS and size > 0 else 0.0
+
+
+def _braked(log: Log, drives: Sequence[int], count: int) -> list[Finding]:
+    """Return warnings on drives that brake joints which keep turning."""
+    findings = []
+    for k in drives:
+        number = f" {k + 1}" if count > 1 else ""
+        what = f"the force brakes the joint over more than {_TURNS:.0f} turns in which it does not slow down"
+        hint = "set sign = { force = -1 } in [log] if its sign is turned, or declare the load that drives it"
+        findings.append(Finding("warning", what, f"{log.source}, force{number}", hint))
+    return findings
 
 
 def _dissipated(

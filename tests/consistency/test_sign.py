@@ -80,6 +80,32 @@ SOUND = {
 }
 
 
+def spindle(speed: float = 5.0, teeth: int = 72) -> Setup:
+    """A spindle that turns at one speed: its loop answers the ripple, so that force and speed oppose."""
+    friction = {"viscous_friction": {"coefficient": 2e-3}, "coulomb_friction": {"level": 0.05}}
+    ripple = {"cogging": {"amplitude": 0.1, "period": 2 * np.pi / teeth, "phase": 0.3}}
+    machine = Machine(inertia=2e-3, effects=friction | ripple)
+    loop = Loop(kind="cascade_pd", kp=2.0, kv=0.02, limit=np.inf, reference=speed * np.arange(6000) / RATE)
+    return Setup(machine, loop, Sensor(position_resolution=2 * np.pi / 20000, force_noise=1e-3), RATE, 6.0, 0)
+
+
+SPINDLE = (("viscous_friction", {"coefficient": 2e-3}), ("coulomb_friction", {"level": 0.05}))
+
+
+@pytest.mark.parametrize("teeth", [12, 72])
+def test_the_loop_of_a_spindle_at_one_speed_is_no_wrong_sign(teeth):
+    of = spindle(teeth=teeth)
+    findings = opened(of, logged(of), SPINDLE, motion="rotary").findings
+    assert not any("brakes" in f.what for f in findings)
+
+
+@pytest.mark.parametrize("teeth", [12, 72])
+def test_a_force_that_brakes_a_spindle_over_turns_is_warned_of(teeth):
+    of = spindle(teeth=teeth)
+    findings = opened(of, logged(of, turned=True), SPINDLE, motion="rotary").findings
+    assert any("brakes the joint over more than 3 turns" in f.what for f in findings)
+
+
 @pytest.mark.parametrize("name", SOUND)
 def test_a_force_that_brakes_rightly_is_not_refused(name):
     of, run, case = SOUND[name]()
