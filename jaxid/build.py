@@ -250,7 +250,14 @@ def _with_effect(
 ) -> tuple[Plant, list[Free]]:
     """Return the plant with an effect on one of its ports, and the unknowns of the effect."""
     values = {name: of_ports[at] for name, of_ports in entry.parameters.items()}
-    effect = entry.cls(port=entry.ports[at], **{name: v.start(at_truth) for name, v in values.items()})
+    port = entry.ports[at]
+    if entry.cls.of_rotary and (plant.motion(port) or case.plant.units.motion) != "rotary":
+        raise InputError(
+            f"{entry.cls.kind} acts on a joint that turns, and this one moves along a line",
+            where=f"{case.where}, [[effects]]",
+            hint='say motion = "rotary" in [plant], or take another effect',
+        )
+    effect = entry.cls(port=port, **{name: v.start(at_truth) for name, v in values.items()})
     key = effect_name(plant, effect)
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():

@@ -120,6 +120,8 @@ def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> 
     plant = machine.plant
     if not plant.accepts(cls, port, data.force.shape[1]):
         return False
+    if cls.of_rotary and (plant.motion(port) or machine.units.motion) != "rotary":
+        return False
     equivalent = plant.equivalent_parameter(cls, port)
     fitted = equivalent is not None and any(
         f.path == (equivalent[0],) and f.index == equivalent[1] for f in machine.parameters.free

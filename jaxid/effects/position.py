@@ -57,6 +57,34 @@ class CubicStiffness(Effect):
         return Action(force=-self.coefficient * x.y**3)
 
 
+@register("unbalance")
+class Unbalance(Effect):
+    """-m r g cos(q + phase): the weight of a mass off the axis of a joint that turns.
+
+    The phase is zero if the mass is level with the axis at q = 0, and -pi/2 if it hangs below it. Mass and
+    distance enter as their product only.
+
+    Source:
+        The torque of a point mass on a lever, m g r cos of its angle above the horizontal.
+    """
+
+    of_rotary = True
+    # A search by default would have to tell it from a ripple of one period a turn.
+    on_request = True
+
+    moment: Array = parameter("moment", "nonnegative", "m r, mass times distance from the axis")
+    phase: Array = parameter("angle", "free", "of the mass above the horizontal at q = 0")
+
+    def act(self, x: Signals, state: None) -> Action:
+        return Action(force=-self.moment * x.field * jnp.cos(x.y + self.phase))
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        # Of three phases one has the right sign and at least half of the strength.
+        moment = scales.natural("moment")
+        return [{"moment": moment, "phase": phase} for phase in (0.0, 2 / 3 * np.pi, 4 / 3 * np.pi)]
+
+
 @register("cogging")
 class Cogging(Effect):
     """-A cos(2 pi q / period + phase): a force periodic in position."""

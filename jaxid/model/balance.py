@@ -91,12 +91,13 @@ class _PortSignals:
     width: Array
     stiffness: Array
     damping: Array
+    field: Array
 
     @classmethod
     def of(cls, plant: Plant, q: Array, qd: Array, qdd: Array) -> _PortSignals:
         motion = port_motion(plant, q, qd, qdd)
         gravity, normal, width = plant.port_gravity(q), plant.port_normal(q), plant.port_width(q)
-        return cls(*motion, gravity, normal, width, *plant.port_spring(q))
+        return cls(*motion, gravity, normal, width, *plant.port_spring(q), plant.field)
 
     def at(self, i: int, u: Array, t: Array, dry_scale: Sum) -> Signals:
         """Return the signals of an effect on port i."""
@@ -112,6 +113,7 @@ class _PortSignals:
             normal=self.normal[i],
             stiffness=self.stiffness[i],
             damping=self.damping[i],
+            field=self.field,
         )
 
 

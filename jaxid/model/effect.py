@@ -11,6 +11,9 @@ import equinox as eqx
 from jaxid.arrays import Array
 from jaxid.model.parameter import ParameterInfo, parameters_of
 
+# Acceleration of gravity [m/s^2] of a case that does not state one.
+STANDARD_GRAVITY = 9.81
+
 
 class Signals(eqx.Module):
     """The signals that an effect may use, in the coordinate of its port.
@@ -28,6 +31,7 @@ class Signals(eqx.Module):
         normal: Force that presses the sliding surfaces together [N].
         stiffness: Stiffness of the plant's spring whose elongation is the port [N/m or N m/rad]; else zero.
         damping: Damping of this spring [N s/m or N m s/rad]; else zero.
+        field: Magnitude of the acceleration of gravity, whatever the direction of the port [m/s^2].
     """
 
     y: Array
@@ -41,6 +45,7 @@ class Signals(eqx.Module):
     normal: Array
     stiffness: Array
     damping: Array
+    field: Array | float = STANDARD_GRAVITY
 
 
 class Action(eqx.Module):
@@ -90,6 +95,7 @@ class Scales:
             "force": self.force,
             "position": self.position,
             "time": self.position / self.velocity,
+            "moment": self.force / STANDARD_GRAVITY,
         }
         if "inertia" in dimension:
             base["inertia"] = self.force / self.acceleration
@@ -142,6 +148,8 @@ class Effect(eqx.Module):
     of_spring: ClassVar[bool] = False
     # True if only a plant with springs can have it, False if only one without; None: any plant.
     with_springs: ClassVar[bool | None] = None
+    # Whether it acts on joints that turn only.
+    of_rotary: ClassVar[bool] = False
     # Whether it is the same along every direction: then it may act on a tool, which moves along several.
     any_direction: ClassVar[bool] = False
     # Whether a search tries it on stages only: on other machines it would absorb any difference by direction.
@@ -198,7 +206,7 @@ class Effect(eqx.Module):
 
 def carries_force(info: ParameterInfo) -> bool:
     """Check that an added force is in proportion to a parameter."""
-    return info.dimension.startswith(("force", "inertia"))
+    return info.dimension.startswith(("force", "inertia", "moment"))
 
 
 def scaled(cls: type[Effect], values: dict[str, float], factor: float) -> dict[str, float]:

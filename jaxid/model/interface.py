@@ -88,6 +88,11 @@ class PlantInterface(SearchHints):
         """Return the acceleration of gravity along each port [m/s^2]."""
         return jnp.zeros_like(self.ports(q))
 
+    @property
+    def field(self) -> Array:
+        """Magnitude of the acceleration of gravity [m/s^2]."""
+        return jnp.linalg.norm(self.base_gravity)
+
     def port_normal(self, q: Array) -> Array:
         """Return the force that presses the sliding surfaces of each port together [N]."""
         return jnp.zeros_like(self.ports(q))

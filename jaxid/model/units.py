@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 _LABELS = {
-    "linear": {"force": "N", "position": "m", "time": "s", "inertia": "kg", "gravity": "m/s^2"},
+    "linear": {
+        "force": "N",
+        "position": "m",
+        "time": "s",
+        "inertia": "kg",
+        "gravity": "m/s^2",
+        "moment": "kg m",
+    },
     "rotary": {"force": "N m", "position": "rad", "time": "s", "inertia": "kg m^2"},
 }
 
@@ -30,10 +37,11 @@ class Units:
         """Turn a dimension such as "force*time/position" into a label such as "N s/m".
 
         Args:
-            dimension: Product of force, position, time and inertia; "1", or "angle" for a phase.
+            dimension: Product of force, position, time and inertia; "1", "angle" for a phase, or "moment"
+                for a mass times its distance from an axis.
             motion: Motion of a joint that differs from the others; None: that of the machine.
         """
-        labels = dict(_LABELS[motion or self.motion]) | {"angle": "rad"}
+        labels = dict(_LABELS[motion or self.motion]) | {"angle": "rad", "moment": "kg m"}
         if self.position is not None or self.force is not None:
             labels["position"] = self.position or labels["position"]
             labels["force"] = self.force or labels["force"]

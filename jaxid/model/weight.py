@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from jaxid.arrays import Array
+from jaxid.model.effect import STANDARD_GRAVITY
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
 
@@ -17,7 +18,11 @@ class WithGravity(Plant):
         gravity: Acceleration of gravity g [m/s^2].
     """
 
-    gravity: Array = eqx.field(converter=as_array, default=9.81, kw_only=True)
+    gravity: Array = eqx.field(converter=as_array, default=STANDARD_GRAVITY, kw_only=True)
+
+    @property
+    def field(self) -> Array:
+        return self.gravity
 
 
 class WithWeight(WithGravity):

@@ -64,7 +64,9 @@ def _finite(
         others = (plant.port_gravity(q), plant.port_normal(q), *plant.port_spring(q))
         gravity, normal, stiffness, damping = (x[port] for x in others)
         width = plant.port_width(q)[port]
-        x = Signals(y, yd, ydd, force, t, width, jnp.ones(()), gravity, normal, stiffness, damping)
+        x = Signals(
+            y, yd, ydd, force, t, width, jnp.ones(()), gravity, normal, stiffness, damping, plant.field
+        )
 
         def forces(leaves: list[Array]) -> tuple[list[Array], list[Array]]:
             action = jax.tree.unflatten(structure, leaves).act(x, effect.initial_state(force))

@@ -14,6 +14,7 @@ LABELS = {
     "position": ("m", "rad", "V"),
     "time": ("s", "s", "s"),
     "inertia": ("kg", "kg m^2", "V s^2/V"),
+    "moment": ("kg m", "kg m", "kg m"),
     "1": ("1", "1", "1"),
     "1/time": ("1/s", "1/s", "1/s"),
     "position/time": ("m/s", "rad/s", "V/s"),
@@ -54,7 +55,7 @@ def test_every_declared_dimension_has_labels_and_a_natural_size(dimension):
     # ten times the force and a hundred times the mass: sizes follow their dimension
     one = Scales(1.0, 2.0, 3.0, 5.0, 4.0, 10.0, 1e-3, 20.0)
     two = Scales(1.0, 2.0, 3.0, 50.0, 4.0, 100.0, 1e-3, 20.0)
-    factor = 10.0 if dimension.startswith(("force", "inertia")) else 1.0
+    factor = 10.0 if dimension.startswith(("force", "inertia", "moment")) else 1.0
     assert two.natural(dimension) == pytest.approx(factor * one.natural(dimension))
 
 

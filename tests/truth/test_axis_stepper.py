@@ -50,6 +50,16 @@ def test_passes_through_zero_velocity_without_losing_time():
     np.testing.assert_allclose(log["true_velocity"], expected, atol=1e-11)
 
 
+def test_a_mass_off_the_axis_swings_with_its_energy_kept():
+    inertia, moment = 0.5, 1.2
+    machine = Machine(inertia, {"unbalance": {"moment": moment, "phase": -np.pi / 2}})
+    log = free_run(machine, 5.0, initial_position=1.0)
+    kinetic = 0.5 * inertia * log["true_velocity"] ** 2
+    potential = -moment * 9.81 * np.cos(log["true_position"])
+    assert np.ptp(kinetic) > 5.0
+    np.testing.assert_allclose(kinetic + potential, potential[0], atol=2e-8)
+
+
 def test_undamped_oscillator_keeps_its_energy():
     mass, stiffness = 2.0, 2.0e4
     machine = Machine(mass, {"linear_stiffness": {"coefficient": stiffness}})

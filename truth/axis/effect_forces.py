@@ -99,6 +99,11 @@ ROWS: dict[str, Row] = {
         {"amplitude": 20.0, "period": 0.02, "phase": 0.4},
         lambda x: x.u - 20.0 * math.cos(2 * math.pi * x.q / 0.02 + 0.4),
     ),
+    "unbalance": Row(
+        "unbalance",
+        {"moment": 2.5, "phase": 0.4},
+        lambda x: x.u - 2.5 * GRAVITY * math.cos(x.q + 0.4),
+    ),
     # own state: friction over its level, here 0.6
     "hysteresis": Row("hysteresis", {"stiffness": 1e5, "level": 30.0}, lambda x: x.u - 30.0 * x.z, own=0.6),
     "velocity_hysteresis": Row(

@@ -10,6 +10,7 @@ from truth.axis.machines import Setup
 
 VISCOUS = ("viscous_friction", {"coefficient": 203.5})
 COULOMB = ("coulomb_friction", {"level": 20.39})
+SERVO = (("viscous_friction", {"coefficient": 2e-4}), ("coulomb_friction", {"level": 0.01}))
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class SearchCase:
         duration: Of each log [s].
         inertia_known: Whether the case gives the inertia.
         orientation: Of the plant.
+        motion: Of the plant.
         also: Kinds that this log cannot tell from it; then `alternatives` must hold the true one.
         tolerance: Of the parameters, relative; they may also be within three deviations.
         extra: More hidden effects.
@@ -37,6 +39,7 @@ class SearchCase:
     duration: float = 8.0
     inertia_known: bool = False
     orientation: str = "horizontal"
+    motion: str = "linear"
     also: tuple[str, ...] = ()
     tolerance: float = 0.05
     extra: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
@@ -60,6 +63,7 @@ class SearchCase:
             off=off,
             inertia_known=self.inertia_known,
             orientation=self.orientation,
+            motion=self.motion,
         )
         return text + (f'[discover]\ncandidates = ["{self.kind}"]\n' if self.asked else "")
 
@@ -79,6 +83,14 @@ def _rows() -> dict[str, SearchCase]:
         SearchCase("quadratic_stiffness", {"coefficient": 400.0}),
         SearchCase("cubic_stiffness", {"coefficient": 1600.0}),
         SearchCase("cogging", {"amplitude": 5.0, "period": 0.02, "phase": 0.7}),
+        SearchCase(
+            "unbalance",
+            {"moment": 5e-4, "phase": 0.7},
+            declared=SERVO,
+            preset=machines.servo,
+            motion="rotary",
+            asked=True,
+        ),
         SearchCase("hysteresis", {"stiffness": 5000.0, "level": 20.0}, declared=(VISCOUS,)),
         # With friction unknown too, a gain is a mass by another name.
         SearchCase("actuator_gain", {"gain": 0.85}, inertia_known=True, also=("added_mass",)),

@@ -39,6 +39,8 @@ class Physics(NamedTuple):
     cogging: float = 0.0  # N
     cogging_period: float = 1.0  # m
     cogging_phase: float = 0.0  # rad
+    moment: float = 0.0  # kg m, of a mass off the axis of a rotary machine
+    moment_phase: float = 0.0  # rad above the horizontal at q = 0
     coulomb: float = 0.0  # N
     static: float = 0.0  # N, above Coulomb, at rest only
     stribeck: float = 0.0  # N, above Coulomb
@@ -80,6 +82,8 @@ def position_force(p, q, z):
     force = p.constant - q * (p.stiffness1 + q * (p.stiffness2 + q * p.stiffness3))
     if p.cogging != 0.0:
         force -= p.cogging * math.cos(2.0 * math.pi * q / p.cogging_period + p.cogging_phase)
+    if p.moment != 0.0:
+        force -= p.moment * 9.81 * math.cos(q + p.moment_phase)
     return force - p.dahl_stiffness * z
 
 

@@ -36,6 +36,7 @@ EFFECTS = {
     "quadratic_stiffness": {"coefficient": "stiffness2"},
     "cubic_stiffness": {"coefficient": "stiffness3"},
     "cogging": {"amplitude": "cogging", "period": "cogging_period", "phase": "cogging_phase"},
+    "unbalance": {"moment": "moment", "phase": "moment_phase"},
     "velocity_hysteresis": {
         "level": "rising_forth",
         "level_negative": "rising_back",
