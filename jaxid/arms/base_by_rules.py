@@ -1,4 +1,4 @@
-"""Base parameters of an arm by closed rules: parameters without effect, and parameters to regroup."""
+"""Base parameters of an arm or a tree by closed rules: parameters without effect, and parameters to regroup."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from jaxtyping import Float
 
 from jaxid.arms.base_parameters import BaseParameters, standard_places, tidied
 from jaxid.arms.pseudo_inertia import TEN, moved
-from jaxid.plants import SerialArm
+from jaxid.plants import LinkTree
 
 _MASS, _X, _Y, _Z, _XX, _XY, _XZ, _YY, _YZ, _ZZ = range(10)
 _TENSOR = (_XX, _XY, _XZ, _YY, _YZ, _ZZ)
 
 
-def base_parameters_by_rules(plant: SerialArm, tolerance: float = 1e-9) -> BaseParameters:
-    """Find the base parameters of an arm without its regressor, link by link from the tip to the base.
+def base_parameters_by_rules(plant: LinkTree, tolerance: float = 1e-9) -> BaseParameters:
+    """Find the base parameters of an arm without its regressor, link by link from the tips to the base.
 
     Elimination, after (2.14)-(2.16) of the PA-10 report: a parameter goes if it changes neither the kinetic
     energy nor, except for a constant, the potential energy. Regrouping, after (2.17)-(2.18): a body whose
     inertia does not depend on the position of its joint may as well be part of the link before. For a
     revolute joint these are a mass on its axis, its first moment along it, and equal moments about x and y;
     for a prismatic one every part that only resists rotation. Up to the second axis that is not parallel to
-    the first, links turn about one direction only, and more parameters are without effect.
+    the first, links turn about one direction only, and more parameters are without effect. In a tree this
+    holds along the way from the base to each link.
 
     Args:
         plant: The arm; only its geometry, its direction of gravity and the presence of rotors matter.
@@ -36,7 +37,7 @@ def base_parameters_by_rules(plant: SerialArm, tolerance: float = 1e-9) -> BaseP
 
     Raises:
         ValueError: If the arm is without weight: a link that does not move its origin then has no first
-            moment, which these rules do not cover; use `base_parameters`.
+            moment, which these rules do not cover; or if a joint follows another one. Use `base_parameters`.
 
     Source:
         Gautier & Khalil (1990), IEEE Trans. Robotics and Automation 6(3); Khalil & Dombre (2002), chapter 9,
@@ -46,8 +47,10 @@ def base_parameters_by_rules(plant: SerialArm, tolerance: float = 1e-9) -> BaseP
     weight = np.asarray(plant.gravity_vector)
     if not np.linalg.norm(weight) > 0:
         raise ValueError("the closed rules need weight: give gravity_vector, or use base_parameters.")
+    if plant.copies:
+        raise ValueError("the closed rules need free joints: use base_parameters.")
     n, places = plant.joints, standard_places(plant)
-    chain = _Chain.of(plant, tolerance)
+    parents = plant.tree.parents
 
     # Each parameter of each link as a sum of standard ones; a sum without effect or regrouped becomes zero.
     sums = [np.zeros((10, len(places))) for _ in range(n)]
@@ -57,13 +60,14 @@ def base_parameters_by_rules(plant: SerialArm, tolerance: float = 1e-9) -> BaseP
         if name in TEN:
             sums[k][TEN.index(name), column] = 1.0
         else:
-            rotors[k, column] = 1.0
+            rotors[k, column] = 1.0 if plant.gear_ratio is None else float(plant.gear_ratio[k]) ** 2
 
     kept = np.ones((n, 11), dtype=bool)
     kept[:, 10] = plant.rotor_inertia is not None
     for k in reversed(range(n)):
-        before = sums[k - 1] if k else np.zeros((10, len(places)))
-        _regroup(k, chain, sums[k], before, rotors[k], kept[k])
+        before = sums[parents[k]] if parents[k] >= 0 else np.zeros((10, len(places)))
+        chain = _Chain.of(plant, k, tolerance)
+        _regroup(len(chain.axis) - 1, chain, sums[k], before, rotors[k], kept[k])
 
     rows = np.concatenate([np.vstack([s, r]) for s, r in zip(sums, rotors, strict=True)])
     names: list[tuple[str, int | None]] = [(name, k) for k in range(n) for name in (*TEN, "rotor_inertia")]
@@ -74,7 +78,7 @@ def base_parameters_by_rules(plant: SerialArm, tolerance: float = 1e-9) -> BaseP
 
 @dataclass(frozen=True)
 class _Chain:
-    """Geometry of an arm as the rules need it; joints count from 0.
+    """Geometry of the way from the base to a link, as the rules need it; its joints count from 0.
 
     Args:
         revolute: Mask of the revolute joints.
@@ -83,7 +87,7 @@ class _Chain:
         first, second: The first revolute joint, and the first one not parallel to it; n without one.
         weight: Direction of gravity in the base frame.
         on_axis: Mask of the links whose origin stays on the axis of the first revolute joint.
-        into: Matrices from each link's parameters into those of the link before, joint at zero.
+        into: Matrix from the link's parameters into those of the link before, joint at zero.
         direction: `turns` in each frame, (n, 3).
         zero: Tolerance below which a number counts as zero.
     """
@@ -95,15 +99,16 @@ class _Chain:
     second: int
     weight: np.ndarray
     on_axis: np.ndarray
-    into: list[np.ndarray]
+    into: np.ndarray
     direction: np.ndarray
     zero: float
 
     @classmethod
-    def of(cls, plant: SerialArm, zero: float) -> _Chain:
-        """Compute the geometry of an arm with its joints at zero."""
-        n, revolute = plant.joints, plant.geometry.revolute > 0
-        axes, origins = (np.asarray(x) for x in plant.geometry.frames(jnp.zeros(n)))
+    def of(cls, plant: LinkTree, link: int, zero: float) -> _Chain:
+        """Compute the geometry of the way to a link with all joints at zero."""
+        way = plant.way(link)
+        n, revolute = len(way), plant.geometry.revolute[way] > 0
+        axes, origins = (np.asarray(x)[way] for x in plant.geometry.frames(jnp.zeros(plant.joints)))
         whole, at = np.eye(3), np.zeros(3)
         frame_list, point_list = [], []
         for turn, origin in zip(axes, origins, strict=True):
@@ -133,7 +138,7 @@ class _Chain:
             second=int(other[0]) if other else n,
             weight=weight / np.linalg.norm(weight),
             on_axis=on_axis,
-            into=[moved(a, o) for a, o in zip(axes, origins, strict=True)],
+            into=moved(axes[-1], origins[-1]),
             direction=np.zeros((n, 3)) if turns is None else np.einsum("kij,i->kj", frames, turns),
             zero=zero,
         )
@@ -175,14 +180,14 @@ def _regroup(
     """Remove parameters of a link that have no effect, or the same effect in the link before or the rotor.
 
     Args:
-        k: Index of the link.
-        chain: Geometry of the arm.
+        k: Index of the link among those of its way, the last one.
+        chain: Geometry of the way to it.
         link: Parameters of the link as sums of standard ones; changed in place.
         before: Parameters of the link before; changed in place.
         rotor: Rotor inertia of the joint; changed in place.
         kept: Mask of the link's ten parameters and its rotor that remain; changed in place.
     """
-    into = chain.into[k]
+    into = chain.into
 
     def move(*parameters: int) -> None:
         for p in parameters:

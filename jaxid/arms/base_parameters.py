@@ -107,7 +107,7 @@ def standard_places(plant: Plant) -> tuple[tuple[str, int | None], ...]:
     order = [*(n for n in infos if n not in last), *(n for n in last if n in infos)]
     single = [(name, None) for name in order if infos[name].more is None]
     # A list may have more entries than the plant has joints.
-    counts = {name: plant.joints + info.more for name, info in infos.items() if info.more is not None}
+    counts = {name: np.shape(getattr(plant, name))[0] for name in infos if infos[name].more is not None}
     longest = max(counts.values(), default=0)
     listed = ((name, k) for k in range(longest) for name in order if name in counts and k < counts[name])
     return (*single, *listed)

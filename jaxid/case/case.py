@@ -22,6 +22,7 @@ from jaxid.case.tables import (
     controller_table,
     validation_keys,
 )
+from jaxid.case.tree import own_effects
 from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
@@ -273,7 +274,8 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
     """
     top = Spot(UNNAMED if path is None else str(path), folder=folder)
     _check_top(tables, top)
-    plant = read_plant(tables["plant"], top)
+    plant, given = read_plant(tables["plant"], top), tables
+    tables = _with_defaults(tables, plant)
     drives = plant.drives
     root = replace(top, counts=Counts(plant.joints, drives, plant.names))
 
@@ -286,9 +288,9 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
     case = Case(
         path=path,
         base=folder,
-        tables=tables,
+        tables=given,
         plant=plant,
-        effects=read_effects(tables.get("effects", []), plant, root),
+        effects=_all_effects(tables, plant, root),
         actuator=read(Actuator, "actuator"),
         log=_log(tables, root),
         preprocess=read(Preprocess, "preprocess"),
@@ -321,6 +323,20 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
     check_kinds(case.own_effects, root)
     _check_loop(case, root)
     return case
+
+
+def _with_defaults(tables: Mapping[str, Any], plant: PlantEntry) -> Mapping[str, Any]:
+    """Return the tables with those that the plant's file states, such as its servos, if the case has none."""
+    log = tables.get("log", {})
+    followed = "reference" in tables or (isinstance(log, dict) and "reference" in log)
+    defaults = {k: v for k, v in plant.defaults.items() if k != "controller" or followed}
+    return {**defaults, **tables}
+
+
+def _all_effects(tables: Mapping[str, Any], plant: PlantEntry, root: Spot) -> tuple[EffectEntry, ...]:
+    """Return the effects of the case, and behind them those of the plant's file that it does not replace."""
+    declared = read_effects(tables.get("effects", []), plant, root)
+    return (*declared, *own_effects(declared, plant.effects))
 
 
 def _check_top(tables: Mapping[str, Any], top: Spot) -> None:

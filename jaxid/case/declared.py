@@ -25,7 +25,10 @@ class PlantEntry:
         joints: Number of joints.
         actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
         options: Further fields of its class: the geometry and the shafts of an arm.
-        names: Names of the joints, if a URDF file gives them.
+        names: Names of the joints, if a URDF or MJCF file gives them.
+        effects: Effects that such a file states.
+        defaults: Tables of the case that such a file states, by name.
+        notes: Parts of such a file that the plant does not hold, a sentence each.
     """
 
     cls: type[Plant]
@@ -37,6 +40,9 @@ class PlantEntry:
     actuated: tuple[int, ...] | None = None
     options: dict[str, Any] = field(default_factory=dict)
     names: tuple[str, ...] = ()
+    effects: tuple[EffectEntry, ...] = ()
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def drives(self) -> int:

@@ -9,6 +9,7 @@ from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.links import LINKED, check_links, read_links, read_links_of_urdf, read_shafts
 from jaxid.case.places import check_places, read_ports
 from jaxid.case.tables import PLANT
+from jaxid.case.tree import read_tree
 from jaxid.case.user_effect import user_effect
 from jaxid.case.user_faults import check_action, is_user_class
 from jaxid.case.user_file import names_a_file
@@ -69,6 +70,8 @@ def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
     else:
         cls = PLANTS[read_kind(table, PLANTS, spot)]
     keys = {"kind": Key(anything), **PLANT}
+    if cls is PLANTS["tree"]:
+        return read_tree(table, cls, keys, spot)
     if cls.linked:
         return _linked(table, cls, keys, spot)
     if cls.couplings:

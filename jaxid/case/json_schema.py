@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-from jaxid.case.entries import actuated_key, coupling_key, parameter_keys, search_keys
+from jaxid.case.entries import actuated_key, coupling_key, parameter_keys, search_keys, unit_of
 from jaxid.case.links import LINKED, SHAFT, link_keys
 from jaxid.case.tables import PLANT, TOP, controller_keys, validation_keys
-from jaxid.case.values import values_schema
+from jaxid.case.tree import TREE
+from jaxid.case.values import value_schema, values_schema
 from jaxid.controllers import CONTROLLERS
 from jaxid.effects import EFFECTS
 from jaxid.model.effect import Effect
@@ -117,6 +118,8 @@ def _unread(value: Any, spot: Spot) -> Any:
 
 def _plant(cls: type[Plant]) -> list[dict[str, Any]]:
     """Return the schemas of a plant: one for each of its couplings, or one."""
+    if cls is PLANTS["tree"]:
+        return [_robot(cls)]
     if cls.linked:
         return [_arm(cls)]
     if not cls.couplings:
@@ -153,6 +156,21 @@ def _arm(cls: type[Plant]) -> dict[str, Any]:
     schema["properties"]["links"] = list_of(link)
     schema["properties"]["shafts"] = list_of(schema_of(SHAFT, "drive that turns with several joints"))
     schema["oneOf"] = [{"required": ["links"]}, {"required": ["urdf"]}]
+    return schema
+
+
+def _robot(cls: type[Plant]) -> dict[str, Any]:
+    """Return the schema of a tree, which a URDF or MJCF file describes."""
+    taken = {name: key for name, key in PLANT.items() if name not in ("orientation", "gravity")}
+    schema = _kind(cls.kind, {**taken, **TREE}, _doc(cls))
+    schema["properties"]["shafts"] = list_of(schema_of(SHAFT, "drive that turns with several joints"))
+    parameters = {}
+    for name, info in parameters_of(cls).items():
+        value = value_schema(info)
+        by_joint = {"type": "object", "additionalProperties": value}
+        parameters[name] = Key(Reader(_unread, either(list_of(value), by_joint)), info.doc, unit=unit_of(info))
+    schema["properties"]["parameters"] = schema_of(parameters)
+    schema["oneOf"] = [{"required": ["urdf"]}, {"required": ["mjcf"]}]
     return schema
 
 

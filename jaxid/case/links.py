@@ -34,8 +34,8 @@ from jaxid.schema import (
     whole,
 )
 
-# Chosen: more links than any arm has.
-_MOST_LINKS = 50
+# Chosen: more links than any arm has, and most robots.
+MOST_LINKS = 50
 # Entries of a list of the case, by the plant's parameters that they are.
 _LISTS = {"first_moment": TEN[1:4], "inertia": TEN[4:]}
 # Angles, which may be in degrees: a right angle in rad has no end.
@@ -47,7 +47,7 @@ SHAFT: Keys = {
     "ratios": Key(several(number()), "turns of the shaft for one of each joint", note="1 each"),
 }
 # A sine of an angle of a URDF file below this counts as zero: such files state a right angle as 1.5708.
-_ANGLE = 1e-4
+ANGLE = 1e-4
 # Choices of the parameters of a URDF file that are unknown.
 UNKNOWN = ("none", "base", "all")
 # Keys of [plant] that only an arm has.
@@ -75,8 +75,8 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
         raise spot.fault("'links' is missing", hint)
     if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
         raise spot.at("links").fault("is not a list of tables", "write [[plant.links]], in double brackets")
-    if not 1 <= len(links) <= _MOST_LINKS:
-        raise spot.at("links").fault(f"has {len(links)} entries", f"an arm has 1 to {_MOST_LINKS}")
+    if not 1 <= len(links) <= MOST_LINKS:
+        raise spot.at("links").fault(f"has {len(links)} entries", f"an arm has 1 to {MOST_LINKS}")
 
 
 def read_links(
@@ -117,8 +117,8 @@ def read_links_of_urdf(
     if "links" in given:
         raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
     arm = read_urdf(spot.folder / given["urdf"], given.get("tip"))
-    if len(arm.names) > _MOST_LINKS:
-        raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {_MOST_LINKS}")
+    if len(arm.names) > MOST_LINKS:
+        raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {MOST_LINKS}")
     unknown = given.get("unknown", "none")
     values = dict(zip(TEN, arm.bodies.T, strict=True))
     free = {name: np.full(len(arm.names), unknown == "all") for name in TEN}
@@ -129,7 +129,7 @@ def read_links_of_urdf(
         if not np.any(np.asarray(plant.gravity_vector)):
             hint = 'state a gravity_vector other than zero, or unknown = "all"'
             raise spot.at("unknown").refuse("base", "needs weight", hint)
-        base = base_parameters_by_rules(plant, _ANGLE)
+        base = base_parameters_by_rules(plant, ANGLE)
         values = {name: np.zeros(len(arm.names)) for name in TEN}
         for (name, k), value in zip(base.places, base.of(plant), strict=True):
             values[name][k], free[name][k] = value, True

@@ -1,10 +1,10 @@
-"""Arms from URDF files: the chain of joints that such a file describes, and the bodies that they move."""
+"""Arms and trees from URDF files: the joints that such a file describes, and the bodies that they move."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
@@ -12,11 +12,14 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.case.robot import Follows, Robot, RobotJoint, towards
 from jaxid.errors import InputError, suggest
 from jaxid.plants.geometry import JointFrames
 
 # Motion of a joint of each type; None: it is fixed.
 _TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
+# Joints of other types, which a tree holds.
+_HELD = ("floating", "planar")
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -48,6 +51,7 @@ class _Joint:
     place: np.ndarray
     axis: np.ndarray
     mimics: str | None
+    element: Element
 
 
 def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
@@ -89,7 +93,7 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
                 ahead.append((joint.child, body, frame @ joint.place))
                 continue
             turn = np.eye(4)
-            turn[:3, :3] = _towards(joint.axis)
+            turn[:3, :3] = towards(joint.axis)
             names.append(joint.name)
             places.append((joint.motion, frame @ joint.place @ turn))
             bodies.append(np.zeros(10))
@@ -108,6 +112,105 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
         np.array([p[:3, 3] for _, p in places]),
     )
     return Urdf(tuple(names), geometry, np.array(bodies[1:]))
+
+
+def read_urdf_tree(path: str | Path) -> Robot:
+    """Read a tree of joints from a URDF file, with friction, limits and joints that follow others.
+
+    Links behind fixed joints are one body. Joints stand in the order of a walk from the first link, branches
+    in the order of the file. Joints of other types (floating, planar) are held.
+
+    Args:
+        path: The file.
+
+    Raises:
+        InputError: If the file cannot be read, is no URDF, or describes no tree.
+
+    Source:
+        The URDF's XML specification of ROS.
+    """
+    file = str(path)
+    robot = _tree(Path(path))
+    links = {name: link for name, link in _named(robot, "link", file)}
+    elements = dict(_named(robot, "joint", file))
+    notes = []
+    for name, element in elements.items():
+        if element.get("type") in _HELD:
+            notes.append(f"joint '{name}' is {element.get('type')}: it is held at zero")
+            element.set("type", "fixed")
+    joints = [_joint(name, element, links, file) for name, element in elements.items()]
+    root = _root(links, joints, file)
+
+    out: list[RobotJoint] = []
+    bodies: list[np.ndarray] = []
+
+    def visit(link: str, body: int, frame: np.ndarray) -> None:
+        inertial = links[link].find("inertial")
+        if inertial is not None and body >= 0:
+            bodies[body] += _inertial(inertial, frame, f"{file}, link '{link}'")
+        for joint in (j for j in joints if j.parent == link):
+            if joint.motion is None:
+                visit(joint.child, body, frame @ joint.place)
+                continue
+            turn = np.eye(4)
+            turn[:3, :3] = towards(joint.axis)
+            out.append(_tree_joint(joint, body, frame @ joint.place @ turn, file))
+            bodies.append(np.zeros(10))
+            visit(joint.child, len(out) - 1, turn.T)
+
+    visit(root, -1, np.eye(4))
+    leaders = _leaders(joints, file)
+    whole = tuple(
+        replace(joint, body=body, follows=leaders.get(joint.name))
+        for joint, body in zip(out, bodies, strict=True)
+    )
+    return Robot(file, whole, notes=tuple(notes))
+
+
+def _tree_joint(joint: _Joint, parent: int, place: np.ndarray, file: str) -> RobotJoint:
+    """Return a joint with its friction and limits; its body is still empty."""
+    where, known = f"{file}, joint '{joint.name}'", {}
+    assert joint.motion is not None, "fixed joints are merged before"
+    dynamics, limit = joint.element.find("dynamics"), joint.element.find("limit")
+    for key, name in (("damping", "damping"), ("friction", "friction")):
+        if dynamics is not None and dynamics.get(name) is not None:
+            known[key] = float(_numbers(dynamics, name, 1, where)[0])
+    for name, value in known.items():
+        if value < 0:
+            what = f"<dynamics> has a negative {name}: {value:g}"
+            raise InputError(what, where=where, hint="give it without its sign")
+    if "damping" in known:
+        known["damping"] = (known["damping"], 0.0, 0.0)
+    if limit is not None and joint.element.get("type") != "continuous":
+        ends = [0.0 if limit.get(k) is None else _numbers(limit, k, 1, where)[0] for k in ("lower", "upper")]
+        if ends[0] < ends[1]:
+            known["range"] = (float(ends[0]), float(ends[1]))
+    return RobotJoint(joint.name, joint.motion, parent, place, np.zeros(10), **known)
+
+
+def _leaders(joints: list[_Joint], file: str) -> dict[str, Follows]:
+    """Return the free joint that each <mimic> follows, through those that follow others themselves."""
+    moving = {j.name: j for j in joints if j.motion is not None}
+    out = {}
+    for name, joint in moving.items():
+        ratio, offset, at, seen = 1.0, 0.0, joint, [name]
+        while at.mimics is not None:
+            where = f"{file}, joint '{at.name}'"
+            element = at.element.find("mimic")
+            assert element is not None, "it has a <mimic>"
+            more = [
+                default if element.get(k) is None else float(_numbers(element, k, 1, where)[0])
+                for k, default in (("multiplier", 1.0), ("offset", 0.0))
+            ]
+            ratio, offset = ratio * more[0], ratio * more[1] + offset
+            if at.mimics not in moving or at.mimics in seen:
+                what = f"<mimic> names '{at.mimics}', which is no joint that moves freely"
+                raise InputError(what, where=where, hint=suggest(at.mimics, [n for n in moving if n != name]))
+            seen.append(at.mimics)
+            at = moving[at.mimics]
+        if at is not joint:
+            out[name] = Follows(at.name, ratio, offset)
+    return out
 
 
 def _tree(path: Path) -> Element:
@@ -197,6 +300,7 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
         place=_place(joint.find("origin"), where),
         axis=axis / (length or 1.0),
         mimics=None if copied is None else copied.get("joint", ""),
+        element=joint,
     )
 
 
@@ -331,18 +435,3 @@ def _inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndar
     tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
     tensor += mass * (c @ c * np.eye(3) - np.outer(c, c))
     return np.array([mass, *(mass * c), *tensor[np.triu_indices(3)]])
-
-
-def _towards(axis: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """Turn the axes of a link such that z is the joint's; keep them if it is already."""
-    # Half a turn about x first, if z would turn by more than a right angle: the divisor stays above zero.
-    half = np.diag([1.0, -1.0, -1.0]) if axis[2] < 0 else np.eye(3)
-    x, y, z = half @ axis
-    # About the cross product of both, by Rodrigues' formula.
-    return half @ np.array(
-        [
-            [1 - x * x / (1 + z), -x * y / (1 + z), x],
-            [-x * y / (1 + z), 1 - y * y / (1 + z), y],
-            [-x, -y, z],
-        ]
-    )

@@ -10,6 +10,7 @@ from jaxid.plants.denavit_hartenberg import DenavitHartenberg as DenavitHartenbe
 from jaxid.plants.five_bar import FiveBar as FiveBar
 from jaxid.plants.flexible_axis import FlexibleAxis as FlexibleAxis
 from jaxid.plants.geometry import JointFrames as JointFrames
+from jaxid.plants.link_tree import LinkTree as LinkTree
 from jaxid.plants.micropositioning_stage import MicropositioningStage as MicropositioningStage
 from jaxid.plants.micropositioning_stage import RigidMicropositioningStage as RigidMicropositioningStage
 from jaxid.plants.pa10 import pa10 as pa10
@@ -17,5 +18,5 @@ from jaxid.plants.righettini_five_bar import righettini_five_bar as righettini_f
 from jaxid.plants.serial_arm import SerialArm as SerialArm
 
 PLANTS: dict[str, type[Plant]] = {
-    cls.kind: cls for cls in (Axis, Chain, FlexibleAxis, MicropositioningStage, SerialArm, FiveBar)
+    cls.kind: cls for cls in (Axis, Chain, FlexibleAxis, MicropositioningStage, SerialArm, LinkTree, FiveBar)
 }

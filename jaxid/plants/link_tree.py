@@ -1,0 +1,192 @@
+"""A tree of rigid links with revolute and prismatic joints, some of which may follow others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.arrays import Array
+from jaxid.model.effect import Effect
+from jaxid.model.links import WithLinks
+from jaxid.model.parameter import as_array, parameter
+from jaxid.plants.geometry import Geometry
+from jaxid.plants.rigid_tree import Tree, inverse_dynamics, pseudo_inertia
+
+_FIRST = ("inertia*position", "free")
+_SECOND = ("inertia", "free")
+
+
+class LinkTree(WithLinks):
+    """tau = M(q) qdd + h(q, qd), of links by ten inertial parameters each.
+
+    `inertial` is linear in the parameters: mass, first moments and inertia of a link are about the origin of
+    its frame and along its axes. `jaxid.arms.base_parameters` gives the identifiable combinations. Ports are
+    the joints, and behind them the shafts: drives that turn with several joints, such as a belt to the last
+    joint of a wrist that runs over the one before.
+
+    A link whose joint follows another one (a gear, a mimic joint) has no coordinate of its own: it moves by
+    `copies` with that joint, and its forces are projected on it.
+
+    Args:
+        mass: m, a value for each link [kg].
+        first_moment_x, first_moment_y, first_moment_z: Mass times centre of mass, by link [kg m].
+        inertia_xx, inertia_xy, inertia_xz, inertia_yy, inertia_yz, inertia_zz: Inertia tensor about the
+            frame's origin, by link; off its diagonal -sum of m x y and so on [kg m^2].
+        rotor_inertia: Inertia of each drive, (n,) [kg m^2, or kg at a prismatic joint], or None for none. It
+            is that seen at the joint, or with `gear_ratio` that of the motor.
+        geometry: Frame of each link in that on which it hangs.
+        shafts: Ratios by which each shaft turns with the joints, a row of n for each shaft.
+        gravity_vector: Acceleration of gravity in the base's frame, (3,) [m/s^2].
+        parents: Index of the link on which each link hangs, -1 for the base; empty: on the one before.
+        copies: The joint by which each link moves, and how much of it; empty: each link by one of its own.
+        leading: Where there are `copies`, the link that each free joint moves itself.
+        gear_ratio: Turns of each motor for one of its joint, (n,): rotors count times its square. None: 1.
+        actuated: Driven joints, 0-based, in the order of their drives; None: all.
+        moments: Pseudo-inertias of the links, (links, 4, 4), as `prepared` computes them from the parameters.
+
+    Source:
+        `jaxid.plants.rigid_tree`; Khalil & Kleinfinger (1987) for parameters about the origins of modified
+        Denavit-Hartenberg frames, in which the forces are linear.
+    """
+
+    kind = "tree"
+    linked = True
+    coupled = True
+    usual_motion = "rotary"
+    # Parameters of a link to leave out first if columns depend on each other.
+    regrouped: ClassVar[tuple[str, ...]] = ("first_moment_z", "mass", "inertia_yy")
+
+    mass: Array = parameter("inertia", "nonnegative", "masses, one a link", more=0, motion="linear")
+    first_moment_x: Array = parameter(*_FIRST, "m x of the centre of mass", more=0, motion="linear")
+    first_moment_y: Array = parameter(*_FIRST, "m y of the centre of mass", more=0, motion="linear")
+    first_moment_z: Array = parameter(*_FIRST, "m z of the centre of mass", more=0, motion="linear")
+    inertia_xx: Array = parameter(*_SECOND, "about the frame's origin", more=0, motion="rotary")
+    inertia_xy: Array = parameter(*_SECOND, "-sum m x y", more=0, motion="rotary")
+    inertia_xz: Array = parameter(*_SECOND, "-sum m x z", more=0, motion="rotary")
+    inertia_yy: Array = parameter(*_SECOND, "about the frame's origin", more=0, motion="rotary")
+    inertia_yz: Array = parameter(*_SECOND, "-sum m y z", more=0, motion="rotary")
+    inertia_zz: Array = parameter(*_SECOND, "about the frame's origin", more=0, motion="rotary")
+    rotor_inertia: Array | None = parameter(
+        "inertia", "nonnegative", "of each drive, seen at the joint", optional=True, more=0
+    )
+    geometry: Geometry = eqx.field(kw_only=True)
+    shafts: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
+    gravity_vector: Array = eqx.field(converter=as_array, default=(0.0, 0.0, -9.81), kw_only=True)
+    parents: tuple[int, ...] = eqx.field(static=True, default=(), kw_only=True)
+    copies: tuple[tuple[int, float], ...] = eqx.field(static=True, default=(), kw_only=True)
+    leading: tuple[int, ...] = eqx.field(static=True, default=(), kw_only=True)
+    gear_ratio: Array | None = eqx.field(
+        converter=lambda x: None if x is None else as_array(x), default=None, kw_only=True
+    )
+    actuated: tuple[int, ...] | None = eqx.field(static=True, default=None, kw_only=True)
+    moments: Array | None = eqx.field(default=None, kw_only=True)
+
+    @property
+    def joints(self) -> int:
+        """Joints that move freely: as many as links, less those that follow another one."""
+        return len(self.leading) if self.copies else len(self.geometry.joints)
+
+    @property
+    def tree(self) -> Tree:
+        """The order of the links."""
+        kinds = self.geometry.joints
+        if not self.parents:
+            return Tree.chain(kinds)
+        return Tree(self.parents, tuple(kind == "revolute" for kind in kinds))
+
+    def first_link(self, joint: int) -> int:
+        """Return the link that a joint moves, both from 0; further ones may follow."""
+        return self.leading[joint] if self.copies else joint
+
+    def way(self, link: int) -> list[int]:
+        """Return the links from the base to one of them, that one included."""
+        parents, out = self.tree.parents, [link]
+        while parents[out[-1]] >= 0:
+            out.append(parents[out[-1]])
+        return out[::-1]
+
+    def ports(self, q: Array) -> Array:
+        return jnp.concatenate([q, np.array(self.shafts) @ q]) if self.shafts else q
+
+    @property
+    def ports_are_joints(self) -> bool:
+        return not self.shafts
+
+    def place(self, port: int) -> tuple[str, int]:
+        return ("joint", port + 1) if port < self.joints else ("shaft", port - self.joints + 1)
+
+    def motion(self, port: int) -> str:
+        first = self.joints_loaded_by(port, self.joints)[0]
+        return "rotary" if self.geometry.joints[self.first_link(first)] == "revolute" else "linear"
+
+    def joints_loaded_by(self, port: int, joints: int) -> tuple[int, ...]:
+        return (port,) if port < joints else tuple(np.flatnonzero(self.shafts[port - joints]).tolist())
+
+    def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int] | None:
+        return ("rotor_inertia", port) if effect.kind == "added_mass" and port < self.joints else None
+
+    @property
+    def base_gravity(self) -> Array:
+        return jnp.asarray(self.gravity_vector)
+
+    @classmethod
+    def links(cls, joints: int) -> int:
+        return joints
+
+    def frame(self, link: int, q: Array) -> tuple[Array, Array]:
+        axes, origins = self.geometry.frames(self._of_links(q))
+        first, *rest = self.way(self.first_link(link))
+        whole, origin = axes[first], origins[first]
+        for k in rest:
+            origin = origin + _times(whole, origins[k])
+            whole = jnp.sum(whole[:, :, None] * axes[k][None, :, :], axis=1)
+        return whole, origin
+
+    def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Return the forces of the links, whose derivatives are analytical, and of the rotors."""
+        moments = self._moments() if self.moments is None else self.moments
+        motion = (self._of_links(x) for x in (q, qd, qdd))
+        tau = inverse_dynamics(self.tree, self.geometry, -self.gravity_vector, moments, *motion)
+        if self.copies:
+            tau = jnp.sum(self._ratios().T * tau[None, :], axis=1)
+        if self.rotor_inertia is None:
+            return tau
+        if self.gear_ratio is None:
+            return tau + self.rotor_inertia * qdd
+        return tau + self.rotor_inertia * self.gear_ratio**2 * qdd
+
+    def prepared(self) -> Self:
+        return replace(self, geometry=self.geometry.at_zero(), moments=self._moments())
+
+    def _ratios(self) -> Float[np.ndarray, "links n"]:
+        """Return how much each link's joint moves with each free joint."""
+        out = np.zeros((len(self.copies), self.joints))
+        for link, (joint, ratio) in enumerate(self.copies):
+            out[link, joint] = ratio
+        return out
+
+    def _of_links(self, x: Float[Array, " n"]) -> Float[Array, " links"]:
+        """Return the motion of each link's joint, from that of the free ones."""
+        return jnp.sum(self._ratios() * x[None, :], axis=1) if self.copies else x
+
+    def _moments(self) -> Float[Array, "links 4 4"]:
+        return pseudo_inertia(self.mass, self._first_moments(), self._tensors())
+
+    def _first_moments(self) -> Float[Array, "links 3"]:
+        return jnp.stack([self.first_moment_x, self.first_moment_y, self.first_moment_z], axis=-1)
+
+    def _tensors(self) -> Float[Array, "links 3 3"]:
+        xx, xy, xz = self.inertia_xx, self.inertia_xy, self.inertia_xz
+        yy, yz, zz = self.inertia_yy, self.inertia_yz, self.inertia_zz
+        rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _times(matrix: Float[Array, "3 3"], x: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Multiply a matrix and a vector without a call to a matrix library, since it is used in loops."""
+    return jnp.sum(matrix * x, axis=1)
