@@ -70,10 +70,13 @@ def test_dynamics_are_those_that_pinocchio_reads(name):
 def possible(path: Path, folder: Path) -> Path:
     """Write the file with a ball in place of each inertia that no body has, which MuJoCo refuses."""
     tree = ElementTree.parse(path)
-    for tensor in tree.getroot().iter("inertia"):
+    for inertial in tree.getroot().iter("inertial"):
+        mass, tensor = inertial.find("mass"), inertial.find("inertia")
+        if float(mass.get("value")) == 0:
+            continue
         xx, xy, xz, yy, yz, zz = (float(tensor.get(f"i{k}")) for k in ("xx", "xy", "xz", "yy", "yz", "zz"))
         moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        if moments[0] <= 1e-9 or moments[0] + moments[1] < moments[2]:
+        if moments[0] <= 1e-12 or moments[0] + moments[1] < moments[2]:
             ball = max(abs(xx + yy + zz) / 3, 1e-6)
             for k in ("xx", "yy", "zz"):
                 tensor.set(f"i{k}", repr(ball))
