@@ -134,7 +134,7 @@ def open_session(
 
     fit = _followed(case, fit, machine.plant)
     short = case.fits_within_prior(method)
-    findings = _check(case, fit, machine, short)
+    findings = [*_left_out(case), *_check(case, fit, machine, short)]
     recipe = choose_recipe(fit, case.preprocess)
     if align_hold is not None:
         recipe = replace(recipe, align_hold=align_hold)
@@ -316,6 +316,12 @@ def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]
         findings += [slip] if slip is not None else []
     raise_on_error(findings)
     return findings
+
+
+def _left_out(case: Case) -> list[Finding]:
+    """Return the parts of a robot's file that the machine does not hold."""
+    hint = "state an effect if the log shows it"
+    return [Finding("warning", note, f"{case.where}, [plant]", hint) for note in case.plant.notes]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Base parameters of an arm or a tree by closed rules: parameters without effect, and parameters to regroup."""
+"""Base parameters of an arm or a tree by closed rules: parameters without effect, or to regroup."""
 
 from __future__ import annotations
 

@@ -26,6 +26,7 @@ class PlantEntry:
         actuated: Joints that are driven, 0-based, in the order of their drives; None: all.
         options: Further fields of its class: the geometry and the shafts of an arm.
         names: Names of the joints, if a URDF or MJCF file gives them.
+        links: Names of the joints that move each link, if a tree's file gives them.
         effects: Effects that such a file states.
         defaults: Tables of the case that such a file states, by name.
         notes: Parts of such a file that the plant does not hold, a sentence each.
@@ -40,6 +41,7 @@ class PlantEntry:
     actuated: tuple[int, ...] | None = None
     options: dict[str, Any] = field(default_factory=dict)
     names: tuple[str, ...] = ()
+    links: tuple[str, ...] = ()
     effects: tuple[EffectEntry, ...] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

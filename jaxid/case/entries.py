@@ -23,7 +23,7 @@ from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.names import MOTIONS
-from jaxid.plants import PLANTS
+from jaxid.plants import PLANTS, LinkTree
 from jaxid.schema import (
     Key,
     Reader,
@@ -70,8 +70,8 @@ def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
     else:
         cls = PLANTS[read_kind(table, PLANTS, spot)]
     keys = {"kind": Key(anything), **PLANT}
-    if cls is PLANTS["tree"]:
-        return read_tree(table, cls, keys, spot)
+    if cls is LinkTree:
+        return read_tree(table, keys, spot)
     if cls.linked:
         return _linked(table, cls, keys, spot)
     if cls.couplings:

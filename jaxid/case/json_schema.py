@@ -15,7 +15,7 @@ from jaxid.model.effect import Effect
 from jaxid.model.interface import PLACES
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
-from jaxid.plants import PLANTS
+from jaxid.plants import PLANTS, LinkTree
 from jaxid.references import REFERENCES
 from jaxid.schema import Key, Keys, Reader, Spot, either, flag, keys_of, list_of, schema_of, text
 from jaxid.settings import (
@@ -118,7 +118,7 @@ def _unread(value: Any, spot: Spot) -> Any:
 
 def _plant(cls: type[Plant]) -> list[dict[str, Any]]:
     """Return the schemas of a plant: one for each of its couplings, or one."""
-    if cls is PLANTS["tree"]:
+    if cls is LinkTree:
         return [_robot(cls)]
     if cls.linked:
         return [_arm(cls)]
@@ -168,7 +168,9 @@ def _robot(cls: type[Plant]) -> dict[str, Any]:
     for name, info in parameters_of(cls).items():
         value = value_schema(info)
         by_joint = {"type": "object", "additionalProperties": value}
-        parameters[name] = Key(Reader(_unread, either(list_of(value), by_joint)), info.doc, unit=unit_of(info))
+        parameters[name] = Key(
+            Reader(_unread, either(list_of(value), by_joint)), info.doc, unit=unit_of(info)
+        )
     schema["properties"]["parameters"] = schema_of(parameters)
     schema["oneOf"] = [{"required": ["urdf"]}, {"required": ["mjcf"]}]
     return schema

@@ -267,7 +267,6 @@ def _drives(mujoco: Any, model: Any, names: list[str], notes: list[str]) -> Iter
 def _drive(mujoco: Any, model: Any, k: int, names: list[str]) -> tuple[RobotDrive | None, list[str]]:
     """Return one actuator, None if a tree cannot have it; and sentences on what it lacks."""
     title = f"actuator '{model.actuator(k).name or k + 1}'"
-    gains, biases, kinds = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
     gear, *others = (float(g) for g in model.actuator_gear[k])
     if not _is(model.actuator_trntype[k], mujoco.mjtTrn.mjTRN_JOINT) or any(others):
         return None, [f"{title} does not act on one joint, and is not kept"]
@@ -275,37 +274,14 @@ def _drive(mujoco: Any, model: Any, k: int, names: list[str]) -> tuple[RobotDriv
     if not _is(model.jnt_type[j], mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
         return None, [f"{title} drives no hinge or slide, and is not kept"]
 
-    gainprm, biasprm, dynprm = (np.asarray(x[k]) for x in (
-        model.actuator_gainprm, model.actuator_biasprm, model.actuator_dynprm
-    ))
-    gaintype, biastype, dyntype = (
-        x[k] for x in (model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype)
-    )
-    lost, gain, kp, kd, drag, lag = list[str](), gear, None, None, 0.0, 0.0
-    if _is(gaintype, gains.mjGAIN_DCMOTOR):
-        resistance, constant = float(gainprm[0]), float(gainprm[1])
-        more = np.any(gainprm[2:]) or np.any(dynprm) or np.any(biasprm)
-        if more or int(model.actuator_ctrlspec[k]) != int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE):
-            lost.append(f"{title} has more than a resistance and a constant, for a voltage: not kept")
-        gain = gear * constant / resistance
-        drag = gear**2 * constant**2 / resistance
-    elif _is(gaintype, gains.mjGAIN_FIXED) and _is(biastype, biases.mjBIAS_NONE, biases.mjBIAS_AFFINE):
-        own = float(gainprm[0])
-        offset, slope, rate = (float(b) for b in biasprm[:3]) if _is(biastype, biases.mjBIAS_AFFINE) else (0.0,) * 3
-        if offset:
-            lost.append(f"{title} has a constant force of {offset:g}: it is not kept")
-        if slope == 0.0:
-            # A velocity servo is a gain on the wanted velocity, and drag.
-            gain, drag = gear * own, -(gear**2) * rate
-        elif own == -slope and gear == 1.0:
-            kp, kd, gain = own, -rate, 1.0
-        else:
-            return None, [f"{title} is a servo with a gear, or of unequal gains, and is not kept"]
-    else:
-        return None, [f"{title} is none of motor, position, velocity or dcmotor, and is not kept"]
-
+    lost: list[str] = []
+    law = _law(mujoco, model, k, gear, title, lost)
+    if law is None:
+        return None, lost
+    gain, kp, kd, drag = law
+    kinds, dyntype, lag = mujoco.mjtDyn, model.actuator_dyntype[k], 0.0
     if _is(dyntype, kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT):
-        lag = float(dynprm[0])
+        lag = float(model.actuator_dynprm[k, 0])
         if kp is not None and lag > 0:
             lost.append(f"{title} filters its reference by {lag:g} s: it is not kept")
             lag = 0.0
@@ -331,6 +307,40 @@ def _drive(mujoco: Any, model: Any, k: int, names: list[str]) -> tuple[RobotDriv
         lag,
         float(model.actuator_delay[k]),
     ), lost
+
+
+def _law(
+    mujoco: Any, model: Any, k: int, gear: float, title: str, lost: list[str]
+) -> tuple[float, float | None, float | None, float] | None:
+    """Return gain, kp, kd and drag of an actuator; None if it is none that a tree can have."""
+    gains, biases = mujoco.mjtGain, mujoco.mjtBias
+    gainprm, biasprm = np.asarray(model.actuator_gainprm[k]), np.asarray(model.actuator_biasprm[k])
+    if _is(model.actuator_gaintype[k], gains.mjGAIN_DCMOTOR):
+        resistance, constant = float(gainprm[0]), float(gainprm[1])
+        voltage = int(model.actuator_ctrlspec[k]) == int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE)
+        if np.any(gainprm[2:]) or np.any(model.actuator_dynprm[k]) or np.any(biasprm) or not voltage:
+            lost.append(f"{title} is more than a winding without inductance, driven by a voltage: not kept")
+            return None
+        return gear * constant / resistance, None, None, gear**2 * constant**2 / resistance
+    biastype = model.actuator_biastype[k]
+    if not _is(model.actuator_gaintype[k], gains.mjGAIN_FIXED) or not _is(
+        biastype, biases.mjBIAS_NONE, biases.mjBIAS_AFFINE
+    ):
+        lost.append(f"{title} is none of motor, position, velocity and dcmotor, and is not kept")
+        return None
+    own = float(gainprm[0])
+    offset, slope, rate = (float(b) for b in biasprm[:3])
+    if _is(biastype, biases.mjBIAS_NONE):
+        offset, slope, rate = 0.0, 0.0, 0.0
+    if offset:
+        lost.append(f"{title} has a constant force of {offset:g}: it is not kept")
+    if slope == 0.0:
+        # A velocity servo is a gain on the wanted velocity, and drag.
+        return gear * own, None, None, -(gear**2) * rate
+    if own == -slope and gear == 1.0:
+        return 1.0, own, -rate, 0.0
+    lost.append(f"{title} is a servo with a gear, or of unequal gains, and is not kept")
+    return None
 
 
 def _absent(mujoco: Any, model: Any) -> list[str]:

@@ -13,7 +13,6 @@ from jaxid.errors import InputError, suggest
 from jaxid.plants.geometry import JointFrames
 
 
-
 @dataclass(frozen=True)
 class Follows:
     """A joint's motion as that of another one: ratio times its coordinate, plus offset."""
@@ -119,7 +118,7 @@ class Robot:
 
     @property
     def geometry(self) -> JointFrames:
-        """Frames of the joints, each in that of its parent; offsets of joints that follow are part of them."""
+        """Frames of the joints, each in that of its parent, with offsets of joints that follow."""
         places = [
             joint.place @ moved_by(joint.motion, joint.follows.offset) if joint.follows else joint.place
             for joint in self.joints

@@ -141,7 +141,7 @@ class Tree:
         return bool(self.robot.drives) and self.given.get("actuators", True)
 
 
-def read_tree(table: dict[str, Any], cls: type[LinkTree], keys: Keys, spot: Spot) -> PlantEntry:
+def read_tree(table: dict[str, Any], keys: Keys, spot: Spot) -> PlantEntry:
     """Read [plant] of a tree.
 
     Raises:
@@ -176,15 +176,16 @@ def read_tree(table: dict[str, Any], cls: type[LinkTree], keys: Keys, spot: Spot
         options["shafts"] = read_shafts(table["shafts"], free.geometry, spot)
     servo, notes = _servo(tree)
     return PlantEntry(
-        cls=cls,
-        parameters=_parameters(tree, cls, options),
-        units=Units(given.get("motion", cls.usual_motion), **given.get("units", {})),
+        cls=LinkTree,
+        parameters=_parameters(tree, options),
+        units=Units(given.get("motion", LinkTree.usual_motion), **given.get("units", {})),
         vertical=False,
         gravity=None,
         joints=len(robot.free),
         actuated=_actuated(tree),
         options=options,
         names=tree.names,
+        links=robot.names,
         effects=_effects(tree),
         defaults=_limits(tree) | _gains(tree) | servo,
         notes=(*robot.notes, *notes),
@@ -243,9 +244,9 @@ def _driven(tree: Tree) -> list[str]:
     return [*tree.names] if actuated is None else [tree.names[k] for k in actuated]
 
 
-def _parameters(tree: Tree, cls: type[LinkTree], options: dict[str, Any]) -> dict[str, tuple[Value, ...]]:
+def _parameters(tree: Tree, options: dict[str, Any]) -> dict[str, tuple[Value, ...]]:
     """Return the ten parameters of each link, and the rotors; those that the case states come last."""
-    robot, infos = tree.robot, parameters_of(cls)
+    robot, infos = tree.robot, parameters_of(LinkTree)
     links = dict(zip(TEN, robot.bodies.T, strict=True))
     free = {name: np.full(len(robot.joints), tree.unknown("all")) for name in TEN}
     stated = tree.given.get("parameters", {})
@@ -260,7 +261,7 @@ def _parameters(tree: Tree, cls: type[LinkTree], options: dict[str, Any]) -> dic
     rotors = rotors / np.asarray(options.get("gear_ratio", 1.0)) ** 2
     turns = np.any(rotors) or tree.unknown("armature") or "rotor_inertia" in stated
     if tree.unknown("base"):
-        plant = cls(**links, rotor_inertia=rotors if turns else None, **_fixed(options))
+        plant = LinkTree(**links, rotor_inertia=rotors if turns else None, **_fixed(options))
         places, values = _base(plant, tree.at.at("unknown"))
         links = {name: np.zeros(len(robot.joints)) for name in TEN}
         for (name, k), value in zip(places, values, strict=True):

@@ -9,6 +9,7 @@ from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.plants.link_tree import LinkTree
 
 # Standard deviations by which an inertia must be below the least one that is possible.
 _SIGMAS = 5.0
@@ -36,14 +37,14 @@ def weight_findings(machine: Machine, log: Log, fit: BalanceFit) -> list[Finding
         fit: Balance of the prepared log.
     """
     plant = machine.plant
-    if not plant.linked or not fit.counts.any():
+    if not isinstance(plant, LinkTree) or not fit.counts.any():
         return []
     unknown = set(machine.parameters.names)
     names = [f.name for f in fit.unknowns]
     values, residual = fit.fit(bounded=False)
     std = fit.precision(values, residual).std
     findings = []
-    for link in range(plant.joints):
+    for link in range(plant.mass.size):
         turning = f"inertia_zz[{link + 1}]"
         if turning not in names or any(f"{name}[{link + 1}]" in unknown for name in _FIXED):
             continue

@@ -24,6 +24,7 @@ from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.model.effect import Effect
 from jaxid.model.unknowns import REFERENCE, several_places
+from jaxid.plants.link_tree import LinkTree
 
 if TYPE_CHECKING:
     from jaxid.results.result import FitResult
@@ -164,6 +165,7 @@ def case_text(result: FitResult, folder: Path) -> str:
     tables = tomllib.loads(text)
     rename = _renamer(case.folder, folder)
     added = [rename(_table(effect, place, v, case, tables)) for effect, place, v in findings.added]
+    added += _of_file(case, findings, len(tables.get("effects", [])))
 
     wanted = rename(copy.deepcopy(tables))
     _put_guesses(wanted, case, findings)
@@ -227,16 +229,34 @@ def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
     for name, guesses in findings.plant.items():
         _put_plant(tables["plant"], case, name, guesses)
     for number, by_name in findings.effects.items():
-        for name, guesses in by_name.items():
+        # Effects of a robot's file stand in no table of the case.
+        for name, guesses in by_name.items() if number < len(tables.get("effects", ())) else ():
             places = len(case.effects[number].ports)
             _put(tables["effects"][number], name, guesses, places, case.effects[number].parameters[name])
     for key, guess in findings.reference.items():
         tables["reference"][key]["guess"] = guess
 
 
+def _of_file(case: Case, findings: Findings, declared: int) -> list[dict[str, Any]]:
+    """Return tables [[effects]] that take the place of a robot file's effects, with new guesses."""
+    out = []
+    for number, by_name in findings.effects.items():
+        if number < declared:
+            continue
+        entry = case.effects[number]
+        for name, guesses in by_name.items():
+            for at, guess in guesses.items():
+                place = {"joint": entry.ports[at] + 1} if case.plant.joints > 1 else {}
+                out.append({"kind": entry.cls.kind, **place, name: {"guess": guess}})
+    return out
+
+
 def _put_plant(table: Any, case: Case, name: str, guesses: Mapping[Index, float]) -> None:
-    """Put new guesses of one parameter into [plant]; those of a URDF file have no place there."""
+    """Put new guesses of one parameter into [plant]; those of an arm's URDF file have no place there."""
     values: Any = case.plant.parameters[name]
+    if table["kind"] == LinkTree.kind:
+        _put_tree(table, case, name, guesses)
+        return
     if "links" in table:
         for index, guess in guesses.items():
             key, entry = _LINKS.get(name, (name, None))
@@ -264,6 +284,21 @@ def _put_plant(table: Any, case: Case, name: str, guesses: Mapping[Index, float]
                 len(values),
                 values,
             )
+
+
+def _put_tree(table: Any, case: Case, name: str, guesses: Mapping[Index, float]) -> None:
+    """Put new guesses of links or rotors of a tree into [plant.parameters], by joint."""
+    names = case.plant.links if name in TEN else case.plant.names
+    parameters = table.setdefault("parameters", {})
+    given: Any = parameters.setdefault(name, {})
+    for index, guess in guesses.items():
+        assert isinstance(index, int), "each has a value a link or joint"
+        if not isinstance(given, list) and names[index] not in given:
+            given[names[index]] = {"guess": guess}
+            continue
+        stated = given[index] if isinstance(given, list) else given[names[index]]
+        if isinstance(stated, Mapping):
+            stated["guess"] = guess  # pyright: ignore[reportIndexIssue]  # a dict
 
 
 def _put(table: Any, key: Any, guesses: Mapping[int, float], places: int, values: Sequence[Any]) -> None:

@@ -34,7 +34,7 @@ def need_bodies(session: Session) -> Session:
     if not machine.plant.linked:
         return session
     unknown, bodies = machine.parameters.free, []
-    for link in range(machine.plant.joints):
+    for link in range(len(bodies_of(machine.plant))):
         indices = {f.path[0]: k for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
         if indices:
             bodies.append(_body(link, indices, unknown, f"{where}, link {link + 1}"))

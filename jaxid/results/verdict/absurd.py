@@ -11,6 +11,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, Free
+from jaxid.plants.link_tree import LinkTree
 from jaxid.results.report.numbers import plain, pretty_unit, with_std
 from jaxid.session import Session
 
@@ -207,11 +208,11 @@ def _undetermined(f: Free, value: float, std: float) -> Remark | None:
 def _unreal_links(estimate: Estimate) -> list[Remark]:
     """Question a link whose inertia about its axis is below that of its mass at its centre of mass."""
     machine, plant = estimate.machine, estimate.machine.plant
-    if not plant.linked:
+    if not isinstance(plant, LinkTree):
         return []
     names = {f.name: k for k, f in enumerate(machine.parameters.free)}
     out = []
-    for link in range(plant.joints):
+    for link in range(plant.mass.size):
         place = f"[{link + 1}]"
         own = [n for n in names if n.endswith(place) and n.split("[")[0] in _AXIAL]
         turning = next((n for n in own if n.startswith("inertia_zz")), None)
