@@ -247,7 +247,7 @@ def _driven(tree: Tree) -> list[str]:
 def _parameters(tree: Tree, options: dict[str, Any]) -> dict[str, tuple[Value, ...]]:
     """Return the ten parameters of each link, and the rotors; those that the case states come last."""
     robot, infos = tree.robot, parameters_of(LinkTree)
-    links = dict(zip(TEN, robot.bodies.T, strict=True))
+    links = dict(zip(TEN, robot.bodies.T.copy(), strict=True))
     free = {name: np.full(len(robot.joints), tree.unknown("all")) for name in TEN}
     stated = tree.given.get("parameters", {})
     spot = tree.at.under("[plant.parameters]")
@@ -260,21 +260,23 @@ def _parameters(tree: Tree, options: dict[str, Any]) -> dict[str, tuple[Value, .
     rotors = np.array([joint.armature for joint in projected(robot).values()])
     rotors = rotors / np.asarray(options.get("gear_ratio", 1.0)) ** 2
     turns = np.any(rotors) or tree.unknown("armature") or "rotor_inertia" in stated
+    free["rotor_inertia"] = np.full(len(rotors), tree.unknown("armature"))
     if tree.unknown("base"):
-        plant = LinkTree(**links, rotor_inertia=rotors if turns else None, **_fixed(options))
-        places, values = _base(plant, tree.at.at("unknown"))
-        links = {name: np.zeros(len(robot.joints)) for name in TEN}
+        # Known rotors stand for themselves; unknown ones are part of the sums.
+        unknown = {"rotor_inertia": rotors} if tree.unknown("armature") else {}
+        places, values = _base(LinkTree(**links, **unknown, **_fixed(options)), tree.at.at("unknown"))
+        for name, one in (links | unknown).items():
+            one[:], free[name][:] = 0.0, False
         for (name, k), value in zip(places, values, strict=True):
-            if name in TEN:
-                links[name][k], free[name][k] = value, True
-            else:
-                rotors[k] = value
+            (links | unknown)[name][k], free[name][k] = value, True
     out = {
         name: tuple(Value(float(v), bool(f)) for v, f in zip(links[name], free[name], strict=True))
         for name in TEN
     }
     if turns:
-        out["rotor_inertia"] = tuple(Value(float(v), tree.unknown("armature")) for v in rotors)
+        out["rotor_inertia"] = tuple(
+            Value(float(v), bool(f)) for v, f in zip(rotors, free["rotor_inertia"], strict=True)
+        )
     for name, value in stated.items():
         of_links = name in TEN
         places = robot.names if of_links else tree.names
