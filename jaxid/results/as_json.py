@@ -240,17 +240,23 @@ def notes(session: Session, estimate: Estimate) -> list[str]:
     return [*warnings, *estimate.notes]
 
 
-def effect_json(effect: NamedEffect, estimate: Estimate) -> dict[str, Any]:
-    """Return one entry of `effects` in discovery.json."""
+def effect_json(effect: NamedEffect, estimate: Estimate, names: Sequence[str] = ()) -> dict[str, Any]:
+    """Return one entry of `effects` in discovery.json; names are those of the joints, if a file has them."""
     parameters = parameters_json(estimate, effect.names)
     fields = {f.name: str(f.path[-1]) for f in estimate.machine.parameters.free}
     return {
         "kind": effect.kind,
         effect.place[0]: effect.place[1],
+        **joint_name(effect.place, names),
         "parameters": {fields[name]: entry for name, entry in parameters.items()},
         "evidence": effect.score.evidence,
         "alternatives": [_alternative(s, estimate.machine.plant) for s in effect.alternatives],
     }
+
+
+def joint_name(place: tuple[str, int], names: Sequence[str]) -> dict[str, str]:
+    """Return the name of the joint on which an effect acts; nothing without names, or in another place."""
+    return {"joint_name": names[place[1] - 1]} if names and place[0] == "joint" else {}
 
 
 def _alternative(score: Score, plant: Plant) -> dict[str, Any]:
@@ -270,6 +276,7 @@ def where_json(result: Discovery) -> dict[str, Any] | None:
         return None
     return {
         "joint": w.joint,
+        **joint_name(("joint", w.joint), result.session.case.plant.names),
         "variable": w.variable,
         "region": list(w.region),
         "intervals": [list(i) for i in w.intervals],
@@ -291,7 +298,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         "converged": result.converged,
         **judgement_json(result),
         "where": where_json(result),
-        "effects": [effect_json(e, result.after) for e in result.effects],
+        "effects": [effect_json(e, result.after, result.session.case.plant.names) for e in result.effects],
         "experiments": [proposal_json(p, machine) for p in result.proposals],
         "steps": [
             step_json(r, result.session.machine.plant)

@@ -175,7 +175,9 @@ def discovery_table(result: Discovery) -> str:
     for effect in result.effects:
         others = ", ".join(s.candidate.label for s in effect.alternatives)
         alternatives = f"; not distinguishable from {others} in this log" if others else ""
-        lines.append(f"effect:  {effect.label} (evidence {effect.score.evidence:.0f} nats{alternatives})")
+        named = results.joint_name(effect.place, result.session.case.plant.names)
+        at = f" at joint '{named['joint_name']}'" if named else ""
+        lines.append(f"effect:  {effect.label}{at} (evidence {effect.score.evidence:.0f} nats{alternatives})")
     lines += [_EVIDENCE_WORDS] if result.effects else []
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
 

@@ -246,7 +246,8 @@ def _of_file(case: Case, findings: Findings, declared: int) -> list[dict[str, An
         entry = case.effects[number]
         for name, guesses in by_name.items():
             for at, guess in guesses.items():
-                place = {"joint": entry.ports[at] + 1} if case.plant.joints > 1 else {}
+                port = entry.ports[at]
+                place = {"joint": case.plant.names[port]} if case.plant.joints > 1 else {}
                 out.append({"kind": entry.cls.kind, **place, name: {"guess": guess}})
     return out
 
@@ -328,7 +329,9 @@ def _table(
     effect: Effect, place: tuple[str, int] | None, values: Mapping[str, Value], case: Case, tables: Mapping
 ) -> dict[str, Any]:
     """Return the table [[effects]] of an effect that was added."""
-    known = {} if place is None else {place[0]: place[1]}
+    known: dict[str, Any] = {} if place is None else {place[0]: place[1]}
+    if "joint" in known and case.plant.names:
+        known["joint"] = case.plant.names[known["joint"] - 1]
     return {"kind": _kind(type(effect), case, tables), **known} | {
         name: {"guess": value.guess} for name, value in values.items()
     }

@@ -111,10 +111,11 @@ def unbroken(text: str) -> str:
 
 
 def place_words(entry: Mapping) -> str:
-    """Return the place of an effect, such as "joint 2" or "spring 3", or nothing."""
+    """Return the place of an effect, such as "joint 2, elbow" or "spring 3", or nothing."""
     for key in PLACES:
         if entry.get(key) is not None:
-            return f"{key} {entry[key]}"
+            name = f", {entry['joint_name']}" if entry.get("joint_name") else ""
+            return f"{key} {entry[key]}{name}"
     return ""
 
 
