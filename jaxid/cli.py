@@ -12,7 +12,7 @@ from typing import NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
-from jaxid.names import LIKELIHOOD_METHODS, METHODS, MINIMISERS, OUTPUTS, SOLVERS, WHEN
+from jaxid.names import LIKELIHOOD_METHODS, METHODS, MINIMISERS, OUTPUTS, SOLVERS, TARGETS, WHEN
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -85,6 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     _identify(commands)
     _discover(commands)
     _study(commands)
+    _export(commands)
     return parser
 
 
@@ -235,6 +236,17 @@ def _study(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers run the chunks"
     )
+
+
+def _export(commands: argparse._SubParsersAction) -> None:
+    purpose = "put the values of a result into the robot's own file"
+    parser = commands.add_parser("export", help=purpose, description=purpose)
+    parser.set_defaults(run=_run_export)
+    parser.add_argument("result", metavar="RESULT.json", help="result.json or discovery.json of a tree")
+    parser.add_argument("--to", metavar="TARGET", required=True, help=f"one of {', '.join(TARGETS)}")
+    parser.add_argument("--model", metavar="ROBOT.xml", required=True, help="the file that the case names")
+    parser.add_argument("-o", metavar="FILE", required=True, help="file to write")
+    parser.add_argument("--force", action="store_true", help="overwrite a file that jaxid did not make")
 
 
 class Savable(Protocol):
@@ -428,6 +440,19 @@ def _run_study(args: argparse.Namespace) -> int:
         from jaxid.studies.result import FILES
 
         print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in FILES)}")
+    return 0
+
+
+def _run_export(args: argparse.Namespace) -> int:
+    from jaxid.commands.export import export
+    from jaxid.files import ready_file, write_whole
+
+    path = ready_file(Path(args.o), overwrite=args.force, suffix=".xml")
+    exported = export(args.result, args.to, args.model)
+    write_whole(path, exported.content)
+    lines = [f"not exported: {note}" for note in exported.notes]
+    changed = ", ".join(exported.changed) or "nothing"
+    print("\n".join([*lines, f"changed {changed} in {path}"]))
     return 0
 
 

@@ -216,20 +216,21 @@ def mark_folder(folder: Path) -> None:
         ) from error
 
 
-def ready_file(path: Path, *, overwrite: bool = False) -> Path:
-    """Check that a log may be written, before the work that makes it.
+def ready_file(path: Path, *, overwrite: bool = False, suffix: str = ".csv") -> Path:
+    """Check that a log, or another file, may be written, before the work that makes it.
 
     Raises:
         InputError: If the file exists and `overwrite` is false, its folder does not exist, it is a folder, or
-            its name does not end in .csv.
+            its name does not end in the suffix.
     """
     if path.is_dir():
-        raise InputError("is a folder", where=str(path), hint="name a file: -o LOG.csv")
-    if path.suffix.lower() != ".csv":
+        raise InputError("is a folder", where=str(path), hint=f"name a file: -o LOG{suffix}")
+    if path.suffix.lower() != suffix:
         raise InputError(
-            f"suffix {path.suffix!r}: the log is written as CSV",
+            f"suffix {path.suffix!r}: the {'log' if suffix == '.csv' else 'file'} is written as "
+            f"{suffix[1:].upper()}",
             where=str(path),
-            hint="end its name in .csv",
+            hint=f"end its name in {suffix}",
         )
     if path.exists() and not overwrite:
         raise InputError(

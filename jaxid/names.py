@@ -114,3 +114,5 @@ SIGN_OF = UNIT_OF[1:]
 SIDES = ("load", "motor")
 # Ways to resample: lines between readings, or cubic splines.
 RESAMPLINGS = ("linear", "band_limited")
+# Files of other programs that `export` writes.
+TARGETS = ("mjcf",)

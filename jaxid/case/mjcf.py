@@ -34,7 +34,7 @@ def read_mjcf(path: str | Path) -> Robot:
     Raises:
         InputError: If MuJoCo is not installed, or cannot read the file.
     """
-    mujoco, path = _mujoco(str(path)), Path(path)
+    mujoco, path = need_mujoco(str(path)), Path(path)
     if not path.is_file():
         beside = ", ".join(sorted(p.name for p in path.parent.glob("*.xml"))[:8]) or "none"
         hint = f"check the path, which starts at the case; XML files in that folder: {beside}"
@@ -54,7 +54,7 @@ def robot_of_spec(spec: Any, file: str = "model") -> tuple[Robot, Any]:
         spec: An MjSpec; shapes without which its bodies keep their inertia are deleted from it.
         file: Name of its file, for messages.
     """
-    mujoco = _mujoco(file)
+    mujoco = need_mujoco(file)
     touching = any(geom.contype and geom.conaffinity for geom in spec.geoms)
     _without_shapes(mujoco, spec)
     model = spec.compile()
@@ -64,7 +64,7 @@ def robot_of_spec(spec: Any, file: str = "model") -> tuple[Robot, Any]:
     return robot, model
 
 
-def _mujoco(file: str) -> Any:
+def need_mujoco(file: str) -> Any:
     """Import MuJoCo.
 
     Raises:
@@ -110,7 +110,7 @@ def robot_of_model(model: Any, file: str = "model") -> Robot:
         model: An MjModel.
         file: Name of its file, for messages.
     """
-    mujoco, notes = _mujoco(file), list[str]()
+    mujoco, notes = need_mujoco(file), list[str]()
     names = [model.joint(k).name or f"joint{k + 1}" for k in range(model.njnt)]
     joints = _joints(mujoco, model, names, notes)
     follows, held = _equalities(mujoco, model, names, notes)
@@ -134,13 +134,13 @@ def _joints(mujoco: Any, model: Any, names: list[str], notes: list[str]) -> list
     for b in range(model.nbody):
         carrier, frame = carriers[model.body_parentid[b]] if b else (-1, np.eye(4))
         first, count = int(model.body_jntadr[b]), int(model.body_jntnum[b])
-        free = count > 0 and _is(model.jnt_type[first], kinds.mjJNT_FREE)
+        free = count > 0 and is_one_of(model.jnt_type[first], kinds.mjJNT_FREE)
         # The pose of a body on a free joint is that of its start, as that of any other body.
         frame = frame @ _place(mujoco, model.body_pos[b], model.body_quat[b])
         if free:
             notes.append(f"free joint '{names[first]}' is held: the base is fixed")
         for k in range(first, first + (0 if free else count)):
-            if _is(model.jnt_type[k], kinds.mjJNT_BALL):
+            if is_one_of(model.jnt_type[k], kinds.mjJNT_BALL):
                 notes.append(f"ball joint '{names[k]}' is held")
                 continue
             anchor, turn = np.eye(4), np.eye(4)
@@ -191,7 +191,7 @@ def _with_motors(
     out = {joint.name: joint for joint in joints}
     for k in range(len(model.actuator_trntype)):
         name = names[int(model.actuator_trnid[k, 0])]
-        if not _is(model.actuator_trntype[k], mujoco.mjtTrn.mjTRN_JOINT) or name not in out:
+        if not is_one_of(model.actuator_trntype[k], mujoco.mjtTrn.mjTRN_JOINT) or name not in out:
             continue
         gear, joint = float(model.actuator_gear[k, 0]), out[name]
         if np.any(model.actuator_dampingpoly[k]):
@@ -217,7 +217,9 @@ def _equalities(
         if not model.eq_active0[k]:
             continue
         one, other = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
-        usable = kind == "joint" and not np.any(model.eq_data[k, 2:5]) and _is(model.jnt_type[one], *moving)
+        usable = (
+            kind == "joint" and not np.any(model.eq_data[k, 2:5]) and is_one_of(model.jnt_type[one], *moving)
+        )
         if not usable or names[one] in follows:
             notes.append(f"{title} is not kept")
             continue
@@ -268,10 +270,10 @@ def _drive(mujoco: Any, model: Any, k: int, names: list[str]) -> tuple[RobotDriv
     """Return one actuator, None if a tree cannot have it; and sentences on what it lacks."""
     title = f"actuator '{model.actuator(k).name or k + 1}'"
     gear, *others = (float(g) for g in model.actuator_gear[k])
-    if not _is(model.actuator_trntype[k], mujoco.mjtTrn.mjTRN_JOINT) or any(others):
+    if not is_one_of(model.actuator_trntype[k], mujoco.mjtTrn.mjTRN_JOINT) or any(others):
         return None, [f"{title} does not act on one joint, and is not kept"]
     j = int(model.actuator_trnid[k, 0])
-    if not _is(model.jnt_type[j], mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+    if not is_one_of(model.jnt_type[j], mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
         return None, [f"{title} drives no hinge or slide, and is not kept"]
 
     lost: list[str] = []
@@ -280,12 +282,12 @@ def _drive(mujoco: Any, model: Any, k: int, names: list[str]) -> tuple[RobotDriv
         return None, lost
     gain, kp, kd, drag = law
     kinds, dyntype, lag = mujoco.mjtDyn, model.actuator_dyntype[k], 0.0
-    if _is(dyntype, kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT):
+    if is_one_of(dyntype, kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT):
         lag = float(model.actuator_dynprm[k, 0])
         if kp is not None and lag > 0:
             lost.append(f"{title} filters its reference by {lag:g} s: it is not kept")
             lag = 0.0
-    elif not _is(dyntype, kinds.mjDYN_NONE, kinds.mjDYN_DCMOTOR):
+    elif not is_one_of(dyntype, kinds.mjDYN_NONE, kinds.mjDYN_DCMOTOR):
         return None, [f"{title} has an activation, and is not kept"]
     limits = []
     for limited, size, what, (low, high) in (
@@ -315,7 +317,7 @@ def _law(
     """Return gain, kp, kd and drag of an actuator; None if it is none that a tree can have."""
     gains, biases = mujoco.mjtGain, mujoco.mjtBias
     gainprm, biasprm = np.asarray(model.actuator_gainprm[k]), np.asarray(model.actuator_biasprm[k])
-    if _is(model.actuator_gaintype[k], gains.mjGAIN_DCMOTOR):
+    if is_one_of(model.actuator_gaintype[k], gains.mjGAIN_DCMOTOR):
         resistance, constant = float(gainprm[0]), float(gainprm[1])
         voltage = int(model.actuator_ctrlspec[k]) == int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE)
         if np.any(gainprm[2:]) or np.any(model.actuator_dynprm[k]) or np.any(biasprm) or not voltage:
@@ -323,14 +325,14 @@ def _law(
             return None
         return gear * constant / resistance, None, None, gear**2 * constant**2 / resistance
     biastype = model.actuator_biastype[k]
-    if not _is(model.actuator_gaintype[k], gains.mjGAIN_FIXED) or not _is(
+    if not is_one_of(model.actuator_gaintype[k], gains.mjGAIN_FIXED) or not is_one_of(
         biastype, biases.mjBIAS_NONE, biases.mjBIAS_AFFINE
     ):
         lost.append(f"{title} is none of motor, position, velocity and dcmotor, and is not kept")
         return None
     own = float(gainprm[0])
     offset, slope, rate = (float(b) for b in biasprm[:3])
-    if _is(biastype, biases.mjBIAS_NONE):
+    if is_one_of(biastype, biases.mjBIAS_NONE):
         offset, slope, rate = 0.0, 0.0, 0.0
     if offset:
         lost.append(f"{title} has a constant force of {offset:g}: it is not kept")
@@ -357,7 +359,7 @@ def _absent(mujoco: Any, model: Any) -> list[str]:
     return out
 
 
-def _is(value: Any, *kinds: Any) -> bool:
+def is_one_of(value: Any, *kinds: Any) -> bool:
     """Check that a number of the model is one of some members of an enumeration of MuJoCo."""
     return int(value) in [int(kind) for kind in kinds]
 

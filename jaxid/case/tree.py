@@ -334,8 +334,8 @@ def _effects(tree: Tree) -> tuple[EffectEntry, ...]:
         put("cubic_friction", "coefficient", port, joint.damping[2])
         put("coulomb_friction", "level", port, joint.friction, "frictionloss")
         constant, *slopes = joint.spring
-        # A rest position other than zero is unknown with the stiffness.
-        put("constant_force", "level", port, -constant, "stiffness" if constant else "")
+        # A spring's rest is unknown with its stiffness.
+        put("constant_force", "level", port, -constant, "stiffness")
         put("linear_stiffness", "coefficient", port, slopes[0], "stiffness")
         put("quadratic_stiffness", "coefficient", port, slopes[1])
         put("cubic_stiffness", "coefficient", port, slopes[2])

@@ -34,9 +34,9 @@ def machine_of(folder, **plant):
     return case, build_machine(case)
 
 
-def forces_of_mujoco(q, qd, qdd, ctrl):
+def forces_of_mujoco(q, qd, qdd, ctrl, text=BRANCHED):
     """M qdd + bias - passive - actuators, projected on the free joints; equalities and limits are off."""
-    model = mujoco.MjModel.from_xml_string(BRANCHED)
+    model = mujoco.MjModel.from_xml_string(text)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_LIMIT)
     data = mujoco.MjData(model)
     order = [model.joint(k).name for k in range(model.njnt)]

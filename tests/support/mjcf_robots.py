@@ -53,6 +53,7 @@ CART = """
 <mujoco model="cart">
   <compiler angle="radian"/>
   <option gravity="0 0 -9.81" timestep="0.0002" integrator="RK4"/>
+  <default><joint solreffriction="0.001 1"/></default>
   <worldbody>
     <body name="cart">
       <joint name="rail" type="slide" axis="1 0 0" damping="4" frictionloss="{rail}"/>

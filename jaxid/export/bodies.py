@@ -1,0 +1,134 @@
+"""Rigid bodies behind parameters that a log determines only in sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.arms.base_by_rules import base_parameters_by_rules
+from jaxid.arms.base_parameters import BaseParameters, base_parameters
+from jaxid.arms.pseudo_inertia import TEN, log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.plants.link_tree import LinkTree
+
+# Sines of angles, and lengths [m], that count as zero: files state a right angle as 1.5708.
+_ZERO = 1e-4
+# Chosen: steps of a Newton method that ends within ten from a nearby start.
+_STEPS = 100
+# Relative change of the sums at which the bodies count as found.
+_CLOSE = 1e-10
+
+
+def links_of(plant: LinkTree) -> Float[np.ndarray, "links 10"]:
+    """Return the ten parameters of each link of a plant."""
+    return np.stack([np.asarray(getattr(plant, name)) for name in TEN], axis=-1)
+
+
+def are_bodies(ten: Float[np.ndarray, "links 10"]) -> bool:
+    """Check that each link is one that a body can be, or without any mass and inertia."""
+    least = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten))))
+    return bool(np.all(least[:, 0] >= -1e-12 * np.abs(least[:, -1])))
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Links and rotors that move as those of a result.
+
+    Args:
+        links: Ten parameters of each link, (links, 10).
+        rotors: Inertia of each rotor, seen at its joint, (n,).
+        error: Largest difference of a sum from that of the result, relative to its size.
+    """
+
+    links: Float[np.ndarray, "links 10"]
+    rotors: Float[np.ndarray, " n"]
+    error: float
+
+
+def bodies_of(
+    plant: LinkTree, start: Float[np.ndarray, "links 10"], rotors: Float[np.ndarray, " n"]
+) -> Bodies:
+    """Find bodies that move as the links of a plant do, near those of a file.
+
+    Links that are bodies themselves are returned as they are. Otherwise each is a body of positive density
+    whose sums, the base parameters, are those of the plant: Newton steps of least size in the log-Cholesky
+    coordinates of the bodies, from the file's on. Rotors that are part of a sum stay those of the file.
+
+    Args:
+        plant: The plant; its parameters may be base parameters, with zeros for the others. Its rotors are
+            those seen at the joints.
+        start: Parameters of the links of the file; links without mass keep theirs.
+        rotors: Rotors of the file.
+
+    Source:
+        Rucker & Wensing (2022), IEEE RA-L 7(2), for the coordinates.
+    """
+    found = links_of(plant)
+    own = np.zeros(plant.joints) if plant.rotor_inertia is None else np.asarray(plant.rotor_inertia)
+    if are_bodies(found):
+        return Bodies(found, own, 0.0)
+    sums = _sums_of(plant)
+    columns = [k for k, (name, _) in enumerate(sums.standard) if name in TEN]
+    turning = [k for k, (name, _) in enumerate(sums.standard) if name not in TEN]
+    alone = [_alone(sums, c) for c in turning]
+    final = np.where(alone, own, rotors) if turning else own
+    mapping = sums.mapping[:, columns]
+    kinds = np.array([TEN.index(sums.standard[c][0]) for c in columns])
+    links = np.array([sums.standard[c][1] for c in columns])
+    wanted = mapping @ found[links, kinds] + sums.mapping[:, turning] @ (own - final)[: len(turning)]
+    # A row counts by the size of its sum over the magnitudes of the file's bodies.
+    size = np.abs(mapping) @ np.abs(start[links, kinds]) + np.abs(wanted)
+    size = np.where(size > 1e-9 * size.max(), size, 1e-9 * size.max())
+    heavy = np.flatnonzero(start[:, 0] > 0)
+
+    @jax.jit
+    def rest(x: jax.Array) -> jax.Array:
+        whole = jnp.asarray(start).at[heavy].set(jax.vmap(of_log_cholesky)(x.reshape(-1, 10)))
+        return (jnp.asarray(mapping) @ whole[links, kinds] - wanted) / size
+
+    slope = jax.jit(jax.jacfwd(rest))
+    x = np.asarray(jax.vmap(log_cholesky)(jnp.asarray(_fuller(start[heavy])))).ravel()
+    error = np.asarray(rest(jnp.asarray(x)))
+    for _ in range(_STEPS):
+        if np.abs(error).max() < _CLOSE:
+            break
+        step = np.linalg.lstsq(np.asarray(slope(jnp.asarray(x))), -error, rcond=1e-10)[0]
+        step *= min(1.0, 1.0 / np.abs(step).max())
+        shorter = ((step * 0.5**k, np.asarray(rest(jnp.asarray(x + step * 0.5**k)))) for k in range(20))
+        better = next((s for s in shorter if np.linalg.norm(s[1]) < np.linalg.norm(error)), None)
+        if better is None:
+            break
+        x, error = x + better[0], better[1]
+    out = start.copy()
+    out[heavy] = np.asarray(jax.vmap(of_log_cholesky)(jnp.asarray(x.reshape(-1, 10))))
+    return Bodies(out, final, float(np.abs(error).max()))
+
+
+def _alone(sums: BaseParameters, column: int) -> bool:
+    """Check that a parameter is a sum of itself alone."""
+    rows = np.flatnonzero(sums.mapping[:, column])
+    return rows.size == 1 and np.count_nonzero(sums.mapping[rows[0]]) == 1
+
+
+def _sums_of(plant: LinkTree) -> BaseParameters:
+    """Return the base parameters of a plant."""
+    if np.any(np.asarray(plant.gravity_vector)) and not plant.copies:
+        return base_parameters_by_rules(plant, _ZERO)
+    return base_parameters(plant)
+
+
+def _fuller(ten: Float[np.ndarray, "links 10"]) -> Float[np.ndarray, "links 10"]:
+    """Return bodies with some extent in every direction, which have such coordinates."""
+    out = ten.copy()
+    for body in out:
+        moments = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(body))))
+        about = body[1:4] / body[0]
+        # The second moments about the centre of mass may be zero, or slightly less, in files.
+        second = np.asarray(pseudo_inertia(jnp.asarray(body)))[:3, :3] - body[0] * np.outer(about, about)
+        values = np.linalg.eigvalsh(second)
+        short = max(1e-4 * max(values[-1], 1e-8 * moments[-1]) - values[0], 0.0)
+        body[[4, 7, 9]] += 2 * short
+    return out

@@ -1,0 +1,108 @@
+"""Changes of single attributes in the text of an XML file, all else left as it is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from xml.parsers import expat
+
+
+@dataclass
+class Element:
+    """An element of the text.
+
+    Args:
+        tag: Its name.
+        attributes: Its attributes.
+        start, end: Bytes from the first of its start tag to the one behind it.
+        children: Elements in it.
+    """
+
+    tag: str
+    attributes: dict[str, str]
+    start: int
+    end: int
+    children: list[Element] = field(default_factory=list)
+
+    def find(self, tag: str) -> Element | None:
+        """Return the first child of a name; None if there is none."""
+        return next((child for child in self.children if child.tag == tag), None)
+
+    def walk(self) -> Iterator[Element]:
+        """Return all elements in it, itself first."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+
+class XmlText:
+    """An XML file whose start tags can be changed.
+
+    Args:
+        content: Bytes of the file.
+
+    Raises:
+        expat.ExpatError: If it is not XML.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        self.content = content
+        self._edits: dict[tuple[int, int], bytes] = {}
+        # An element around the first one, so that there is always a last one open.
+        whole = Element("", {}, 0, 0)
+        stack = [whole]
+        parser = expat.ParserCreate()
+
+        def start(tag: str, attributes: dict[str, str]) -> None:
+            at = parser.CurrentByteIndex
+            element = Element(tag, attributes, at, _end_of_tag(content, at))
+            stack[-1].children.append(element)
+            stack.append(element)
+
+        parser.StartElementHandler = start
+        parser.EndElementHandler = lambda tag: stack.pop()
+        parser.Parse(content, True)
+        self.root = whole.children[0]
+
+    def set(self, element: Element, values: Mapping[str, str | None]) -> None:
+        """Set attributes of an element; None takes one away."""
+        place = (element.start, element.end)
+        text = self._edits.get(place, self.content[element.start : element.end]).decode()
+        for name, value in values.items():
+            pattern = re.compile(rf"\s+{name}\s*=\s*(\"[^\"]*\"|'[^']*')")
+            shown = "" if value is None else f' {name}="{value}"'
+            if pattern.search(text):
+                text = pattern.sub(shown.replace("\\", r"\\"), text, count=1)
+            elif value is not None:
+                head, close = re.match(r"(?s)(.*?)(\s*/?>)$", text).groups()  # pyright: ignore[reportOptionalMemberAccess]  # a tag
+                text = head + shown + close
+        self._edits[place] = text.encode()
+
+    def insert_into(self, element: Element, text: str) -> None:
+        """Insert text as the first child of an element, which has an end tag, indented as its others."""
+        line = self.content.rfind(b"\n", 0, element.start) + 1
+        indent = self.content[line : element.start]
+        indent = indent if not indent.strip() else b""
+        self._edits[(element.end, element.end)] = b"\n" + indent + b"  " + text.encode()
+
+    def text(self) -> bytes:
+        """Return the file with all changes."""
+        out = self.content
+        for (start, end), new in sorted(self._edits.items(), reverse=True):
+            out = out[:start] + new + out[end:]
+        return out
+
+
+def _end_of_tag(content: bytes, at: int) -> int:
+    """Return the byte behind a start tag; a bracket between quotes is none of its own."""
+    quote = 0
+    for k in range(at, len(content)):
+        byte = content[k]
+        if quote:
+            quote = 0 if byte == quote else quote
+        elif byte in b"\"'":
+            quote = byte
+        elif byte == ord(">"):
+            return k + 1
+    return len(content)
