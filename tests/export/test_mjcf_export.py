@@ -157,6 +157,7 @@ def forward(text: str, u: np.ndarray, start: np.ndarray, rate: int) -> np.ndarra
     return out
 
 
+@pytest.mark.slow
 def test_a_wrong_file_becomes_that_of_the_log(tmp_path, capsys):
     """Rotors, dry friction, damping, a spring and a mass that the file lacks are in the log."""
     sprung = cart(rail=2.0, pole=0.15).replace(
