@@ -74,6 +74,7 @@ def output_residual(
         run = replay.following(places, theta)(scatter(places, plant, theta), nudge)
         outputs: dict[str, tuple[Array, ...]] = {
             "position": (run.position,),
+            "velocity": (run.velocity,),
             "force": (replay.drive.gain * run.command,),
         }
         outputs["both"] = outputs["position"] + outputs["force"]
@@ -106,7 +107,8 @@ def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np
     """Return a log's output, (time, k), and the mask of columns that count; see `output_residual`."""
     force = log.force * machine.gain
     outputs = {"position": (log.filled,), "force": (force,), "both": (log.filled, force)}
-    counts = {"position": log.measured, "force": (True,) * force.shape[1]}
+    outputs["velocity"] = (log.readings,)
+    counts = {"position": log.measured, "velocity": log.measured, "force": (True,) * force.shape[1]}
     counts["both"] = counts["position"] + counts["force"]
     return np.concatenate(outputs[on], axis=1), np.array(counts[on])
 
@@ -227,6 +229,8 @@ def output_error_steps(
     need_names(profile, machine.parameters.names)
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
+    elif log.integrated:
+        on = "velocity"
     machine = machine if start is None else machine.with_estimate(start)
     chosen = numerics is None
     numerics = numerics or choose_numerics(machine, log)
@@ -482,6 +486,8 @@ def turning_steps(machine: Machine, log: Log) -> int:
     if inertia is None or not np.any(noise > 0):
         return 1
     period = machine.controller.period if machine.controller is not None else log.period
+    # Noise of a velocity moves an integrated position by as much in one sample.
+    noise = noise * log.period if log.integrated else noise
     n = log.position.shape[1]
     zero, u = jnp.zeros(n), jnp.zeros(log.force.shape[1])
     q = jnp.asarray(log.filled[0])
@@ -529,7 +535,7 @@ def notes_of(
         steps = f"by diffrax's {numerics.solver}, each step within {RELATIVE:g}"
     notes = [f"simulated {where}, {steps}; dry friction {how}"]
     if on != "position":
-        notes.append(f"fitted on {'position and force' if on == 'both' else 'force'}")
+        notes.append(f"fitted on {'position and force' if on == 'both' else on}")
     if numerics.segment:
         seconds = numerics.segment * log.period
         notes.append(f"restarted from the log every {seconds:.3g} s, because it would drift off otherwise")

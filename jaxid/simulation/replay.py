@@ -243,7 +243,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     count = min(samples, log.samples)
     assert replay.command is not None, "make_replay gives an open loop its command"
     short = eqx.tree_at(lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1])
-    nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
+    nudge = _start(short, plant, jnp.asarray(log.readings[:count]), log.measured, log.integrated)
     n = replay.position.size
     moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
     if not bool(jnp.all(jnp.isfinite(nudge))):
@@ -252,9 +252,13 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
 
 
 @eqx.filter_jit
-def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, ...]) -> Array:
+def _start(
+    replay: Replay, plant: Plant, readings: Array, measured: tuple[bool, ...], of_velocity: bool
+) -> Array:
     def residual(nudge: Array) -> Array:
-        return ((replay(plant, nudge).position - position) * np.array(measured)).ravel()
+        run = replay(plant, nudge)
+        simulated = run.velocity if of_velocity else run.position
+        return ((simulated - readings) * np.array(measured)).ravel()
 
     def improve(_: int, nudge: Array) -> Array:
         jacobian = jax.jacfwd(residual)(nudge)
@@ -336,6 +340,8 @@ def local_line(
         k: Number of the sample.
         noise: Standard deviation of a reading by joint, (n,); None: estimated from the log.
     """
+    if log.integrated:
+        return log.position[k], _parabola(replace(log, position=log.readings), k, _REACHES[0])[0]
     noise = signals.high_band_std(log.filled) if noise is None else noise
     position, velocity, size = _parabola(log, k, _REACHES[0])
     # The second term tolerates rounding in a log without noise.
