@@ -13,7 +13,7 @@ from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.consistency.absent import check_absent
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
-from jaxid.consistency.law import law_findings, replayed_law
+from jaxid.consistency.law import law_findings, loop_velocity_findings, replayed_law
 from jaxid.consistency.noise import estimated_force_noise, noise_findings
 from jaxid.consistency.reference_hold import (
     compare_reference_holds,
@@ -385,6 +385,7 @@ def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bo
         findings, settings = [*findings, *doubts], settings | setting
     replayed = replayed_law(machine, log)
     findings += law_findings(machine, log, replayed, confirmed=confirmed)
+    findings += loop_velocity_findings(machine, log)
     raise_on_error(findings)
 
     findings += weight_findings(machine, log, declared)

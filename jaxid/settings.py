@@ -168,6 +168,11 @@ class LogTable:
     velocity: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of the velocity, one a joint; beside a position only its unit is checked"
     )
+    loop_velocity: str | tuple[str, ...] | None = key(
+        columns(),
+        f"{_COLUMN} of the velocity that the drive measures and its own loop uses, one a joint",
+        note="the loop differences positions",
+    )
     acceleration: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of the acceleration, one a joint; no method uses it"
     )

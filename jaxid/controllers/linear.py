@@ -34,7 +34,8 @@ class PD(Controller):
     derivative: str = eqx.field(static=True, default="error", kw_only=True)
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Array:
-        return tick.reference
+        # A machine that moves already follows a reference that moves.
+        return tick.reference - self.period * tick.at_drives(velocity)
 
     def law(self, tick: Tick, velocity: Array, memory: Array, disturbance: Array) -> tuple:
         slope = (tick.reference - memory) / self.period if self.derivative == "error" else 0.0
@@ -82,7 +83,7 @@ class PID(Controller):
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> tuple:
         none = jnp.zeros_like(tick.reference)
-        return tick.reference, none, none
+        return tick.reference - self.period * tick.at_drives(velocity), none, none
 
     def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
         last, integral, slope = memory

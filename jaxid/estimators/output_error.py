@@ -30,6 +30,7 @@ from jaxid.model.unknowns import REFERENCE, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess, full_hessian, hessian_notes
+from jaxid.simulation.kalman import rounded_readings
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
     LONGEST_MEMORY,
@@ -56,6 +57,8 @@ _CLEARLY = 10.0
 _TURNING = 0.04
 _LITTLE = 0.1
 _MOST = 4
+# Least steps a sample of a free motion.
+_FREE = 4
 # Number of segments; each is long enough to show friction and short enough not to drift away.
 _SEGMENTS = 40
 
@@ -278,7 +281,7 @@ def output_error_steps(
         minimum = yield SolveRequest(_fit, (*problem, active, solver))
     measured, weight = problem[3], problem[4]
     e = np.asarray(minimum.residual).reshape(measured.shape)
-    counts = np.broadcast_to(weight[0] > 0, e.shape)
+    counts = np.asarray(weight) > 0
     jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
     theta = np.asarray(minimum.theta)
     names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
@@ -426,12 +429,16 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str)
     free = np.full(nuisance, np.inf)
     transform = Transform.of(parameters)
     transform = replace(transform, log=np.concatenate([transform.log, np.zeros(nuisance, bool)]))
+    weight = np.tile(counts.astype(float), (len(measured), 1))
+    if log.passive and on == "position":
+        # A free motion ends at rest, where one rounding error stands in every reading.
+        weight = weight * rounded_readings(machine, log)
     return (
         replay,
         parameters.places,
         machine.plant,
         measured,
-        np.tile(counts.astype(float), (len(measured), 1)),
+        weight,
         np.concatenate([parameters.guess, np.zeros(nuisance)]),
         transform,
         (np.concatenate([lower, -free]), np.concatenate([upper, free])),
@@ -462,6 +469,9 @@ def choose_numerics(
         set_valued=not breaks_away and solver is None,
         solver=solver,
     )
+    if log.passive and solver is None:
+        # Without noise of a force the phase of a swing is so precise that it shows the error of a step.
+        numerics = replace(numerics, substeps=max(numerics.substeps, _FREE))
     if not numerics.set_valued and solver is None:
         numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))
     if machine.controller is not None or not segments:

@@ -176,6 +176,11 @@ class Log:
         return not self.force.any()
 
     @property
+    def stepped(self) -> bool:
+        """True if every force is constant, and one of them drives: a step that began with the log."""
+        return not self.passive and not np.ptp(self.force, axis=0).any()
+
+    @property
     def period(self) -> float:
         """Sampling period [s].
 
@@ -351,9 +356,9 @@ def read_log(
         # A turn is one of the column's unit.
         position, reference = joined(groups["position"], groups.get("reference"), table.unwrap)
         groups |= {"position": position} | ({} if reference is None else {"reference": reference})
-    groups, absent = _completed(groups, joints, drives)
     frame = Frame() if frame is None else frame
     groups, units = converted(groups, names, content.units, table, frame, str(path))
+    groups, absent = _completed(groups, joints, drives)
     time, groups, rows, timing = _at_one_rate(groups, table, rows, path)
     if time.size < MINIMUM_SAMPLES:
         raise _too_short(time.size, path)
@@ -508,6 +513,8 @@ def _names(table: LogTable) -> dict[str, list[str]]:
     """Return the names of columns by quantity."""
     quantities = ("time", "position", "force", *OPTIONAL_COLUMNS, *_OF_STEADY)
     given = {quantity: getattr(table, quantity) for quantity in quantities}
+    if given["velocity"] is None:
+        given["velocity"] = table.loop_velocity
     return {q: [g] if isinstance(g, str) else list(g) for q, g in given.items() if g is not None}
 
 

@@ -18,8 +18,10 @@ from jaxtyping import Bool, Float
 from jaxid.arrays import Array
 from jaxid.dynamics.rhs import State
 from jaxid.logs.log import Log
+from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.numerics.filters import high_band_std
 from jaxid.simulation.loops import Drive, interval_forces
 from jaxid.simulation.replay import Numerics, make_replay
 from jaxid.simulation.sensor_noise import position_noise
@@ -203,7 +205,31 @@ def readings_used(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
     stated, resolution = machine.sensor.position_noise, machine.sensor.position_resolution
     step = np.zeros(n) if resolution is None else np.broadcast_to(np.asarray(resolution), n)
     noise = position_noise(machine, log) if stated is None else np.broadcast_to(np.asarray(stated), n)
+    return independent_readings(log, step, noise)
 
+
+def rounded_readings(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
+    """Return the mask of `readings_used`, with the resolution that the readings show where none is stated."""
+    n = log.position.shape[1]
+    stated = machine.sensor.position_resolution
+    if stated is not None or log.integrated:
+        return readings_used(machine, log)
+    step = np.array([position_levels(q)[1] if seen else 0.0 for q, seen in zip(log.position.T, log.measured)])
+    # What is left in the high band beside the rounding is noise that dithers it.
+    high = high_band_std(log.filled)
+    return independent_readings(log, step, np.sqrt(np.maximum(high**2 - step**2 / 12, 0.0)).reshape(n))
+
+
+def independent_readings(
+    log: Log, step: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, "time n"]:
+    """Return the mask of the readings whose rounding error is independent, see `readings_used`.
+
+    Args:
+        log: The log.
+        step: Step of each encoder, (n,); zero for one that does not round.
+        noise: Standard deviation of the noise before rounding, (n,).
+    """
     # The speed is smoothed: a choice by the readings themselves would prefer one side of a count.
     steps, used = np.abs(smooth_steps(log)), np.zeros(log.position.shape, bool)
     for j in np.flatnonzero(log.measured):

@@ -90,7 +90,8 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
     joints = np.flatnonzero(np.isfinite(gap.rms)).tolist()
     if run.log.steady is not None:
         return [_of_rows(machine, run, gap, k, fitted=fitted) for k in joints]
-    force = run.data.at_kept(run.data.force - run.data.force.mean(axis=0))
+    middle = 0.0 if run.log.stepped else run.data.force.mean(axis=0)
+    force = run.data.at_kept(run.data.force - middle)
     if run.log.passive:
         force = np.asarray(_inertial(machine.plant, ForceData.of(run.data)))
     size = float(np.sqrt(np.mean(force**2))) if force.size else 0.0
