@@ -21,7 +21,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum
 from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import solve_balance, linear_scale
+from jaxid.estimators.inverse_dynamics import linear_scale, solve_balance
 from jaxid.logs.finding import Finding
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -42,9 +42,7 @@ _ROUNDING = 1e-10
 _UNTOLD = 0.5
 
 
-def open_steady(
-    case: Case, log: LogLike, validate: Sequence[LogLike], read: Callable[..., Log]
-) -> Session:
+def open_steady(case: Case, log: LogLike, validate: Sequence[LogLike], read: Callable[..., Log]) -> Session:
     """Open a case and its tables of steady speeds.
 
     Args:
@@ -153,8 +151,8 @@ def _findings(log: Log) -> list[Finding]:
 def steady_fit(session: Session) -> Steps[Estimate]:
     """Fit the unknowns of a session on a table of steady speeds by weighted least squares.
 
-    With a stated scatter each row counts by it; without one, by the number of its readings, and the scatter is
-    that of the residual. The standard deviations are enlarged by Student's distribution for the few rows, so
+    With a stated scatter each row counts by it; without one, by the number of its readings, and the scatter
+    is that of the residual. The standard deviations are enlarged by Student's distribution for the few rows, so
     that 1.96 of them is a 95 % interval.
 
     Args:

@@ -84,7 +84,7 @@ def position_dependent(plant: Plant) -> str:
 
 
 def acts_by_position(effect: Effect) -> bool:
-    """Check that the force of an effect depends on the coordinate of its port, whatever its parameters are."""
+    """Check that the force of an effect depends on the coordinate of its port, at some parameters."""
     names = [name for name in parameters_of(type(effect)) if getattr(effect, name) is not None]
     # At a guess of zero no force would show.
     effect = replace(effect, **{name: jnp.asarray(1.0) for name in names})
@@ -118,9 +118,7 @@ def _need_known_force(case: Case, machine: Machine, log: Log) -> None:
         what = f"{missing}, and nothing known acts: {listed} may be multiplied by one factor"
         if len(unscaled) == 1:
             what = f"{missing}, and nothing known acts beside {listed}"
-        hint = (
-            "state one of them as a known number (a weight, a spring or an inertia), or log the force that drives"
-        )
+        hint = "state one as a known number (a weight, a spring or an inertia), or log the force that drives"
         raise InputError(what, where=log.source, hint=hint)
 
 

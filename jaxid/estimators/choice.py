@@ -59,7 +59,9 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
         return Choice("output_error", "links are to be physically consistent")
 
     if log.passive:
-        return Choice("output_error", "nothing drives the machine: the start and the model give the whole motion")
+        return Choice(
+            "output_error", "nothing drives the machine: the start and the model give the whole motion"
+        )
 
     looped = controller is not None and log.reference is not None
     breaks_away = any(e.break_away_level is not None for e in plant.effects)

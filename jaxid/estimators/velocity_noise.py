@@ -67,6 +67,4 @@ def without_velocity_noise(session: Session, estimate: Estimate) -> Steps[Estima
         return estimate
     theta = np.clip(theta + np.where(estimate.identifiable, shift, 0.0), *machine.parameters.bounds)
     note = "the bias by the noise of the measured velocity was removed, by simulating as much noise again"
-    return replace(
-        estimate, theta=theta, machine=machine.with_estimate(theta), notes=(*estimate.notes, note)
-    )
+    return replace(estimate, theta=theta, machine=machine.with_estimate(theta), notes=(*estimate.notes, note))

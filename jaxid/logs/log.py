@@ -504,7 +504,7 @@ def _check_kind(table: LogTable, given: dict[str, Any], spot: Spot) -> None:
     other = next((name for name in _OF_STEADY if name in given), None)
     if other is not None:
         raise spot.at(other).fault('goes with kind = "steady" only', "leave it out")
-    if table.position is None and table.velocity is None:
+    if table.position is None and table.velocity is None and table.loop_velocity is None:
         hint = "add position: the name of its column; or velocity, where only the velocity was logged"
         raise spot.fault("'position' is missing", hint)
 

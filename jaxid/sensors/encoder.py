@@ -24,7 +24,7 @@ class Sensor(eqx.Module):
         position_resolution: Size of one count [m or rad].
         position_noise: Standard deviation of white noise before rounding [m or rad].
         force_noise: Standard deviation on the logged command, in its units.
-        velocity_noise: Standard deviation of a velocity that is measured in place of a position [m/s or rad/s].
+        velocity_noise: Standard deviation of a velocity, measured in place of a position [m/s or rad/s].
         hold: Ticks of the loop for which a reading of a position is held.
         inertial: Gyroscopes and accelerometers; None if there are none.
     """

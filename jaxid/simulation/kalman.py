@@ -214,7 +214,9 @@ def rounded_readings(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
     stated = machine.sensor.position_resolution
     if stated is not None or log.integrated:
         return readings_used(machine, log)
-    step = np.array([position_levels(q)[1] if seen else 0.0 for q, seen in zip(log.position.T, log.measured)])
+    step = np.zeros(n)
+    for j in np.flatnonzero(log.measured):
+        step[j] = position_levels(log.position[:, j])[1]
     # What is left in the high band beside the rounding is noise that dithers it.
     high = high_band_std(log.filled)
     return independent_readings(log, step, np.sqrt(np.maximum(high**2 - step**2 / 12, 0.0)).reshape(n))
