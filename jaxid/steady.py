@@ -32,7 +32,7 @@ from jaxid.model.unknowns import label
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import Precision, held, named_directions
 from jaxid.session import OpenedLog, Session
-from jaxid.simulation.force_balance import ForceData, sharpened
+from jaxid.simulation.force_balance import ForceData, force_and_columns, sharpened
 
 # A row at this part of the slowest speed would count as at rest: the smoothed sign is exact at every row.
 _SLOWER = 0.1
@@ -152,8 +152,8 @@ def steady_fit(session: Session) -> Steps[Estimate]:
     """Fit the unknowns of a session on a table of steady speeds by weighted least squares.
 
     With a stated scatter each row counts by it; without one, by the number of its readings, and the scatter
-    is that of the residual. The standard deviations are enlarged by Student's distribution for the few rows, so
-    that 1.96 of them is a 95 % interval.
+    is that of the residual. The standard deviations are enlarged by Student's distribution for the few rows,
+    so that 1.96 of them is a 95 % interval.
 
     Args:
         session: The session, of `open_steady`.
@@ -192,6 +192,22 @@ def steady_fit(session: Session) -> Steps[Estimate]:
         steps=int(fit.steps),
         notes=tuple(notes),
     )
+
+
+def balance_rows(session: Session) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows p"]]:
+    """Return weighted residual and Jacobian of a session's machine at the rows that count.
+
+    Args:
+        session: The session; its machine is at the values of interest.
+    """
+    machine, run = session.machine, session.fit
+    weight, _ = _weights(machine, run.log)
+    rows = run.data.fitted
+    arrays = ForceData.of(run.data, rows)
+    places, theta = machine.parameters.places, np.asarray(machine.parameters.guess)
+    plant = sharpened(machine.plant, run.data)
+    e, jacobian = (np.asarray(x) for x in force_and_columns(plant, places, arrays, theta))
+    return (weight * e)[rows], (weight[..., None] * jacobian)[rows]
 
 
 def _weights(machine: Machine, log: Log) -> tuple[Float[np.ndarray, "rows n"], bool]:

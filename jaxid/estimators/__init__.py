@@ -359,9 +359,9 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         options: Keyword arguments of the method.
 
     Raises:
-        InputError: If the log lacks a position or time that the method needs; if the reference has unknowns and
-            the method does not fit them in a simulated loop; if links must be physically consistent, and the
-            method or the links do not allow it; or if the case asks for a Hessian or a profile, and the
+        InputError: If the log lacks a position or time that the method needs; if the reference has unknowns
+            and the method does not fit them in a simulated loop; if links must be physically consistent, and
+            the method or the links do not allow it; or if the case asks for a Hessian or a profile, and the
             method maximises no likelihood.
     """
     need_likelihood(method, session.case)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxid.cli import main
+from jaxid.commands.discover import discover
 from jaxid.commands.identify import identify, identify_many
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
@@ -120,6 +121,22 @@ def test_a_field_table_of_steady_speeds(tmp_path, capsys):
     assert result.gaps[0].force.relative[0] < 0.02
     result.save(tmp_path / "out")
     assert (tmp_path / "out" / "result.json").read_text().count("NaN") == 0
+
+
+@pytest.mark.parametrize("scatter", [False, True])
+def test_hidden_friction_of_a_steady_table_is_found(scatter):
+    log = {**TABLE, "scatter": "s"} if scatter else TABLE
+    columns = table(3, rows=24)
+    columns["f"] = columns["f"] + 0.08 * columns["v"] * np.abs(columns["v"])
+    found = discover(case_of(log), columns)
+    assert found.verdict == "found"
+    drag = found.effects[0]
+    assert "quadratic_drag" in {drag.kind, *(s.candidate.kind for s in drag.alternatives)}
+    assert drag.score.evidence > 10
+
+
+def test_noise_of_a_steady_table_is_no_effect():
+    assert [discover(case_of(TABLE), table(seed)).kinds for seed in range(12)] == [[]] * 12
 
 
 @pytest.mark.parametrize(
