@@ -25,18 +25,22 @@ _INSTANTS = 4
 BY_VELOCITY = ("inverse_dynamics", "prediction_error", "output_error", "power", "recursive")
 
 
-def check_absent(case: Case, machine: Machine, log: Log) -> None:
+def check_absent(case: Case, machine: Machine, log: Log, *, alone: bool = True) -> None:
     """Refuse a log without position or force for a machine that needs it.
 
     Args:
         case: The case.
         machine: Its machine.
         log: The log.
+        alone: Whether it is the only log of the fit; others may tell what a step leaves open.
 
     Raises:
-        InputError: If a force depends on where the machine is and only the velocity was logged; or if
-            nothing drives the machine and nothing known acts on it.
+        InputError: If a force depends on where the machine is and only the velocity was logged; if nothing
+            drives the machine and nothing known acts on it; or if one step drives it and an unknown takes any
+            part of it.
     """
+    if log.stepped and alone:
+        _need_known_part(machine, log)
     if log.integrated:
         _need_no_position(case, machine, log)
     if log.passive:
@@ -120,6 +124,37 @@ def _need_known_force(case: Case, machine: Machine, log: Log) -> None:
             what = f"{missing}, and nothing known acts beside {listed}"
         hint = "state one as a known number (a weight, a spring or an inertia), or log the force that drives"
         raise InputError(what, where=log.source, hint=hint)
+
+
+def _need_known_part(machine: Machine, log: Log) -> None:
+    """Refuse a step of the force against an unknown that is as constant as the step.
+
+    Masses and frictions of zero and all of the force in that unknown then fit best.
+    """
+    plant, free = machine.plant, machine.parameters.free
+    travel = np.sign(log.filled[-1] - log.filled[0])
+    theta = np.asarray(machine.parameters.guess, float)
+    u = jnp.asarray(log.force[0] * machine.gain)
+
+    def residual(values: np.ndarray, speed: float, rate: float) -> np.ndarray:
+        at = machine.parameters.insert(plant, values)
+        states = at.initial_states(u)
+        own = at.balance(log.filled[0], speed * travel, rate * travel, u, jnp.zeros(()), states)
+        return np.asarray(own.residual)
+
+    for k, f in enumerate(free):
+        if not _is_force(plant, f):
+            continue
+        more = theta + (np.arange(theta.size) == k) * max(abs(theta[k]), 1.0)
+        # Speeds far beyond the width over which the sign is smoothed.
+        slow, fast = (residual(more, *at) - residual(theta, *at) for at in ((1e6, 2.0), (3e6, -1.0)))
+        if np.any(slow) and np.allclose(slow, fast, rtol=1e-6, atol=0.0):
+            others = [g.name for g in free if g is not f and _is_force(plant, g)]
+            level = ", ".join(f"{x:.4g}" for x in log.force[0])
+            what = f"the force is {level} throughout, as after a step, of which {f.name} may take any part"
+            together = f"{', '.join(others[:4])} change with it: " if others else ""
+            hint = f"{together}state {f.name} as a known number, or take a log in which the force changes"
+            raise InputError(what, where=log.source, hint=hint)
 
 
 def without_scale(machine: Machine, log: Log) -> list[str]:

@@ -168,10 +168,6 @@ def _prediction_error(
 
     machine, run, demands = session.machine, session.fit, session.case.identification
     first = yield from inverse_dynamics_steps(machine, run.data)
-    if run.log.stepped and not first.all_identified:
-        # Along a combination that a step leaves open, a likelihood runs off to masses of zero.
-        note = "a step of the force leaves a combination of the unknowns open: values by inverse_dynamics"
-        return replace(first, notes=(*first.notes, note))
     return (
         yield from prediction_error_steps(
             machine,
