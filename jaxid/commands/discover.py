@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -188,7 +189,8 @@ def start_search(
     if log.integrated:
         # Where the machine is was not measured.
         scales = scales_of(machine.plant, data)[0]
-        searched = tuple(cls for cls in searched if not acts_by_position(cls(**cls.starts(scales)[0])))
+        starts: dict[type, dict[str, Any]] = {cls: dict(cls.starts(scales)[0]) for cls in searched}
+        searched = tuple(cls for cls in searched if not acts_by_position(cls(**starts[cls])))
     union = build_candidate_model(baseline.machine, data, searched)
     others = tuple(v.data for v in session.validations)
     return baseline, Search(union, data, floor, colour, others, progress)
