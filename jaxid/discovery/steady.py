@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +25,7 @@ from jaxid.discovery.where import Where
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import force_gap, gaps, row_noise
 from jaxid.machine import Machine
-from jaxid.model.effect import Effect, Scales, Signals
+from jaxid.model.effect import Effect, Scales, Signals, scaled
 from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect, label
 from jaxid.numerics.lanes import run_alone
@@ -157,9 +158,9 @@ def _candidates(session: Session) -> list[Effect]:
             continue
         starts = cls.starts(scales)
         start = starts[len(starts) // 2]
-        effect = cls(
-            **{name: jnp.asarray(0.1 * v if k == 0 else v) for k, (name, v) in enumerate(start.items())}
-        )
+        # Weak at first, so that the refit begins near the model without it.
+        values: dict[str, Any] = {name: jnp.asarray(v) for name, v in scaled(cls, start, 0.1).items()}
+        effect = cls(**values)
         if not acts_by_position(effect) and _acts_at_speed(effect):
             out.append(effect)
     return out

@@ -239,12 +239,14 @@ def steady_log(
     return Log(
         time=np.arange(len(own["velocity"]), dtype=float),
         position=np.zeros_like(own["velocity"]),
+        velocity=own["velocity"],
+        force=own["force"],
+        temperature=own.get("temperature"),
         rows=content.rows,
         source=str(path),
         assumed=(*content.assumed, *units, *said),
         table=table,
         steady=SteadyRows(spread, count),
-        **own,
     )
 
 

@@ -211,8 +211,9 @@ def _in_motion(machine: Machine, log: Log, every: int, disturbance: np.ndarray |
     if not np.any(np.abs(velocity) > _MOVING * typical):
         return controller
     driven, shape = machine.plant.driven(log.position.shape[1]), log.force[:first].shape
-    arrays = [np.broadcast_to(log.reference[:first], shape), np.broadcast_to(disturbance[:first], shape)]
-    made = np.asarray(commands(controller, driven, log.position[:first], *arrays, velocity))
+    reference, extra = (np.broadcast_to(x[:first], shape) for x in (log.reference, disturbance))
+    readings = (jnp.asarray(x) for x in (log.position[:first], reference, extra, velocity))
+    made = np.asarray(commands(controller, driven, *readings))
     inside = np.ones(shape, bool)
     if controller.limit is not None:
         inside = np.abs(log.force[:first]) < (1 - 1e-6) * np.asarray(controller.limit)
