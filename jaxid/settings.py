@@ -106,11 +106,6 @@ class LogTable:
 
     time: str | None = key(text, "name of the column with the time", unit="s", note="give sample_rate")
     sample_rate: float | None = key(number("positive"), "samples per second", unit="Hz", note="give time")
-    kind: str = key(
-        choice(LOG_KINDS),
-        "a log over time, or steady: a table of steady velocities and the forces that hold them",
-        default=LOG_KINDS[0],
-    )
     position: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of the position, one a joint", note="the integral of the velocity"
     )
@@ -187,6 +182,11 @@ class LogTable:
     )
     temperature: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of a temperature; no method uses it"
+    )
+    kind: str = key(
+        choice(LOG_KINDS),
+        "a log over time, or steady: a table of steady velocities and the forces that hold them",
+        default=LOG_KINDS[0],
     )
     scatter: str | tuple[str, ...] | None = key(
         columns("drive"), f"{_COLUMN} of the standard deviation of the force; with kind = 'steady'"
