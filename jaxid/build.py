@@ -339,7 +339,8 @@ def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controlle
             known = Machine(model, Parameters(tuple(free)), gain, plant.units)
             settings = Recursive(**{k: arrays.pop(k) for k in ON_LINE if k in arrays})
             arrays["estimator"] = _estimator(case, known, period, settings)
-    return cls(period=period, **arrays)
+    own = case.log is not None and case.log.loop_velocity is not None
+    return cls(period=period, own_velocity=own, **arrays)
 
 
 def _estimator(case: Case, machine: Machine, period: float, settings: Recursive) -> Any:

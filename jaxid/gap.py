@@ -116,8 +116,18 @@ def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:
 
 def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray, " n"]:
     """Compute the RMS force that the sensors' noise alone causes in the band [N or N m], by joint."""
+    if log.steady is not None:
+        return row_noise(machine, log)
     f, power = noise_density(machine, log, data)
     return np.sqrt(np.trapezoid(power, f, axis=0))
+
+
+def row_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
+    """Return the RMS of the stated scatter of a steady table's rows [N or N m], by joint; NaN: not known."""
+    assert log.steady is not None, "only a steady table has rows with a scatter"
+    if log.steady.std is None:
+        return np.full(log.position.shape[1], np.nan)
+    return np.sqrt(np.mean(np.square(log.steady.std * machine.gain), axis=0))
 
 
 @dataclass(frozen=True)
@@ -162,6 +172,8 @@ def _simulation_gap_of(machine: Machine, log: Log) -> SimulationGap | None:
 
 def simulated(machine: Machine, log: Log, *, at_rest: bool = False) -> SimulationGap | None:
     """Compute the gap in position over the whole log; None if the simulation cannot run or diverges."""
+    if log.steady is not None:
+        return None
     if machine.controller is not None and log.reference is None and machine.unknown_reference is None:
         machine = replace(machine, controller=None)
     # No gradient is needed here: dry friction sticks exactly, break-away friction too.

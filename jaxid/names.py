@@ -83,6 +83,8 @@ OPTIONAL_COLUMNS = (
     "load_acceleration",
     "temperature",
 )
+# Kinds of a log: samples over time, or a table of steady speeds.
+LOG_KINDS = ("time", "steady")
 # Ways to differentiate a position, see `jaxid.logs.prepare`.
 DERIVATIVES = ("central", "spectral", "parabolic")
 # Signals that the derivative gain of a PD law acts on.

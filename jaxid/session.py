@@ -10,9 +10,10 @@ import numpy as np
 
 from jaxid.build import build_machine, drives_of_case, make_plant, motions_of
 from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.consistency.absent import check_absent
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
-from jaxid.consistency.law import law_findings, replayed_law
+from jaxid.consistency.law import law_findings, loop_velocity_findings, replayed_law
 from jaxid.consistency.noise import estimated_force_noise, noise_findings
 from jaxid.consistency.reference_hold import (
     compare_reference_holds,
@@ -124,6 +125,10 @@ def open_session(
     if isinstance(validate, str) or not isinstance(validate, Sequence):
         raise InputError("validate is not a list of logs", hint="put it into a list: validate=[log]")
     as_logged = load_case(case)
+    if as_logged.log is not None and as_logged.log.kind == "steady":
+        from jaxid.steady import open_steady
+
+        return open_steady(as_logged, log, validate, _read)
     case = at_joints(as_logged)
     fit = _read(as_logged, log)
     # The machine of the first log serves them all: only the controller's period depends on the log.
@@ -304,7 +309,9 @@ def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]
         driven=driven,
         fewest_levels=2 if short else FEWEST_LEVELS,
         resolution_stated=stated,
+        free=True,
     )
+    check_absent(case, machine, log)
     impossible = plant.impossible(log.position) if all(log.measured) else None
     if impossible is not None:
         row, what = impossible
@@ -356,6 +363,9 @@ def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bo
         InputError: If the log contradicts the case.
     """
     log, data = opened.log, opened.data
+    if log.passive:
+        # Sign, hold and noise of a force, and a law, need a force.
+        return _Held([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
     declared = balance_fits(machine, data)[0]
     if not declared.finite:
         return _Held([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
@@ -381,6 +391,7 @@ def _held_against(case: Case, machine: Machine, opened: OpenedLog, free_hold: bo
         findings, settings = [*findings, *doubts], settings | setting
     replayed = replayed_law(machine, log)
     findings += law_findings(machine, log, replayed, confirmed=confirmed)
+    findings += loop_velocity_findings(machine, log)
     raise_on_error(findings)
 
     findings += weight_findings(machine, log, declared)

@@ -18,6 +18,7 @@ from jaxid.names import (
     HOLDS,
     IN_LOOP,
     INERTIAL_KINDS,
+    LOG_KINDS,
     METHODS,
     MINIMISERS,
     OUTPUTS,
@@ -105,9 +106,11 @@ class LogTable:
 
     time: str | None = key(text, "name of the column with the time", unit="s", note="give sample_rate")
     sample_rate: float | None = key(number("positive"), "samples per second", unit="Hz", note="give time")
-    position: str | tuple[str, ...] = key(columns(), f"{_COLUMN} of the position, one a joint", required=True)
-    force: str | tuple[str, ...] = key(
-        columns("drive"), f"{_COLUMN} of the command, one a drive", required=True
+    position: str | tuple[str, ...] | None = key(
+        columns(), f"{_COLUMN} of the position, one a joint", note="the integral of the velocity"
+    )
+    force: str | tuple[str, ...] | None = key(
+        columns("drive"), f"{_COLUMN} of the command, one a drive", note="zero: a free swing"
     )
     hold: str | None = key(
         choice(HOLDS), "course of the command between samples", note="zero_order or linear, as the log shows"
@@ -158,7 +161,12 @@ class LogTable:
     )
     rows: tuple[int, int] | None = key(rows, "first row and end, 0-based, half open", note="all rows")
     velocity: str | tuple[str, ...] | None = key(
-        columns(), f"{_COLUMN} of the velocity, one a joint; only its unit is checked"
+        columns(), f"{_COLUMN} of the velocity, one a joint; beside a position only its unit is checked"
+    )
+    loop_velocity: str | tuple[str, ...] | None = key(
+        columns(),
+        f"{_COLUMN} of the velocity that the drive measures and its own loop uses, one a joint",
+        note="the loop differences positions",
     )
     acceleration: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of the acceleration, one a joint; no method uses it"
@@ -174,6 +182,17 @@ class LogTable:
     )
     temperature: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of a temperature; no method uses it"
+    )
+    kind: str = key(
+        choice(LOG_KINDS),
+        "a log over time, or steady: a table of steady velocities and the forces that hold them",
+        default=LOG_KINDS[0],
+    )
+    scatter: str | tuple[str, ...] | None = key(
+        columns("drive"), f"{_COLUMN} of the standard deviation of the force; with kind = 'steady'"
+    )
+    samples: str | None = key(
+        text, f"{_COLUMN} of the number of readings of which each row is the mean; with kind = 'steady'"
     )
 
 
@@ -349,6 +368,12 @@ class SensorTable:
     )
     position_noise: ByJoint | None = key(
         by_joint(number("nonnegative")), "standard deviation of a position", unit="position", note="not known"
+    )
+    velocity_noise: ByJoint | None = key(
+        by_joint(number("positive")),
+        "standard deviation of a velocity, of logs without a position",
+        unit=_SPEED,
+        note="estimated from the log",
     )
     force_noise: ByJoint | None = key(
         by_drive(number("nonnegative")),

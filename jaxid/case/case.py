@@ -182,7 +182,7 @@ class Case:
         if self.log is None:
             return True
         named = self.log.position
-        whole = not isinstance(named, str) and len(named) == self.plant.joints
+        whole = named is not None and not isinstance(named, str) and len(named) == self.plant.joints
         return whole or self.log.load_position is not None
 
     @property

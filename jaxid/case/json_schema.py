@@ -193,8 +193,10 @@ def _user_effect() -> dict[str, Any]:
 
 
 def _log() -> dict[str, Any]:
-    one_time_base = [{"required": ["time"]}, {"required": ["sample_rate"]}]
-    return {**schema_of(keys_of(LogTable), _doc(LogTable)), "oneOf": one_time_base}
+    steady = {"properties": {"kind": {"const": "steady"}}, "required": ["kind", "velocity", "force"]}
+    time_base = [{"required": ["time"]}, {"required": ["sample_rate"]}, steady]
+    motion = [{"required": ["position"]}, {"required": ["velocity"]}, {"required": ["loop_velocity"]}]
+    return {**schema_of(keys_of(LogTable), _doc(LogTable)), "oneOf": time_base, "anyOf": motion}
 
 
 def _signal(doc: str) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from jaxid.files import json_text, write_results
 from jaxid.gap import noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import Precision
 from jaxid.session import Session, open_session
 from jaxid.simulation.force_balance import ForceData, force_residual, force_size, sharpened
@@ -92,6 +93,9 @@ class Check:
         free = session.machine.parameters.free
         identifiable = self.precision.identifiable
 
+        measures = "velocity" if log.integrated else "position"
+        stated = sensor.velocity_noise if log.integrated else sensor.position_std
+
         def at_encoders(x: np.ndarray) -> np.ndarray:
             return np.where(log.measured, x, np.nan)
 
@@ -106,10 +110,10 @@ class Check:
                 "peak_velocity": np.abs(at_encoders(session.fit.data.qd)).max(axis=0),
                 "peak_force": np.abs(session.fit.data.force).max(axis=0),
                 "moving": float(session.fit.data.moving.mean()),
-                "position_noise": at_encoders(position_noise(session.machine, log)),
+                f"{measures}_noise": at_encoders(position_noise(session.machine, log)),
                 "force_noise": one_or_list(force_noise(session.machine, session.fit.data)),
                 "noise_from": {
-                    "position": "estimated" if sensor.position_std is None else "stated",
+                    measures: "estimated" if stated is None else "stated",
                     "force": "estimated" if sensor.force_noise is None else "stated",
                 },
             },
@@ -170,6 +174,10 @@ def check(case: CaseLike, log: LogLike, *, validate: Sequence[LogLike] = ()) -> 
     session = open_session(case, log, validate)
     machine, data = session.machine, session.fit.data
     floor = noise_floor(machine, session.fit.log, data)
+    if session.fit.log.steady is not None:
+        from jaxid.steady import steady_fit
+
+        return Check(session, run_alone(steady_fit(session)).precision, floor)
     arrays = ForceData.of(data, data.fitted)
     theta = machine.parameters.guess
     jacobian = _jacobian(sharpened(machine.plant, data), machine.parameters.places, arrays, theta)

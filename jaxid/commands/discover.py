@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from jaxid.case.case import Case, CaseLike
 from jaxid.case.user_faults import named_faults
+from jaxid.consistency.absent import acts_by_position
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.in_loop.confirm import WHY, hindering
@@ -18,7 +20,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import proposals
-from jaxid.discovery.superset import build_candidate_model
+from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_known_reference
@@ -112,6 +114,10 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
+    if session.fit.log.steady is not None:
+        from jaxid.discovery.steady import explore_steady
+
+        return explore_steady(session, max_effects=max_effects, progress=progress)
     if session.case.fits_within_prior("discover"):
         return explore_within(session, max_effects=max_effects, progress=progress)
     data = session.fit.data
@@ -179,7 +185,13 @@ def start_search(
     baseline = inverse_dynamics(machine, data)
     floor = noise_floor(baseline.machine, log, data)
     colour = sensor_colour(baseline.machine, log, data)
-    union = build_candidate_model(baseline.machine, data, session.case.searched)
+    searched = session.case.searched
+    if log.integrated:
+        # Where the machine is was not measured.
+        scales = scales_of(machine.plant, data)[0]
+        starts: dict[type, dict[str, Any]] = {cls: dict(cls.starts(scales)[0]) for cls in searched}
+        searched = tuple(cls for cls in searched if not acts_by_position(cls(**starts[cls])))
+    union = build_candidate_model(baseline.machine, data, searched)
     others = tuple(v.data for v in session.validations)
     return baseline, Search(union, data, floor, colour, others, progress)
 

@@ -45,6 +45,8 @@ _WHITE, _LAGS, _NOISE = 0.1, 5, 0.5
 _NORMAL, _OUTLIERS = 1.4826, 1.2
 # A difference below this part of the command is rounding.
 _ROUNDED = 1e-6
+# Part of an inertia from which a delay of the loop's velocity is said.
+_SEEN = 0.005
 # Laws without a model of the plant.
 _PLAIN = (CascadePD, PD, PID, FrictionCompensation)
 
@@ -125,7 +127,14 @@ def law_at_ticks(machine: Machine, log: Log) -> LawAtTicks | None:
     position, reference, extra, every = ticks
     driven = machine.plant.driven(position.shape[1])
     arrays = (jnp.asarray(a) for a in (position, reference, extra, start_velocity(log)))
-    made = np.asarray(commands(controller, driven, *arrays))
+    own = None
+    if controller.own_velocity and log.velocity is not None:
+        own = log.velocity
+        if every > 1:
+            times = log.time[0] + controller.period * np.arange((log.samples - 1) * every + 1)
+            own = scipy.interpolate.CubicSpline(log.time, own, axis=0)(np.minimum(times, log.time[-1]))
+        own = jnp.asarray(own)
+    made = np.asarray(commands(controller, driven, *arrays, own=own))
     if isinstance(controller, PID):
         # The integral before the first row is not known.
         made = made + np.median(log.force - made[::every], axis=0)
@@ -187,6 +196,31 @@ def law_findings(
             severity = "error" if sure else "warning"
         findings.append(Finding(severity, what, f"{log.source}, [controller]", hint))
     return findings
+
+
+def loop_velocity_findings(machine: Machine, log: Log) -> list[Finding]:
+    """Say what it means if a drive in a loop faster than its log measures its velocity itself.
+
+    A differenced position is half of its window late, which acts like a mass. Between the samples of a slow
+    log the command does not show which of the two the loop uses.
+    """
+    controller, inertia = machine.controller, machine.plant.own_inertia()
+    if not isinstance(controller, CascadePD | PD | PID) or controller.own_velocity or inertia is None:
+        return []
+    if log.reference is None or round(log.period / controller.period) <= 1:
+        return []
+    damping = np.asarray(controller.kv if isinstance(controller, CascadePD) else controller.kd)
+    late = 0.5 * controller.period * controller.velocity_average
+    mass = np.max(np.abs(damping * machine.gain) * late)
+    part = float(mass / np.max(np.asarray(inertia)))
+    if part < _SEEN:
+        return []
+    what = (
+        f"the loop is taken to difference positions; if the drive measures its velocity itself, the inertia "
+        f"is {mass:.2g} {machine.unit('inertia')} smaller than the fit says, {100 * part:.2g} % of the guess"
+    )
+    hint = "name the column of that velocity as loop_velocity in [log], if so"
+    return [Finding("warning", what, f"{log.source}, [controller]", hint)]
 
 
 def _best_law(machine: Machine, log: Log, drive: int) -> _Fitted | None:

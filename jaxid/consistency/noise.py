@@ -83,7 +83,7 @@ def _beyond_controller(machine: Machine, log: Log) -> np.ndarray:
     driven = machine.plant.driven(machine.plant.joints)
     out = np.empty(log.force.shape[1])
     for k, j in enumerate(driven):
-        of = [log.filled[:, int(j)]]
+        of = [log.readings[:, int(j)]]
         if log.reference is not None:
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
         out[k] = _unexplained(log.force[:, k], of)
@@ -167,7 +167,8 @@ def noise_findings(
         fit: Balance of the prepared log.
         estimate: Result of `estimated_force_noise`.
     """
-    return [*_force(machine, log, data, fit, estimate), *_position(machine, log)]
+    of_position = [] if log.integrated else _position(machine, log)
+    return [*_force(machine, log, data, fit, estimate), *of_position]
 
 
 def _force(

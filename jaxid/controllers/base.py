@@ -86,11 +86,13 @@ class Controller(eqx.Module):
         period: Sampling time [s].
         limit: Bound of the magnitude of the command; None: no bound.
         velocity_average: Number of samples whose mean is differenced backwards for the velocity.
+        own_velocity: Whether the drive measures the velocity, so that no position is differenced for it.
     """
 
     period: float = eqx.field(static=True, kw_only=True)
     limit: Array | None = eqx.field(default=None, kw_only=True)
     velocity_average: int = eqx.field(static=True, default=1, kw_only=True)
+    own_velocity: bool = eqx.field(static=True, default=False, kw_only=True)
 
     # Whether the law needs the reference's derivatives.
     anticipates: ClassVar[bool] = False

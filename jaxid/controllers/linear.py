@@ -34,7 +34,8 @@ class PD(Controller):
     derivative: str = eqx.field(static=True, default="error", kw_only=True)
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> Array:
-        return tick.reference
+        # A machine that moves already follows a reference that moves.
+        return tick.reference - self.period * tick.at_drives(velocity)
 
     def law(self, tick: Tick, velocity: Array, memory: Array, disturbance: Array) -> tuple:
         slope = (tick.reference - memory) / self.period if self.derivative == "error" else 0.0
@@ -71,18 +72,21 @@ class PID(Controller):
     """u = kp e + ki sum(e) period + kd de, de low-passed with time constant `derivative_filter`.
 
     With `anti_windup` the integral is held while the command is at its limit and the error
-    would drive it further out.
+    would drive it further out. It starts at `integral`, which a log that begins in motion gives.
     """
+
+    of_machine = ("integral",)
 
     kp: Array
     ki: Array
     kd: Array
     derivative_filter: Array = eqx.field(default=0.0, kw_only=True)
     anti_windup: bool = eqx.field(static=True, default=False, kw_only=True)
+    integral: Array = eqx.field(default=0.0, kw_only=True)
 
     def start_law(self, tick: Tick, velocity: Array, path: Path | None = None) -> tuple:
         none = jnp.zeros_like(tick.reference)
-        return tick.reference, none, none
+        return tick.reference - self.period * tick.at_drives(velocity), none + self.integral, none
 
     def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
         last, integral, slope = memory

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.consistency.absent import need_position
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.unknowns import REFERENCE
@@ -29,7 +30,16 @@ if TYPE_CHECKING:
 def _inverse_dynamics(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 
-    return inverse_dynamics_steps(session.machine, session.fit.data)
+    if session.fit.log.steady is not None:
+        from jaxid.steady import steady_fit
+
+        return (yield from steady_fit(session))
+    estimate = yield from inverse_dynamics_steps(session.machine, session.fit.data)
+    if not session.fit.log.integrated:
+        return estimate
+    from jaxid.estimators.velocity_noise import without_velocity_noise
+
+    return (yield from without_velocity_noise(session, estimate))
 
 
 def _output_error(
@@ -345,11 +355,13 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         options: Keyword arguments of the method.
 
     Raises:
-        InputError: If the reference has unknowns and the method does not fit them in a simulated loop; if
-            links must be physically consistent, and the method or the links do not allow it; or if the case
-            asks for a Hessian or a profile, and the method maximises no likelihood.
+        InputError: If the log lacks a position or time that the method needs; if the reference has unknowns
+            and the method does not fit them in a simulated loop; if links must be physically consistent, and
+            the method or the links do not allow it; or if the case asks for a Hessian or a profile, and the
+            method maximises no likelihood.
     """
     need_likelihood(method, session.case)
+    need_position(method, session.fit.log)
     if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
     if method == "within_prior":

@@ -45,6 +45,8 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
     case, machine, log = session.case, session.machine, session.fit.log
     plant, controller = machine.plant, machine.controller
 
+    if log.steady is not None:
+        return Choice("inverse_dynamics", "a table of steady speeds is a balance of forces in each row")
     if asked is not None:
         return Choice("output_error", f"{asked} is an option of it")
     if "output_error" in case.tables and case.within_prior is None:
@@ -55,6 +57,11 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
         return Choice("output_error", "the reference has unknowns, which only a simulated loop shows")
     if case.identification.physically_consistent:
         return Choice("output_error", "links are to be physically consistent")
+
+    if log.passive:
+        return Choice(
+            "output_error", "nothing drives the machine: the start and the model give the whole motion"
+        )
 
     looped = controller is not None and log.reference is not None
     breaks_away = any(e.break_away_level is not None for e in plant.effects)

@@ -34,7 +34,7 @@ _SHARES = (0.2, 0.5, 0.8)
 
 
 @eqx.filter_jit
-def _solve(
+def solve_balance(
     plant: Plant,
     places: tuple,
     data: ForceData,
@@ -88,12 +88,12 @@ def inverse_dynamics_steps(
     options = (transform, parameters.bounds, damping)
     fits, size = [], np.zeros(())
     for at in [theta, *phase_starts(machine, theta), *shape_starts(machine, theta)]:
-        fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
+        fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, at, *options))
         fits.append(fit)
     # Only jumps of the other joints identify dry friction at a joint without an encoder, and the cost has
     # many local minima.
     for at in [] if whole else _splits(machine, np.asarray(fits[0].theta), data.measured):
-        fit, size = yield SolveRequest(_solve, (plant, places, arrays, at, *options))
+        fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, at, *options))
         fits.append(fit)
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
     # Among the fits that reach the lowest cost, to rounding, prefer one that converged.
@@ -105,7 +105,7 @@ def inverse_dynamics_steps(
         # A sample with zero weight keeps zero weight.
         e = np.where(was > 0, e / np.where(was > 0, was, 1.0), np.inf)
         arrays = eqx.tree_at(lambda a: a.weight, arrays, _robust(e, rows))
-        fit, _ = yield SolveRequest(_solve, (plant, places, arrays, fit.theta, *options))
+        fit, _ = yield SolveRequest(solve_balance, (plant, places, arrays, fit.theta, *options))
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)

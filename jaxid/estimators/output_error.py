@@ -30,6 +30,7 @@ from jaxid.model.unknowns import REFERENCE, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess, full_hessian, hessian_notes
+from jaxid.simulation.kalman import rounded_readings
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
     LONGEST_MEMORY,
@@ -56,6 +57,8 @@ _CLEARLY = 10.0
 _TURNING = 0.04
 _LITTLE = 0.1
 _MOST = 4
+# Least steps a sample of a free motion.
+_FREE = 4
 # Number of segments; each is long enough to show friction and short enough not to drift away.
 _SEGMENTS = 40
 
@@ -74,6 +77,7 @@ def output_residual(
         run = replay.following(places, theta)(scatter(places, plant, theta), nudge)
         outputs: dict[str, tuple[Array, ...]] = {
             "position": (run.position,),
+            "velocity": (run.velocity,),
             "force": (replay.drive.gain * run.command,),
         }
         outputs["both"] = outputs["position"] + outputs["force"]
@@ -106,7 +110,8 @@ def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np
     """Return a log's output, (time, k), and the mask of columns that count; see `output_residual`."""
     force = log.force * machine.gain
     outputs = {"position": (log.filled,), "force": (force,), "both": (log.filled, force)}
-    counts = {"position": log.measured, "force": (True,) * force.shape[1]}
+    outputs["velocity"] = (log.readings,)
+    counts = {"position": log.measured, "velocity": log.measured, "force": (True,) * force.shape[1]}
     counts["both"] = counts["position"] + counts["force"]
     return np.concatenate(outputs[on], axis=1), np.array(counts[on])
 
@@ -227,6 +232,8 @@ def output_error_steps(
     need_names(profile, machine.parameters.names)
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
+    elif log.integrated:
+        on = "velocity"
     machine = machine if start is None else machine.with_estimate(start)
     chosen = numerics is None
     numerics = numerics or choose_numerics(machine, log)
@@ -274,7 +281,7 @@ def output_error_steps(
         minimum = yield SolveRequest(_fit, (*problem, active, solver))
     measured, weight = problem[3], problem[4]
     e = np.asarray(minimum.residual).reshape(measured.shape)
-    counts = np.broadcast_to(weight[0] > 0, e.shape)
+    counts = np.asarray(weight) > 0
     jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
     theta = np.asarray(minimum.theta)
     names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
@@ -422,12 +429,16 @@ def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str)
     free = np.full(nuisance, np.inf)
     transform = Transform.of(parameters)
     transform = replace(transform, log=np.concatenate([transform.log, np.zeros(nuisance, bool)]))
+    weight = np.tile(counts.astype(float), (len(measured), 1))
+    if log.passive and on == "position":
+        # A free motion ends at rest, where one rounding error stands in every reading.
+        weight = weight * rounded_readings(machine, log)
     return (
         replay,
         parameters.places,
         machine.plant,
         measured,
-        np.tile(counts.astype(float), (len(measured), 1)),
+        weight,
         np.concatenate([parameters.guess, np.zeros(nuisance)]),
         transform,
         (np.concatenate([lower, -free]), np.concatenate([upper, free])),
@@ -458,6 +469,9 @@ def choose_numerics(
         set_valued=not breaks_away and solver is None,
         solver=solver,
     )
+    if log.passive and solver is None:
+        # Without noise of a force the phase of a swing is so precise that it shows the error of a step.
+        numerics = replace(numerics, substeps=max(numerics.substeps, _FREE))
     if not numerics.set_valued and solver is None:
         numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))
     if machine.controller is not None or not segments:
@@ -482,6 +496,8 @@ def turning_steps(machine: Machine, log: Log) -> int:
     if inertia is None or not np.any(noise > 0):
         return 1
     period = machine.controller.period if machine.controller is not None else log.period
+    # Noise of a velocity moves an integrated position by as much in one sample.
+    noise = noise * log.period if log.integrated else noise
     n = log.position.shape[1]
     zero, u = jnp.zeros(n), jnp.zeros(log.force.shape[1])
     q = jnp.asarray(log.filled[0])
@@ -529,7 +545,7 @@ def notes_of(
         steps = f"by diffrax's {numerics.solver}, each step within {RELATIVE:g}"
     notes = [f"simulated {where}, {steps}; dry friction {how}"]
     if on != "position":
-        notes.append(f"fitted on {'position and force' if on == 'both' else 'force'}")
+        notes.append(f"fitted on {'position and force' if on == 'both' else on}")
     if numerics.segment:
         seconds = numerics.segment * log.period
         notes.append(f"restarted from the log every {seconds:.3g} s, because it would drift off otherwise")

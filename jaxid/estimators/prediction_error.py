@@ -24,7 +24,7 @@ from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, assess, hessian_notes
-from jaxid.simulation.kalman import make_filter, slow_samples
+from jaxid.simulation.kalman import make_filter, slow_samples, smooth_steps
 from jaxid.simulation.replay import Numerics, exact_numerics
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import needed_steps
@@ -145,8 +145,8 @@ def prediction_error_steps(
             hint="take a log with more motion, lower [preprocess] rest_velocity, or use another method",
         )
 
-    force = np.maximum(np.std(log.force, axis=0), 1e-300)
-    stroke = np.maximum(np.ptp(log.filled, axis=0), 1e-300)
+    force = _force_scale(machine, log)
+    stroke = np.maximum(np.ptp(log.readings, axis=0), 1e-300)
     reading = np.maximum(position_noise(machine, log), 1e-9 * stroke)[measured]
     noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
     floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
@@ -268,6 +268,23 @@ def _corrected_steps(
     return x[:p] - shift[:p], read
 
 
+def _force_scale(machine: Machine, log: Log) -> Float[np.ndarray, " m"]:
+    """Return the typical size of each command, in its unit, (m,).
+
+    That of a constant force is its level. Of a machine that nothing drives it is the command that would
+    accelerate the masses as they were, at the guesses.
+    """
+    if log.passive:
+        speed = smooth_steps(log) / log.period
+        inertia = machine.plant.own_inertia()
+        mass = 1.0 if inertia is None else np.asarray(inertia)
+        own = np.sqrt(np.mean((mass * np.gradient(speed, log.period, axis=0)) ** 2, axis=0))
+        driven = machine.plant.driven(machine.plant.joints)[: log.force.shape[1]]
+        return np.maximum(np.max(own[list(driven)]) / np.abs(machine.gain), 1e-300)
+    spread, size = np.std(log.force, axis=0), np.sqrt(np.mean(log.force**2, axis=0))
+    return np.maximum(np.where(spread > 1e-9 * size, spread, size), 1e-300)
+
+
 def slides(machine: Machine, log: Log) -> bool:
     """Check that dry friction acts somewhere."""
     plant, n = machine.plant, log.position.shape[1]
@@ -328,7 +345,11 @@ def _estimate(
         steps=steps,
         notes=tuple(notes),
         details={
-            "noise": {"force": noise[:drives], "force_reading": read, "position": noise[drives:]},
+            "noise": {
+                "force": noise[:drives],
+                "force_reading": read,
+                "velocity" if problem.kalman.of_velocity else "position": noise[drives:],
+            },
             "log_likelihood": -float(scored.cost),
             "whiteness": {"lags": _LAGS, "p": p_values},
         },

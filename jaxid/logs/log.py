@@ -30,6 +30,27 @@ Column = np.ndarray
 
 
 @dataclass(frozen=True)
+class SteadyRows:
+    """Precision of the rows of a table of steady speeds.
+
+    Attributes:
+        scatter: Standard deviation of the force in each row, or of one reading of it if `count` is given, in
+            units of the command, (rows, drives); None: not known.
+        count: Number of readings of which each row is the mean, (rows,); None: not known.
+    """
+
+    scatter: Float[np.ndarray, "rows drives"] | None = None
+    count: Float[np.ndarray, " rows"] | None = None
+
+    @property
+    def std(self) -> Float[np.ndarray, "rows drives"] | None:
+        """Standard deviation of the force of each row, in units of the command; None: not known."""
+        if self.scatter is None or self.count is None:
+            return self.scatter
+        return self.scatter / np.sqrt(self.count)[:, None]
+
+
+@dataclass(frozen=True)
 class Log:
     """One measured or simulated log; its arrays are read-only float64 copies.
 
@@ -37,7 +58,8 @@ class Log:
 
     Attributes:
         time: Time [s], from the start of the file.
-        position: Positions [m or rad], a column a joint; NaN throughout for a joint without an encoder.
+        position: Positions [m or rad], a column a joint; NaN throughout for a joint without an encoder. None
+            with `velocity` given: the integral of the velocity, which starts at zero.
         force: The logged command, before the known gain of the actuator.
         velocity: Measured velocity [m/s or rad/s].
         acceleration: Measured acceleration [m/s^2 or rad/s^2].
@@ -50,10 +72,12 @@ class Log:
         source: Origin of the log, for messages.
         assumed: Everything that was assumed to read it.
         table: The `[log]` table by which it was read; None: it was not read from a file.
+        integrated: Whether the velocity was measured, and the position is its integral.
+        steady: Precision of the rows of a table of steady speeds; None: the rows are samples over time.
     """
 
     time: Column
-    position: Column
+    position: Column | Any
     force: Column
     velocity: Column | None = None
     acceleration: Column | None = None
@@ -66,15 +90,23 @@ class Log:
     source: str = "log"
     assumed: tuple[Assumed, ...] = ()
     table: LogTable | None = None
+    integrated: bool = False
+    steady: SteadyRows | None = None
 
     def __post_init__(self):
         """Copy the arrays, make them read-only and check that they fit together.
 
         Raises:
-            InputError: If lengths differ or `hold` is unknown.
+            InputError: If lengths differ, `hold` is unknown, or there is neither position nor velocity.
         """
         time = _frozen(np.ravel(self.time))
         object.__setattr__(self, "time", time)
+        if self.position is None:
+            if self.velocity is None:
+                hint = "give position, or velocity if only that was measured"
+                raise InputError("neither position nor velocity is given", where=self.source, hint=hint)
+            object.__setattr__(self, "position", integral(time, self.velocity))
+            object.__setattr__(self, "integrated", True)
         for name in ("position", "force", *OPTIONAL_COLUMNS):
             given = getattr(self, name)
             if given is None:
@@ -120,12 +152,33 @@ class Log:
             )
 
     @property
+    def readings(self) -> Float[np.ndarray, "samples joints"]:
+        """Readings of the sensors of motion: positions, or velocities if only these were measured."""
+        return self.velocity if self.integrated and self.velocity is not None else self.filled
+
+    @property
     def filled(self) -> Float[np.ndarray, "samples joints"]:
         """Positions, with the mean of the other joints in place of those without an encoder."""
         if all(self.measured):
             return self.position
         others = np.nanmean(self.position, axis=1, keepdims=True)
         return np.where(self.measured, self.position, others)
+
+    @property
+    def readings_of_speed(self) -> Float[np.ndarray, "samples joints"]:
+        """Measured velocities of a log that has them."""
+        assert self.velocity is not None, "only logs with a velocity are asked"
+        return self.velocity
+
+    @property
+    def passive(self) -> bool:
+        """True if no force drives the machine: it was not logged, or it is zero throughout."""
+        return not self.force.any()
+
+    @property
+    def stepped(self) -> bool:
+        """True if every force is constant, and one of them drives: a step that began with the log."""
+        return not self.passive and not np.ptp(self.force, axis=0).any()
 
     @property
     def period(self) -> float:
@@ -140,6 +193,77 @@ class Log:
     def rate_hz(self) -> float:
         """Sampling rate [Hz]."""
         return 1.0 / self.period
+
+
+def steady_log(
+    groups: dict[str, np.ndarray],
+    names: Mapping[str, list[str]],
+    content: Table,
+    table: LogTable,
+    frame: Frame,
+    path: Path,
+) -> Log:
+    """Return a table of steady speeds as a log, whose time is the number of the row.
+
+    Args:
+        groups: Columns by quantity, (rows, width) each.
+        names: Names of the columns by quantity.
+        content: The table as its reader gave it.
+        table: The `[log]` table.
+        frame: The machine, on which the conversion of units depends.
+        path: The file, for messages.
+
+    Raises:
+        InputError: If a unit does not go with the machine, or a scatter or number of samples is not positive.
+    """
+    groups = dict(groups)
+    apart = {name: groups.pop(name) for name in _OF_STEADY if name in groups}
+    for name, values in apart.items():
+        if not np.all(values > 0):
+            row = content.rows[0] + int(np.flatnonzero(~np.all(values > 0, axis=1))[0])
+            hint = f"correct the row, or leave {name} out"
+            raise InputError(f"{name} is not positive in row {row}", where=str(path), hint=hint)
+    own, units = converted(groups, names, content.units, table, frame, str(path))
+    spread = None
+    if "scatter" in apart:
+        # The scatter is in the unit of the force, whose sign does not matter.
+        of_force = {"force": apart["scatter"]}
+        turned = replace(table, sign=None)
+        spread = np.abs(converted(of_force, names, content.units, turned, frame, str(path))[0]["force"])
+    count = apart["samples"][:, 0] if "samples" in apart else None
+    said = []
+    resting = int(np.sum(~own["velocity"].any(axis=1)))
+    if resting:
+        what = "dry friction is undetermined at rest, so that they do not count"
+        said.append(Assumed("rows at rest", resting, what))
+    return Log(
+        time=np.arange(len(own["velocity"]), dtype=float),
+        position=np.zeros_like(own["velocity"]),
+        velocity=own["velocity"],
+        force=own["force"],
+        temperature=own.get("temperature"),
+        rows=content.rows,
+        source=str(path),
+        assumed=(*content.assumed, *units, *said),
+        table=table,
+        steady=SteadyRows(spread, count),
+    )
+
+
+def integral(time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Return the integral of a velocity by the trapezoidal rule, from zero.
+
+    Args:
+        time: Time [s], (samples,).
+        velocity: Velocities [m/s or rad/s], (samples,) or (samples, joints).
+    """
+    v = np.asarray(velocity, dtype=np.float64)
+    v = v[:, None] if v.ndim == 1 else v
+    if len(v) != time.size:
+        # The log itself refuses unequal lengths.
+        return np.zeros_like(v)
+    steps = 0.5 * (v[1:] + v[:-1]) * np.diff(time)[:, None]
+    return np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def with_load(log: Log, load: int | None, joints: int) -> Log:
@@ -226,14 +350,17 @@ def read_log(
         for key, group in names.items()
     }
     _check_widths(groups, names, joints, drives, path)
+    if table.kind == "steady":
+        return steady_log(groups, names, content, table, Frame() if frame is None else frame, path)
     if rows[1] - rows[0] < MINIMUM_SAMPLES:
         raise _too_short(rows[1] - rows[0], path)
-    if table.unwrap:
+    if table.unwrap and "position" in groups:
         # A turn is one of the column's unit.
         position, reference = joined(groups["position"], groups.get("reference"), table.unwrap)
         groups |= {"position": position} | ({} if reference is None else {"reference": reference})
     frame = Frame() if frame is None else frame
     groups, units = converted(groups, names, content.units, table, frame, str(path))
+    groups, absent = _completed(groups, joints, drives)
     time, groups, rows, timing = _at_one_rate(groups, table, rows, path)
     if time.size < MINIMUM_SAMPLES:
         raise _too_short(time.size, path)
@@ -242,10 +369,28 @@ def read_log(
         hold=HOLDS[0] if table.hold is None else table.hold,
         rows=rows,
         source=str(path),
-        assumed=(*content.assumed, *units, *timing),
+        assumed=(*content.assumed, *absent, *units, *timing),
         table=table,
-        **groups,
+        **{"position": None, **groups},
     )
+
+
+def _completed(
+    groups: dict[str, np.ndarray], joints: int | None, drives: int | None
+) -> tuple[dict[str, np.ndarray], list[Assumed]]:
+    """Return the columns with a force of zero where none was logged, and what was assumed of absent ones."""
+    said = []
+    if "position" not in groups:
+        why = "the log has no position; where it starts is arbitrary, and the noise is that of the velocity"
+        said.append(Assumed("position", "integral of velocity", why))
+    if "force" not in groups:
+        motion = groups.get("position", groups.get("velocity"))
+        assert motion is not None, "`log_table` refuses a log without motion"
+        width = motion.shape[1] if joints is None else joints
+        force = np.zeros((len(motion), width if drives is None else drives))
+        groups = {**groups, "force": force}
+        said.append(Assumed("force", 0.0, "the log has none, so that nothing drives the machine"))
+    return groups, said
 
 
 def _too_short(samples: int, path: Path) -> InputError:
@@ -332,16 +477,46 @@ def log_table(columns: LogTable | Mapping[str, Any], spot: Spot = _LOG) -> LogTa
     if isinstance(columns, LogTable):
         return columns
     table = read_settings(LogTable, dict(columns), spot)
+    _check_kind(table, dict(columns), spot)
+    if table.kind == "steady":
+        return table
     if table.time is None and table.sample_rate is None:
         hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
         raise spot.fault("neither time nor sample_rate is given", hint)
     return table
 
 
+# Keys that only a table of steady speeds has, and keys that it may have.
+_OF_STEADY = ("scatter", "samples")
+_STEADY_KEYS = ("kind", "velocity", "force", "units", "sign", "position_at", "rows", "format", *_OF_STEADY)
+_STEADY_KEYS = (*_STEADY_KEYS, "separator", "decimal", "temperature", "counts_per_revolution")
+
+
+def _check_kind(table: LogTable, given: dict[str, Any], spot: Spot) -> None:
+    """Refuse columns that the kind of the log does not have, or lacks."""
+    if table.kind == "steady":
+        for name in ("velocity", "force"):
+            if name not in given:
+                hint = f"add {name} = its column: a steady table has a velocity and the force that holds it"
+                raise spot.fault(f"'{name}' is missing", hint)
+        other = next((name for name in given if name not in _STEADY_KEYS), None)
+        if other is not None:
+            raise spot.at(other).fault('does not go with kind = "steady"', "leave it out, or remove kind")
+        return
+    other = next((name for name in _OF_STEADY if name in given), None)
+    if other is not None:
+        raise spot.at(other).fault('goes with kind = "steady" only', "leave it out")
+    if table.position is None and table.velocity is None and table.loop_velocity is None:
+        hint = "add position: the name of its column; or velocity, where only the velocity was logged"
+        raise spot.fault("'position' is missing", hint)
+
+
 def _names(table: LogTable) -> dict[str, list[str]]:
     """Return the names of columns by quantity."""
-    quantities = ("time", "position", "force", *OPTIONAL_COLUMNS)
+    quantities = ("time", "position", "force", *OPTIONAL_COLUMNS, *_OF_STEADY)
     given = {quantity: getattr(table, quantity) for quantity in quantities}
+    if given["velocity"] is None:
+        given["velocity"] = table.loop_velocity
     return {q: [g] if isinstance(g, str) else list(g) for q, g in given.items() if g is not None}
 
 
@@ -385,7 +560,8 @@ def _check_widths(
     path: Path,
 ) -> None:
     """Check for one time, as many positions as joints, and as many forces as drives, or at most as joints."""
-    expected = groups["position"].shape[1] if joints is None else joints
+    moving = "position" if "position" in groups else "velocity"
+    expected = groups[moving].shape[1] if joints is None else joints
     drive_count = expected if drives is None else drives
     for key, values in groups.items():
         width, needed, what = values.shape[1], expected, "joint"

@@ -14,7 +14,7 @@ import scipy.signal
 from jaxtyping import Bool, Float
 
 from jaxid.errors import InputError
-from jaxid.logs.log import Log
+from jaxid.logs.log import Log, integral
 from jaxid.numerics import filters as signals
 from jaxid.settings import Preprocess
 
@@ -293,10 +293,13 @@ def choose_recipe(log: Log, stated: Preprocess = _CHOSEN) -> Recipe:
 
 def _rest_velocity(log: Log, cutoff_hz: float, how: str, reach: int) -> np.ndarray:
     """Choose the velocity below which a sample counts as at rest, by joint: see `choose_recipe`."""
-    _, qd, _ = differentiate(log.filled, log.period, cutoff_hz, 4, how, reach=reach)
+    _, qd, _ = motion(log, cutoff_hz, 4, how, reach)
     rate = log.rate_hz
-    noise = signals.high_band_std(log.filled)
-    if how == "parabolic":
+    noise = signals.high_band_std(log.readings)
+    if log.integrated:
+        # White noise of density 2 sigma^2 / rate; a parabola does not filter a velocity.
+        velocity_noise = noise * (1.0 if how == "parabolic" else np.sqrt(2 * cutoff_hz / rate))
+    elif how == "parabolic":
         # Slope of a line through 2 k + 1 samples.
         velocity_noise = noise * rate * np.sqrt(3 / (reach * (reach + 1) * (2 * reach + 1)))
     else:
@@ -346,10 +349,10 @@ def trimmed(log: Log, band_hz: float, decimation: int, *, literal: bool, periods
 
 
 def _noise_cutoff(log: Log) -> float:
-    """Find the frequency up to which every joint's position is above its noise without a gap [Hz]."""
+    """Find the frequency up to which every joint's reading is above its noise without a gap [Hz]."""
     rate = log.rate_hz
     # Segments of two seconds: corners of friction recur over seconds, noise is everywhere.
-    position = log.position[:, list(log.measured)]
+    position = log.readings[:, list(log.measured)]
     length = int(min(len(position), max(256, 2 * rate)))
     f, p = scipy.signal.welch(position, rate, window="hann", nperseg=length, detrend="linear", axis=0)
     floor = 2 * signals.high_band_std(position) ** 2 / rate
@@ -383,6 +386,20 @@ def differentiate(
     return tuple(out)
 
 
+def motion(
+    log: Log, cutoff_hz: float, order: int, how: str, reach: int = 2
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return filtered position, velocity and acceleration of a log, (time, n) each; see `differentiate`.
+
+    Where the velocity was measured, it is filtered and differentiated once, and the position is its integral.
+    """
+    if not log.integrated:
+        q, qd, qdd = differentiate(log.filled, log.period, cutoff_hz, order, how, reach=reach)
+        return q, qd, qdd
+    qd, qdd = differentiate(log.readings, log.period, cutoff_hz, order, how, orders=1, reach=reach)
+    return integral(log.time, qd), qd, qdd
+
+
 def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | None = None) -> Prepared:
     """Filter a log and mark the samples that count.
 
@@ -392,9 +409,7 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | Non
         recipe: Settings of the filter.
         hold_period: Time for which a held command is held [s]; None: the log's sampling time.
     """
-    q, qd, qdd = differentiate(
-        log.filled, log.period, recipe.cutoff_hz, recipe.order, recipe.derivatives, reach=recipe.reach
-    )
+    q, qd, qdd = motion(log, recipe.cutoff_hz, recipe.order, recipe.derivatives, recipe.reach)
     kept = recipe.decimator.kept(len(q))
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
     reach = recipe.decimator.reach

@@ -31,6 +31,8 @@ FEWEST_LEVELS = 5
 # Parts of all rows; a command that is at its limit more often than not does not determine the force.
 _SATURATED = 0.5
 _OFTEN_SATURATED = 0.05
+# Number of stretches of a log under a constant force, and the part of its speed that changes in a transient.
+_PIECES, _CHANGES = 10, 0.2
 
 
 def check_log(
@@ -43,6 +45,7 @@ def check_log(
     driven: Sequence[int] | np.ndarray | None = None,
     fewest_levels: int = FEWEST_LEVELS,
     resolution_stated: bool = False,
+    free: bool = False,
 ) -> list[Finding]:
     """Find the faults of a readable log.
 
@@ -56,15 +59,16 @@ def check_log(
         driven: Indices of the joints with a drive, in the order of the drives; None: the first ones.
         fewest_levels: Least number of distinct positions that count as motion.
         resolution_stated: Whether the case states the resolution of the position.
+        free: Whether a log without any force is accepted, because the machine is known to tell that it is.
 
     Returns:
         The faults; empty for a sound log.
     """
     where = str(path or log.source)
     findings = [
-        *wrap_findings(log.position, where),
+        *([] if log.integrated else wrap_findings(log.position, where)),
         *_movement(log, where, fewest_levels, resolution_stated),
-        *_force(log, command_limit, where),
+        *_force(log, command_limit, where, free),
     ]
     still = any(finding.severity == "error" for finding in findings)
     if not still:
@@ -96,39 +100,40 @@ def raise_on_error(findings: Iterable[Finding]) -> None:
 
 def _movement(log: Log, path: str, fewest: int, stated: bool) -> list[Finding]:
     """Find joints that do not move, and positions with coarse steps."""
-    measured = [(j, q) for j, q in enumerate(log.position.T, start=1) if log.measured[j - 1]]
-    reasons = [_stillness(q, fewest) for _, q in measured]
+    what = "velocity" if log.integrated else "position"
+    measured = [(j, q) for j, q in enumerate(log.readings.T, start=1) if log.measured[j - 1]]
+    reasons = [_stillness(q, fewest, what) for _, q in measured]
     if all(reasons):
-        hint = "check that position names the right column and that the machine moved"
-        return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, position", hint)]
+        hint = f"check that {what} names the right column and that the machine moved"
+        return [Finding("error", f"nothing moves: {reasons[0]}", f"{path}, {what}", hint)]
     findings = []
     for (joint, q), reason in zip(measured, reasons, strict=True):
-        where = f"{path}, position of joint {joint}"
+        where = f"{path}, {what} of joint {joint}"
         levels, step = position_levels(q)
         if reason:
             hint = "its parameters are not identifiable from this log; check the column"
             findings.append(Finding("warning", f"the joint does not move: {reason}", where, hint))
         elif step and levels < _COARSE_LEVELS:
-            what = f"the position is quantised in steps of {step:.3g}: {levels} levels in all"
+            coarse = f"the {what} is quantised in steps of {step:.3g}: {levels} levels in all"
             hint = "log a longer stroke or more digits"
-            hint += "" if stated else ", and give sensor.position_resolution"
-            findings.append(Finding("warning", what, where, hint))
+            hint += "" if stated or log.integrated else ", and give sensor.position_resolution"
+            findings.append(Finding("warning", coarse, where, hint))
     return findings
 
 
-def _stillness(q: np.ndarray, fewest: int) -> str:
-    """Explain why a position shows no motion; empty if it does."""
+def _stillness(q: np.ndarray, fewest: int, what: str = "position") -> str:
+    """Explain why a position, or a velocity, shows no motion; empty if it does."""
     if np.ptp(q) == 0:
-        return f"the position is {q[0]:.6g} throughout"
+        return f"the {what} is {q[0]:.6g} throughout"
     levels, step = position_levels(q)
     if levels < fewest:
-        return f"the position takes only {levels} values, {step:.3g} apart"
+        return f"the {what} takes only {levels} values, {step:.3g} apart"
     centred = q - q.mean()
     lags = range(1, min(20, q.size // 4) + 1)
     similar = [abs(centred[lag:] @ centred[:-lag]) / (centred @ centred) for lag in lags]
     # A motion that the sampling resolves is correlated with itself a sample later; noise is not.
     if max(similar) < max(0.1, 4.0 / np.sqrt(q.size)):
-        return f"the position is noise of {q.std():.3g} (standard deviation)"
+        return f"the {what} is noise of {q.std():.3g} (standard deviation)"
     return ""
 
 
@@ -145,14 +150,22 @@ def position_levels(q: np.ndarray) -> tuple[int, float]:
     return gaps.size + 1, float(gaps.min()) if on_grid else 0.0
 
 
-def _force(log: Log, limit: ByJoint | None, path: str) -> list[Finding]:
+def _force(log: Log, limit: ByJoint | None, path: str, free: bool) -> list[Finding]:
     """Find commands that are constant, or at their limit."""
     channels = log.force.T
+    if log.passive:
+        if free:
+            return []
+        hint = "check that force names the right column; a constant force identifies nothing"
+        return [Finding("error", "the force is zero throughout", f"{path}, force", hint)]
     constant = np.ptp(log.force, axis=0) == 0
     if constant.all():
-        level = "zero" if not log.force.any() else f"constant ({channels[0][0]:.6g})"
+        if _transient(log):
+            return []
         hint = "check that force names the right column; a constant force identifies nothing"
-        return [Finding("error", f"the force is {level} throughout", f"{path}, force", hint)]
+        hint += " of a motion without a transient"
+        what = f"the force is constant ({channels[0][0]:.6g}) throughout"
+        return [Finding("error", what, f"{path}, force", hint)]
     limits = [None] * len(channels) if limit is None else np.broadcast_to(limit, len(channels))
     findings = []
     for k, (u, bound) in enumerate(zip(channels, limits, strict=True), start=1):
@@ -163,6 +176,17 @@ def _force(log: Log, limit: ByJoint | None, path: str) -> list[Finding]:
         else:
             findings += _saturation(u, bound, where)
     return findings
+
+
+def _transient(log: Log) -> bool:
+    """Check that a machine under a constant force gets faster or slower without turning, as after a step."""
+    position = log.filled
+    part = max(len(position) // _PIECES, 2)
+    speeds = np.stack([position[k + part - 1] - position[k] for k in range(0, len(position) - part, part)])
+    fastest = np.max(np.abs(speeds), axis=0)
+    one_way = np.abs(np.sum(np.sign(speeds) * (np.abs(speeds) > 0.05 * fastest), axis=0))
+    turns = one_way < np.sum(np.abs(speeds) > 0.05 * fastest, axis=0)
+    return bool(np.any((np.ptp(speeds, axis=0) > _CHANGES * fastest) & ~turns))
 
 
 def _saturation(u: np.ndarray, bound: float | None, where: str) -> list[Finding]:

@@ -113,7 +113,7 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     unit, measured = session.machine.unit_by_joint, np.flatnonzero(session.fit.log.measured).tolist()
     out: dict[str, Any] = {
         "unit": unit("force"),
-        "band_hz": session.recipe.band_hz(session.fit.log.rate_hz),
+        "band_hz": _band(session),
         "fit": one_or_list(fit.force.rms),
         "validation": _worst(others, "force.rms"),
         "noise_floor": one_or_list(floor),
@@ -143,6 +143,12 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
             for g in others
         }
     return out
+
+
+def _band(session: Session) -> float | None:
+    """Return the edge of the band in which forces are compared [Hz]; None for a table, which has no time."""
+    log = session.fit.log
+    return None if log.steady is not None else session.recipe.band_hz(log.rate_hz)
 
 
 def versions() -> dict[str, str]:
@@ -346,7 +352,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         ],
         "gap": {
             "unit": machine.unit_by_joint("force"),
-            "band_hz": result.session.recipe.band_hz(result.session.fit.log.rate_hz),
+            "band_hz": _band(result.session),
             "before": _worst(before[judged], "force.rms"),
             "after": _worst(after[judged], "force.rms"),
             "noise_floor": one_or_list(result.noise_floor),

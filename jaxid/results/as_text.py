@@ -264,17 +264,22 @@ def check_table(result: Check) -> str:
         f"floor {_number(one(content['noise_floor']))} {unit('force')}"
     )
     source = log["noise_from"]
+    speeds = result.session.fit.log.integrated
+    what, of = ("velocity", "position/time") if speeds else ("position", "position")
     noise = (
-        f"noise of a reading: position {_number(one(log['position_noise']))} {unit('position')} "
-        f"({source['position']}), force {_number(log['force_noise'])} in units of the log ({source['force']})"
+        f"noise of a reading: {what} {_number(one(log[f'{what}_noise']))} {unit(of)} "
+        f"({source[what]}), force {_number(log['force_noise'])} in units of the log ({source['force']})"
     )
+    lines = [head, how, noise]
+    if result.session.fit.log.steady is not None:
+        peaks = f"{_number(one(log['peak_velocity']))} {unit('position/time')}"
+        peaks += f" and {_number(one(log['peak_force']))} {unit('force', driven)}"
+        lines = [f"{log['samples']} steady speeds, up to {peaks}"]
     rows = check_rows(content)
     combinations = _unidentifiable_lines([c["combination"] for c in content["unidentifiable"]])
     table = ["", aligned(rows)] if len(rows) > 1 else []
     seen = results.reading_lines(result.session)
-    return "\n".join(
-        [*seen, "the log is sound", head, how, noise, *table, *combinations, *_notes(content["warnings"])]
-    )
+    return "\n".join([*seen, "the log is sound", *lines, *table, *combinations, *_notes(content["warnings"])])
 
 
 def check_rows(content: Mapping[str, Any]) -> list[list[str]]:

@@ -24,6 +24,7 @@ class Sensor(eqx.Module):
         position_resolution: Size of one count [m or rad].
         position_noise: Standard deviation of white noise before rounding [m or rad].
         force_noise: Standard deviation on the logged command, in its units.
+        velocity_noise: Standard deviation of a velocity, measured in place of a position [m/s or rad/s].
         hold: Ticks of the loop for which a reading of a position is held.
         inertial: Gyroscopes and accelerometers; None if there are none.
     """
@@ -33,6 +34,7 @@ class Sensor(eqx.Module):
     force_noise: Array | None = None
     hold: int = eqx.field(static=True, default=1)
     inertial: InertialSensors | None = None
+    velocity_noise: Array | None = None
 
     def read(self, q: Array, noise: Array | None = None) -> Array:
         """Return the reading of a position, rounded with a straight-through gradient.

@@ -30,6 +30,7 @@ class ForceData(eqx.Module):
         decimator: Filter that the balance passes through.
         measured: Whether each joint has an encoder.
         steps: Integration steps per sample for the motion of joints without an encoder.
+        passive: Whether no force drives the machine.
     """
 
     q: Float[Array, "time n"]
@@ -43,6 +44,7 @@ class ForceData(eqx.Module):
     decimator: signals.Decimator = eqx.field(static=True)
     measured: tuple[bool, ...] = eqx.field(static=True, default=(True,))
     steps: int = eqx.field(static=True, default=1)
+    passive: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def of(cls, data: Prepared, rows: np.ndarray | None = None) -> ForceData:
@@ -60,6 +62,7 @@ class ForceData(eqx.Module):
             data.recipe.decimator,
             data.measured,
             data.steps,
+            not data.force.any(),
         )
 
 
@@ -118,8 +121,16 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
 
 
 def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
-    """Return the 2-norm of the measured force at the samples that count."""
-    return jnp.linalg.norm(jnp.where(data.weight > 0, measured_force(plant, data), 0.0))
+    """Return the 2-norm of the measured force at the samples that count; of a free motion that of M qdd."""
+    force = inertial_force(plant, data) if data.passive else measured_force(plant, data)
+    return jnp.linalg.norm(jnp.where(data.weight > 0, force, 0.0))
+
+
+def inertial_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
+    """Return the force of the accelerations alone, filtered, by joint [N or N m]."""
+    rest = jnp.zeros(data.q.shape[1])
+    force = jax.vmap(lambda q, a: plant.inertial(q, rest, a) - plant.inertial(q, rest, rest))
+    return data.decimator(force(jnp.asarray(data.q), jnp.asarray(data.qdd)))
 
 
 force_size = eqx.filter_jit(_size)

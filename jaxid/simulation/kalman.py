@@ -18,8 +18,10 @@ from jaxtyping import Bool, Float
 from jaxid.arrays import Array
 from jaxid.dynamics.rhs import State
 from jaxid.logs.log import Log
+from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.numerics.filters import high_band_std
 from jaxid.simulation.loops import Drive, interval_forces
 from jaxid.simulation.replay import Numerics, make_replay
 from jaxid.simulation.sensor_noise import position_noise
@@ -39,24 +41,26 @@ class KalmanFilter(eqx.Module):
     Args:
         drive: Gain, hold and integration of the command.
         command: Logged command at every tick, (ticks, m).
-        position: Readings at every tick, (ticks, n); between the samples of the log any number.
+        readings: Readings at every tick, (ticks, n); between the samples of the log any number.
         used: Mask of the readings that correct the state, (ticks, n).
         kicks: Standard deviation of a change of velocity that no force causes, at every tick, (ticks, n).
         start: Position and velocity before the first reading, (2 n,).
         spread: Standard deviations of `start`, (2 n,).
         measured: Joints with an encoder.
         every: Number of ticks per sample of the log.
+        of_velocity: Whether the readings are velocities.
     """
 
     drive: Drive
     command: Float[Array, "ticks m"]
-    position: Float[Array, "ticks n"]
+    readings: Float[Array, "ticks n"]
     used: Bool[Array, "ticks n"]
     kicks: Float[Array, "ticks n"]
     start: Float[Array, " 2n"]
     spread: Float[Array, " 2n"]
     measured: tuple[int, ...] = eqx.field(static=True)
     every: int = eqx.field(static=True)
+    of_velocity: bool = eqx.field(static=True, default=False)
 
     def __call__(
         self, plant: Plant, force_noise: Float[Array, " m"], reading_noise: Float[Array, " k"]
@@ -66,13 +70,15 @@ class KalmanFilter(eqx.Module):
         Args:
             plant: The plant.
             force_noise: Standard deviation of the command's error, constant between two ticks, (m,).
-            reading_noise: Standard deviation of a reading, (k,) [m or rad].
+            reading_noise: Standard deviation of a reading, (k,) [m or rad, of a velocity per s].
 
         Source:
             Anderson & Moore (1979), Optimal Filtering, section 8.2; readings are taken one after the other,
             so that no matrix is inverted.
         """
-        drive, n = self.drive, self.position.shape[1]
+        drive, n = self.drive, self.readings.shape[1]
+        # The state begins with the positions, which the velocities follow.
+        first = n if self.of_velocity else 0
         before, after = interval_forces(plant, drive, self.command)
         held = drive.hold == "zero_order"
 
@@ -91,8 +97,9 @@ class KalmanFilter(eqx.Module):
 
             innovations, variances = [], []
             for i, j in enumerate(self.measured):
-                e, s = reading[j] - x[j], p[j, j] + reading_variance[i]
-                gain = jnp.where(used[j], p[:, j] / s, 0.0)
+                at = first + j
+                e, s = reading[j] - x[at], p[at, at] + reading_variance[i]
+                gain = jnp.where(used[j], p[:, at] / s, 0.0)
                 x, p = x + gain * e, p - s * gain[:, None] * gain[None, :]
                 innovations.append(e)
                 variances.append(s)
@@ -109,7 +116,7 @@ class KalmanFilter(eqx.Module):
             return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
 
         times = drive.period * jnp.arange(self.command.shape[0])
-        inputs = (before, after, times, self.position, self.used, self.kicks)
+        inputs = (before, after, times, self.readings, self.used, self.kicks)
         out = jax.lax.scan(tick, (x, p), inputs)[1]
         return out[0][:: self.every], out[1][:: self.every]
 
@@ -132,26 +139,29 @@ def make_filter(
     every, ticks, n = replay.every, len(replay.command), log.position.shape[1]
     slow = np.zeros(log.position.shape, bool) if slow is None else slow
 
-    used, position, kicks = np.zeros((ticks, n), bool), np.zeros((ticks, n)), np.zeros((ticks, n))
-    used[::every], position[::every] = readings_used(machine, log) | (slow & log.measured), log.filled
+    used, readings, kicks = np.zeros((ticks, n), bool), np.zeros((ticks, n)), np.zeros((ticks, n))
+    used[::every], readings[::every] = readings_used(machine, log) | (slow & log.measured), log.readings
     fastest = np.max(np.abs(np.diff(smooth_steps(log), axis=0)), axis=0, initial=0.0) / log.period
     kicks[::every] = slow * fastest
 
     noise, stroke = position_noise(machine, log), np.maximum(np.ptp(log.filled, axis=0), 1e-300)
     speed = np.sqrt(np.mean(np.diff(log.filled, axis=0) ** 2, axis=0)) / log.period
     # A joint without an encoder may be anywhere within the stroke of the others.
+    # The start of an integrated position is chosen, and so it is known.
+    noise = 0.0 * noise if log.integrated else noise
     unsure = np.where(log.measured, np.maximum(3 * noise, 1e-6 * stroke), 0.1 * np.max(stroke))
     speed = np.where(log.measured, speed, np.max(speed))
     return KalmanFilter(
         drive=replay.drive,
         command=replay.command,
-        position=position,
+        readings=readings,
         used=used,
         kicks=kicks,
         start=np.concatenate([replay.position, replay.velocity]),
         spread=np.concatenate([unsure, speed]),
         measured=tuple(np.flatnonzero(log.measured).tolist()),
         every=every,
+        of_velocity=log.integrated,
     )
 
 
@@ -190,10 +200,38 @@ def readings_used(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
     from one reading to the next. On slower motion readings are left out, so many that one is taken a step.
     """
     n = log.position.shape[1]
+    if log.integrated:
+        return np.broadcast_to(log.measured, log.position.shape)
     stated, resolution = machine.sensor.position_noise, machine.sensor.position_resolution
     step = np.zeros(n) if resolution is None else np.broadcast_to(np.asarray(resolution), n)
     noise = position_noise(machine, log) if stated is None else np.broadcast_to(np.asarray(stated), n)
+    return independent_readings(log, step, noise)
 
+
+def rounded_readings(machine: Machine, log: Log) -> Bool[np.ndarray, "time n"]:
+    """Return the mask of `readings_used`, with the resolution that the readings show where none is stated."""
+    n = log.position.shape[1]
+    stated = machine.sensor.position_resolution
+    if stated is not None or log.integrated:
+        return readings_used(machine, log)
+    step = np.zeros(n)
+    for j in np.flatnonzero(log.measured):
+        step[j] = position_levels(log.position[:, j])[1]
+    # What is left in the high band beside the rounding is noise that dithers it.
+    high = high_band_std(log.filled)
+    return independent_readings(log, step, np.sqrt(np.maximum(high**2 - step**2 / 12, 0.0)).reshape(n))
+
+
+def independent_readings(
+    log: Log, step: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, "time n"]:
+    """Return the mask of the readings whose rounding error is independent, see `readings_used`.
+
+    Args:
+        log: The log.
+        step: Step of each encoder, (n,); zero for one that does not round.
+        noise: Standard deviation of the noise before rounding, (n,).
+    """
     # The speed is smoothed: a choice by the readings themselves would prefer one side of a count.
     steps, used = np.abs(smooth_steps(log)), np.zeros(log.position.shape, bool)
     for j in np.flatnonzero(log.measured):

@@ -215,7 +215,8 @@ def closed_loop(
     first = jax.tree.map(lambda x: x[0], path)
     memory = controller.start(Tick(position, first, driven), velocity, path)
     times = drive.period * jnp.arange(reference.shape[0])
-    tick0 = Tick(sensor.read(position), first, driven)
+    own = velocity if controller.own_velocity else None
+    tick0 = Tick(sensor.read(position), first, driven, velocity=own)
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
     past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
     x0 = State(position, velocity, plant.initial_states(held))
@@ -239,7 +240,7 @@ def closed_loop(
         reading = sensor.read(x.q, None if noise is None else noise[:n])
         if fresh is not None:
             reading = held = jnp.where(fresh, reading, held)
-        v, a, renewed = None, None, True
+        v, a, renewed = x.qd if controller.own_velocity else None, None, True
         if inertial is not None:
             more = None if noise is None or noise.shape[0] <= n + m else noise[n + m :]
             (v, a, renewed), moved = sensed(x, reading, moved, more, renews)

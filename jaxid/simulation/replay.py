@@ -12,7 +12,7 @@ import scipy.signal
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.controllers import Controller
+from jaxid.controllers import PID, Controller
 from jaxid.dynamics.hidden_joints import resting
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
@@ -22,6 +22,7 @@ from jaxid.numerics import filters as signals
 from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
+from jaxid.simulation.law_replay import commands
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
 from jaxid.simulation.reference_course import reference_at
 from jaxid.simulation.solvers import AdaptiveStep
@@ -34,6 +35,8 @@ _LONGER = 2.0
 # Number of first samples in which an error of a loop's start appears, and the factor by which their mean
 # square residual then exceeds that of the others.
 _FIRST, _FAR_MORE = 100, 5.0
+# Part of the typical speed from which a log begins in motion.
+_MOVING = 0.2
 # Factor by which a band-limited command is upsampled before its samples are joined by lines.
 _REFINE = 8
 
@@ -178,7 +181,7 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
     disturbance = disturbance_at(machine.disturbance, times, log)
     return Replay(
         _drive(machine, log, numerics, period, "zero_order"),
-        machine.controller,
+        _in_motion(machine, log, every, disturbance),
         machine.sensor.mean,
         reference,
         disturbance,
@@ -188,6 +191,36 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         every,
         follow,
     )
+
+
+def _in_motion(machine: Machine, log: Log, every: int, disturbance: np.ndarray | Array) -> Controller:
+    """Return the controller of a machine, its integral as the first commands of a moving log have it.
+
+    Before a log that begins at rest the integral counts as zero.
+    """
+    controller = machine.controller
+    assert controller is not None, "only a loop has a controller"
+    if not isinstance(controller, PID):
+        return controller
+    # One shape for all logs, so that they share compiled code.
+    controller = replace(controller, integral=jnp.zeros(log.force.shape[1]))
+    if log.reference is None or every > 1 or not all(log.measured):
+        return controller
+    velocity, first = start_velocity(log), min(_FIRST, log.samples)
+    typical = np.sqrt(np.mean((np.diff(log.position, axis=0) / log.period) ** 2, axis=0))
+    if not np.any(np.abs(velocity) > _MOVING * typical):
+        return controller
+    driven, shape = machine.plant.driven(log.position.shape[1]), log.force[:first].shape
+    reference, extra = (np.broadcast_to(x[:first], shape) for x in (log.reference, disturbance))
+    readings = (jnp.asarray(x) for x in (log.position[:first], reference, extra, velocity))
+    made = np.asarray(commands(controller, driven, *readings))
+    inside = np.ones(shape, bool)
+    if controller.limit is not None:
+        inside = np.abs(log.force[:first]) < (1 - 1e-6) * np.asarray(controller.limit)
+    missing = np.nanmedian(np.where(inside, log.force[:first] - made, np.nan), axis=0)
+    gain = np.broadcast_to(np.asarray(controller.ki), missing.shape)
+    integral = np.where(np.isfinite(missing) & (gain != 0), missing / np.where(gain != 0, gain, 1.0), 0.0)
+    return replace(controller, integral=jnp.asarray(integral))
 
 
 def _drive(machine: Machine, log: Log, numerics: Numerics, period: float, hold: str) -> Drive:
@@ -243,7 +276,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     count = min(samples, log.samples)
     assert replay.command is not None, "make_replay gives an open loop its command"
     short = eqx.tree_at(lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1])
-    nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
+    nudge = _start(short, plant, jnp.asarray(log.readings[:count]), log.measured, log.integrated)
     n = replay.position.size
     moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
     if not bool(jnp.all(jnp.isfinite(nudge))):
@@ -252,9 +285,13 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
 
 
 @eqx.filter_jit
-def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, ...]) -> Array:
+def _start(
+    replay: Replay, plant: Plant, readings: Array, measured: tuple[bool, ...], of_velocity: bool
+) -> Array:
     def residual(nudge: Array) -> Array:
-        return ((replay(plant, nudge).position - position) * np.array(measured)).ravel()
+        run = replay(plant, nudge)
+        simulated = run.velocity if of_velocity else run.position
+        return ((simulated - readings) * np.array(measured)).ravel()
 
     def improve(_: int, nudge: Array) -> Array:
         jacobian = jax.jacfwd(residual)(nudge)
@@ -336,6 +373,8 @@ def local_line(
         k: Number of the sample.
         noise: Standard deviation of a reading by joint, (n,); None: estimated from the log.
     """
+    if log.integrated:
+        return log.position[k], _parabola(replace(log, position=log.readings), k, _REACHES[0])[0]
     noise = signals.high_band_std(log.filled) if noise is None else noise
     position, velocity, size = _parabola(log, k, _REACHES[0])
     # The second term tolerates rounding in a log without noise.

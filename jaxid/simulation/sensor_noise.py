@@ -21,11 +21,11 @@ def position_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:
     """Return the standard deviation of a reading of each joint, (n,) [m or rad].
 
     It is the stated one, or else an estimate from the high band of the log. A joint without an encoder has
-    zero.
+    zero. Of a log of velocities it is the deviation of a velocity [m/s or rad/s].
     """
-    stated = machine.sensor.position_std
+    stated = machine.sensor.velocity_noise if log.integrated else machine.sensor.position_std
     if stated is None:
-        stated = signals.high_band_std(log.filled)
+        stated = signals.high_band_std(log.readings)
     return np.broadcast_to(np.asarray(stated), log.position.shape[1]) * log.measured
 
 
@@ -45,7 +45,7 @@ def position_density(
     """Compute the one-sided density of the force that position noise alone causes [N^2/Hz], by joint.
 
     The noise passes the plant's impedance -M w^2 + i C w + K (linearised at a typical velocity), the response
-    of each derivative and the parallel filter.
+    of each derivative and the parallel filter. Noise of a measured velocity counts as that of its integral.
 
     Args:
         machine: The machine; its parameters enter through the impedance only.
@@ -67,6 +67,8 @@ def position_density(
         data.measured,
     )
     through = recipe.decimator.response(f, rate)
+    if log.integrated:
+        through = through / w[:, 0, 0]
     density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
     return f, np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
 

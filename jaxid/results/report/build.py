@@ -231,6 +231,7 @@ def _view(run: OpenedLog, before: Gap | None, after: Gap, joint: int, joints: in
         force_measured=after.force.measured[rows, joint],
         residual_before=None if before is None else before.force.residual[rows, joint],
         residual_after=after.force.residual[rows, joint],
+        steady=log.steady is not None,
     )
 
 

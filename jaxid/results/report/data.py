@@ -32,6 +32,7 @@ class LogView:
         drive_measured: Declared force of its drive as logged, (N,), if that is to be compared.
         drive_simulated: Declared force of its drive as the simulated loop commands it, (N,).
         units: Labels at this joint that differ from those of the page, by quantity.
+        steady: Whether the rows are steady speeds, without a time.
     """
 
     name: str
@@ -49,6 +50,7 @@ class LogView:
     drive_measured: np.ndarray | None = None
     drive_simulated: np.ndarray | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    steady: bool = False
 
 
 @dataclass(frozen=True)

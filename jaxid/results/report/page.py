@@ -88,7 +88,7 @@ def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
         "name": view.name,
         "anchor": f"log-{number}",
         "simulated": simulated,
-        "fit": _picture(words, plots.plot_fit, view, units),
+        "fit": None if view.steady else _picture(words, plots.plot_fit, view, units),
         "drive": None,
         "force": None,
         "against": [],
@@ -96,12 +96,12 @@ def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
     if view.drive_simulated is not None:
         words = f"{view.name}: force of the drive over time, measured and simulated"
         entry["drive"] = _picture(words, plots.plot_drive, view, units)
-    if len(view.band_time):
+    if len(view.band_time) and not view.steady:
         words = f"{view.name}: measured force and force residual over time"
         draw = plots.plot_residual_over_time
         entry["force"] = _picture(words, draw, view, units, noise_floor=floor)
     if residual and len(view.band_time):
-        for variable in ("velocity", "position", "time"):
+        for variable in ("velocity",) if view.steady else ("velocity", "position", "time"):
             figure = plots.plot_residual_against(view, units, variables=(variable,))
             entry["against"].append(image(figure, f"{view.name}: force residual over {variable}"))
     return entry

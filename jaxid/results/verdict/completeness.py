@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import equinox as eqx
 import numpy as np
+import scipy.stats
 from jaxtyping import Float
 
 from jaxid.discovery.evidence import Whitener
 from jaxid.discovery.noise import NUMERICS, high_band_force_noise, sensor_colour
-from jaxid.gap import ForceGap, noise_density
+from jaxid.gap import ForceGap, noise_density, row_noise
 from jaxid.machine import Machine
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import OpenedLog
+from jaxid.simulation.force_balance import ForceData, inertial_force
 
 # Part of the half sampling rate of the kept samples that holds the band of the filter, see
 # `jaxid.logs.prepare.A_PERIOD`. Beyond it the filtered residual is rounding and errors of numerics.
@@ -85,7 +88,12 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
         fitted: Whether the machine was fitted to this log.
     """
     joints = np.flatnonzero(np.isfinite(gap.rms)).tolist()
-    force = run.data.at_kept(run.data.force - run.data.force.mean(axis=0))
+    if run.log.steady is not None:
+        return [_of_rows(machine, run, gap, k, fitted=fitted) for k in joints]
+    middle = 0.0 if run.log.stepped else run.data.force.mean(axis=0)
+    force = run.data.at_kept(run.data.force - middle)
+    if run.log.passive:
+        force = np.asarray(_inertial(machine.plant, ForceData.of(run.data)))
     size = float(np.sqrt(np.mean(force**2))) if force.size else 0.0
     if size == 0:
         reason = "the log has no force to compare with"
@@ -122,6 +130,26 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
         loud = power > _LOUDER**2 + _SCATTER / np.sqrt(max(count, 1))
         out.append(_decided(found, count, loud=loud, stated=stated))
     return out
+
+
+_inertial = eqx.filter_jit(inertial_force)
+
+
+def _of_rows(machine: Machine, run: OpenedLog, gap: ForceGap, joint: int, *, fitted: bool) -> Residual:
+    """Compare the residual of a steady table with the stated scatter of its rows, by chi-square."""
+    std = None if run.log.steady is None else run.log.steady.std
+    rms = float(gap.rms[joint])
+    if std is None:
+        reason = "[log] states no scatter of the rows"
+        return Residual(run.name, joint, None, rms, np.nan, reason=reason)
+    z = (gap.residual / (std * np.abs(machine.gain)))[:, joint]
+    z = z[np.isfinite(z)]
+    freedom = z.size - (len(machine.parameters.free) if fitted else 0)
+    floor = float(row_noise(machine, run.log)[joint])
+    if freedom < 1:
+        return Residual(run.name, joint, None, rms, floor, reason="the table has no rows to spare")
+    fits = bool(scipy.stats.chi2.sf(np.sum(z**2), freedom) > _RARELY)
+    return Residual(run.name, joint, fits, rms, floor)
 
 
 def _decided(found: Residual, count: int, *, loud: bool, stated: bool) -> Residual:

@@ -166,7 +166,7 @@ def _off(run: OpenedLog, gap: Gap) -> np.ndarray:
 def _drifted(session: Session, gaps: Sequence[Gap]) -> list[str]:
     """Return a sentence on open-loop simulations that drift away from their log."""
     for run, gap in zip(session.runs, gaps, strict=True):
-        if _looped(session, run):
+        if _looped(session, run) or run.log.steady is not None:
             continue
         if gap.simulation is None or np.max(_off(run, gap)) >= _DRIFTED:
             return [
