@@ -190,6 +190,13 @@ def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: 
     return [Finding("warning", f"{finding}, which should be 1", where, hint)]
 
 
+def time_unit_of(period: float) -> str:
+    """Return the unit of a time column in which so much from row to row is a machine's sampling period."""
+    if period < _SLOW:
+        return "s"
+    return "ms" if period < _MICRO else "us" if period < _NANO else "ns"
+
+
 def period_findings(log: Log, path: str) -> list[Finding]:
     """Find sampling periods that no machine has, whatever the unit of its positions.
 
@@ -199,7 +206,7 @@ def period_findings(log: Log, path: str) -> list[Finding]:
         return []
     whole = bool(np.all(np.abs(log.time - np.round(log.time)) < 1e-6))
     severity = "error" if log.period > _SLOWEST or whole else "warning"
-    unit = "milliseconds" if log.period < _MICRO else "microseconds" if log.period < _NANO else "nanoseconds"
+    unit = next(name for name, short in _NAMED.items() if short == time_unit_of(log.period))
     rows = " or rows" if unit == "milliseconds" else ""
     what = f"the sampling period is {log.period:.4g} s: time looks like {unit}{rows}"
     hint = how_to_say(f"time looks like {unit}", "give time in seconds")
