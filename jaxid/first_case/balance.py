@@ -10,15 +10,20 @@ from jaxtyping import Float
 
 from jaxid.logs.rough_inertia import Signal, smooth, windows
 
-# Part of the force that the plain model leaves, from which a weight or a spring is tried, and the part of that
-# which must be left at most for it to be taken.
+# Part of the force that the plain model leaves, from which a weight or a spring is tried; the part of it that
+# one of them may leave at most.
 _INCOMPLETE, _TAKEN = 0.1, 0.6
 # Part of the best window's explanation that another one must have; two windows agree within the second.
 _NEARLY, _AGREE = 0.98, 1.25
 # Part of the force's deviation beyond which an offset counts.
 _OFFSET = 0.5
-# Velocity below which a sample counts as at rest, over the largest one.
-_REST = 0.02
+# Velocity below which a sample counts as at rest, over the largest one; and the part of the samples that must
+# move the other way for dry friction and an offset to be two things.
+_REST, _REVERSED = 0.02, 0.02
+# Deviation of a force over its mean below which it is one level, whose motion shows the rest.
+_LEVEL = 0.05
+# Part of a force that dry friction is taken to be if the motion does not reverse.
+_DRY = 0.05
 
 
 @dataclass(frozen=True)
@@ -48,12 +53,12 @@ class RoughBalance:
 
     @property
     def braked(self) -> bool:
-        """Whether the force as logged brakes its motion: inertia and friction come out negative together."""
-        return self.explained > 0.5 and self.inertia < 0 and self.viscous + self.coulomb < 0
+        """True if the force as logged brakes its motion: inertia and friction come out negative together."""
+        return self.explained > 0.8 and self.inertia < 0 and self.viscous + self.coulomb < 0
 
     @property
     def has_offset(self) -> bool:
-        """Whether a constant force is a large part of the force."""
+        """True if a constant force is a large part of the force."""
         return abs(self.offset) > _OFFSET * self.force
 
 
@@ -86,6 +91,10 @@ def rough_balance(
         velocity = (motion[2:] - motion[:-2]) / (2.0 * period)
         acceleration = (motion[2:] - 2.0 * motion[1:-1] + motion[:-2]) / period**2
         position = motion[1:-1]
+    if force.std() < _LEVEL * abs(force.mean()):
+        return _of_level(
+            float(force.mean()), acceleration, velocity, position, rotary=rotary and not of_velocity
+        )
     found = []
     for window in windows(velocity.size):
         f, a, v, q, *x = (smooth(s, window) for s in (force[1:-1], acceleration, velocity, position, *others))
@@ -106,9 +115,10 @@ def _one(
     f: Signal, a: Signal, v: Signal, q: Signal | None, rotary: bool, weights: Sequence[Signal]
 ) -> RoughBalance:
     """Fit the plain balance, and with a weight or a spring if that leaves clearly less."""
-    at_rest = np.abs(v) < _REST * np.abs(v).max()
-    sign = np.where(at_rest, 0.0, np.sign(v))
-    plain = [a, v, sign, np.ones_like(f), *weights]
+    sign = _signs(v)
+    # Without a reversal an offset looks like dry friction.
+    offset = np.ones_like(f) if _reverses(v) else np.zeros_like(f)
+    plain = [a, v, sign, offset, *weights]
     theta, left = _solve(plain, f)
     total = float(np.var(f)) or 1.0
     speed, size = float(np.sqrt(np.mean(v**2))), float(f.std())
@@ -119,7 +129,7 @@ def _one(
             options = [("weight", [*plain, np.sin(q), np.cos(q)]), *options]
         tried = [(kind, *_solve(columns, f)) for kind, columns in options]
         kind, values, after = min(tried, key=lambda t: t[2] * (0.9 if t[0] == "weight" else 1.0))
-        pulls = kind == "weight" or values[4] > 0
+        pulls = kind == "weight" or values[4] * values[0] > 0
         if after < _TAKEN**2 * left and pulls:
             theta, left = values, after
             weight = (float(values[4]), float(values[5])) if kind == "weight" else None
@@ -127,6 +137,51 @@ def _one(
     inertia, viscous, coulomb, offset = (float(x) for x in theta[:4])
     explained = 1.0 - left / total
     return RoughBalance(inertia, viscous, coulomb, offset, weight, spring, explained, speed=speed, force=size)
+
+
+def _signs(v: Signal) -> Signal:
+    return np.where(np.abs(v) < _REST * np.abs(v).max(), 0.0, np.sign(v))
+
+
+def _reverses(v: Signal) -> bool:
+    """Check whether a joint moves both ways."""
+    signs = _signs(v)
+    moving = max(np.count_nonzero(signs), 1)
+    return bool(min(np.sum(signs > 0), np.sum(signs < 0)) > _REVERSED * moving)
+
+
+def _of_level(force: float, a: Signal, v: Signal, q: Signal, *, rotary: bool) -> RoughBalance:
+    """Return the balance under a force of one level, by least squares on the acceleration that it leaves."""
+    best = RoughBalance(0.0, 0.0, 0.0, 0.0)
+    both = _reverses(v)
+    turns = both and rotary
+    for window in windows(v.size):
+        x, y, z = (smooth(s, window) for s in (a, v, q))
+        if x.size < 20 or x.std() == 0:
+            continue
+        columns = [np.full_like(x, force), y]
+        columns += [_signs(y)] if both else []
+        # The zero is taken to be where a weight hangs: its cosine looks like the force.
+        columns += [np.sin(z)] if turns else []
+        theta, left = _solve(columns, x)
+        explained = 1.0 - left / float(np.var(x))
+        if theta[0] == 0 or explained <= best.explained:
+            continue
+        inertia = 1.0 / float(theta[0])
+        inertia, dry = (inertia, -float(theta[2]) * inertia) if both else (inertia * (1 - _DRY), _DRY * force)
+        weight = (-float(theta[3]) * inertia, 0.0) if turns else None
+        best = RoughBalance(
+            inertia,
+            -float(theta[1]) * inertia,
+            abs(dry),
+            0.0,
+            weight,
+            None,
+            explained,
+            speed=float(np.sqrt(np.mean(y**2))),
+            force=abs(force),
+        )
+    return best
 
 
 def _solve(columns: Sequence[Signal], f: Signal) -> tuple[Float[np.ndarray, " columns"], float]:
@@ -170,6 +225,8 @@ def free_swing(position: Signal, period: float) -> FreeSwing | None:
         a, v, q = (smooth(s, window) for s in (acceleration, velocity, position[1:-1]))
         if a.size < 20 or a.std() == 0:
             continue
+        if not _reverses(v):
+            return None
         moves = np.abs(v) > _REST * np.abs(v).max()
         columns = [x[moves] for x in (np.sin(q), np.cos(q), v, np.sign(v))]
         theta, left = _solve(columns, a[moves])

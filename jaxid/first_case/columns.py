@@ -14,7 +14,7 @@ from jaxid.logs.rough_inertia import correlation
 
 # Sampling rate that a case states if the log has no time.
 NO_TIME_RATE = 1000.0
-# Correlation with the position, and ratio of strokes, from which a second position is a reference or the same.
+# Correlation with the position, and ratio of strokes, up to which a second position has the same course.
 _SAME_COURSE, _SAME_SIZE = 0.95, 1.25
 # Correlation with the position from which a wanted value without a quantity counts as a reference.
 _FOLLOWED = 0.5
@@ -45,7 +45,7 @@ class Column:
 
     @property
     def moves(self) -> bool:
-        """Whether the values are not all the same."""
+        """True if the values are not all the same."""
         return bool(np.ptp(self.values) > 0)
 
 
@@ -282,8 +282,10 @@ def _bare_command(column: Column, position: Mapping[str, Column]) -> bool:
 def _no_force(column: Column, position: object) -> str:
     """Return why a column cannot be a force; empty if it can."""
     values = column.values
+    if not values.any():
+        return "it is zero throughout"
     if not column.moves:
-        return f"it is {values[0]:g} throughout"
+        return ""
     low, high = float(values.min()), float(values.max())
     magnitude = (
         low >= 0 and low <= _NEAR_ZERO * high and column.meaning.quantity in ("load", "current", "duty")

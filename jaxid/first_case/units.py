@@ -83,16 +83,17 @@ def measures_of(chosen: Chosen) -> Measures:
     counts = not position and bool(chosen.position) and _whole(chosen.position[0])
     if chosen.position and chosen.velocity and not counts and wrap is None:
         position, velocity = _by_slope(chosen, period, position, velocity, said)
-    motion = _motion(chosen, place, position or velocity, wrap is not None, said, questions)
+    motion = "rotary"
+    if not counts:
+        motion = _motion(chosen, place, position or velocity, wrap is not None, said, questions)
 
     if counts:
         labels["position"] = "count"
         said.append("positions are whole numbers: encoder counts, which stay as they are")
         questions["position"] = (
-            'how many counts are a turn? With units.position = "count" and counts_per_revolution in [log], in '
-            "place of [plant] units, results are in rad"
+            'how many counts are a turn? In [log], units.position = "count" and counts_per_revolution '
+            "give rad in place of the label"
         )
-        motion = "rotary"
     elif position:
         _state("position", position, units, said, place if chosen.position else None)
     elif chosen.position:
@@ -174,7 +175,7 @@ def _by_slope(
                 same = f"{position}/s" if position and not velocity else velocity
                 return position, same
             said.append(
-                f"velocity over the derivative of the position is {ratio:.4g}: {of_position} and {of_velocity}"
+                f"velocity over the slope of the position is {ratio:.4g}: {of_position} and {of_velocity}"
             )
             return of_position, velocity or of_velocity
     if not velocity:
@@ -208,7 +209,8 @@ def _motion(
     span = float(np.ptp(place.values)) if chosen.position else 0.0
     speed = max((float(np.abs(v.values).max()) for v in chosen.velocity), default=0.0)
     if span > _TURNS_BEYOND or speed > _FAST:
-        said.append(f"the motion is rotary: {span:.4g} m or {speed:.4g} m/s would be no axis")
+        size = f"a way of {span:.4g} m" if span > _TURNS_BEYOND else f"a speed of {speed:.4g} m/s"
+        said.append(f"the motion is rotary: no axis has {size}")
         return "rotary"
     said.append("the motion is taken to be linear: nothing says whether it turns or slides")
     questions["motion"] = 'does it turn? Then motion = "rotary": units are rad, N m and kg m^2'
@@ -241,11 +243,14 @@ def _force(
     label = _LABELS.get(kind, "%" if kind == "percent" else "command")
     if kind in ("torque", "force"):
         label = "N m" if kind == "torque" else "N"
+    if label == "command" and column.name.isidentifier() and parse_unit(column.name) is None:
+        label = column.name
     if stated is not None and kind in ("current", "voltage") and stated.factor != 1.0:
         units["force"] = column.unit
     labels["force"] = label
+    of = "" if label == column.name else f" of '{column.name}'"
     force = "N" if motion == "linear" else "N m"
-    said.append(f"results are per {label}: the {force} for one {label} of '{column.name}' are not known")
+    said.append(f"results are per {label}: the {force} for one {label}{of} are not known")
     questions["force"] = questions_of_drive(kind, motion, label)
 
 

@@ -11,7 +11,7 @@ from jaxid.logs.readers.dialect import split_unit
 _QUANTITIES: dict[str, str] = {
     "time": "t time zeit zeitstempel timestamp timestamps stamp elapsed uhrzeit datum datetime epoch clock "
     "laufzeit zeitpunkt millis micros seconds",
-    "position": "q pos position positions lage stellung weg winkel drehwinkel angle theta phi x y z s hub "
+    "position": "q p pos position positions lage stellung weg winkel drehwinkel angle theta phi x y z s hub "
     "displacement encoder enc counts count inkremente increments ticks hoehe height distance dof pose",
     "velocity": "dq qd v vel velocity velocities speed geschwindigkeit drehzahl omega rpm qdot dtheta "
     "thetadot w dx xdot",
@@ -82,8 +82,8 @@ class Meaning:
 
     Attributes:
         name: The name.
-        quantity: "time", "position", "velocity", "acceleration", one of `FORCES`, "temperature", "passed over",
-            or empty: the name says nothing.
+        quantity: "time", "position", "velocity", "acceleration", one of `FORCES`, "temperature" or "passed
+            over"; empty: the name says nothing.
         reference: Whether it is a wanted value.
         joint: Words that are left, which name the joint; empty if there are none.
         unit: Unit that the name ends in; empty if it has none.
