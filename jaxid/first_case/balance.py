@@ -97,7 +97,8 @@ def rough_balance(
         )
     found = []
     for window in windows(velocity.size):
-        f, a, v, q, *x = (smooth(s, window) for s in (force[1:-1], acceleration, velocity, position, *others))
+        signals = (force[1:-1], acceleration, velocity, position, *(other[1:-1] for other in others))
+        f, a, v, q, *x = (smooth(s, window) for s in signals)
         if f.size > 20 and f.std() > 0 and v.std() > 0:
             weights = [w for y in x for w in (np.sin(y), np.cos(y))]
             found.append(_one(f, a, v, None if of_velocity else q, rotary, weights))

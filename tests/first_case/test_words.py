@@ -66,7 +66,12 @@ def test_meaning(name):
 
 @pytest.mark.parametrize(
     ("name", "quantity", "unit"),
-    [("t_us", "time", "us"), ("ms", "time", "ms"), ("axis_pos_mm", "position", "mm"), ("speed_rpm", "velocity", "rpm")],
+    [
+        ("t_us", "time", "us"),
+        ("ms", "time", "ms"),
+        ("axis_pos_mm", "position", "mm"),
+        ("speed_rpm", "velocity", "rpm"),
+    ],
 )
 def test_units_at_the_end_of_a_name(name, quantity, unit):
     found = meaning_of(name)
