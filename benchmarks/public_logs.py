@@ -75,11 +75,12 @@ def run(row: Row, data: Path, folder: Path) -> dict[str, Any]:
 
 def printed(row: Row, record: dict[str, Any]) -> dict[str, float]:
     """Return the values of a record that the table compares."""
-    values = {
-        name: entry["value"]
-        for name, entry in record.get("parameters", {}).items()
-        if isinstance(entry.get("value"), int | float)
-    }
+    values: dict[str, float] = {}
+    for name, entry in record.get("parameters", {}).items():
+        several = isinstance(entry["value"], list)
+        listed = entry["value"] if several else [entry["value"]]
+        names = [f"{name}[{k}]" if several else name for k in range(1, len(listed) + 1)]
+        values |= {n: v for n, v in zip(names, listed, strict=True) if v is not None}
     if row.derived is not None and values:
         return dict(row.derived(values))
     return {name: values[name] for name in row.truth if name in values} if row.truth else values

@@ -21,6 +21,8 @@ def of_arm(chosen: Chosen, arm: Urdf, urdf: str, where: str) -> Chosen:
     if all(keys) and len(set(keys)) == len(keys) and set(keys) <= set(chosen.joints):
         at = [chosen.joints.index(key) for key in keys]
         said = f"columns belong to the joints of {Path(urdf).name} by their names"
+        left = [f"'{joint}'" for joint in chosen.joints if joint not in keys]
+        said += f"; those of {', '.join(left)} are no joints up to that tip" if left else ""
     elif len(chosen.joints) == len(arm.names):
         at = list(range(len(arm.names)))
         said = f"columns belong to the joints {', '.join(arm.names)} of {Path(urdf).name} in this order"

@@ -158,19 +158,13 @@ def test_a_bag_with_a_urdf(tmp_path, capsys):
     one = jaxid.init(bag)
     assert any("2 joints: the case is of that of" in line for line in one.assumed)
     assert any("--urdf FILE --tip LINK" in line for line in one.questions)
-    refused(
-        capsys,
-        tmp_path,
-        "init",
-        bag,
-        "--urdf",
-        urdf,
-        "--tip",
-        "upper",
-        "-o",
-        tmp_path / "b.toml",
-        told="moves shoulder_joint",
-    )
+    part = jaxid.init(bag, urdf=urdf, tip="upper")
+    assert any("those of 'elbow' are no joints up to that tip" in line for line in part.assumed)
+    third = {f"{name}_wrist": np.ones(100) * np.arange(100) for name in ("t", "position", "effort")}
+    with pytest.raises(
+        InputError, match="columns of 'wrist', and arm.urdf moves shoulder_joint, elbow_joint"
+    ):
+        jaxid.init({**third, "t": np.arange(100) / 100}, urdf=urdf)
 
 
 def test_several_joints_by_numbers(tmp_path):

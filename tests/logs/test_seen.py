@@ -48,11 +48,12 @@ def test_jitter_doubled_and_missing_stamps(tmp_path):
     log = signals(400)
     log["t"] = log["t"] + np.random.default_rng(0).uniform(-2e-4, 2e-4, 400)
     log["t"][100] = log["t"][99]
+    # With the doubled stamp a fourth sample is missing.
     kept = np.delete(np.arange(400), [200, 201, 202])
     said = lines(write_csv(tmp_path / "log.csv", {name: x[kept] for name, x in log.items()}))
     assert said[0].endswith("after resampling")
     assert any("1 row(s) have the time of the row before, first row 100" in line for line in said)
-    assert any("steps are off the period" in line and "3 sample(s) are missing" in line for line in said)
+    assert any("steps are off the period" in line and "4 sample(s) are missing" in line for line in said)
     assert any(line.startswith("time: resampled to ") and "say `resample = " in line for line in said)
 
 
