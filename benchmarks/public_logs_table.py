@@ -47,6 +47,9 @@ EMPS = friction(95.109 / EMPS_GAIN, 203.50 / EMPS_GAIN, 20.39 / EMPS_GAIN)
 DFKI = friction(0.133, 0.260, 0.345, names=PENDULUM)
 SILVERBOX_RATE = 1e7 / 2**14
 
+# Friction of joint 4, which moves most, at its motor: the gear has 48 turns.
+TX40_JOINT_4 = {"viscous_friction.coefficient": 1.11 / 48**2, "coulomb_friction.level": 2.48 / 48}
+
 
 def resonance(values: Values) -> Values:
     """Natural frequency and damping of the oscillator; `init` assumes 1000 samples a second."""
@@ -106,7 +109,7 @@ ROWS = (
     ),
     Row("tx40/pos_read_data.csv", {}, "figaroh"),
     Row("tx40/curr_data.csv", {}, "figaroh"),
-    Row("tx40/both, joined.csv", {}, "figaroh", made=tx40_table),
+    Row("tx40/both, joined.csv", TX40_JOINT_4, "figaroh, of joint 4", made=tx40_table),
     Row("so101/backlash_detection.csv", {}, "none"),
     Row("so101/multisine.csv", {}, "none"),
     Row("so101/wave_motion.csv", {}, "none"),

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.first_case.words import FORCES, Meaning, meaning_of
+from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
 
 # Sampling rate that a case states if the log has no time.
@@ -102,7 +103,7 @@ def columns_of(
             continue
         rows = np.arange(flat.size)
         filled = flat if known.all() else np.interp(rows, rows[known], flat[known])
-        out.append(Column(meaning, filled, units.get(name, "") or meaning.unit))
+        out.append(Column(meaning, filled, units.get(name, "") or meaning.unit or split_unit(name)[1]))
     return out
 
 

@@ -275,9 +275,27 @@ class Draft:
             driven=tuple(range(self._joints)),
             labels=self._measures.labels,
         )
+        if self._empty():
+            # A text table has such readings by itself; in other formats the case must say so.
+            columns["resample"] = table.keys["resample"] = rounded(self._rate(), 6)
+            table.assumed.append("values that are NaN are no readings: resampled at the rate of the log")
         log = as_log(self._log, columns, joints=self._joints, drives=self._joints, frame=frame)
         table.assumed += [str(a) for a in log.assumed if not a.setting.startswith("units.")]
         return log
+
+    def _empty(self) -> bool:
+        """Check for values that are NaN in a log whose format has no empty cells."""
+        chosen = self._chosen
+        used = [*chosen.position, *chosen.velocity, *chosen.force, *chosen.reference]
+        nan = any(np.isnan(self._raw.data[c.name]).any() for c in used)
+        return nan and not self._raw.sparse and chosen.time is not None
+
+    def _rate(self) -> float:
+        """Return the usual rate of the log [Hz]."""
+        assert self._chosen.time is not None, "the caller has seen it"
+        unit = parse_unit(self._measures.units.get("time", "s"))
+        steps = np.diff(self._chosen.time.values)
+        return 1.0 / (float(np.median(steps[steps > 0])) * (1.0 if unit is None else unit.factor))
 
     def _by_hand(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return time, position or velocity, and force (zero if there is none), at even steps in SI units."""

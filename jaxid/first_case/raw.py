@@ -19,12 +19,21 @@ from jaxid.settings import LogTable
 
 @dataclass(frozen=True)
 class RawLog:
-    """All columns of a log as they are: the data by name, units, and the file's own list."""
+    """All columns of a log as they are.
+
+    Attributes:
+        source: Name of the log.
+        contents: Its list of columns.
+        data: Columns of numbers by name, (rows, 1).
+        units: Units that the file states.
+        sparse: Whether its reader takes NaN for "no reading at this time".
+    """
 
     source: str
     contents: Contents
     data: dict[str, np.ndarray]
     units: Mapping[str, str]
+    sparse: bool = False
 
 
 def raw_log(log: LogLike) -> RawLog:
@@ -57,23 +66,24 @@ def raw_log(log: LogLike) -> RawLog:
     )
     try:
         read = read_table(path, names, None, settings)
-        columns, units = read.columns, dict(read.units)
+        columns, units, sparse = read.columns, dict(read.units), bool(read.sparse)
     except InputError:
         # One column of text or of another length is no reason to refuse the others.
-        columns, units = _one_by_one(path, names, contents, settings)
+        columns, units, sparse = _one_by_one(path, names, contents, settings)
     data = {name: values for name, values in columns.items() if values.shape[1] == 1}
     rows = max((len(v) for v in data.values()), default=0)
     data = {name: values for name, values in data.items() if len(values) == rows > 1}
-    return RawLog(str(path), contents, data, {**contents.units, **units})
+    return RawLog(str(path), contents, data, {**contents.units, **units}, sparse)
 
 
 def _one_by_one(
     path: Path, names: Sequence[str], contents: Contents, settings: LogTable
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+) -> tuple[dict[str, np.ndarray], dict[str, str], bool]:
     """Read those columns that are numbers."""
     columns: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
     first: InputError | None = None
+    sparse = False
     for name in names:
         wanted = [name] if not contents.time or name == contents.time else [contents.time, name]
         try:
@@ -83,6 +93,7 @@ def _one_by_one(
             continue
         columns |= read.columns
         units |= dict(read.units)
+        sparse |= bool(read.sparse)
     if not columns and first is not None:
         raise first
-    return columns, units
+    return columns, units, sparse

@@ -169,15 +169,16 @@ def _by_slope(
         said.append(f"'{chosen.velocity[0].name}' is not the derivative of the position: it is passed over")
         return position, _unknown()
     ratio = float(measured.std() / derived.std())
-    for factor, of_position, of_velocity in _PAIRS:
-        if 1 / _NEAR < ratio / factor < _NEAR and (not position or position == of_position or factor == 1.0):
-            if factor == 1.0:
-                same = f"{position}/s" if position and not velocity else velocity
-                return position, same
-            said.append(
-                f"velocity over the slope of the position is {ratio:.4g}: {of_position} and {of_velocity}"
-            )
-            return of_position, velocity or of_velocity
+    possible = [pair for pair in _PAIRS if position in ("", pair[1]) or pair[0] == 1.0]
+    factor, of_position, of_velocity = min(possible, key=lambda pair: abs(math.log(ratio / pair[0])))
+    near = 1 / _NEAR < ratio / factor < _NEAR
+    if near and factor == 1.0:
+        return position, f"{position}/s" if position and not velocity else velocity
+    if near:
+        said.append(
+            f"velocity over the slope of the position is {ratio:.4g}: {of_position} and {of_velocity}"
+        )
+        return of_position, velocity or of_velocity
     if not velocity:
         said.append(
             f"'{chosen.velocity[0].name}' is {ratio:.4g} times the derivative of the position: passed over"

@@ -218,6 +218,7 @@ def test_degrees_and_revolutions_by_their_ratio():
     for scale, speed, units in (
         (180 / np.pi, 1.0, {"position": "deg"}),
         (1.0, 30 / np.pi, {"velocity": "rpm"}),
+        (0.5 / np.pi, 30 / np.pi, {"position": "rev", "velocity": "rpm"}),
         (1.0, 1.0, None),
     ):
         first = jaxid.init({**base, "theta": scale * log["q"], "omega": speed * v})
@@ -225,6 +226,53 @@ def test_degrees_and_revolutions_by_their_ratio():
         assert first.tables["log"].get("units", {}).get("velocity", "") == (units or {}).get(
             "velocity", "rad/s" if units else ""
         )
+
+
+def test_units_in_the_names_of_a_table_in_memory():
+    log = recorded()
+    named = {
+        "Zeit [ms]": 1e3 * log["t"],
+        "Winkel [°]": np.degrees(log["q"]),
+        "Drehmoment [mNm]": 1e3 * log["u"],
+    }
+    first = jaxid.init(named)
+    assert first.tables["log"]["units"] == {"time": "ms", "position": "°", "force": "mNm"}
+    fitted = jaxid.as_log(named, first.case().columns)
+    np.testing.assert_allclose(fitted.position[:, 0], log["q"], atol=1e-12)
+
+
+def test_values_that_are_nan():
+    log = recorded()
+    log["q"] = np.where(np.arange(2000) % 7 == 3, np.nan, log["q"])
+    first = jaxid.init(log)
+    assert first.tables["log"]["resample"] == pytest.approx(500.0)
+    jaxid.check(first.case(), log)
+
+
+def test_an_export_of_a_twincat_scope(tmp_path):
+    """By hand after published exports: a key before each value, and a time before each channel."""
+    log = recorded()
+    head = [
+        "Name\tC:\\Scope",
+        "",
+        "\t".join(["Name\tAxis1.ActPos", "Name\tAxis1.ActCurrent", "Name\tAxis1.SetPos"]),
+        "\t".join(["SampleTime[ms]\t2"] * 3),
+        "",
+    ]
+    rows = [
+        "\t".join(f"{2 * k}\t{german(x, 6)}" for x in (1e3 * q, u, 1e3 * r))
+        for k, (q, u, r) in enumerate(zip(log["q"], log["u"], log["ref"], strict=True))
+    ]
+    path = tmp_path / "scope.csv"
+    path.write_text("\r\n".join([*head, *rows, "EOF", ""]))
+    table = jaxid.init(path).tables["log"]
+    assert [table[key] for key in ("time", "position", "force", "reference")] == [
+        "Name",
+        "Axis1.ActPos",
+        "Axis1.ActCurrent",
+        "Axis1.SetPos",
+    ]
+    assert table["units"] == {"time": "ms"}
 
 
 def test_what_is_refused(tmp_path, capsys):

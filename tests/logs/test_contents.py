@@ -50,7 +50,8 @@ def test_a_row_of_units_is_no_header(tmp_path):
 def test_a_time_before_each_channel(tmp_path):
     rows = ["Name\tAxis1.ActPos\tName\tAxis1.ActCurrent", "0\t0\t0\t1", "1\t0.5\t1\t2"]
     (tmp_path / "log.csv").write_text("\n".join(rows))
-    assert contents_of(tmp_path / "log.csv").names == ("Name", "Axis1.ActPos", "Axis1.ActCurrent")
+    found = contents_of(tmp_path / "log.csv")
+    assert (found.names, found.time) == (("Name", "Axis1.ActPos", "Axis1.ActCurrent"), "Name")
 
 
 def test_arrays_and_their_columns(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ from jaxid.logs.units import parse_unit
 
 # Most entries of an array in a message that count as columns: longer ones are pictures and clouds.
 _MOST_ENTRIES = 64
+# Head of the time before each channel of a TwinCAT Scope.
+_SCOPE_TIME = "Name"
 # Depth to which the fields of a message are followed.
 _DEPTH = 4
 
@@ -98,12 +100,28 @@ def _with_units(header: Sequence[str], units: Sequence[str] = ()) -> Contents:
 def _of_text(path: Path) -> Contents:
     """Return the header of a text table: the last line of text above the numbers that is no row of units."""
     dialect, lines = dialect_of(path, [])
+    scope = _scope_header(lines, dialect)
+    if scope is not None:
+        dialect, _ = dialect_of(path, scope)
+        return replace(_with_units(dialect.header, dialect.units), time=_SCOPE_TIME)
     cells = [cell for cell in dialect.header if cell]
     if cells and not dialect.units.count("") == 0 and _are_units(cells):
         above = _line_above(lines, dialect)
         if above is not None:
             dialect, _ = dialect_of(path, above)
     return _with_units(dialect.header, dialect.units)
+
+
+def _scope_header(lines: Sequence[str], dialect: Dialect) -> list[str] | None:
+    """Return the channels of a row as a TwinCAT Scope writes it, "Name" before each; None without one.
+
+    Rows of metadata, a key before each value, stand between it and the numbers.
+    """
+    for line in lines:
+        cells = cells_of(bare(line), dialect.separator)
+        if len(cells) > 3 and set(cells[::2]) == {_SCOPE_TIME} and all(cells[1::2]):
+            return list(dict.fromkeys(cells[1::2]))
+    return None
 
 
 def _are_units(cells: Sequence[str]) -> bool:
