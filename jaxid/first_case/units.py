@@ -212,6 +212,10 @@ def _motion(
     if span > _TURNS_BEYOND or speed > _FAST:
         size = f"a way of {span:.4g} m" if span > _TURNS_BEYOND else f"a speed of {speed:.4g} m/s"
         said.append(f"the motion is rotary: no axis has {size}")
+        questions["motion"] = (
+            'is the position in rad? Else say units = { position = "deg" } in [log], or "mm" with '
+            'motion = "linear" in [plant]'
+        )
         return "rotary"
     said.append("the motion is taken to be linear: nothing says whether it turns or slides")
     questions["motion"] = 'does it turn? Then motion = "rotary": units are rad, N m and kg m^2'
