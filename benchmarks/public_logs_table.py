@@ -37,6 +37,10 @@ SIMULATED = "exact simulation"
 FEEDFORWARD = friction(0.02, 0.12, 0.25)
 TIME = friction(0.05, 0.15, 0.4)
 SWING = friction(1.9e-4, 0.021 / 9.81, 4e-4, names=PENDULUM)
+SO101 = (
+    "backlash_detection chirp_sweep friction_gravity hold_under_gravity multisine prbs_excitation "
+    "single_joint_elbow single_joint_rotation slow_precision step_response trapezoidal_profile wave_motion"
+).split()
 # Counts of 1440 a turn, and 255 steps of PWM for 12 V.
 COUNT, STEP = 2 * pi / 1440, 12 / 255
 PWM = friction(7.82e-3 / STEP * COUNT, 0.0240 / STEP * COUNT, 0.235 / STEP)
@@ -110,7 +114,5 @@ ROWS = (
     Row("tx40/pos_read_data.csv", {}, "figaroh"),
     Row("tx40/curr_data.csv", {}, "figaroh"),
     Row("tx40/both, joined.csv", TX40_JOINT_4, "figaroh, of joint 4", made=tx40_table),
-    Row("so101/backlash_detection.csv", {}, "none"),
-    Row("so101/multisine.csv", {}, "none"),
-    Row("so101/wave_motion.csv", {}, "none"),
+    *(Row(f"so101/{motion}.csv", {}, "none") for motion in SO101),
 )
