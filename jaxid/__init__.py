@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from jaxid.commands.identify import Identification as Identification
     from jaxid.commands.identify import identify as identify
     from jaxid.commands.identify import identify_many as identify_many
+    from jaxid.commands.init import FirstCase as FirstCase
+    from jaxid.commands.init import init as init
     from jaxid.commands.live import Live as Live
     from jaxid.commands.live import follow as follow
     from jaxid.commands.simulate import simulate as simulate
@@ -93,6 +95,7 @@ _HOMES = {
     "identify": ("jaxid.commands.identify", "identify"),
     "identify_many": ("jaxid.commands.identify", "identify_many"),
     "discover": ("jaxid.commands.discover", "discover"),
+    "init": ("jaxid.commands.init", "init"),
     "simulate": ("jaxid.commands.simulate", "simulate"),
     "design": ("jaxid.commands.design", "design"),
     "study": ("jaxid.commands.study", "study"),
@@ -110,6 +113,7 @@ _HOMES = {
     "Discovery": ("jaxid.discovery.result", "Discovery"),
     "Check": ("jaxid.commands.check", "Check"),
     "Study": ("jaxid.studies.result", "Study"),
+    "FirstCase": ("jaxid.commands.init", "FirstCase"),
     "Design": ("jaxid.experiment_design.in_loop", "Design"),
     "Excitation": ("jaxid.experiment_design.along_reference", "Excitation"),
     "Parameter": ("jaxid.results.parameters", "Parameter"),

@@ -79,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     ):
         commands.add_parser(name, help=purpose, description=purpose).set_defaults(run=run)
     _schema(commands)
+    _init(commands)
     _simulate(commands)
     _design(commands)
     _check(commands)
@@ -111,6 +112,17 @@ def _demo(commands: argparse._SubParsersAction) -> None:
     parser = _add(commands, "demo", purpose, _run_demo)
     parser.add_argument(
         "-o", metavar="DIR", default="jaxid-demo", help="folder for the results; default: jaxid-demo"
+    )
+
+
+def _init(commands: argparse._SubParsersAction) -> None:
+    parser = _add(commands, "init", "write a first case from a raw log", _run_init)
+    parser.add_argument("log", metavar="LOG")
+    parser.add_argument("--urdf", metavar="FILE", help="file that describes the arm of the log")
+    parser.add_argument("--tip", metavar="LINK", help="its last link; needed only where the chain branches")
+    parser.add_argument("--mjcf", metavar="FILE", help="MuJoCo model of the machine; not built yet")
+    parser.add_argument(
+        "-o", metavar="CASE.toml", default="case.toml", help="file to write the case to; default: case.toml"
     )
 
 
@@ -310,6 +322,16 @@ def _run_schema(args: argparse.Namespace) -> int:
     from jaxid.case.json_schema import case_schema
 
     print(json.dumps(case_schema(), indent=2, ensure_ascii=False))
+    return 0
+
+
+def _run_init(args: argparse.Namespace) -> int:
+    from jaxid.commands.init import check_target, init
+
+    path = check_target(Path(args.o), overwrite=args.force)
+    first = init(args.log, urdf=args.urdf, tip=args.tip, mjcf=args.mjcf, folder=path.parent)
+    first.save(path, overwrite=args.force)
+    print(f"{first}\n\nwrote {path}; next: jaxid check {path} {args.log}")
     return 0
 
 

@@ -19,6 +19,7 @@ from jaxid.estimators.inverse_dynamics import force_precision
 from jaxid.files import json_text, write_results
 from jaxid.gap import noise_floor
 from jaxid.logs.in_memory import LogLike
+from jaxid.logs.seen import Sight, sights_of
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import Precision
@@ -51,6 +52,11 @@ class Check:
     def warnings(self) -> list[str]:
         """Doubts about the logs, a line each."""
         return [f"{f.where}: {f.what}; {f.hint}" for f in self.session.findings]
+
+    @property
+    def sights(self) -> list[Sight]:
+        """Everything that was seen when the fitted log was read, with the statements that settle it."""
+        return sights_of(self.session.fit.log, self.session.findings)
 
     @property
     def parameters(self) -> ParameterTable:
@@ -102,6 +108,7 @@ class Check:
         return {
             "sound": True,
             "warnings": self.warnings,
+            "seen": [{"about": s.about, "text": s.text, "say": s.say or None} for s in self.sights],
             "log": {
                 "samples": log.samples,
                 "rate_hz": log.rate_hz,

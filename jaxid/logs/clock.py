@@ -48,7 +48,7 @@ def clock_findings(log: Log, path: str) -> list[Finding]:
         f"drift by {1e6 * drift:+.3g} ppm"
     )
     hint = "record both with one clock, or fit shorter stretches by rows"
-    return [Finding("warning", what, f"{path}, force", hint)]
+    return [Finding("warning", what, f"{path}, force", hint, "time")]
 
 
 def _line(force: Signal, q: Signal, period: float) -> tuple[float, float, float] | None:

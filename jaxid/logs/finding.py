@@ -13,12 +13,14 @@ class Finding:
         what: The fault, with its size and unit.
         where: File and quantity in which it is.
         hint: What the user can do about it.
+        about: "time", "units" or "wrap" for a doubt on how the log was read; empty: on its content.
     """
 
     severity: Literal["error", "warning"]
     what: str
     where: str
     hint: str
+    about: str = ""
 
     def __str__(self) -> str:
         """Format the finding as one line for a terminal."""

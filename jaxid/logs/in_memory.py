@@ -52,8 +52,8 @@ def as_log(
         return log
     if isinstance(log, str | Path):
         return read_log(log, columns, joints=joints, drives=drives, frame=frame)
-    name, known = _arrays(log)
-    units = _units(log)
+    name, known = arrays_of(log)
+    units = units_of_table(log)
 
     def read(source: Path, names: list[str], rows: Rows | None) -> Table:
         return Table(*pick_columns(source, known, list(dict.fromkeys(names)), rows), units)
@@ -61,7 +61,7 @@ def as_log(
     return read_log(name, columns, joints=joints, drives=drives, frame=frame, read=read)
 
 
-def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:
+def arrays_of(log: Any) -> tuple[str, Mapping[str, Any]]:
     """Return the name of a table in messages, and its columns by name.
 
     No library is imported, because the library of a given table is loaded already.
@@ -84,7 +84,7 @@ def _arrays(log: Any) -> tuple[str, Mapping[str, Any]]:
     )
 
 
-def _units(log: Any) -> dict[str, str]:
+def units_of_table(log: Any) -> dict[str, str]:
     """Return the units among the attributes of an xarray Dataset, by the name of the variable."""
     variables = log.variables.items() if type(log).__module__.partition(".")[0] == "xarray" else ()
     return {str(name): str(v.attrs["units"]) for name, v in variables if v.attrs.get("units")}

@@ -16,7 +16,7 @@ from jaxid.logs.readers.table import Assumed, Table
 from jaxid.logs.resample import Readings, readings_of, resampled
 from jaxid.logs.timebase import TimeBase, time_base
 from jaxid.logs.units import Frame, converted
-from jaxid.logs.wrap import joined
+from jaxid.logs.wrap import find_wrap, joined
 from jaxid.names import HOLDS, OPTIONAL_COLUMNS, RESAMPLINGS
 from jaxid.schema import Spot, read_settings
 from jaxid.settings import LogTable
@@ -354,8 +354,10 @@ def read_log(
         return steady_log(groups, names, content, table, Frame() if frame is None else frame, path)
     if rows[1] - rows[0] < MINIMUM_SAMPLES:
         raise _too_short(rows[1] - rows[0], path)
+    wraps: list[Assumed] = []
     if table.unwrap and "position" in groups:
         # A turn is one of the column's unit.
+        wraps = _joins(groups["position"], table.unwrap)
         position, reference = joined(groups["position"], groups.get("reference"), table.unwrap)
         groups |= {"position": position} | ({} if reference is None else {"reference": reference})
     frame = Frame() if frame is None else frame
@@ -369,7 +371,7 @@ def read_log(
         hold=HOLDS[0] if table.hold is None else table.hold,
         rows=rows,
         source=str(path),
-        assumed=(*content.assumed, *absent, *units, *timing),
+        assumed=(*content.assumed, *absent, *units, *wraps, *timing),
         table=table,
         **{"position": None, **groups},
     )
@@ -391,6 +393,21 @@ def _completed(
         groups = {**groups, "force": force}
         said.append(Assumed("force", 0.0, "the log has none, so that nothing drives the machine"))
     return groups, said
+
+
+def _joins(position: np.ndarray, stated: bool | float) -> list[Assumed]:
+    """Return words on the turns that are found in a log and joined; empty if their size is stated."""
+    found = [] if stated is not True else [find_wrap(q) for q in position.T]
+    return [
+        Assumed(
+            "unwrap",
+            float(f"{wrap.turn:.9g}"),
+            f"the position of joint {joint} jumps by {wrap.name or format(wrap.turn, '.6g')} in "
+            f"{wrap.rows.size} row(s): joined",
+        )
+        for joint, wrap in enumerate(found, start=1)
+        if wrap is not None
+    ]
 
 
 def _too_short(samples: int, path: Path) -> InputError:

@@ -89,12 +89,15 @@ def raise_on_error(findings: Iterable[Finding]) -> None:
         findings: Findings of `check_log`.
 
     Raises:
-        InputError: For the first error; its hint gives the number of further ones.
+        InputError: For the first error; its hint gives the further ones.
     """
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
-        first, others = errors[0], len(errors) - 1
-        hint = first.hint + (f" (and {others} more error(s))" if others else "")
+        first, *others = errors
+        hint = first.hint
+        if others:
+            listed = "; ".join(f"{f.where.rpartition(', ')[2]}: {f.what}; {f.hint}" for f in others)
+            hint += f" (and {len(others)} more error{'s' * (len(others) > 1)}: {listed})"
         raise InputError(first.what, where=first.where, hint=hint)
 
 

@@ -185,9 +185,16 @@ def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: 
     for slip in slips:
         if slip.matches(ratio, motion, 1.2):
             hint = how_to_say(slip.text, "convert all columns to SI units")
-            return [Finding("error", f"{finding}: {slip.text}", where, hint)]
+            return [Finding("error", f"{finding}: {slip.text}", where, hint, "units")]
     hint = "check the units of both columns"
-    return [Finding("warning", f"{finding}, which should be 1", where, hint)]
+    return [Finding("warning", f"{finding}, which should be 1", where, hint, "units")]
+
+
+def time_unit_of(period: float) -> str:
+    """Return the unit of a time column in which so much from row to row is a machine's sampling period."""
+    if period < _SLOW:
+        return "s"
+    return "ms" if period < _MICRO else "us" if period < _NANO else "ns"
 
 
 def period_findings(log: Log, path: str) -> list[Finding]:
@@ -199,11 +206,11 @@ def period_findings(log: Log, path: str) -> list[Finding]:
         return []
     whole = bool(np.all(np.abs(log.time - np.round(log.time)) < 1e-6))
     severity = "error" if log.period > _SLOWEST or whole else "warning"
-    unit = "milliseconds" if log.period < _MICRO else "microseconds" if log.period < _NANO else "nanoseconds"
+    unit = next(name for name, short in _NAMED.items() if short == time_unit_of(log.period))
     rows = " or rows" if unit == "milliseconds" else ""
     what = f"the sampling period is {log.period:.4g} s: time looks like {unit}{rows}"
     hint = how_to_say(f"time looks like {unit}", "give time in seconds")
-    return [Finding(severity, what, f"{path}, time", f"{hint}, or give sample_rate in its place")]
+    return [Finding(severity, what, f"{path}, time", f"{hint}, or give sample_rate in its place", "time")]
 
 
 def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list[Finding]:
@@ -227,7 +234,7 @@ def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list
                 'say units = { position = "count" } and counts_per_revolution in [log], '
                 'or the size of a count: units = { position = "0.5 um" }'
             )
-            findings.append(Finding("error", what, where, hint))
+            findings.append(Finding("error", what, where, hint, "units"))
         elif finding := _magnitude(q, log.period, motions[joint - 1], where):
             findings.append(finding)
     return findings
@@ -253,7 +260,7 @@ def _magnitude(q: np.ndarray, period: float, motion: str, where: str) -> Finding
         return None
     severity = "error" if value > absurd else "warning"
     hint = how_to_say(f"position looks like {unit}", "convert position to SI units")
-    return Finding(severity, f"{what}: position looks like {unit}", where, hint)
+    return Finding(severity, f"{what}: position looks like {unit}", where, hint, "units")
 
 
 def plausible_inertia(
@@ -310,5 +317,5 @@ def _judge_inertia(rough: float | None, guess: float, span: float, motion: str, 
             hint += "; else check actuator.gain, or correct the guess"
             # A guess may be wrong by a factor of 57; an angle of more than 20 indicates degrees.
             sure = slip.severity == "error" or (slip.motion == "rotary" and span > 20.0)
-            return Finding("error" if sure else "warning", f"{what}: {slip.text}", where, hint)
+            return Finding("error" if sure else "warning", f"{what}: {slip.text}", where, hint, "units")
     return None

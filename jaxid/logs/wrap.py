@@ -93,7 +93,7 @@ def wrap_findings(position: Float[np.ndarray, "time n"], path: str) -> list[Find
             "it starts anew after a turn"
         )
         hint = "set unwrap = true in [log]" if wrap.name else "set unwrap = <size of a turn> in [log]"
-        findings.append(Finding("error", what, f"{path}, position of joint {joint}", hint))
+        findings.append(Finding("error", what, f"{path}, position of joint {joint}", hint, "wrap"))
     return findings
 
 

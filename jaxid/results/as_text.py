@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.logs.seen import sights_of
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.parameters import lines_of
@@ -278,8 +279,12 @@ def check_table(result: Check) -> str:
     rows = check_rows(content)
     combinations = _unidentifiable_lines([c["combination"] for c in content["unidentifiable"]])
     table = ["", aligned(rows)] if len(rows) > 1 else []
-    seen = results.reading_lines(result.session)
-    return "\n".join([*seen, "the log is sound", *lines, *table, *combinations, *_notes(content["warnings"])])
+    session = result.session
+    seen = [str(sight) for sight in result.sights]
+    doubts = [f for f in session.findings if not f.about]
+    others = [f"log {run.name}: {sight}" for run in session.runs[1:] for sight in sights_of(run.log)]
+    notes = _notes([f"{f.where}: {f.what}; {f.hint}" for f in doubts])
+    return "\n".join([*seen, *others, "the log is sound", *lines, *table, *combinations, *notes])
 
 
 def check_rows(content: Mapping[str, Any]) -> list[list[str]]:

@@ -83,7 +83,8 @@ def judge_gap(gap, *, validated):
 def test_check(folder, capsys):
     ran = run(capsys, "check", folder / "case.toml", folder / "log.csv", folder=folder / "check")
     assert (ran.status, ran.err) == (0, "")
-    assert ran.out.startswith("the log is sound\n2000 samples at 500 Hz, 4 s; stroke ")
+    assert ran.out.startswith("time: 2000 samples, one every 2 ms (500 Hz), even to 1 %\nthe log is sound\n")
+    assert "\n2000 samples at 500 Hz, 4 s; stroke " in ran.out
     assert [p.name for p in sorted(ran.folder.iterdir())] == [".jaxid", "check.json"]
     found = ran.json("check.json")
     assert (found["sound"], found["warnings"], found["unidentifiable"]) == (True, [], [])

@@ -110,7 +110,7 @@ def read_table(
             beside = [p.name for p in path.parent.glob("*" + path.suffix)]
             hint = f"check the path; in that folder there is: {', '.join(sorted(beside)[:8]) or 'none'}"
             raise InputError("no such file", where=str(path), hint=hint)
-        reader = _reader_of(path, None if settings is None else settings.format)
+        reader = reader_of(path, None if settings is None else settings.format)
         if path.is_file() and path.stat().st_size == 0:
             raise InputError("is empty", where=str(path), hint="export the log again")
         wanted = list(dict.fromkeys(names))
@@ -125,8 +125,12 @@ def read_table(
         raise InputError("is too large for the memory", where=str(path), hint=hint) from error
 
 
-def _reader_of(path: Path, stated: str | None) -> Reader:
-    """Return the reader of a log: of the stated format, by a file in its folder, or by its suffix."""
+def reader_of(path: Path, stated: str | None) -> Reader:
+    """Return the reader of a log: of the stated format, by a file in its folder, or by its suffix.
+
+    Raises:
+        InputError: If the path is no log, or its format is not known.
+    """
     if path.is_dir():
         known = next((reader for file, reader in FOLDERS.items() if (path / file).is_file()), None)
         if known is not None:

@@ -47,6 +47,20 @@ def read_csv(path: Path, names: list[str], rows: Rows | None, settings: LogTable
         raise InputError(f"cannot be read ({error})", where=str(path), hint="export the log again") from error
 
 
+def dialect_of(path: Path, names: list[str]) -> tuple[Dialect, list[str]]:
+    """Return the dialect of a text table, and the lines of its beginning.
+
+    Args:
+        path: The file.
+        names: Names of columns that the header must have; empty: any header.
+
+    Raises:
+        InputError: If it is no text table.
+    """
+    reading = _Reading(path, names, None)
+    return reading.dialect, reading.beginning()
+
+
 class _Reading:
     """One pass over a file: dialect, then part by part."""
 
@@ -75,6 +89,11 @@ class _Reading:
         self._sparse: set[str] = set()
         # The first stamp of each column that holds some.
         self._begin: dict[str, str] = {}
+
+    def beginning(self) -> list[str]:
+        """Return the first lines of the file."""
+        with self._open() as file:
+            return self._decoded(_samples(file)[0]).split("\n")
 
     def _of_groups(self, names: list[str], time: str) -> dict[str, list[int]]:
         """Return the columns of a time that is there several times: each is of the columns to its right."""

@@ -38,6 +38,38 @@ def read_excel(path: Path, names: list[str], rows: Rows | None) -> Table:
             book.close()
 
 
+def header_of_book(path: Path) -> list[str]:
+    """Return the widest header of a workbook: a row of text with numbers soon below it, in any sheet.
+
+    Raises:
+        InputError: If the file is no workbook.
+    """
+    openpyxl = need("openpyxl", path, "Excel")
+    book, best = None, []
+    try:
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            rows = list(sheet.iter_rows(values_only=True, max_row=_HEADER + _BELOW + 1))
+            numbers = [any(_is_number(c) for c in row) for row in rows]
+            for k, row in enumerate(rows[:_HEADER]):
+                header = ["" if c is None else str(c).strip() for c in row]
+                if any(numbers[k + 1 : k + 2 + _BELOW]) and not numbers[k] and _width(header) > _width(best):
+                    best = header
+    except (InputError, OSError):
+        raise
+    except Exception as error:
+        what = f"cannot be read ({str(error) or type(error).__name__})"
+        raise InputError(what, where=str(path), hint="is it an .xlsx file? save it again") from error
+    finally:
+        if book is not None:
+            book.close()
+    return best
+
+
+def _width(header: Sequence[str]) -> int:
+    return sum(map(bool, header))
+
+
 def _of_book(book: Any, path: Path, names: list[str], rows: Rows | None) -> Table:
     known: list[str] = []
     for sheet in book.worksheets:

@@ -53,6 +53,29 @@ def read_hdf5(path: Path, names: list[str], rows: Rows | None) -> Table:
     return Table(columns, taken, units)
 
 
+def datasets_of(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
+    """Return path, shape and unit of each dataset of numbers, and of each field of a table.
+
+    Raises:
+        InputError: If it is no HDF5 file.
+    """
+    h5py = need("h5py", path, "HDF5")
+    try:
+        with h5py.File(path, "r") as file:
+            found = _datasets(file, h5py)
+            kinds = {name: (d.dtype[field] if field else d.dtype).kind for name, (d, field) in found.items()}
+            return [
+                (name, d.shape, _unit_of(d, name).get(name, ""))
+                for name, (d, _) in found.items()
+                if kinds[name] in "fiu"
+            ]
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        what = f"cannot be read ({error or type(error).__name__})"
+        raise InputError(what, where=str(path), hint="is it an HDF5 file? export it again") from error
+
+
 def _datasets(file: Any, h5py: Any) -> dict[str, tuple[Any, str]]:
     """Return all datasets by their paths, and the fields of tables, each with its dataset and field."""
     found: dict[str, tuple[Any, str]] = {}

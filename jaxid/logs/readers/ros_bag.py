@@ -25,7 +25,8 @@ from jaxid.logs.readers.table import Assumed, Table, on_one_time
 # Names that `time` may have: of the message's header, or of the recorder.
 HEADER, RECORDED = "header.stamp", "log_time"
 _JOINTS = "sensor_msgs/msg/JointState"
-_VECTORS = ("position", "velocity", "effort")
+# Fields of a joint state whose entries have the names of joints.
+JOINT_VECTORS = ("position", "velocity", "effort")
 _NAME = re.compile(r"(?P<topic>[^.]+)\.(?P<field>[^\[\]]+)(\[(?P<entry>.+)\])?$")
 # Messages whose bytes are read at once.
 _PART = 20_000
@@ -123,7 +124,7 @@ def _read(reader: Any, topic: str, columns: dict[str, _Column], path: Path) -> _
     for part in _parts(reader.messages(connections=connections)):
         kind = part[0][0].msgtype
         out.recorded.append(_NANO * np.array([stamp for _, stamp, _ in part], dtype=np.int64))
-        quick = kind == _JOINTS and all(c.path in _VECTORS for c in columns.values())
+        quick = kind == _JOINTS and all(c.path in JOINT_VECTORS for c in columns.values())
         if not (quick and reader.is2 and _quickly([raw for _, _, raw in part], out, path)):
             for connection, _, raw in part:
                 message = reader.deserialize(raw, connection.msgtype)
@@ -160,7 +161,9 @@ def _add(message: Any, out: _Topic, path: Path) -> None:
                     hint=suggest(part, fields),
                 )
             value = getattr(value, part)
-        joints = [str(joint) for joint in getattr(message, "name", [])] if column.path in _VECTORS else []
+        joints = (
+            [str(joint) for joint in getattr(message, "name", [])] if column.path in JOINT_VECTORS else []
+        )
         value = np.atleast_1d(np.asarray(value, dtype=np.float64))
         value = value if not column.entry else value[[_entry(column, joints, value.size, path)]]
         out.values[name].append(value[None, :])
@@ -190,7 +193,7 @@ def _quickly(raws: Sequence[bytes], out: _Topic, path: Path) -> bool:
     block = np.frombuffer(b"".join(raws), dtype=np.uint8).reshape(len(raws), len(first))
     if np.any(block[:, 12:text] != block[0, 12:text]):
         return False
-    for vector in _VECTORS:
+    for vector in JOINT_VECTORS:
         # Lengths of the arrays are the same too.
         at = starts[vector] - 8
         if np.any(block[:, at : at + 8] != block[0, at : at + 8]) and sizes[vector]:
@@ -232,7 +235,7 @@ def _layout(raw: bytes) -> tuple[list[str], dict[str, int], dict[str, int], int]
             joints.append(raw[at : at + length].rstrip(b"\0").decode())
             at += length
         text, starts, sizes = at, {}, {}
-        for vector in _VECTORS:
+        for vector in JOINT_VECTORS:
             sizes[vector], at = count(at)
             # An empty array takes no place, and no alignment.
             at = 4 + -(-(at - 4) // 8) * 8 if sizes[vector] else at

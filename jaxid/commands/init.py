@@ -1,0 +1,167 @@
+"""The command `init`: from a raw log to a case that runs, with what it assumed and what it has to ask."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxid.case.case import Case, load_case
+from jaxid.case.urdf import read_urdf
+from jaxid.errors import InputError
+from jaxid.files import write_whole
+from jaxid.first_case.columns import Chosen, choose, columns_of
+from jaxid.first_case.drafting import Draft
+from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_arm
+from jaxid.first_case.raw import raw_log
+from jaxid.first_case.section import case_text
+from jaxid.first_case.units import measures_of
+from jaxid.logs.in_memory import LogLike
+from jaxid.logs.log import Log
+
+_TITLE = (
+    "Lines that begin with `assumed` say what the log seemed to show.",
+    "Lines that begin with `question` ask what only you know. Neither stops a command.",
+)
+
+
+@dataclass(frozen=True, repr=False)
+class FirstCase:
+    """A case written from a raw log.
+
+    Args:
+        text: The case as TOML, with comments.
+        folder: Folder that file names in it start from.
+        source: The log.
+        assumed: Everything that was assumed, a line each.
+        questions: Everything that only the user knows, a line each.
+    """
+
+    text: str
+    folder: Path
+    source: str
+    assumed: tuple[str, ...]
+    questions: tuple[str, ...]
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """Tables of the case, as `load_case` takes them."""
+        return tomllib.loads(self.text)
+
+    def case(self) -> Case:
+        """Return the case, as `identify` and the other commands take it."""
+        tables = self.tables
+        if "urdf" in tables["plant"]:
+            tables["plant"]["urdf"] = str(self.folder / tables["plant"]["urdf"])
+        return load_case(tables)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the case to a file.
+
+        Raises:
+            InputError: If the file exists and `overwrite` is not given, or it cannot be written.
+        """
+        path = check_target(Path(path), overwrite=overwrite)
+        write_whole(path, self.text)
+        return path
+
+    def __str__(self) -> str:
+        lines = [f"assumed: {line}" for line in self.assumed]
+        return "\n".join([*lines, *(f"question: {line}" for line in self.questions)])
+
+    def __repr__(self) -> str:
+        return f"FirstCase of {self.source}: {len(self.assumed)} assumed, {len(self.questions)} question(s)"
+
+
+def check_target(path: Path, *, overwrite: bool = False) -> Path:
+    """Check that a case may be written to a file, before the work that makes it.
+
+    Raises:
+        InputError: If it exists and `overwrite` is false, is a folder, or its folder does not exist.
+    """
+    if path.is_dir():
+        raise InputError("is a folder", where=str(path), hint="name a file: -o case.toml")
+    if path.suffix.lower() != ".toml":
+        raise InputError("a case is a .toml file", where=str(path), hint="end its name in .toml")
+    if path.exists() and not overwrite:
+        hint = "choose another -o, or overwrite with --force"
+        raise InputError("exists already", where=str(path), hint=hint)
+    if not path.parent.is_dir():
+        raise InputError("has no such folder", where=str(path), hint="make the folder first")
+    return path
+
+
+def init(
+    log: LogLike,
+    *,
+    urdf: str | Path | None = None,
+    tip: str | None = None,
+    mjcf: str | Path | None = None,
+    folder: str | Path = ".",
+) -> FirstCase:
+    """Write a first case from a raw log: columns, units, sensors, and rough guesses of the unknowns.
+
+    Args:
+        log: The file, or a table in memory (DataFrame, Dataset, dict).
+        urdf: File that describes the arm of the log; None: an axis.
+        tip: Name of its last link; None: there is only one way to go.
+        mjcf: MuJoCo model of the machine; not built yet.
+        folder: Folder in which the case will stand, for the path of the URDF file in it.
+
+    Raises:
+        InputError: If no column is the position or velocity of a joint, there is no force, or nothing else
+            from which one could be concluded.
+    """
+    if mjcf is not None:
+        hint = "give --urdf FILE --tip LINK, or no model for the case of one axis"
+        raise InputError("--mjcf is not built yet", where=str(mjcf), hint=hint)
+    if tip is not None and urdf is None:
+        raise InputError("--tip goes with --urdf", hint="add --urdf FILE, or leave --tip out")
+    if isinstance(log, Log):
+        hint = "give the file, or a table with the columns by name"
+        raise InputError("a Log has its columns already", where=log.source, hint=hint)
+    raw = raw_log(log)
+    chosen = choose(columns_of(raw.data, raw.units, raw.contents.time), raw.source)
+    arm = None if urdf is None else read_urdf(urdf, tip)
+    if arm is not None:
+        chosen = of_arm(chosen, arm, str(urdf), raw.source)
+    elif len(chosen.joints) > 1:
+        need_forces(chosen, raw.source)
+        chosen = most_moved(chosen)
+    draft = Draft(log, raw, chosen, measures_of(chosen), Path(folder))
+    if not chosen.force:
+        sections = draft.without_force()
+    elif arm is not None:
+        assert urdf is not None, "an arm is read from it"
+        sections = draft.arm(arm, Path(urdf), tip)
+    else:
+        sections = draft.axis()
+    title = [f"Case of {Path(raw.source).name}, written by `jaxid init`.", *_TITLE]
+    first = FirstCase(
+        case_text(title, sections),
+        Path(folder),
+        raw.source,
+        tuple(line for section in sections for line in section.assumed),
+        tuple(line for section in sections for line in section.questions),
+    )
+    _need_loadable(first, chosen)
+    return first
+
+
+def _need_loadable(first: FirstCase, chosen: Chosen) -> None:
+    """Refuse a log whose case this version cannot load, with the reason."""
+    try:
+        first.case()
+    except InputError as error:
+        if chosen.force and chosen.position:
+            raise
+        what, hint = (
+            "the log has no position, and velocities alone are not fitted yet",
+            "log the position too",
+        )
+        if not chosen.force:
+            what, hint = "the log has no force, and a free swing is not fitted yet", NO_FORCE_HINT
+        elif chosen.time is None:
+            what = "the log is a table of steady speeds, which is not fitted yet"
+        raise InputError(what, where=first.source, hint=hint) from error

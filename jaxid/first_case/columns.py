@@ -1,0 +1,324 @@
+"""The columns of a raw log by quantity: chosen by name, and by their values if names say nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.errors import InputError
+from jaxid.first_case.words import FORCES, Meaning, meaning_of
+from jaxid.logs.readers.dialect import split_unit
+from jaxid.logs.rough_inertia import correlation
+
+# Sampling rate that a case states if the log has no time.
+NO_TIME_RATE = 1000.0
+# Correlation with the position, and ratio of strokes, up to which a second position has the same course.
+_SAME_COURSE, _SAME_SIZE = 0.95, 1.25
+# Correlation with the position from which a wanted value without a quantity counts as a reference.
+_FOLLOWED = 0.5
+# Part of its peak below which a force without a sign comes at its least, if it is a magnitude.
+_NEAR_ZERO = 0.05
+# Order in which forces are chosen, with those that are only commanded after all that are measured.
+_RANK = {kind: k for k, kind in enumerate(FORCES)}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a raw log.
+
+    Attributes:
+        meaning: Meaning of its name.
+        values: Its values, those without a reading interpolated.
+        unit: Unit that the file or the name states; empty: none.
+    """
+
+    meaning: Meaning
+    values: Float[np.ndarray, " rows"]
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """Name of the column in [log]."""
+        return self.meaning.name
+
+    @property
+    def moves(self) -> bool:
+        """True if the values are not all the same."""
+        return bool(np.ptp(self.values) > 0)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The columns of a log by quantity, in the order of the joints.
+
+    Attributes:
+        time: The time; None: there is none.
+        position, velocity, force, reference: Columns by joint; empty: there are none.
+        joints: Words that name the joints; an empty text for a single one.
+        said: Lines on choices that names do not show.
+        questions: Doubts, by quantity.
+    """
+
+    time: Column | None
+    position: tuple[Column, ...] = ()
+    velocity: tuple[Column, ...] = ()
+    force: tuple[Column, ...] = ()
+    reference: tuple[Column, ...] = ()
+    joints: tuple[str, ...] = ("",)
+    said: tuple[str, ...] = ()
+    questions: Mapping[str, str] = field(default_factory=dict)
+
+    def only(self, joint: int) -> Chosen:
+        """Return the columns of one joint."""
+        parts = {
+            q: getattr(self, q)[joint : joint + 1] for q in ("position", "velocity", "force", "reference")
+        }
+        return replace(self, **parts, joints=self.joints[joint : joint + 1])
+
+
+def columns_of(
+    data: Mapping[str, Float[np.ndarray, "rows 1"]], units: Mapping[str, str], time: str
+) -> list[Column]:
+    """Return the columns of a table with the meaning of their names.
+
+    Args:
+        data: Columns by name.
+        units: Units that the file states, by name.
+        time: Name of the time if the format has one of its own; empty otherwise.
+    """
+    out = []
+    for name, values in data.items():
+        meaning = meaning_of(name)
+        if time:
+            quantity = (
+                "time" if name == time else "passed over" if meaning.quantity == "time" else meaning.quantity
+            )
+            meaning = replace(meaning, quantity=quantity)
+        flat = values[:, 0]
+        known = np.isfinite(flat)
+        if np.count_nonzero(known) < 2:
+            continue
+        rows = np.arange(flat.size)
+        filled = flat if known.all() else np.interp(rows, rows[known], flat[known])
+        out.append(Column(meaning, filled, units.get(name, "") or meaning.unit or split_unit(name)[1]))
+    return out
+
+
+def choose(columns: Sequence[Column], where: str) -> Chosen:
+    """Choose the columns of a machine's log.
+
+    Args:
+        columns: All columns of the log.
+        where: The log, for messages.
+
+    Raises:
+        InputError: If no column can be the position or the velocity of a joint.
+    """
+    said: list[str] = []
+    questions: dict[str, str] = {}
+    time = _time(columns, said, questions)
+    rest = [c for c in columns if c is not time and c.meaning.quantity not in ("time", "passed over")]
+    position, spare = _by_joint(rest, "position")
+    velocity, _ = _by_joint(rest, "velocity")
+    if not position and not velocity:
+        position = _smoothest(rest, said, questions, where)
+    joints = tuple(position or velocity)
+    used = [*position.values(), *velocity.values()]
+    others = [c for c in rest if not any(c is u for u in used)]
+    force = _forces(others, joints, position, said, questions)
+    others = [c for c in others if not any(c is u for u in force.values())]
+    reference = _references(others, position, spare, said, questions)
+    velocity = _matched(velocity, joints)
+    return Chosen(
+        time,
+        tuple(position.values()),
+        tuple(velocity.values()),
+        tuple(force.values()),
+        tuple(reference.values()),
+        joints,
+        tuple(said),
+        questions,
+    )
+
+
+def _time(columns: Sequence[Column], said: list[str], questions: dict[str, str]) -> Column | None:
+    """Return the column of the time: by name, or the only one that rises steadily."""
+
+    def rises(column: Column) -> bool:
+        steps = np.diff(column.values)
+        return bool(column.moves and np.mean(steps >= 0) > 0.99)
+
+    named = [c for c in columns if c.meaning.quantity == "time" and rises(c)]
+    if named:
+        others = ", ".join(f"'{c.name}'" for c in named[1:])
+        said += [f"time is '{named[0].name}'; {others} rise(s) as well"] if others else []
+        return named[0]
+    steady = [c for c in columns if not c.meaning.quantity and rises(c) and _steady(c.values)]
+    if steady:
+        said.append(f"time is '{steady[0].name}': it alone rises by equal steps")
+        return steady[0]
+    said.append(f"the log has no time: {NO_TIME_RATE:g} samples a second are assumed")
+    questions["time"] = "the log has no time. Which sampling rate has it?"
+    return None
+
+
+def _steady(values: np.ndarray) -> bool:
+    steps = np.diff(values)
+    return bool(np.ptp(steps) <= 0.5 * np.median(steps))
+
+
+def _by_joint(columns: Sequence[Column], quantity: str) -> tuple[dict[str, Column], dict[str, Column]]:
+    """Return the measured columns of a quantity by joint, and a second one of the same joint, if there is."""
+    found = [c for c in columns if c.meaning.quantity == quantity and not c.meaning.reference]
+    first: dict[str, Column] = {}
+    second: dict[str, Column] = {}
+    for column in found:
+        key = " ".join(column.meaning.joint)
+        if key not in first:
+            first[key] = column
+        elif key not in second and _same_course(column.values, first[key].values):
+            # The wanted course is the smoother of two.
+            wanted = min(first[key], column, key=lambda c: float(np.std(np.diff(c.values, 3))))
+            first[key], second[key] = (column if wanted is first[key] else first[key]), wanted
+        elif quantity == "position" and not _same_course(column.values, first[key].values):
+            first[f"{key} {column.name}".strip()] = column
+    if len(first) > 1:
+        # A column that stands still beside others that move is a setting.
+        first = {key: c for key, c in first.items() if c.moves} or first
+    return first, second
+
+
+def _same_course(one: np.ndarray, other: np.ndarray) -> bool:
+    if np.ptp(one) == 0 or np.ptp(other) == 0:
+        return False
+    ratio = np.ptp(one) / np.ptp(other)
+    return bool(correlation(one, other) > _SAME_COURSE and 1 / _SAME_SIZE < ratio < _SAME_SIZE)
+
+
+def _roughness(values: np.ndarray) -> float:
+    """Return the mean step from row to row over the standard deviation."""
+    return float(np.std(np.diff(values)) / values.std()) if values.std() > 0 else np.inf
+
+
+def _smoothest(
+    rest: Sequence[Column], said: list[str], questions: dict[str, str], where: str
+) -> dict[str, Column]:
+    """Return as position the smoothest of two columns whose names say nothing of it."""
+    moving = [c for c in rest if c.moves and c.meaning.quantity != "temperature"]
+    if len(moving) != 2:
+        listed = ", ".join(f"'{c.name}'" for c in rest[:12]) or "none"
+        hint = "rename the columns (q, position, Lage), or write the case by hand, see docs/case_file.md"
+        raise InputError(
+            f"no column is a position or a velocity by its name: {listed}", where=where, hint=hint
+        )
+    column = min(moving, key=lambda c: _roughness(c.values))
+    said.append(f"position is '{column.name}', the smoother of two columns whose names do not say it")
+    questions["position"] = f"is '{column.name}' the position, and not the force?"
+    return {"": column}
+
+
+def _matched(found: Mapping[str, Column], joints: Sequence[str]) -> dict[str, Column]:
+    """Return a column for each joint; empty if one has none."""
+    if len(joints) == 1 and len(found) == 1:
+        return {joints[0]: next(iter(found.values()))}
+    return {joint: found[joint] for joint in joints} if set(joints) <= set(found) else {}
+
+
+def _forces(
+    others: Sequence[Column],
+    joints: Sequence[str],
+    position: Mapping[str, Column],
+    said: list[str],
+    questions: dict[str, str],
+) -> dict[str, Column]:
+    """Return the force of each joint: the surest witness of it that the log has; empty if there is none."""
+    known = [c for c in others if c.meaning.quantity in FORCES or _bare_command(c, position)]
+    ranked = sorted(known, key=_force_rank)
+    usable = []
+    for column in ranked:
+        doubt = _no_force(column, position.values())
+        if doubt:
+            said.append(f"'{column.name}' is passed over: {doubt}")
+        else:
+            usable.append(column)
+    of_joint: dict[str, list[Column]] = {}
+    for column in usable:
+        of_joint.setdefault(" ".join(column.meaning.joint), []).append(column)
+    if len(joints) == 1:
+        chosen = {joints[0]: usable[0]} if usable else {}
+    else:
+        chosen = {j: of_joint[j][0] for j in joints if j in of_joint}
+        chosen = chosen if len(chosen) == len(joints) else {}
+    if not chosen and not known and len(joints) == 1:
+        silent = [c for c in others if not c.meaning.quantity and c.moves and not c.meaning.reference]
+        silent = [c for c in silent if not any(_same_course(c.values, p.values) for p in position.values())]
+        if silent:
+            column = max(silent, key=lambda c: _roughness(c.values))
+            said.append(f"force is '{column.name}', because no name says force, torque, current or voltage")
+            questions["force"] = f"is '{column.name}' the force, or the command of the drive?"
+            return {joints[0]: column}
+        voltages = [c for c in others if c.meaning.quantity == "voltage" and c.moves]
+        return {joints[0]: voltages[0]} if voltages else {}
+    beside = [c for c in usable if not any(c is k for k in chosen.values())]
+    if chosen and beside and len(joints) == 1:
+        listed = ", ".join(f"'{c.name}'" for c in beside)
+        said.append(f"force is '{next(iter(chosen.values())).name}'; {listed} could be it as well")
+    return chosen
+
+
+def _force_rank(column: Column) -> tuple[int, bool]:
+    return _RANK.get(column.meaning.quantity, len(_RANK)), column.meaning.reference
+
+
+def _bare_command(column: Column, position: Mapping[str, Column]) -> bool:
+    """Check for a wanted value without a quantity that no position follows: the drive's command."""
+    if column.meaning.quantity or not column.meaning.reference:
+        return False
+    return not any(abs(correlation(column.values, p.values)) > _FOLLOWED for p in position.values())
+
+
+def _no_force(column: Column, position: object) -> str:
+    """Return why a column cannot be a force; empty if it can."""
+    values = column.values
+    if not values.any():
+        return "it is zero throughout"
+    if not column.moves:
+        return ""
+    low, high = float(values.min()), float(values.max())
+    magnitude = (
+        low >= 0 and low <= _NEAR_ZERO * high and column.meaning.quantity in ("load", "current", "duty")
+    )
+    if magnitude:
+        return "it is never negative, so it is a magnitude without a direction"
+    return ""
+
+
+def _references(
+    others: Sequence[Column],
+    position: Mapping[str, Column],
+    spare: Mapping[str, Column],
+    said: list[str],
+    questions: dict[str, str],
+) -> dict[str, Column]:
+    """Return the reference of each joint; empty if there is none."""
+    wanted: dict[str, Column] = {}
+    for column in others:
+        if column.meaning.reference and column.meaning.quantity in ("position", ""):
+            wanted.setdefault(" ".join(column.meaning.joint), column)
+    named = _matched(wanted, tuple(position))
+    if named and all(_follows(position[j].values, c.values) for j, c in named.items()):
+        return named
+    if position and set(spare) == set(position):
+        first = next(iter(spare.values()))
+        said.append(f"reference is '{first.name}', which has the course of the position")
+        questions["reference"] = f"is '{first.name}' the wanted position, or a second encoder?"
+        return dict(spare)
+    return {}
+
+
+def _follows(position: np.ndarray, reference: np.ndarray) -> bool:
+    moved = np.ptp(position) > 0 and np.ptp(reference) > 0
+    return not moved or abs(correlation(position, reference)) > _FOLLOWED

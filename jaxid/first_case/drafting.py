@@ -1,0 +1,376 @@
+"""The tables of a first case, from the columns of its log and a rough fit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.case.urdf import Urdf
+from jaxid.errors import InputError
+from jaxid.first_case.balance import FreeSwing, RoughBalance, free_swing, rough_balance
+from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
+from jaxid.first_case.joints import NO_FORCE_HINT, no_force
+from jaxid.first_case.raw import RawLog
+from jaxid.first_case.section import Section, rounded
+from jaxid.first_case.units import Measures
+from jaxid.logs.in_memory import LogLike, as_log
+from jaxid.logs.log import Log
+from jaxid.logs.soundness import position_levels
+from jaxid.logs.units import Frame, parse_unit
+from jaxid.model.units import Units
+from jaxid.numerics.filters import high_band_std
+
+_GRAVITY = 9.81
+# Mass times distance of a swing that nothing states [kg m].
+_MOMENT = 0.1
+# Smallest guesses over the size of the force: friction is positive.
+_LEAST = 0.01
+# Noise beyond that of the rounding, as a variance over it, from which it is stated.
+_BEYOND_ROUNDING = 1.5
+
+
+class Draft:
+    """The sections of one case, as they are written."""
+
+    def __init__(self, log: LogLike, raw: RawLog, chosen: Chosen, measures: Measures, folder: Path):
+        self._log, self._raw, self._chosen, self._measures = log, raw, chosen, measures
+        self._folder = folder
+        self._joints = len(chosen.position or chosen.velocity)
+
+    # what stands in the case
+
+    def axis(self) -> list[Section]:
+        """Return the case of one joint with its force."""
+        chosen, measures = self._chosen, self._measures
+        table = self._log_table()
+        rotary = measures.motion == "rotary"
+        log = self._read(table) if chosen.position else None
+        if log is not None:
+            rough = rough_balance(log.force[:, 0], log.position[:, 0], log.period, rotary=rotary)
+        else:
+            time, motion, force = self._by_hand()
+            rough = rough_balance(
+                force, motion, float(np.median(np.diff(time))), rotary=rotary, of_velocity=not chosen.position
+            )
+        rough, signs = _driven(rough)
+        if signs:
+            table.keys["sign"] = {"force": -1}
+            table.assumed.append("the force as logged brakes the motion: its sign is turned")
+            table.questions.append("is a positive force one that drives a positive velocity?")
+        plant, effects = self._plant(rough), self._effects(rough)
+        return [*plant, *effects, table, *self._sensor(log)]
+
+    def arm(self, arm: Urdf, urdf: Path, tip: str | None) -> list[Section]:
+        """Return the case of an arm from a URDF file."""
+        measures = self._measures
+        plant = Section("[plant]", {"kind": "serial_arm", "urdf": _relative(urdf, self._folder)})
+        if tip is not None:
+            plant.keys["tip"] = tip
+        plant.keys["unknown"] = "base"
+        plant.notes["unknown"] = (
+            'sums of link parameters that torques show; "none": those of the file are right'
+        )
+        if measures.labels:
+            plant.keys["units"] = measures.labels
+            plant.questions.append(measures.questions["force"])
+        plant.questions.append(
+            "does gravity act along -z of the first link? Else gravity_vector = [x, y, z] in m/s^2"
+        )
+        table = self._log_table(arm.names)
+        log = self._read(table)
+        rough = []
+        for k in range(self._joints):
+            others = [log.position[:, j] for j in range(self._joints)]
+            one = rough_balance(log.force[:, k], log.position[:, k], log.period, rotary=True, others=others)
+            rough.append(one)
+        frictions = [
+            Section("[[effects]]", {"kind": kind, key: {"guess": [_positive(r, name) for r in rough]}})
+            for kind, key, name in (
+                ("viscous_friction", "coefficient", "viscous"),
+                ("coulomb_friction", "level", "coulomb"),
+            )
+        ]
+        return [plant, *frictions, table, *self._sensor(log)]
+
+    def without_force(self) -> list[Section]:
+        """Return the case of a free swing, whose weight is the only force."""
+        chosen, measures = self._chosen, self._measures
+        swing = None
+        if self._joints == 1 and chosen.position and not chosen.reference and measures.motion == "rotary":
+            time, position, _ = self._by_hand()
+            swing = free_swing(position, float(np.median(np.diff(time))))
+        if swing is None:
+            raise InputError(no_force(chosen), where=self._raw.source, hint=NO_FORCE_HINT)
+        return [*self._swing(swing), self._log_table()]
+
+    # the tables
+
+    def _log_table(self, joints: Sequence[str] = ()) -> Section:
+        """Return the table [log], with lines on columns and units."""
+        chosen, measures = self._chosen, self._measures
+        section = Section("[log]")
+        steady = chosen.time is None and not chosen.position and bool(chosen.force)
+        if steady:
+            section.keys["kind"] = "steady"
+            section.assumed.append("a table of steady speeds and forces: it has no time and no position")
+        elif chosen.time is not None:
+            section.keys["time"] = chosen.time.name
+        else:
+            section.keys["sample_rate"] = NO_TIME_RATE
+        for quantity in ("position", "velocity", "force", "reference"):
+            names = [c.name for c in getattr(chosen, quantity)]
+            if quantity == "velocity" and chosen.position and not self._velocity_counts():
+                continue
+            if names and joints:
+                section.keys[quantity] = dict(zip(joints, names, strict=True))
+            elif names:
+                section.keys[quantity] = names[0] if len(names) == 1 else names
+        if measures.units:
+            section.keys["units"] = {q: u for q, u in measures.units.items() if q in section.keys}
+        if not section.keys.get("units", True):
+            del section.keys["units"]
+        if measures.unwrap:
+            section.keys["unwrap"] = measures.unwrap
+        if self._raw.contents.episodes > 1:
+            section.keys["episode"] = 0
+            section.questions.append(
+                f"which of the {self._raw.contents.episodes} episodes? The first is taken"
+            )
+        lines = [line for line in chosen.said if not (steady and "no time" in line)]
+        section.assumed += [*lines, *measures.said]
+        asked = {**chosen.questions, **{q: t for q, t in measures.questions.items() if q not in ("force",)}}
+        section.questions += [t for q, t in asked.items() if not (steady and q == "time")]
+        if chosen.reference:
+            section.offers.append(
+                "[controller] with the law of the loop (docs/case_file.md) makes simulations closed-loop"
+            )
+        return section
+
+    def _velocity_counts(self) -> bool:
+        """Check whether the logged velocity has a known unit."""
+        return "position" not in self._measures.labels and not any(
+            "passed over" in line and f"'{self._chosen.velocity[0].name}'" in line
+            for line in self._measures.said
+        )
+
+    def _units(self) -> Units:
+        labels = self._measures.labels
+        return Units(self._measures.motion, labels.get("position"), labels.get("force"))
+
+    def _plant(self, rough: RoughBalance) -> list[Section]:
+        """Return [plant] of an axis, or of a pendulum if the log shows a weight that turns."""
+        measures, units = self._measures, self._units()
+        inertia = {"guess": rounded(rough.inertia)}
+        if rough.weight is not None:
+            x, y = (rounded(w / _GRAVITY, 3) for w in rough.weight)
+            plant = _pendulum([{"guess": x}, {"guess": y}, 0.0], inertia, [_GRAVITY, 0.0, 0.0])
+            plant[0].assumed.append(
+                "the force has a part as of a weight that turns with the joint: first_moment"
+            )
+            self._label(plant[0])
+            return plant
+        plant = Section("[plant]", {"kind": "axis", "motion": measures.motion})
+        self._label(plant)
+        if rough.has_offset and measures.motion == "linear":
+            plant.questions.append('is the axis vertical? Then orientation = "vertical"')
+        values = Section("[plant.parameters]", {"inertia": inertia}, {"inertia": units.label("inertia")})
+        values.assumed.append(
+            f"guesses are those of a rough fit: it explains {100 * rough.explained:.0f} % of the force"
+        )
+        return [plant, values]
+
+    def _label(self, plant: Section) -> None:
+        """Add labels of quantities that are not mechanical, with the question that replaces them."""
+        if self._measures.labels:
+            plant.keys["units"] = self._measures.labels
+            plant.notes["units"] = "labels of results; nothing is converted"
+        if "force" in self._measures.questions:
+            plant.questions.append(self._measures.questions["force"])
+
+    def _effects(self, rough: RoughBalance) -> list[Section]:
+        """Return friction, and what else the rough fit found."""
+        units = self._units()
+
+        def effect(kind: str, key: str, value: float, dimension: str) -> Section:
+            return Section(
+                "[[effects]]", {"kind": kind, key: {"guess": rounded(value)}}, {key: units.label(dimension)}
+            )
+
+        out = [
+            effect("viscous_friction", "coefficient", _positive(rough, "viscous"), "force*time/position"),
+            effect("coulomb_friction", "level", _positive(rough, "coulomb"), "force"),
+        ]
+        if rough.spring is not None:
+            out.append(effect("linear_stiffness", "coefficient", rough.spring, "force/position"))
+            out[-1].assumed.append("the force grows with the position, as of a spring")
+        if rough.has_offset:
+            out.append(effect("constant_force", "level", -rough.offset, "force"))
+            out[-1].assumed.append("a large part of the force is constant: a weight, or an offset")
+        return out
+
+    def _swing(self, swing: FreeSwing) -> list[Section]:
+        """Return a pendulum that swings freely: its weight is known, or every value has that factor."""
+        weight = _MOMENT * _GRAVITY
+        down = [rounded(_GRAVITY * np.cos(swing.rest), 6), rounded(_GRAVITY * np.sin(swing.rest), 6), 0.0]
+        plant = _pendulum([_MOMENT, 0.0, 0.0], {"guess": rounded(swing.inertia * weight)}, down)
+        plant[0].assumed.append("no force is logged, and the joint swings freely: its weight moves it")
+        plant[0].assumed.append(f"it hangs at rest at {swing.rest:.4g} rad")
+        plant[1].assumed.append(f"mass times distance of the centre is {_MOMENT:g} kg m")
+        plant[1].questions.append(
+            "how much is mass times distance of the centre [kg m]? All results grow with first_moment"
+        )
+        frictions = [
+            Section("[[effects]]", {"kind": kind, key: {"guess": rounded(max(value, 1e-4) * weight)}})
+            for kind, key, value in (
+                ("viscous_friction", "coefficient", swing.viscous),
+                ("coulomb_friction", "level", swing.coulomb),
+            )
+        ]
+        return [*plant, *frictions]
+
+    def _sensor(self, log: Log | None) -> list[Section]:
+        """Return [sensor]: counts of the encoders, and the noise beyond them."""
+        if log is None or log.resampled:
+            # Resampled positions lie on no steps, and their noise is another one.
+            return []
+        section = Section("[sensor]")
+        noise = np.atleast_1d(np.asarray(high_band_std(log.position)))
+        counts = [self._count(column) for column in self._chosen.position]
+        unit = self._units().label("position")
+        if all(counts):
+            beyond = [
+                rounded(float(np.sqrt(max(s**2 - c**2 / 12, 0.0))))
+                for s, c in zip(noise, counts, strict=True)
+            ]
+            noisy = any(s**2 > _BEYOND_ROUNDING * c**2 / 12 for s, c in zip(noise, counts, strict=True))
+            section.keys["position_resolution"] = _one([rounded(c, 6) for c in counts])
+            section.notes["position_resolution"] = f"{unit}, the step between the positions of the log"
+            if noisy:
+                section.keys["position_noise"] = _one(beyond)
+                section.notes["position_noise"] = f"{unit}, beyond the rounding, from its highest frequencies"
+        return [section] if section.keys else []
+
+    def _count(self, column: Column) -> float:
+        """Return the step between the positions of a column, in the unit of results; 0 if there is none."""
+        step = position_levels(column.values)[1]
+        unit = self._measures.units.get("position")
+        found = None if unit is None else parse_unit(unit)
+        return step * (1.0 if found is None else found.factor)
+
+    # reading
+
+    def _read(self, table: Section) -> Log:
+        """Read the log as the case will."""
+        columns = {
+            key: list(value.values()) if isinstance(value, dict) and key != "units" else value
+            for key, value in table.keys.items()
+        }
+        frame = Frame(
+            motions=(self._measures.motion,) * self._joints,
+            driven=tuple(range(self._joints)),
+            labels=self._measures.labels,
+        )
+        if self._empty():
+            # A text table has such readings by itself; in other formats the case must say so.
+            columns["resample"] = table.keys["resample"] = rounded(self._rate(), 6)
+            table.assumed.append("values that are NaN are no readings: resampled at the rate of the log")
+        log = as_log(self._log, columns, joints=self._joints, drives=self._joints, frame=frame)
+        table.assumed += [str(a) for a in log.assumed if not a.setting.startswith("units.")]
+        return log
+
+    def _empty(self) -> bool:
+        """Check for values that are NaN in a log whose format has no empty cells."""
+        chosen = self._chosen
+        used = [*chosen.position, *chosen.velocity, *chosen.force, *chosen.reference]
+        nan = any(np.isnan(self._raw.data[c.name]).any() for c in used)
+        return nan and not self._raw.sparse and chosen.time is not None
+
+    def _rate(self) -> float:
+        """Return the usual rate of the log [Hz]."""
+        assert self._chosen.time is not None, "the caller has seen it"
+        unit = parse_unit(self._measures.units.get("time", "s"))
+        steps = np.diff(self._chosen.time.values)
+        return 1.0 / (float(np.median(steps[steps > 0])) * (1.0 if unit is None else unit.factor))
+
+    def _by_hand(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return time, position or velocity, and force (zero if there is none), at even steps in SI units."""
+        chosen, measures = self._chosen, self._measures
+
+        def scaled(column: Column, quantity: str) -> np.ndarray:
+            unit = parse_unit(measures.units.get(quantity, ""))
+            return column.values * (1.0 if unit is None else unit.factor)
+
+        motion = scaled(
+            (chosen.position or chosen.velocity)[0], "position" if chosen.position else "velocity"
+        )
+        force = scaled(chosen.force[0], "force") if chosen.force else np.zeros_like(motion)
+        if chosen.time is None:
+            return np.arange(motion.size) / NO_TIME_RATE, motion, force
+        time = scaled(chosen.time, "time")
+        even = np.linspace(time[0], time[-1], time.size)
+        return even, np.interp(even, time, motion), np.interp(even, time, force)
+
+
+def _driven(rough: RoughBalance) -> tuple[RoughBalance, bool]:
+    """Return the balance with the force turned if it brakes as logged, and whether it was."""
+    if not rough.braked:
+        return _plausible(rough), False
+    weight = None if rough.weight is None else (-rough.weight[0], -rough.weight[1])
+    turned = replace(
+        rough,
+        inertia=-rough.inertia,
+        viscous=-rough.viscous,
+        coulomb=-rough.coulomb,
+        offset=-rough.offset,
+        weight=weight,
+        spring=None if rough.spring is None else -rough.spring,
+    )
+    return _plausible(turned), True
+
+
+def _plausible(rough: RoughBalance) -> RoughBalance:
+    """Return the balance with an inertia above zero."""
+    if rough.inertia > 0:
+        return rough
+    size = rough.force / rough.speed if rough.speed > 0 else 1.0
+    return replace(rough, inertia=max(0.01 * size, 1e-9))
+
+
+def _positive(rough: RoughBalance, name: str) -> float:
+    """Return a friction of a rough balance, at least a small part of the force."""
+    least = _LEAST * (rough.force or 1.0)
+    if name == "viscous":
+        least /= rough.speed or 1.0
+    return rounded(max(getattr(rough, name), least))
+
+
+def _pendulum(first_moment: list[Any], inertia: dict[str, float], gravity: list[float]) -> list[Section]:
+    """Return the tables of one link that turns about a horizontal axis."""
+    plant = Section("[plant]", {"kind": "serial_arm", "gravity_vector": gravity})
+    plant.notes["gravity_vector"] = "in the plane of the swing"
+    link = Section(
+        "[[plant.links]]",
+        {
+            "joint": "revolute",
+            "alpha_deg": 0.0,
+            "a": 0.0,
+            "mass": 0.0,
+            "first_moment": first_moment,
+            "inertia": [0.0, 0.0, 0.0, 0.0, 0.0, inertia],
+        },
+        {"first_moment": "mass times centre [kg m]", "inertia": "about the joint [kg m^2]"},
+    )
+    return [plant, link]
+
+
+def _one(values: list[float]) -> Any:
+    return values[0] if len(set(values)) == 1 else values
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()

@@ -1,0 +1,180 @@
+"""The meaning of a column's name: quantity, role and joint, by words of English and German."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from jaxid.logs.readers.dialect import split_unit
+
+# Words by quantity. A force has several kinds, from the surest witness of the torque on.
+_QUANTITIES: dict[str, str] = {
+    "time": "t time zeit zeitstempel timestamp timestamps stamp elapsed uhrzeit datum datetime epoch clock "
+    "laufzeit zeitpunkt millis micros seconds",
+    "position": "q p pos position positions lage stellung weg winkel drehwinkel angle theta phi x y z s hub "
+    "displacement encoder enc counts count inkremente increments ticks hoehe height distance dof pose",
+    "velocity": "dq qd v vel velocity velocities speed geschwindigkeit drehzahl omega rpm qdot dtheta "
+    "thetadot w dx xdot",
+    "acceleration": "ddq qdd a acc accel acceleration beschleunigung qddot ddtheta alpha ddx",
+    "torque": "tau torque torques trq moment drehmoment effort efforts tq mz",
+    "force": "force forces kraft thrust schub f",
+    "current": "current currents curr strom motorstrom i iq amps amp ampere",
+    "voltage": "voltage volt volts spannung uq motorspannung",
+    "duty": "pwm duty dutycycle aussteuerung",
+    "load": "load last",
+    "command": "u input stellgroesse stellwert control ctrl",
+    "temperature": "temp temperature temperatur",
+    "passed over": "error err fehler schleppfehler schleppabstand following deviation abweichung vsupply "
+    "supply bus battery batterie flag mode activated enabled index idx row rows sample samples counter "
+    "zaehler seq function id ud status power leistung energy friction reibung covariance dc link "
+    "zwischenkreis",
+}
+_ROLES = {
+    "reference": "ref reference soll sollwert target desired des cmd command commanded setpoint set goal "
+    "demand demanded wanted action vorgabe fuehrung",
+    "actual": "ist istwert act actual meas measured gemessen feedback fbk fb value wert present actualvalue",
+}
+# Words that say nothing of a joint.
+_NOISE = (
+    "joint joints states state js axis achse motor drive antrieb gelenk robot observation msg data est "
+    "estimated of the im am an der die das on at signal channel kanal ch filtered raw n no nr m g l"
+)
+# Single letters whose case matters.
+_LETTERS = {
+    "V": "voltage",
+    "U": "voltage",
+    "I": "current",
+    "F": "force",
+    "M": "torque",
+    "T": "temperature",
+}
+# Quantities that a letter and one more letter stand for, as qm or qg.
+_OF_Q = re.compile(r"q[a-z]")
+ROTARY = frozenset("winkel drehwinkel angle theta phi drehzahl omega rpm dtheta thetadot dof tau".split())
+LINEAR = frozenset("weg hub displacement hoehe height distance".split())
+# Endings of a name that are units, as in position_mm or t_us.
+_UNITS = {
+    **{u: u for u in "s ms us ns mm um cm deg rad mrad rev rpm A mA V mV N kN Nm mNm counts".split()},
+    "sec": "s",
+    "degrees": "deg",
+    "radps": "rad/s",
+    "rads": "rad/s",
+    "degs": "deg/s",
+    "dps": "deg/s",
+    "mps": "m/s",
+    "mmps": "mm/s",
+    "mms": "mm/s",
+    "percent": "%",
+    "pct": "%",
+}
+FORCES = ("torque", "force", "current", "voltage", "duty", "command", "load")
+_MEANING = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
+_ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}
+_SILENT = frozenset(_NOISE.split())
+# Words long enough to be parts of others, as in Lageistwert or TorqueActualValue, longest first.
+_STEMS = sorted((w for w in {*_MEANING, *_ROLE, *_SILENT} if len(w) > 2), key=lambda word: (-len(word), word))
+_UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """The meaning of a column's name.
+
+    Attributes:
+        name: The name.
+        quantity: "time", "position", "velocity", "acceleration", one of `FORCES`, "temperature" or "passed
+            over"; empty: the name says nothing.
+        reference: Whether it is a wanted value.
+        joint: Words that are left, which name the joint; empty if there are none.
+        unit: Unit that the name ends in; empty if it has none.
+        words: All words of the name.
+    """
+
+    name: str
+    quantity: str
+    reference: bool
+    joint: tuple[str, ...]
+    unit: str
+    words: frozenset[str]
+
+    @property
+    def motion(self) -> str:
+        """Kind of motion that the words imply: "rotary", "linear" or empty."""
+        if self.words & ROTARY:
+            return "rotary"
+        return "linear" if self.words & LINEAR else ""
+
+
+def meaning_of(name: str) -> Meaning:
+    """Return the meaning of a column's name.
+
+    Args:
+        name: The name, as "Lageistwert [mm]", "dof_pos", or "/joint_states.position[elbow]".
+    """
+    plain = split_unit(name)[0] if " " in name or "(" in name else name
+    parts = _split(plain.translate(_UMLAUTS))
+    unit = ""
+    if len(parts) > 1 and parts[-1] in _UNITS:
+        unit = _UNITS[parts.pop()]
+    if len(parts) == 1 and parts[0] in ("ms", "us", "ns"):
+        return Meaning(name, "time", False, (), parts[0], frozenset(parts))
+
+    quantities, roles, joint, words = [], [], [], []
+    for part in parts:
+        found = [_LETTERS[part]] if part in _LETTERS else []
+        pieces = [] if found else _pieces(part.casefold())
+        if not found and pieces is None:
+            if _OF_Q.fullmatch(part.casefold()):
+                found = ["position"]
+            else:
+                joint.append(part.casefold())
+                continue
+        words += [part.casefold()] if found else pieces or []
+        quantities += found
+        for piece in pieces or []:
+            if piece in _ROLE:
+                roles.append(_ROLE[piece])
+            elif piece in _MEANING:
+                quantities.append(_MEANING[piece])
+    quantity = _one(quantities)
+    reference = "reference" in roles and "actual" not in roles
+    return Meaning(name, quantity, reference, tuple(joint), unit, frozenset(words))
+
+
+def _one(found: list[str]) -> str:
+    """Return the quantity of a name with several words for one."""
+    if "passed over" in found:
+        return "passed over"
+    moved = [q for q in found if q in ("position", "velocity", "acceleration")]
+    if moved and "current" in found:
+        # Of "current position" the first word is an adjective.
+        return moved[-1]
+    if "time" in found and len(set(found)) > 1:
+        return next(q for q in found if q != "time")
+    forces = [q for q in FORCES if q in found]
+    if forces:
+        return forces[0]
+    return moved[-1] if moved else found[0] if found else ""
+
+
+def _split(name: str) -> list[str]:
+    """Split a name at signs, capitals and digits."""
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z]{2})", " ", name)
+    spaced = re.sub(r"(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])", " ", spaced)
+    # A current or a voltage of the q axis may be split by its sign.
+    spaced = re.sub(r"(?i)\b([iu])_q\b", r"\1q", spaced)
+    return re.findall(r"[A-Za-z]+|\d+|%", spaced)
+
+
+def _pieces(word: str) -> list[str] | None:
+    """Return the known words that a word consists of; None if it is not made of them."""
+    if word in _MEANING or word in _ROLE or word in _SILENT:
+        return [word]
+    for stem in _STEMS:
+        if word.startswith(stem) and len(word) > len(stem):
+            rest = word[len(stem) :]
+            for linked in (rest, rest.removeprefix("s"), rest.removeprefix("en")):
+                below = _pieces(linked) if len(linked) > 2 else None
+                if below is not None:
+                    return [stem, *below]
+    return None

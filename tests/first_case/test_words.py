@@ -1,0 +1,84 @@
+"""Names of columns as drives, robots and measuring programs write them, in English and German."""
+
+import pytest
+
+from jaxid.first_case.words import meaning_of
+
+NAMES = {
+    # Siemens, Beckhoff, Bosch Rexroth and CiA 402 words for the same quantities
+    "Lage-Istwert": "position",
+    "Lageistwert": "position",
+    "LageSollwert": "position wanted",
+    "Sollposition": "position wanted",
+    "Drehmomentistwert": "torque",
+    "Stromistwert": "current",
+    "Drehzahlistwert": "velocity",
+    "Schleppfehler": "passed over",
+    "Kraft [N]": "force",
+    "Temperatur [°C]": "temperature",
+    "Zeit [s]": "time",
+    "Axis1.ActPos": "position of 1",
+    "Axis1.ActCurrent": "current of 1",
+    "position_actual_value": "position",
+    "torque_actual_value": "torque",
+    "target_current": "current wanted",
+    "current_position": "position",
+    # robots
+    "/joint_states.position[shoulder]": "position of shoulder",
+    "/joint_states.effort[shoulder_pan]": "torque of shoulder pan",
+    "/joint_states/joint1/position": "position of 1",
+    "observation.state[elbow_flex.pos]": "position of elbow flex",
+    "action[elbow_flex.pos]": "position wanted of elbow flex",
+    "des_dof_pos": "position wanted",
+    "q_target": "position wanted",
+    "tau_est": "torque",
+    "cmd_vel": "velocity wanted",
+    "q1": "position of 1",
+    "cmd3": "wanted of 3",
+    "load2": "load of 2",
+    "header.stamp": "time of header",
+    "__time": "time",
+    # drives and hobby electronics
+    "Iq": "current",
+    "i_q": "current",
+    "Uq": "voltage",
+    "Vsupply": "passed over",
+    "Reference Velocity": "velocity wanted",
+    "pwm": "duty",
+    "counts": "position",
+    "theta": "position",
+    "dq": "velocity",
+    "u": "command",
+    # nothing is known of these
+    "Joint_1": "of 1",
+    "vir": "of vir",
+    "kp": "of kp",
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_meaning(name):
+    found = meaning_of(name)
+    joint = f"of {' '.join(found.joint)}" if found.joint else ""
+    words = [found.quantity, "wanted" if found.reference else "", joint]
+    assert " ".join(word for word in words if word) == NAMES[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity", "unit"),
+    [
+        ("t_us", "time", "us"),
+        ("ms", "time", "ms"),
+        ("axis_pos_mm", "position", "mm"),
+        ("speed_rpm", "velocity", "rpm"),
+    ],
+)
+def test_units_at_the_end_of_a_name(name, quantity, unit):
+    found = meaning_of(name)
+    assert (found.quantity, found.unit) == (quantity, unit)
+
+
+def test_words_of_a_turn_and_of_a_slide():
+    assert meaning_of("Winkel").motion == "rotary"
+    assert meaning_of("Hub").motion == "linear"
+    assert meaning_of("Lage").motion == ""
