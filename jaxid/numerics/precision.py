@@ -170,9 +170,10 @@ def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[
     size = fast_length(len(jacobian) + min(len(jacobian), _REMEMBERED))
     weight = noise.density(size)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    spectrum, root = rfft(jacobian, size, axis=0), np.sqrt(weight)[:, None]
-    real, imaginary = spectrum.real * root, spectrum.imag * root
-    return (real.T @ real + imaginary.T @ imaginary) / size
+    # By rows, of which the transforms are faster; real and imaginary parts take turns.
+    spectrum = rfft(np.ascontiguousarray(jacobian.T), size).view(np.float64)
+    spectrum *= np.repeat(np.sqrt(weight), 2)
+    return spectrum @ spectrum.T / size
 
 
 def cross_sandwich(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.controllers import Controller
@@ -219,6 +219,12 @@ def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
     """
     squares = np.nanmean(np.square(off), axis=1)
     return bool(np.mean(squares[:_FIRST]) > _FAR_MORE * np.mean(squares[_FIRST:]))
+
+
+def start_shows_by_run(off: Float[np.ndarray, "time runs k"]) -> Bool[np.ndarray, " runs"]:
+    """Check each of several runs like `start_shows`, without missing readings."""
+    first, rest = (np.einsum("trk,trk->r", x, x) / len(x) for x in (off[:_FIRST], off[_FIRST:]))
+    return first > _FAR_MORE * rest
 
 
 def with_sensor(replay: Replay, sensor: Sensor) -> Replay:

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.dynamics.residuals import residual_along
 from jaxid.estimators.common.levenberg_marquardt import Transform, levenberg_marquardt
 from jaxid.estimators.common.shapes import shapes
 from jaxid.estimators.common.side_by_side import Ends, descend_side_by_side
@@ -28,13 +28,13 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.filters import Decimator, high_band_std_of_rows, spectral_rows
+from jaxid.numerics.filters import delayed_rows, high_band_std_of_rows, spectral_rows
+from jaxid.numerics.lanes import side_by_side
 from jaxid.numerics.precision import NoiseModel, assess_from_sums, sandwich
 from jaxid.session import Session, enough
 from jaxid.simulation.disturbance import disturbance_at
-from jaxid.simulation.force_balance import ForceData, _size, force_residual
 from jaxid.simulation.loops import closed_loop
-from jaxid.simulation.replay import Numerics, Replay, line_at, make_replay, start_shows
+from jaxid.simulation.replay import Numerics, Replay, line_at, make_replay, start_shows_by_run
 from jaxid.studies.levels import Level
 from jaxid.studies.plan import Plan, accelerator
 from jaxid.studies.rows import RunRow
@@ -44,6 +44,12 @@ from jaxid.studies.rows import RunRow
 _SURELY = 0.5
 # Runs side by side on a processor: twice as many no longer fit its caches.
 _LANES = 8
+# Samples of a Jacobian that are copied at once.
+_AT_ONCE = 1000
+
+
+# Rows of a run by estimator, its reference, and the motion that followed it, (time, n).
+Fitted = tuple[list[RunRow], np.ndarray | None, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,7 @@ class LoopFits:
             return None
         return cls(plan, level, machine, recipe, make_replay(session.machine, session.fit.log, numerics))
 
-    def rows(self, runs: Sequence[int]) -> list[tuple[list[RunRow], np.ndarray, np.ndarray] | None]:
+    def rows(self, runs: Sequence[int]) -> list[Fitted | None]:
         """Return for each run its row, the reference and the true motion; None for a run that is left.
 
         Args:
@@ -177,21 +183,34 @@ class LoopFits:
         motion = spectral_rows(by_run.reshape(runs * n, time), period, recipe.cutoff_hz)
         q, qd, qdd = (np.moveaxis(x.reshape(runs, n, time), 1, 2) for x in motion)
         counts = np.stack([counted(v, recipe, (True,) * n)[1] for v in qd])
-        rms = lambda v: float(np.sqrt(np.mean(v**2)))
-        velocity = np.stack([typical_velocity(machine.plant, v, rms) for v in qd])
         lower, upper = self._bounds(guesses)
-        plant = machine.plant.smoothed(np.asarray(1 / 3), self._rest_velocity())
+
+        # All filters of the balance are linear: its columns pass through them as the measured force does.
         hold = recipe.hold_of(self.level.scene.machine.hold, machine.hold_period or period)
+        force = (np.moveaxis(logs.force, 0, -1) * machine.gain[:, None]).reshape(-1, time)
+        acts = delayed_rows(force, period, hold=hold)
+        applied = np.swapaxes(acts.reshape(runs, -1, time), 1, 2)
+        plant = machine.plant.smoothed(np.asarray(1 / 3), self._rest_velocity())
+        rows = _balance_rows(plant, machine.parameters.places, q, qd, qdd, applied, period, guesses)
+        # One run after the other, whose transforms stay in the cache.
+        filtered = [recipe.decimator.of_rows(own.reshape(-1, time)) for own in np.asarray(rows)]
+        kept = np.stack(filtered).reshape(runs, guesses.shape[1] + 2, n, -1)
+        weighted = np.moveaxis(kept, -1, 2) * counts[:, None]
         transform, damping = linear_scale(machine)
-        force = np.swapaxes(logs.force, 0, 1) * machine.gain
-        found = _solve_balances(
-            plant, machine.parameters.places, (q, qd, qdd, force, counts.astype(float)),
-            period, hold, recipe.decimator, guesses, transform, (lower, upper), damping,
-        )  # fmt: skip
-        theta, cost, gram, size, converged = (np.asarray(x) for x in found)
+        found = _solve_balances(weighted, guesses, transform, (lower, upper), damping)
+        theta, cost, gram, converged = (np.asarray(x) for x in found)
+        size = np.sqrt(np.sum(weighted[:, -1] ** 2, axis=(1, 2)))
         good = converged & (counts.sum(axis=(1, 2)) >= enough(machine))
         good &= np.all((theta >= lower) & (theta <= upper), axis=1)
-        return theta, velocity, good & self._identified(guesses, cost, gram, size)
+        return theta, self._velocities(qd), good & self._identified(guesses, cost, gram, size)
+
+    def _velocities(self, qd: Float[np.ndarray, "runs time n"]) -> np.ndarray:
+        """Return the scale of the smoothed sign's velocity by run, as a session takes it from its log."""
+        plant = self.machine.plant
+        if len(plant.velocity_groups()) == 1:
+            return np.sqrt(np.mean(qd**2, axis=(1, 2)))
+        rms = lambda v: float(np.sqrt(np.mean(v**2)))
+        return np.stack([typical_velocity(plant, v, rms) for v in qd])
 
     def _rest_velocity(self) -> np.ndarray:
         """Return the velocity scale of the smoothed sign in the balance, see `force_balance.sharpened`."""
@@ -235,21 +254,22 @@ class LoopFits:
         names, reference = self.machine.parameters.names, self.level.scene.signal[:: self.level.scene.every]
         theta, gram, steps = (np.asarray(x) for x in (ends.theta, ends.gram, ends.steps))
         converged, residual = np.asarray(ends.converged), np.asarray(ends.residual)
-        jacobian = np.asarray(ends.jacobian)
+        jacobian = _by_run(np.asarray(ends.jacobian))
         runs, n = residual.shape[1:]
         e = np.moveaxis(residual, 0, -1).reshape(runs * n, -1)
         noises = NoiseModel.fit_each(np.where(np.isfinite(e), e, 0.0))
         centred = logs.position - logs.position.mean(axis=0)
         signal = np.sqrt(np.sum(centred**2, axis=(0, 2)))
+        shows = start_shows_by_run(residual)
         out: list = []
         for k in range(runs):
-            if not (good[k] and converged[k]) or start_shows(residual[:, k]):
+            if not (good[k] and converged[k]) or shows[k]:
                 out.append(None)
                 continue
             own = noises[k * n : (k + 1) * n]
             white = n == 1 and not own[0].coefficients.size
             meat = own[0].innovation ** 2 * gram[k] if white else sum(
-                sandwich(np.ascontiguousarray(jacobian[:, :, k, i]), noise) for i, noise in enumerate(own)
+                sandwich(jacobian[k, i].T, noise) for i, noise in enumerate(own)
             )  # fmt: skip
             scale = np.where(theta[k] != 0, theta[k], 1.0)
             found = assess_from_sums(names, gram[k], np.asarray(meat), float(signal[k]), scale)
@@ -258,12 +278,22 @@ class LoopFits:
         return out
 
 
+def _by_run(jacobian: Float[np.ndarray, "time p runs n"]) -> Float[np.ndarray, "runs n p time"]:
+    """Return Jacobians run by run; a few samples after the others, which then stay in the cache."""
+    time, p, runs, n = jacobian.shape
+    out = np.empty((runs, n, p, time))
+    for first in range(0, time, _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        out[..., part] = jacobian[part].transpose(2, 3, 1, 0)
+    return out
+
+
 def _delays(machine: Machine) -> bool:
     """Check that a loop may have to keep more past commands as a fit goes on."""
     return any(e.delays_command() for e in machine.plant.effects)
 
 
-@eqx.filter_jit
+@side_by_side
 def _simulate(
     places: tuple,
     plant: Plant,
@@ -287,44 +317,52 @@ def _simulate(
     return jax.vmap(one, out_axes=1)(truth, noise)
 
 
-@eqx.filter_jit
-def _solve_balances(
+@side_by_side
+def _balance_rows(
     plant: Plant,
     places: tuple,
-    arrays: tuple[Array, Array, Array, Array, Array],
+    q: Float[Array, "runs time n"],
+    qd: Float[Array, "runs time n"],
+    qdd: Float[Array, "runs time n"],
+    applied: Float[Array, "runs time m"],
     period: float,
-    hold: float,
-    decimator: Decimator,
+    theta: Float[Array, "runs p"],
+) -> Float[Array, "runs rows n time"]:
+    """Return the columns of the balance, its residual at theta and the applied force, in this order."""
+
+    def one(q: Array, qd: Array, qdd: Array, applied: Array, theta: Array) -> Array:
+        def balance(x: Array) -> Array:
+            own = scatter(places, plant, x)
+            return residual_along(own, q, qd, qdd, applied, period, jnp.zeros(())).T
+
+        push = lambda d: jax.jvp(balance, (theta,), (d,))
+        here, columns = jax.vmap(push, out_axes=(None, 0))(jnp.eye(theta.size))
+        force = jax.vmap(lambda u: plant.applied(u, q.shape[1]))(applied).T
+        return jnp.concatenate([columns, here[None], force[None]])
+
+    return jax.vmap(one)(q, qd, qdd, applied, theta)
+
+
+@side_by_side
+def _solve_balances(
+    rows: Float[Array, "runs rows kept n"],
     theta: Float[Array, "runs p"],
     transform: Transform,
     bounds: tuple[Array, Array],
     damping: float,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return estimates of inverse dynamics, cost, J'J, size of the force, and convergence, by run."""
+) -> tuple[Array, Array, Array, Array]:
+    """Return estimates of inverse dynamics, cost, J'J, and convergence, by run; see `_balance_rows`."""
 
-    def one(theta: Array, lower: Array, upper: Array, arrays: tuple) -> tuple:
-        every = (True,) * arrays[0].shape[1]
-        q, qd, qdd, force, weight = arrays
-        data = ForceData(q, qd, qdd, force, weight, jnp.zeros(()), period, hold, decimator, every)
-        balance = lambda x: (data.weight * force_residual(scatter(places, plant, x), data)).ravel()
-        # The balance is linear in the unknowns: its columns are computed once.
-        push = lambda d: jax.jvp(balance, (theta,), (d,))
-        here, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(theta.size))
-        fit = levenberg_marquardt(
-            lambda x: here + columns @ (x - theta),
-            theta,
-            transform,
-            lower,
-            upper,
-            damping=damping,
-            keep=False,
-        )
-        return fit.theta, fit.cost, columns.T @ columns, _size(plant, data), fit.converged
+    def one(rows: Array, theta: Array, lower: Array, upper: Array) -> tuple:
+        columns, here = rows[: theta.size].reshape(theta.size, -1).T, rows[theta.size].ravel()
+        linear = lambda x: here + columns @ (x - theta)
+        fit = levenberg_marquardt(linear, theta, transform, lower, upper, damping=damping, keep=False)
+        return fit.theta, fit.cost, columns.T @ columns, fit.converged
 
-    return jax.vmap(one)(theta, *bounds, arrays)
+    return jax.vmap(one)(rows, theta, *bounds)
 
 
-@eqx.filter_jit
+@side_by_side
 def _fit(
     replay: Replay,
     places: tuple,
