@@ -19,8 +19,6 @@ from jaxid.numerics.fft import fast_length, irfft, rfft
 # Periods of the cut-off over which a signal fades out beyond its ends. After as many periods the impulse
 # response of the roll-off has decayed to 10^-4.
 _MEMORY = 30
-# A gain below this is zero.
-_NOTHING = 1e-30
 
 
 def butterworth_zero_phase(
@@ -286,13 +284,6 @@ class Decimator:
 
         return _through(x, int(32 / self.pass_band), lambda f: jnp.asarray(gain(f)), self.factor)
 
-    def of_rows(self, x: Float[np.ndarray, "k time"]) -> Float[np.ndarray, "k kept"]:
-        """Return the same as a call for signals by row, by transforms of scipy, which are faster."""
-        if self.filters:
-            gain = lambda f: self.response(f, 1.0)
-            x = _through_rows(x, int(32 / self.pass_band), gain, self.factor)
-        return x[:, self.trim : x.shape[1] - self.trim]
-
 
 def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every: int = 1) -> Array:
     """Pass the columns of x through a frequency response, without transients at the ends.
@@ -323,51 +314,6 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
         spectrum = jnp.sum(both, axis=0)[: few // 2 + 1] / every
     first = lead // every
     return jnp.fft.irfft(spectrum, few, axis=0)[first : first - (-n // every)]
-
-
-def _through_rows(
-    x: Float[np.ndarray, "k time"], pad: int, response: Callable[[np.ndarray], np.ndarray], every: int = 1
-) -> Float[np.ndarray, "k kept"]:
-    """Return the same as `_through` for signals by row."""
-    k, n = x.shape
-    lead, pad = min(n - 1, pad + every - 1) // every * every, min(n - 1, pad)
-    few = fast_length(-(-(n + lead + 2 * pad) // every))
-    gap = every * few - n - lead - pad
-    whole = np.empty((k, every * few))
-    whole[:, :lead] = 2 * x[:, :1] - x[:, lead:0:-1]
-    whole[:, lead : lead + n] = x
-    whole[:, lead + n : lead + n + pad] = 2 * x[:, -1:] - x[:, -2 : -pad - 2 : -1]
-    s = 0.5 * (1 - np.cos(np.pi * (np.arange(gap) + 1) / (gap + 1)))
-    last = whole[:, lead + n + pad - 1, None]
-    whole[:, lead + n + pad :] = last + s * (whole[:, :1] - last)
-    gain = response(np.fft.rfftfreq(every * few))
-    # A Gaussian passes next to nothing of most frequencies.
-    passed = len(gain) - int(np.argmax(np.abs(gain[::-1]) > _NOTHING))
-    spectrum = rfft(whole)[:, :passed] * gain[:passed]
-    if every > 1:
-        # Decimation folds the spectrum, so that the inverse transform needs the decimated length only.
-        half, negative = few // 2, min(passed - 1, (every * few - 1) // 2)
-        folded = np.zeros((k, half + 1), complex)
-        for band in range(every + 1):
-            above = spectrum[:, band * few : band * few + half + 1]
-            folded[:, : above.shape[1]] += above
-            least, most = band * few - half, min(band * few, negative)
-            if band and least <= most:
-                folded[:, band * few - most :] += np.conj(spectrum[:, least : most + 1])[:, ::-1]
-        spectrum = folded / every
-    first = lead // every
-    return irfft(spectrum, few)[:, first : first - (-n // every)]
-
-
-def delayed_rows(
-    u: Float[np.ndarray, "k time"], period: float, *, hold: float
-) -> Float[np.ndarray, "k time"]:
-    """Return the same as `delayed` for commands by row that act at once."""
-
-    def response(f: np.ndarray) -> np.ndarray:
-        return np.exp(-1j * np.pi * f * hold / period) * np.sinc(f * hold / period)
-
-    return _through_rows(u, 200, response)
 
 
 def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: float) -> Float[Array, "time m"]:

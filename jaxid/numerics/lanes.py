@@ -202,19 +202,19 @@ def _solved(key: Any, runs: list[list[np.ndarray]], lanes: int) -> list[Any]:
     return [jax.tree.unflatten(structure, [x[k] for x in leaves]) for k in range(len(runs))]
 
 
-def _batched(function: Callable, structure: Any, static: tuple, stacked: list[Array]) -> Any:
+def _batched(function: Callable, structure: Any, static: tuple, stacked: Sequence[Array]) -> Any:
     return _compiled_batch()(function, structure, static, stacked)
 
 
 @functools.cache
 def _compiled_batch() -> Callable[..., Any]:
-    def batched(function: Callable, structure: Any, static: tuple, stacked: list[Array]) -> Any:
+    def batched(function: Callable, structure: Any, static: tuple, stacked: Sequence[Array]) -> Any:
         return jax.vmap(lambda own: function(*_joined(structure, static, own)))(stacked)
 
     return jax.jit(batched, static_argnums=(0, 1, 2), compiler_options=wide_vectors())
 
 
-def _joined(structure: Any, static: tuple, arrays: list[Array]) -> Any:
+def _joined(structure: Any, static: tuple, arrays: Sequence[Array]) -> Any:
     """Return a tree of arguments from its static leaves and its arrays."""
     rest = iter(arrays)
     return jax.tree.unflatten(structure, [next(rest) if x is _Hole else x for x in static])

@@ -117,9 +117,9 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
     return plant.smoothed(np.asarray(1 / 3), typical_velocity(plant, rest_velocity, np.min))
 
 
-def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
+def size_of_force(plant: Plant, data: ForceData) -> Float[Array, ""]:
     """Return the 2-norm of the measured force at the samples that count."""
     return jnp.linalg.norm(jnp.where(data.weight > 0, measured_force(plant, data), 0.0))
 
 
-force_size = eqx.filter_jit(_size)
+force_size = eqx.filter_jit(size_of_force)

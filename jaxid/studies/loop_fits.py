@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.dynamics.residuals import residual_along
 from jaxid.estimators.common.levenberg_marquardt import Transform, levenberg_marquardt
 from jaxid.estimators.common.shapes import shapes
 from jaxid.estimators.common.side_by_side import Ends, descend_side_by_side
@@ -28,11 +27,12 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.filters import delayed_rows, high_band_std_of_rows, spectral_rows
+from jaxid.numerics.filters import Decimator, high_band_std_of_rows, spectral_rows
 from jaxid.numerics.lanes import side_by_side
 from jaxid.numerics.precision import NoiseModel, assess_from_sums, sandwich
 from jaxid.session import Session, enough
 from jaxid.simulation.disturbance import disturbance_at
+from jaxid.simulation.force_balance import ForceData, force_residual, size_of_force
 from jaxid.simulation.loops import closed_loop
 from jaxid.simulation.replay import Numerics, Replay, line_at, make_replay, start_shows_by_run
 from jaxid.studies.levels import Level
@@ -185,21 +185,15 @@ class LoopFits:
         counts = np.stack([counted(v, recipe, (True,) * n)[1] for v in qd])
         lower, upper = self._bounds(guesses)
 
-        # All filters of the balance are linear: its columns pass through them as the measured force does.
-        hold = recipe.hold_of(self.level.scene.machine.hold, machine.hold_period or period)
-        force = (np.moveaxis(logs.force, 0, -1) * machine.gain[:, None]).reshape(-1, time)
-        acts = delayed_rows(force, period, hold=hold)
-        applied = np.swapaxes(acts.reshape(runs, -1, time), 1, 2)
         plant = machine.plant.smoothed(np.asarray(1 / 3), self._rest_velocity())
-        rows = _balance_rows(plant, machine.parameters.places, q, qd, qdd, applied, period, guesses)
-        # One run after the other, whose transforms stay in the cache.
-        filtered = [recipe.decimator.of_rows(own.reshape(-1, time)) for own in np.asarray(rows)]
-        kept = np.stack(filtered).reshape(runs, guesses.shape[1] + 2, n, -1)
-        weighted = np.moveaxis(kept, -1, 2) * counts[:, None]
+        hold = recipe.hold_of(self.level.scene.machine.hold, machine.hold_period or period)
         transform, damping = linear_scale(machine)
-        found = _solve_balances(weighted, guesses, transform, (lower, upper), damping)
-        theta, cost, gram, converged = (np.asarray(x) for x in found)
-        size = np.sqrt(np.sum(weighted[:, -1] ** 2, axis=(1, 2)))
+        force = np.swapaxes(logs.force, 0, 1) * machine.gain
+        found = _solve_balances(
+            plant, machine.parameters.places, (q, qd, qdd, force, counts.astype(float)),
+            period, hold, recipe.decimator, guesses, transform, (lower, upper), damping,
+        )  # fmt: skip
+        theta, cost, gram, size, converged = (np.asarray(x) for x in found)
         good = converged & (counts.sum(axis=(1, 2)) >= enough(machine))
         good &= np.all((theta >= lower) & (theta <= upper), axis=1)
         return theta, self._velocities(qd), good & self._identified(guesses, cost, gram, size)
@@ -318,48 +312,40 @@ def _simulate(
 
 
 @side_by_side
-def _balance_rows(
+def _solve_balances(
     plant: Plant,
     places: tuple,
-    q: Float[Array, "runs time n"],
-    qd: Float[Array, "runs time n"],
-    qdd: Float[Array, "runs time n"],
-    applied: Float[Array, "runs time m"],
+    arrays: tuple[Array, Array, Array, Array, Array],
     period: float,
-    theta: Float[Array, "runs p"],
-) -> Float[Array, "runs rows n time"]:
-    """Return the columns of the balance, its residual at theta and the applied force, in this order."""
-
-    def one(q: Array, qd: Array, qdd: Array, applied: Array, theta: Array) -> Array:
-        def balance(x: Array) -> Array:
-            own = scatter(places, plant, x)
-            return residual_along(own, q, qd, qdd, applied, period, jnp.zeros(())).T
-
-        push = lambda d: jax.jvp(balance, (theta,), (d,))
-        here, columns = jax.vmap(push, out_axes=(None, 0))(jnp.eye(theta.size))
-        force = jax.vmap(lambda u: plant.applied(u, q.shape[1]))(applied).T
-        return jnp.concatenate([columns, here[None], force[None]])
-
-    return jax.vmap(one)(q, qd, qdd, applied, theta)
-
-
-@side_by_side
-def _solve_balances(
-    rows: Float[Array, "runs rows kept n"],
+    hold: float,
+    decimator: Decimator,
     theta: Float[Array, "runs p"],
     transform: Transform,
     bounds: tuple[Array, Array],
     damping: float,
-) -> tuple[Array, Array, Array, Array]:
-    """Return estimates of inverse dynamics, cost, J'J, and convergence, by run; see `_balance_rows`."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return estimates of inverse dynamics, cost, J'J, size of the force, and convergence, by run."""
 
-    def one(rows: Array, theta: Array, lower: Array, upper: Array) -> tuple:
-        columns, here = rows[: theta.size].reshape(theta.size, -1).T, rows[theta.size].ravel()
-        linear = lambda x: here + columns @ (x - theta)
-        fit = levenberg_marquardt(linear, theta, transform, lower, upper, damping=damping, keep=False)
-        return fit.theta, fit.cost, columns.T @ columns, fit.converged
+    def one(theta: Array, lower: Array, upper: Array, arrays: tuple) -> tuple:
+        every = (True,) * arrays[0].shape[1]
+        q, qd, qdd, force, weight = arrays
+        data = ForceData(q, qd, qdd, force, weight, jnp.zeros(()), period, hold, decimator, every)
+        balance = lambda x: (data.weight * force_residual(scatter(places, plant, x), data)).ravel()
+        # The balance is linear in the unknowns: its columns are computed once.
+        push = lambda d: jax.jvp(balance, (theta,), (d,))
+        here, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(theta.size))
+        fit = levenberg_marquardt(
+            lambda x: here + columns @ (x - theta),
+            theta,
+            transform,
+            lower,
+            upper,
+            damping=damping,
+            keep=False,
+        )
+        return fit.theta, fit.cost, columns.T @ columns, size_of_force(plant, data), fit.converged
 
-    return jax.vmap(one)(rows, theta, *bounds)
+    return jax.vmap(one)(theta, *bounds, arrays)
 
 
 @side_by_side
