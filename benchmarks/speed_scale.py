@@ -24,15 +24,31 @@ LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
 JOINTS = {"chain": (1, 2, 4, 6, 10), "arm": (1, 2, 4, 7)}
 # Milliseconds a fit of studies and of one log that is warm; bytes of a log of a million samples;
 # seconds of `jaxid --help`.
-AIMS = {"axis": 10.0, "stage": 10.0, "fit": 30.0, "memory": 2 * 2**30, "help": 0.5}
+AIMS = {"axis": 2.0, "stage": 10.0, "fit": 30.0, "memory": 2 * 2**30, "help": 0.5}
 
 
-def child(what: str, *words: object, cores: int | None = None) -> dict:
+# Runs of a study, and of a quick look at one; seconds after which a process is given up, and the part of its
+# fits that may fail if its time is to count.
+RUNS, QUICK = {"axis": 1024, "stage": 256, "stage, 500 counts": 256}, 128
+PATIENCE, FAILED = 600.0, 0.05
+
+
+def child(what: str, *words: object, cores: int | None = None, patience: float | None = None) -> dict:
     """What a fresh process prints of itself, on so many cores."""
     prefix = [] if cores is None else ["taskset", "-c", f"0-{cores - 1}"]
     line = [*prefix, sys.executable, "-m", "benchmarks.speed_scale", what, *map(str, words)]
-    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=HERE.parent)
+    options = {"capture_output": True, "text": True, "check": True, "cwd": HERE.parent}
+    done = subprocess.run(line, timeout=patience, **options)
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def study_row(name: str, runs: int, processes: int, cores: int) -> dict:
+    """A study on so many cores; without a time if it does not end."""
+    row = {"case": name, "cores": cores}
+    try:
+        return row | child("study", name, runs, processes, cores=cores, patience=PATIENCE)
+    except subprocess.TimeoutExpired:
+        return row | {"processes": processes, "ms": None, "runs": runs, "failed": runs, "memory": 0}
 
 
 def study(name: str, runs: int, processes: int = 0) -> dict:
@@ -245,13 +261,13 @@ def commands() -> list[dict]:
 def measured(*, quick: bool) -> dict:
     """All of it."""
     n = os.cpu_count() or 1
-    runs, repeats = (128, 2) if quick else (1024, 5)
+    repeats = 2 if quick else 5
     out = {"study": [], "lengths": [], "joints": []}
     for name in CASES:
-        for cores in sorted({1, n}):
-            out["study"].append({"case": name, "cores": cores} | child("study", name, runs, cores=cores))
-        out["study"].append({"case": name, "cores": n} | child("study", name, runs, n, cores=n))
-        for found in out["study"][-3:]:
+        runs = QUICK if quick else RUNS[name]
+        for cores, processes in dict.fromkeys([(1, 0), (n, 0), (n, n)]):
+            out["study"].append(study_row(name, runs, processes, cores))
+        for found in [s for s in out["study"] if s["case"] == name]:
             print(f"study: {found}", flush=True)
     for samples in (25_000, *(LENGTHS[:-1] if quick else LENGTHS)):
         out["lengths"].append(child("fit", samples, repeats if samples < 1e6 else 1))
@@ -271,16 +287,18 @@ def tables(found: dict) -> list[str]:
     lines = ["## Fits by the study", "",
              "| of | cores | as | ms a fit | failed | aim | met | of one core | peak MB |",
              "|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
-    one = {s["case"]: s["ms"] for s in found["study"] if s["cores"] == 1}
+    counts = lambda s: s["ms"] is not None and s["failed"] <= FAILED * s["runs"]
+    one = {s["case"]: s["ms"] for s in found["study"] if s["cores"] == 1 and counts(s)}
     most = max(s["cores"] for s in found["study"])
     for s in found["study"]:
-        aim = AIMS.get(s["case"]) if s["cores"] == most else None
+        aim = AIMS.get(s["case"]) if s["cores"] == most and counts(s) else None
         shown = "|" if aim is None else f"{aim:g} | {met(s['ms'], aim)}"
-        part = s["ms"] / one[s["case"]]
+        ms = f"{s['ms']:.1f}" if counts(s) else "not measured"
+        part = f"{s['ms'] / one[s['case']]:.2f}" if counts(s) and s["case"] in one else ""
         # Of a cluster only the memory of the process that asks it is known.
         memory, way = ("", "processes") if s["processes"] else (megabytes(s["memory"]), "threads")
         failed = f"{s['failed']} of {s['runs']}"
-        cells = (s["case"], s["cores"], way, f"{s['ms']:.1f}", failed, shown, f"{part:.2f}", memory)
+        cells = (s["case"], s["cores"], way, ms, failed, shown, part, memory)
         lines.append(f"| {' | '.join(map(str, cells))} |")
     lines += ["", "## Against the length of the log", "",
               "| samples | prepare s | inverse dynamics, warm s | output error, cold s | warm s | peak MB |",

@@ -103,12 +103,16 @@ def set_valued_step(
         return flow(x), none
     levels_at = lambda *motion: [getattr(at(*motion), n) for n in ("dry", "stick", "rising")]
     moves = depends(lambda qd: levels_at(x.q, qd), (x.qd,))
-    if not plant.coupled or here.rises or depends(levels_at, (x.q, x.qd)):
+
+    def direct() -> tuple[State, Array]:
         answer = action(flow(x))
         reaction = spread(answer.reaction, ports, none.size)
         return under(answer, flow(x, reaction), reaction)
 
-    def general() -> tuple[State, Array]:
+    if here.rises or depends(levels_at, (x.q, x.qd)):
+        return direct()
+
+    def rolled() -> tuple[State, Array]:
         def once(reaction: Array, _: None) -> tuple[Array, tuple[State, _Answer, Array]]:
             after = flow(x, reaction)
             answer = action(after)
@@ -127,7 +131,7 @@ def set_valued_step(
     after = _port_speed(plant, dragged, ports)
     # Where a port nears its reversal, the general case decides whether it is within the step.
     goes_on = jnp.all((before * after > 0.0) & (jnp.abs(after - before) <= jnp.abs(after)))
-    return _unless(goes_on, (dragged, reaction), general)
+    return _unless(goes_on, (dragged, reaction), rolled if plant.coupled else direct)
 
 
 def _entry(k: int, tree: Any) -> Any:

@@ -25,7 +25,7 @@ from jaxid.model.unknowns import Free, scatter
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess
-from jaxid.simulation.force_balance import ForceData, _size, force_residual, sharpened
+from jaxid.simulation.force_balance import ForceData, force_residual, sharpened, size_of_force
 
 # Damping of the solver if the balance is linear in all unknowns: a single step then solves it.
 _UNDAMPED = 1e-10
@@ -49,7 +49,7 @@ def solve_balance(
         return data.weight * force_residual(scatter(places, plant, theta), data)
 
     fit = levenberg_marquardt(residual, theta, transform, *bounds, damping=damping)
-    return fit, _size(plant, data)
+    return fit, size_of_force(plant, data)
 
 
 def inverse_dynamics(

@@ -110,8 +110,11 @@ class Recipe:
             log: The log with its kind of hold.
             period: Period of the controller [s]; None: the log's sampling time.
         """
-        held = self.align_hold and log.hold == "zero_order"
-        return (period or log.period) if held else 0.0
+        return self.hold_of(log.hold, period or log.period)
+
+    def hold_of(self, hold: str, period: float) -> float:
+        """Return the same as `hold` for a kind of hold and the period of the commands."""
+        return period if self.align_hold and hold == "zero_order" else 0.0
 
     @property
     def independent(self) -> float:
@@ -410,15 +413,7 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | Non
         hold_period: Time for which a held command is held [s]; None: the log's sampling time.
     """
     q, qd, qdd = motion(log, recipe.cutoff_hz, recipe.order, recipe.derivatives, recipe.reach)
-    kept = recipe.decimator.kept(len(q))
-    at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
-    reach = recipe.decimator.reach
-    if not recipe.keeps_reversals:
-        reach = affordable(at_rest, turning(qd), max(reach, recipe.decimation - 1))
-        # An axis that swings faster than the filter's reach has only reversals: they are kept.
-        at_rest = at_rest | (turning(qd) & (reach > 0))
-    moving = ~smeared(at_rest, reach)[kept] & log.measured
-    fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & log.measured
+    moving, fitted = counted(qd, recipe, log.measured)
     return Prepared(
         q=q,
         qd=qd,
@@ -428,10 +423,33 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | Non
         hold=recipe.hold(log, hold_period),
         recipe=recipe,
         moving=moving,
-        fitted=fitted if recipe.keeps_reversals else moving,
-        kept=kept,
+        fitted=fitted,
+        kept=recipe.decimator.kept(len(q)),
         measured=log.measured,
     )
+
+
+def counted(
+    qd: Float[np.ndarray, "time n"], recipe: Recipe, measured: tuple[bool, ...]
+) -> tuple[Bool[np.ndarray, "kept n"], Bool[np.ndarray, "kept n"]]:
+    """Return the masks `moving` and `fitted` of `Prepared`.
+
+    Args:
+        qd: Filtered velocity at the log's rate.
+        recipe: Settings of the filter.
+        measured: Whether each joint has an encoder.
+    """
+    kept = recipe.decimator.kept(len(qd))
+    at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
+    reach = recipe.decimator.reach
+    if recipe.keeps_reversals:
+        fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & measured
+        return ~smeared(at_rest, reach)[kept] & measured, fitted
+    turns = turning(qd)
+    reach = affordable(at_rest, turns, max(reach, recipe.decimation - 1))
+    # An axis that swings faster than the filter's reach has only reversals: they are kept.
+    moving = ~smeared(at_rest | (turns & (reach > 0)), reach)[kept] & measured
+    return moving, moving
 
 
 def affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
@@ -446,15 +464,18 @@ def affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
 
 def turning(v: np.ndarray) -> np.ndarray:
     """Mark the samples between which a velocity changes its sign: a fast reversal has none at rest."""
-    turns = np.diff(np.sign(v), axis=0) != 0
+    signs = np.sign(v)
+    turns = signs[1:] != signs[:-1]
     edge = np.zeros((1, v.shape[1]), bool)
     return np.concatenate([turns, edge]) | np.concatenate([edge, turns])
 
 
 def smeared(flags: np.ndarray, reach: int) -> np.ndarray:
     """Mark flags and their neighbours: the parallel filter spreads a stop over them."""
-    width = 2 * reach + 1
-    count = np.cumsum(np.pad(flags, ((reach + 1, reach), (0, 0))), axis=0)
+    width, n = 2 * reach + 1, len(flags)
+    count = np.zeros((n + width, flags.shape[1]), np.int32)
+    np.cumsum(flags, axis=0, dtype=np.int32, out=count[reach + 1 : reach + 1 + n])
+    count[reach + 1 + n :] = count[reach + n]
     return count[width:] > count[:-width]
 
 

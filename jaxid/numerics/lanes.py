@@ -196,16 +196,65 @@ def _solved(key: Any, runs: list[list[np.ndarray]], lanes: int) -> list[Any]:
     filled = [*runs, *[runs[-1]] * (lanes - len(runs))]
     # Numpy stacks them, which needs one transfer each; JAX would dispatch one operation per run.
     stacked = [np.stack(x) for x in zip(*filled, strict=True)]
-    found = jax.tree.map(np.asarray, _batched(*key[:3], stacked))
+    function, structure, static, _ = key
+    found = jax.tree.map(np.asarray, _batched(function, structure, static, stacked))
     leaves, structure = jax.tree.flatten(found)
     return [jax.tree.unflatten(structure, [x[k] for x in leaves]) for k in range(len(runs))]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _batched(function: Callable, structure: Any, static: tuple, stacked: list[Array]) -> Any:
-    def one(own: list[Array]) -> Any:
-        rest = iter(own)
-        leaves = [next(rest) if x is _Hole else x for x in static]
-        return function(*jax.tree.unflatten(structure, leaves))
+def _batched(function: Callable, structure: Any, static: tuple, stacked: Sequence[Array]) -> Any:
+    return _compiled_batch()(function, structure, static, stacked)
 
-    return jax.vmap(one)(stacked)
+
+@functools.cache
+def _compiled_batch() -> Callable[..., Any]:
+    def batched(function: Callable, structure: Any, static: tuple, stacked: Sequence[Array]) -> Any:
+        return jax.vmap(lambda own: function(*_joined(structure, static, own)))(stacked)
+
+    return jax.jit(batched, static_argnums=(0, 1, 2), compiler_options=wide_vectors())
+
+
+def _joined(structure: Any, static: tuple, arrays: Sequence[Array]) -> Any:
+    """Return a tree of arguments from its static leaves and its arrays."""
+    rest = iter(arrays)
+    return jax.tree.unflatten(structure, [next(rest) if x is _Hole else x for x in static])
+
+
+def side_by_side(function: Callable[..., T]) -> Callable[..., T]:
+    """Compile a function of runs side by side, so that they fill the vectors of the processor.
+
+    Leaves of its arguments that are no arrays are static. An argument has no name.
+    """
+
+    @functools.cache
+    def compiled() -> Callable:
+        def on_arrays(structure: Any, static: tuple, arrays: list[Array]) -> T:
+            return function(*_joined(structure, static, arrays))
+
+        return jax.jit(on_arrays, static_argnums=(0, 1), compiler_options=wide_vectors())
+
+    @functools.wraps(function)
+    def call(*args: Any) -> T:
+        leaves, structure = jax.tree.flatten(args)
+        arrays = [x for x in leaves if isinstance(x, _ARRAYS)]
+        static = tuple(_Hole if isinstance(x, _ARRAYS) else x for x in leaves)
+        return compiled()(structure, static, arrays)
+
+    return call
+
+
+@functools.cache
+def wide_vectors() -> dict[str, Any]:
+    """Return the compiler's options for vectors as wide as the processor has; none if it knows none.
+
+    By itself XLA takes half of a vector of 512 bits. Eight runs side by side take 0.29 ms each, in place of
+    0.45, for a Jacobian of 25 000 samples.
+    """
+    options: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512}
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(lambda x: x + 1.0, compiler_options=options)(0.0)
+    except Exception:  # each version of the compiler has its own
+        return {}
+    return options

@@ -71,23 +71,14 @@ class NoiseModel:
         largest = int(min(largest, samples // 10))
         whole = len(e) - np.arange(largest + 1.0)
         pairs = whole if counts.all() else np.maximum(_lagged(counts.astype(float), largest), 1.0)
-        r = _lagged(e, largest) / pairs
-        if r[0] <= 0:
-            return cls(np.zeros(0), 0.0)
-        # Taper, because long lags have few pairs and an untapered estimate need not be a covariance.
-        r = r * (1 - np.arange(largest + 1) / (largest + 1) * 1e-3)
-        best, best_score = cls(np.zeros(0), float(np.sqrt(r[0]))), samples * np.log(r[0])
-        a, variance = np.zeros(0), r[0]
-        for order in range(1, largest + 1):
-            k = (r[order] - a @ r[order - 1 : 0 : -1]) / variance
-            if abs(k) >= 1:
-                break
-            a = np.append(a - k * a[::-1], k)
-            variance *= 1 - k**2
-            score = samples * np.log(variance) + 2 * order
-            if score < best_score:
-                best, best_score = cls(a, float(np.sqrt(variance))), score
-        return best
+        return _by_yule_walker((_lagged(e, largest) / pairs)[None], samples)[0]
+
+    @classmethod
+    def fit_each(cls, e: Float[np.ndarray, "runs time"], largest: int = 40) -> list[NoiseModel]:
+        """Fit a model to each of several residuals, of which every sample counts; see `fit`."""
+        samples = e.shape[1]
+        largest = int(min(largest, samples // 10))
+        return _by_yule_walker(_lagged(e, largest) / (samples - np.arange(largest + 1.0)), samples)
 
     @classmethod
     def of_density(cls, power: Float[np.ndarray, " f"], rate_hz: float, order: int) -> NoiseModel:
@@ -131,19 +122,58 @@ class NoiseModel:
 
 
 def _lagged(x: np.ndarray, largest: int) -> np.ndarray:
-    """Return the sums of x[k] x[k + lag] for lags up to `largest`."""
-    size = fast_length(len(x) + largest + 1)
-    return irfft(np.abs(rfft(x, size)) ** 2, size)[: largest + 1]
+    """Return the sums of x[k] x[k + lag] along the last axis for lags up to `largest`."""
+    size = fast_length(x.shape[-1] + largest + 1)
+    spectrum = rfft(x, size)
+    return irfft(spectrum.real**2 + spectrum.imag**2, size)[..., : largest + 1]
+
+
+def _by_yule_walker(r: Float[np.ndarray, "runs lags"], samples: int) -> list[NoiseModel]:
+    """Return the models of residuals with these covariances, each of the order that Akaike's criterion takes.
+
+    Levinson's recursion, for all residuals side by side.
+
+    Args:
+        r: Covariance of each residual at the lags from zero.
+        samples: Number of samples that count.
+    """
+    runs, largest = r.shape[0], r.shape[1] - 1
+    going = r[:, 0] > 0
+    # Taper, because long lags have few pairs and an untapered estimate need not be a covariance.
+    r = r * (1 - np.arange(largest + 1) / (largest + 1) * 1e-3)
+    variance = np.where(going, r[:, 0], 1.0)
+    best_score, best_variance = samples * np.log(variance), np.where(going, r[:, 0], 0.0)
+    a, best, orders = np.zeros((runs, largest)), np.zeros((runs, largest)), np.zeros(runs, int)
+    for order in range(1, largest + 1):
+        known = a[:, : order - 1]
+        k = (r[:, order] - np.sum(known * r[:, order - 1 : 0 : -1], axis=1)) / variance
+        going = going & (np.abs(k) < 1)
+        if not going.any():
+            break
+        k = np.where(going, k, 0.0)
+        a[:, : order - 1] = known - k[:, None] * known[:, ::-1]
+        a[:, order - 1] = k
+        variance = variance * (1 - k**2)
+        score = samples * np.log(variance) + 2 * order
+        better = going & (score < best_score)
+        best[better], orders[better] = a[better], order
+        best_score, best_variance = (
+            np.where(better, new, old) for new, old in ((score, best_score), (variance, best_variance))
+        )
+    return [NoiseModel(b[:n], float(np.sqrt(v))) for b, n, v in zip(best, orders, best_variance, strict=True)]
 
 
 def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[np.ndarray, "p p"]:
     """Return J' R J with J the Jacobian and R the covariance of the residual."""
+    if not noise.coefficients.size:
+        return noise.innovation**2 * (jacobian.T @ jacobian)
     size = fast_length(len(jacobian) + min(len(jacobian), _REMEMBERED))
     weight = noise.density(size)
     weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    spectrum, root = rfft(jacobian, size, axis=0), np.sqrt(weight)[:, None]
-    real, imaginary = spectrum.real * root, spectrum.imag * root
-    return (real.T @ real + imaginary.T @ imaginary) / size
+    # By rows, of which the transforms are faster; real and imaginary parts take turns.
+    spectrum = rfft(np.ascontiguousarray(jacobian.T), size).view(np.float64)
+    spectrum *= np.repeat(np.sqrt(weight), 2)
+    return spectrum @ spectrum.T / size
 
 
 def cross_sandwich(
@@ -265,23 +295,44 @@ def assess(
         return Precision(np.zeros((0, 0)), np.zeros(0, bool), [], np.zeros(0))
     rows = jacobian if counts.all() else np.where(counts[..., None], jacobian, 0.0)
     flat = rows.reshape(-1, len(names))
-    norm = np.linalg.norm(flat, axis=0)
-    dead = norm * np.abs(scale) <= 1e-9 * signal
-    norm = np.where(dead, 1.0, norm)
-    normal = (flat.T @ flat if solved is None else solved) / np.outer(norm, norm)
-    normal[dead] = 0.0
-    normal[:, dead] = 0.0
-    meat = np.zeros_like(normal)
+    meat = np.zeros((len(names), len(names)))
     noises = [NoiseModel.fit(e, c) for e, c in zip(residual.T, counts.T, strict=True)]
     for i, noise in enumerate(noises):
         # In a chain of many masses each balance contains few of the unknowns.
         own = np.flatnonzero(np.any(rows[:, i] != 0, axis=0))
-        meat[np.ix_(own, own)] += sandwich(rows[:, i, own] / norm[own], noise)
+        meat[np.ix_(own, own)] += sandwich(rows[:, i, own], noise)
     for i, j in itertools.combinations(range(len(noises)) if crossed else (), 2):
         if noises[i].innovation > 0 and noises[j].innovation > 0:
-            pair = [(rows[:, k] / norm, noises[k], residual[:, k]) for k in (i, j)]
+            pair = [(rows[:, k], noises[k], residual[:, k]) for k in (i, j)]
             both = cross_sandwich(*zip(*pair, strict=True))
             meat += both + both.T
+    return assess_from_sums(names, flat.T @ flat, meat, signal, scale, hessian, solved)
+
+
+def assess_from_sums(
+    names: list[str],
+    gram: Float[np.ndarray, "p p"],
+    meat: Float[np.ndarray, "p p"],
+    signal: float,
+    scale: Float[np.ndarray, " p"],
+    hessian: Float[np.ndarray, "p p"] | None = None,
+    solved: Float[np.ndarray, "p p"] | None = None,
+) -> Precision:
+    """Return the precision of a least-squares fit from its sums over the samples.
+
+    Args:
+        names: Names of the p parameters.
+        gram: Matrix J'J, with J the Jacobian of the residual, (p, p).
+        meat: Matrix J'RJ, with R the covariance of the residual, (p, p).
+        signal, scale, hessian, solved: See `assess`.
+    """
+    norm = np.sqrt(np.diag(gram))
+    dead = norm * np.abs(scale) <= 1e-9 * signal
+    norm = np.where(dead, 1.0, norm)
+    normal = (gram if solved is None else solved) / np.outer(norm, norm)
+    normal[dead] = 0.0
+    normal[:, dead] = 0.0
+    meat = meat / np.outer(norm, norm)
     values, vectors = np.linalg.eigh(normal)
     spread = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", vectors, meat, vectors), 0.0))
     safe = np.maximum(values, 1e-300)

@@ -120,7 +120,7 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
     return plant.smoothed(np.asarray(1 / 3), typical_velocity(plant, rest_velocity, np.min))
 
 
-def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
+def size_of_force(plant: Plant, data: ForceData) -> Float[Array, ""]:
     """Return the 2-norm of the measured force at the samples that count; of a free motion that of M qdd."""
     force = inertial_force(plant, data) if data.passive else measured_force(plant, data)
     return jnp.linalg.norm(jnp.where(data.weight > 0, force, 0.0))
@@ -133,4 +133,4 @@ def inertial_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     return data.decimator(force(jnp.asarray(data.q), jnp.asarray(data.qdd)))
 
 
-force_size = eqx.filter_jit(_size)
+force_size = eqx.filter_jit(size_of_force)

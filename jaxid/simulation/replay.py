@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.controllers import PID, Controller
@@ -254,6 +254,12 @@ def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
     return bool(np.mean(squares[:_FIRST]) > _FAR_MORE * np.mean(squares[_FIRST:]))
 
 
+def start_shows_by_run(off: Float[np.ndarray, "time runs k"]) -> Bool[np.ndarray, " runs"]:
+    """Check each of several runs like `start_shows`, without missing readings."""
+    first, rest = (np.einsum("trk,trk->r", x, x) / len(x) for x in (off[:_FIRST], off[_FIRST:]))
+    return first > _FAR_MORE * rest
+
+
 def with_sensor(replay: Replay, sensor: Sensor) -> Replay:
     """Return the run with another sensor for its controller."""
     return eqx.tree_at(lambda r: r.sensor, replay, sensor, is_leaf=lambda x: isinstance(x, Sensor))
@@ -376,13 +382,27 @@ def local_line(
     if log.integrated:
         return log.position[k], _parabola(replace(log, position=log.readings), k, _REACHES[0])[0]
     noise = signals.high_band_std(log.filled) if noise is None else noise
-    position, velocity, size = _parabola(log, k, _REACHES[0])
+    return line_at(log.filled, log.period, k, noise)
+
+
+def line_at(
+    x: Float[np.ndarray, "time k"], period: float, k: int, noise: Float[np.ndarray, " k"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position and velocity at sample k of each column; see `local_line`.
+
+    Args:
+        x: Positions by column, (time, k).
+        period: Sampling time [s].
+        k: Number of the sample.
+        noise: Standard deviation of a reading by column, (k,).
+    """
+    position, velocity, size = _parabola(x, period, k, _REACHES[0])
     # The second term tolerates rounding in a log without noise.
     spread = _STRAY * size * noise + 1e-12 * np.abs(velocity)
     low, high = velocity - spread, velocity + spread
     going = np.ones(position.shape, bool)
     for reach in _REACHES[1:]:
-        q, v, size = _parabola(log, k, reach)
+        q, v, size = _parabola(x, period, k, reach)
         spread = _STRAY * size * noise + 1e-12 * np.abs(v)
         low, high = np.maximum(low, v - spread), np.minimum(high, v + spread)
         going = going & (low <= high)
@@ -390,14 +410,16 @@ def local_line(
     return position, velocity
 
 
-def _parabola(log: Log, k: int, reach: int) -> tuple[np.ndarray, np.ndarray, float]:
+def _parabola(
+    x: Float[np.ndarray, "time k"], period: float, k: int, reach: int
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return value and slope at sample k, and the slope's standard deviation for noise of deviation one."""
-    lo = int(np.clip(k - reach, 0, max(log.samples - 2 * reach - 1, 0)))
-    x = log.filled[lo : lo + 2 * reach + 1]
-    t = log.period * (np.arange(lo, lo + len(x)) - k)
-    fit = np.linalg.pinv(np.vander(t / log.period, 3, increasing=True))
-    q, v = fit[0] @ x, fit[1] @ x / log.period
-    return q, v, float(np.linalg.norm(fit[1]) / log.period)
+    lo = int(np.clip(k - reach, 0, max(len(x) - 2 * reach - 1, 0)))
+    x = x[lo : lo + 2 * reach + 1]
+    t = period * (np.arange(lo, lo + len(x)) - k)
+    fit = np.linalg.pinv(np.vander(t / period, 3, increasing=True))
+    q, v = fit[0] @ x, fit[1] @ x / period
+    return q, v, float(np.linalg.norm(fit[1]) / period)
 
 
 def start_velocity(log: Log) -> np.ndarray:

@@ -136,7 +136,7 @@ class Plan:
     @property
     def lanes(self) -> int:
         """Number of runs in a compiled call; on an accelerator all of a chunk."""
-        return self.chunk if _accelerator() else min(self.chunk, _LANES)
+        return self.chunk if accelerator() else min(self.chunk, _LANES)
 
     @functools.cached_property
     def chunks(self) -> list[tuple[int, range]]:
@@ -216,19 +216,19 @@ def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
     refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
     # Residual, Jacobian and trajectory, kept twice over by the solver.
     each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)
-    most = _RUNS_OF_DEVICE if _accelerator() else max(_LARGEST, _SAMPLES // samples)
+    most = _RUNS_OF_DEVICE if accelerator() else max(_LARGEST, _SAMPLES // samples)
     shared = -(-runs // workers)
     return int(np.clip(_MEMORY * _memory() / workers / each, 1, min(most, shared)))
 
 
-def _accelerator() -> bool:
+def accelerator() -> bool:
     """Return whether JAX has an accelerator, which one chunk then fills."""
     return jax.local_devices()[0].platform != "cpu"
 
 
 def _memory() -> float:
     """Return the memory of the device [bytes]."""
-    if _accelerator():
+    if accelerator():
         return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", _UNSTATED)
     stated = hasattr(os, "sysconf")
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if stated else _UNSTATED
@@ -236,7 +236,7 @@ def _memory() -> float:
 
 def at_once() -> int:
     """Return the number of chunks in work at once: one a core, or one on an accelerator."""
-    return 1 if _accelerator() else cores()
+    return 1 if accelerator() else cores()
 
 
 def fingerprint(case: Case) -> str:

@@ -43,6 +43,29 @@ class RunRow:
     combination_error: np.ndarray = _column(by_parameter=True)
 
     @classmethod
+    def fitted(cls, theta: np.ndarray, std: np.ndarray, identifiable: np.ndarray, steps: int) -> RunRow:
+        """Return the row of a fit that converged.
+
+        Args:
+            theta: Estimates, (p,).
+            std: Standard deviations, (p,).
+            identifiable: Mask of the identifiable parameters, (p,).
+            steps: Evaluations of the Jacobian.
+        """
+        identifiable = identifiable & np.all(np.isfinite(theta))
+        return cls(
+            estimate=np.where(identifiable, theta, np.nan),
+            std=np.where(identifiable, std, np.nan),
+            identifiable=identifiable,
+            converged=True,
+            steps=steps,
+            message="converged",
+            named="",
+            combinations=0,
+            combination_error=np.full(len(theta), np.nan),
+        )
+
+    @classmethod
     def failed(cls, parameters: int, why: str) -> RunRow:
         """Return the row of a run that gave no estimate.
 

@@ -19,16 +19,24 @@ from jaxid.numerics.lanes import Steps, run_alone, run_batched
 from jaxid.session import Session, session_around
 from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics
+from jaxid.studies.loop_fits import LoopFits
 from jaxid.studies.plan import Plan
 from jaxid.studies.rows import COLUMNS, Arrays, RunRow, stacked
 
 
 @dataclass(frozen=True)
 class Ways:
-    """Filter and integration of all runs at one level, which share compiled code."""
+    """Filter and integration of all runs at one level, which share compiled code.
+
+    Args:
+        recipe: Filter of the logs.
+        numerics: Integration of fits that simulate; None: there are none.
+        together: Fits of a chunk as a few compiled programs; None: each run asks its estimators.
+    """
 
     recipe: Recipe
     numerics: Numerics | None
+    together: LoopFits | None = None
 
 
 @dataclass
@@ -60,7 +68,8 @@ class Runner:
         first = inverse_dynamics(session.machine, session.fit.data)
         machine = first.machine if first.all_identified else session.machine
         solver = at.model.output_error.solver
-        return Ways(session.recipe, choose_numerics(machine, log, solver=solver))
+        numerics = choose_numerics(machine, log, solver=solver)
+        return Ways(session.recipe, numerics, LoopFits.of(self.plan, at, session, numerics))
 
     def chunk(self, number: int) -> Arrays:
         """Run a chunk and return arrays by estimator and run.
@@ -73,7 +82,10 @@ class Runner:
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
         ways = self.ways(level) if self.plan.fits else None
-        results = run_batched([self._run(level, k, ways) for k in runs], self.plan.lanes)
+        fitted = [None] * len(runs) if ways is None or ways.together is None else ways.together.rows(runs)
+        left = [k for k, done in zip(runs, fitted, strict=True) if done is None]
+        others = iter(run_batched([self._run(level, k, ways) for k in left], self.plan.lanes))
+        results = [next(others) if done is None else self._arrays_of(level, *done) for done in fitted]
         # An exception ends its run only, even one of a library.
         arrays = [self._all_failed(x) if isinstance(x, Exception) else x for x in results]
         out = {name: np.stack([row[name] for row in arrays], axis=1) for name in (*COLUMNS, "tracking")}
@@ -114,9 +126,15 @@ class Runner:
                 rows.append(_row(estimate, _combinations(session, estimate, truth[plan.own], moved)))
             except Exception as error:
                 rows.append(RunRow.failed(len(plan.names), _words(error)))
-        driven = machine.plant.driven(simulated_log.trajectory.position.shape[1])
-        followed = np.asarray(simulated_log.trajectory.position)[:: at.scene.every, list(driven)]
-        return _run_arrays(rows, _tracking(simulated_log.log.reference, followed))
+        followed = np.asarray(simulated_log.trajectory.position)[:: at.scene.every]
+        return self._arrays_of(level, rows, simulated_log.log.reference, followed)
+
+    def _arrays_of(
+        self, level: int, rows: list[RunRow], reference: np.ndarray | None, followed: np.ndarray
+    ) -> Arrays:
+        """Return the arrays of one run, whose joints followed a reference so, (time, n)."""
+        driven = self.plan.levels[level].machine.plant.driven(followed.shape[1])
+        return _run_arrays(rows, _tracking(reference, followed[:, list(driven)]))
 
     def _all_failed(self, error: Exception) -> Arrays:
         drives = 0 if self.plan.machine.controller is None else self.plan.machine.gain.size

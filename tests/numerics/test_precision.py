@@ -264,3 +264,19 @@ def test_full_hessian_is_jaxs_and_more_than_gauss_newtons():
     np.testing.assert_allclose(ours, expected, rtol=1e-12)
     jacobian = np.asarray(jax.jacfwd(residual)(theta))
     assert np.abs(ours - jacobian.T @ jacobian).max() > 0.1  # the curvature counts here
+
+
+def test_models_of_many_residuals_are_those_of_each():
+    rng = np.random.default_rng(3)
+    e = np.stack([rng.standard_normal(4000), NoiseModel(AR2, 0.5).sample(rng, 4000, 1)[0], np.zeros(4000)])
+    for own, model in zip(e, NoiseModel.fit_each(e), strict=True):
+        alone = NoiseModel.fit(own, np.ones(own.shape, bool))
+        assert len(model.coefficients) == len(alone.coefficients)
+        np.testing.assert_allclose(model.coefficients, alone.coefficients, rtol=1e-9, atol=1e-12)
+        assert model.innovation == pytest.approx(alone.innovation, rel=1e-12)
+
+
+def test_the_sandwich_of_white_noise_needs_no_transform():
+    x = regressor()
+    white, nearly = NoiseModel(np.zeros(0), 0.5), NoiseModel(np.zeros(1), 0.5)
+    np.testing.assert_allclose(sandwich(x, white), sandwich(x, nearly), rtol=1e-12, atol=1e-9)

@@ -472,7 +472,7 @@ def test_an_accelerator_is_filled_by_one_chunk(tmp_path, monkeypatch):
     case = write_case(tmp_path, AXIS + STUDY.replace("chunk = 3\n", ""))
     monkeypatch.setattr(planned, "cores", lambda: 4)
     shared = Plan.of(jaxid.load_case(case), runs=64)
-    monkeypatch.setattr(planned, "_accelerator", lambda: True)
+    monkeypatch.setattr(planned, "accelerator", lambda: True)
     monkeypatch.setattr(planned, "_memory", lambda: 8e10)
     whole = Plan.of(jaxid.load_case(case), runs=64)
     assert planned.at_once() == 1

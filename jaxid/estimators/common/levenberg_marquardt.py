@@ -424,8 +424,38 @@ def _advanced(
     floor: Array | float,
 ) -> Progress:
     """Accept or reject the trial point from its residual and Jacobian, and choose the next one."""
-    (lower, upper), keep = bounds, p.kept[0].size > 0
-    cost = 0.5 * e @ e
+    kept = (e, jacobian) if p.kept[0].size > 0 else p.kept
+    model = (0.5 * e @ e, jacobian.T @ e, jacobian.T @ jacobian)
+    return advanced_by_model(p, model, kept, e.size, bounds, moves, rtol, atol, floor, aux)
+
+
+def advanced_by_model(
+    p: Progress,
+    model: tuple[Array, Array, Array],
+    kept: tuple[Array, Array],
+    size: int,
+    bounds: tuple[Array | float, Array | float],
+    moves: Bool[Array, " p"],
+    rtol: Array | float = _TOLERANCE,
+    atol: Array | float = 0.0,
+    floor: Array | float = -np.inf,
+    aux: Any = None,
+) -> Progress:
+    """Accept or reject the trial point from the quadratic model of the cost there, and choose the next one.
+
+    Args:
+        p: The descent, whose trial point was evaluated.
+        model: Cost, gradient (p,) and normal matrix (p, p) at the trial point, on the solver's scale.
+        kept: Residual and Jacobian at the trial point; empty if they are not kept.
+        size: Number of residuals.
+        bounds: Lower and upper bounds on the solver's scale.
+        moves: Mask of the unknowns that may move, (p,).
+        rtol, atol: The descent has converged if the cost can fall by at most rtol times itself plus atol.
+        floor: Known lower bound of the cost.
+        aux: Auxiliary output of the residual at the trial point.
+    """
+    lower, upper = bounds
+    cost = model[0]
     first = p.steps == 0
     better = first | (cost < p.cost)
     ratio = (p.cost - cost) / jnp.maximum(p.predicted, 1e-300)
@@ -433,10 +463,10 @@ def _advanced(
     damping = jnp.clip(p.damping * jnp.where(better, shrink, p.growth), 1e-15, 1e20)
     x, cost, gradient, normal, kept, aux = jax.tree.map(
         lambda new, old: jnp.where(better, new, old),
-        (p.trial, cost, jacobian.T @ e, jacobian.T @ jacobian, (e, jacobian) if keep else p.kept, aux),
+        (p.trial, *model, kept, aux),
         (p.x, p.cost, p.gradient, p.normal, p.kept, p.aux),
     )
-    nothing = jnp.where(first, _NOTHING * jnp.linalg.norm(e), p.nothing)
+    nothing = jnp.where(first, _NOTHING * jnp.sqrt(2.0 * model[0]), p.nothing)
     # Checked at every step: a velocity has no effect while its friction level is zero, and one later.
     moves = moves & (p.scale * jnp.sqrt(jnp.diag(normal)) > nothing)
     pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
@@ -465,7 +495,7 @@ def _advanced(
         p.scale,
         nothing,
         p.steps + 1,
-        small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / e.size * cost),
+        small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / size * cost),
         aux,
     )
 

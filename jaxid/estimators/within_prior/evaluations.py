@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -19,7 +20,7 @@ from jaxid.estimators.output_error import choose_numerics
 from jaxid.estimators.within_prior.problem import Problem, WeightedResidual
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.numerics.lanes import ParallelCalls, Precompile, SolveRequest, Steps
+from jaxid.numerics.lanes import ParallelCalls, Precompile, SolveRequest, Steps, side_by_side
 from jaxid.simulation.replay import Numerics
 
 # Decrease of the cost that still counts, as a fraction of the variance of one sample: at the end of a fit,
@@ -39,9 +40,10 @@ NO_PRIOR = np.zeros(())
 _MAX_EVALUATIONS = 25
 # Evaluations in a compiled call.
 _EVALUATIONS_PER_CALL = 4
+_ONCE = np.asarray(_EVALUATIONS_PER_CALL)
 
 
-@eqx.filter_jit
+@side_by_side
 def _residuals_at(compared: WeightedResidual, sharpness: Array, w: Array, starts: Array) -> Array:
     """Return the residuals at many whitened points, each from its initial positions, (draws, rows)."""
     compared = compared.at_sharpness(sharpness)
@@ -49,7 +51,7 @@ def _residuals_at(compared: WeightedResidual, sharpness: Array, w: Array, starts
     def at(w: Array, start: Array) -> Array:
         return compared.from_start(start).along(jnp.eye(w.size))(w)
 
-    return eqx.filter_vmap(at)(w, starts)
+    return jax.vmap(at)(w, starts)
 
 
 def residuals_at(
@@ -211,15 +213,25 @@ def linearise(problem: Problem, sharpness: np.ndarray, w: Float[np.ndarray, " q"
     """
     size, width = w.size, min(w.size, BLOCK)
     vectors = np.eye(size, -(-size // width) * width)
-    inactive = (np.zeros(width), np.zeros(width, bool))
+    begun, still = _begun(width, problem.measured.size), np.zeros(width, bool)
+    tolerance = np.asarray(0.1 * SETTLED / len(problem.measured))
 
     parts = []
     for first in range(0, size, width):
         block = vectors[:, first : first + width]
-        parts.append((yield from descent(problem, sharpness, NO_PRIOR, w, block, *inactive)))
+        args = (problem.residual, sharpness, NO_PRIOR, w, block, still, tolerance)
+        # With all coordinates at rest it ends after one evaluation.
+        here = yield SolveRequest(_advance_compiled, (*args, _ONCE, begun))
+        parts.append(here)
 
-    jacobian = np.concatenate([np.asarray(m.jacobian) for m in parts], axis=1)[:, :size]
-    return replace(parts[0], theta=w, jacobian=jacobian)
+    columns = [np.asarray(p.kept[1])[:-width] for p in parts]
+    return replace(_minimum_of(parts[0]), theta=w, jacobian=np.concatenate(columns, axis=1)[:, :size])
+
+
+@functools.lru_cache(maxsize=8)
+def _begun(width: int, size: int) -> Progress:
+    """Return the state of a descent at coordinates of zero."""
+    return _initial_progress(np.zeros(width), size)
 
 
 @eqx.filter_jit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -100,7 +101,7 @@ class Problem:
     encoders: tuple[int, ...]
     minimiser: Minimiser | None = None
 
-    @property
+    @functools.cached_property
     def residual(self) -> WeightedResidual:
         """The residual, as an argument of compiled functions."""
         return WeightedResidual(
