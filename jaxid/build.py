@@ -14,7 +14,7 @@ from jaxid.arrays import Array
 from jaxid.case.case import Case, load_case
 from jaxid.case.declared import EffectEntry
 from jaxid.case.reference import info_of
-from jaxid.case.tables import ON_LINE
+from jaxid.case.tables import ON_LINE, at_start, unknown_info
 from jaxid.case.values import Value
 from jaxid.controllers import CONTROLLERS, Controller, check_drives
 from jaxid.effects.friction import BackEmfDamping
@@ -24,7 +24,7 @@ from jaxid.machine import Machine
 from jaxid.model.parameter import ParameterInfo, as_array, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import Smoothing
-from jaxid.model.unknowns import REFERENCE, Free, Parameters, effect_name, label
+from jaxid.model.unknowns import CONTROLLER, REFERENCE, Free, Parameters, effect_name, label
 from jaxid.names import AXES
 from jaxid.references import REFERENCES
 from jaxid.references.unknown import UnknownReference
@@ -61,8 +61,9 @@ def build_machine(case: Case, *, at_truth: bool = False, period: float | None = 
         raise InputError(what, where=f"{case.where}, [actuator]", hint=hint)
     plant, free = _plant(case, at_truth)
     unknown_reference, more = _unknown_reference(case, at_truth, plant)
+    more += _unknowns_of_controller(case, at_truth, plant)
     gain = drives_of_case(case, plant).gain * np.asarray(plant.gearing)
-    controller = _controller(case, period, gain)
+    controller = _controller(case, period, gain, at_truth)
     sensor = _sensor(case, controller, plant)
     if controller is not None and "renewal" in controller.of_machine and sensor.inertial is not None:
         controller = replace(controller, renewal=sensor.inertial.hold)
@@ -314,7 +315,40 @@ def _unknown_reference(
     return unknown_reference, free
 
 
-def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controller | None:
+def _unknowns_of_controller(case: Case, at_truth: bool, plant: Plant) -> list[Free]:
+    """Return the unknowns of [controller]; gains in units of the command, where the drives have a gain."""
+    if case.controller is None:
+        return []
+    units = case.plant.units
+    if np.any(drives_of_case(case, plant).gain != 1.0):
+        units = replace(units, force="command")
+    driven = plant.driven(plant.joints)
+    free: list[Free] = []
+    for name, given in case.controller.unknown.items():
+        info = unknown_info(case.controller.kind, name)
+        several = isinstance(given, tuple)
+        for k, value in enumerate(given if isinstance(given, tuple) else (given,)):
+            if not isinstance(value, Value) or not value.free:
+                continue
+            free.append(
+                Free(
+                    name=f"{CONTROLLER}.{name}[{k + 1}]" if several else f"{CONTROLLER}.{name}",
+                    path=(CONTROLLER, name),
+                    unit=units.label(info.dimension, plant.motion(driven[k])),
+                    sign=info.sign,
+                    guess=value.start(at_truth),
+                    lower=value.lower,
+                    upper=value.upper,
+                    index=k if several else None,
+                    true=value.true,
+                )
+            )
+    return free
+
+
+def _controller(
+    case: Case, period: float | None, gain: np.ndarray, at_truth: bool = False
+) -> Controller | None:
     """Return the controller of a case; None if it has none."""
     if case.controller is None:
         return None
@@ -326,6 +360,7 @@ def _controller(case: Case, period: float | None, gain: np.ndarray) -> Controlle
         if field.default is not MISSING and isinstance(field.default, float)
     }
     values |= case.controller.law
+    values |= {name: at_start(value, at_truth) for name, value in case.controller.unknown.items()}
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
     arrays: dict[str, Any] = {k: v if k in static else as_array(v) for k, v in values.items()}
     period = case.controller.period or _log_period(case, period)

@@ -12,7 +12,7 @@ from jaxid.arrays import Array
 from jaxid.controllers import Controller
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
-from jaxid.model.unknowns import Parameters
+from jaxid.model.unknowns import CONTROLLER, Parameters, scatter_controller
 from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.settings import Disturbance
@@ -24,7 +24,7 @@ class Machine:
 
     Args:
         plant: The plant at its guesses (or true values).
-        parameters: Unknown parameters of plant and reference.
+        parameters: Unknown parameters of plant, reference and controller.
         gain: Declared force at the joint per unit of the logged command, gears of the plant included, (m,).
         units: Labels of the units.
         controller: The sampled law; None: unknown, only open loop can be simulated.
@@ -51,6 +51,11 @@ class Machine:
     def hold_period(self) -> float | None:
         """Time for which the controller holds a command [s]; None without a controller."""
         return None if self.controller is None else self.controller.period
+
+    @property
+    def unknown_controller(self) -> tuple[str, ...]:
+        """Names of the unknowns of the controller."""
+        return tuple(f.name for f in self.parameters.free if f.path[0] == CONTROLLER)
 
     def unit(self, quantity: str, joint: int = 0) -> str:
         """Return the unit of a quantity at a joint.
@@ -81,9 +86,16 @@ class Machine:
         values = np.asarray(theta, dtype=np.float64)
         parameters = self.parameters.with_guess(values.tolist())
         plant = self.parameters.insert(self.plant, values)
+        controller = scatter_controller(self.parameters.places, self.controller, values)
         unknown_reference = (
             None
             if self.unknown_reference is None
             else self.unknown_reference.with_unknowns(self.parameters.places, values)
         )
-        return replace(self, plant=plant, parameters=parameters, unknown_reference=unknown_reference)
+        return replace(
+            self,
+            plant=plant,
+            parameters=parameters,
+            controller=controller,
+            unknown_reference=unknown_reference,
+        )

@@ -6,20 +6,25 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
+from jaxid.case.values import Value, read_value, value_keys
 from jaxid.controllers import CONTROLLERS, Controller
+from jaxid.model.parameter import ParameterInfo
 from jaxid.names import LAW_DERIVATIVES, MOTIONS, ORIENTATIONS
 from jaxid.schema import (
     Key,
     Keys,
     Reader,
+    Spot,
     anything,
     by_drive,
     choice,
+    either,
     either_text,
     flag,
     inline,
     keys_of,
     number,
+    schema_of,
     several,
     table_of,
     text,
@@ -75,6 +80,43 @@ PLANT: Keys = {
 
 # Keys that an adaptive controller shares with [recursive].
 ON_LINE = ("half_life", "gate_velocity", "gate_acceleration", "rows", "start", "instrument")
+# Keys that may be unknown: the dimension of their value, in units of the command, and its sign.
+_UNKNOWN = {
+    "kp": ("force/position", "positive"),
+    "kv": ("force*time/position", "positive"),
+    "ki": ("force/position", "nonnegative"),
+    "kd": ("force*time/position", "nonnegative"),
+    "derivative_filter": ("time", "nonnegative"),
+    "limit": ("force", "positive"),
+    "delay": ("time", "nonnegative"),
+}
+# Laws whose gains may be unknown.
+_LINEAR = ("cascade_pd", "pd", "pid")
+# Laws whose gains act on a velocity that is itself a gain times the position error.
+_CASCADES = ("cascade_pd",)
+
+
+def unknown_info(kind: str, name: str) -> ParameterInfo:
+    """Return the declaration of a value of [controller] that may be unknown."""
+    dimension, sign = _UNKNOWN[name]
+    if kind in _CASCADES and name == "kp":
+        dimension = "1/time"
+    return ParameterInfo(dimension, sign, "")
+
+
+def _maybe_unknown(read: Reader, kind: str, name: str) -> Reader:
+    """Return the reader of a known value, or of one with a guess."""
+    if kind not in _LINEAR:
+        return read
+    info = unknown_info(kind, name)
+    table = schema_of(value_keys(info))
+
+    def read_either(value: Any, spot: Spot) -> Any:
+        return read_value(value, info, spot) if isinstance(value, dict) else read(value, spot)
+
+    return Reader(read_either, either(read.schema, table))
+
+
 # Keys of the control laws, by the field of the controller; a key belongs to the kinds that have the field.
 _LAW: dict[str, tuple[Reader, str]] = {
     "kp": (by_drive(number()), "gain of the position error"),
@@ -112,13 +154,15 @@ class ControllerTable:
         kind: One of `jaxid.controllers.CONTROLLERS`.
         period: Sampling time [s]; None: that of the log.
         disturbance: Signal that is added to the command: a square wave, or the name of a column.
-        law: Further settings, by the fields of the controller's class.
+        law: Further settings, by the fields of the controller's class; unknown ones at their guess.
+        unknown: Unknown values by name, one for all drives or one each; known ones among them are not free.
     """
 
     kind: str
     period: float | None = None
     disturbance: Disturbance | str | None = None
     law: Mapping[str, Any] = field(default_factory=dict)
+    unknown: Mapping[str, Value | tuple[Value | float, ...]] = field(default_factory=dict)
 
     @property
     def limit(self) -> float | tuple[float, ...] | None:
@@ -130,7 +174,20 @@ def controller_table(given: Mapping[str, Any]) -> ControllerTable:
     """Return [controller] from its checked keys."""
     apart = ("kind", "period", "disturbance")
     law = {name: value for name, value in given.items() if name not in apart}
-    return ControllerTable(**{name: given[name] for name in apart if name in given}, law=law)
+    unknown = {name: value for name, value in law.items() if name in _UNKNOWN and _any_free(value)}
+    law |= {name: at_start(value) for name, value in unknown.items()}
+    return ControllerTable(**{name: given[name] for name in apart if name in given}, law=law, unknown=unknown)
+
+
+def _any_free(value: Any) -> bool:
+    return any(isinstance(v, Value) for v in (value if isinstance(value, tuple) else (value,)))
+
+
+def at_start(value: Any, at_truth: bool = False) -> Any:
+    """Return the guesses of a value of [controller] that may be unknown, or its true values."""
+    if isinstance(value, tuple):
+        return tuple(at_start(v, at_truth) for v in value)
+    return value.start(at_truth) if isinstance(value, Value) else value
 
 
 def controller_keys(kind: str) -> Keys:
@@ -138,7 +195,17 @@ def controller_keys(kind: str) -> Keys:
     keys = {
         "period": Key(number("positive"), "sampling time", unit="s", note="the log's"),
         "velocity_average": Key(whole(1), "samples whose mean is differenced for the velocity", default=1),
-        "limit": Key(by_drive(number("positive")), "bound of the command", note="no bound"),
+        "limit": Key(
+            by_drive(_maybe_unknown(number("positive"), kind, "limit")),
+            "bound of the command",
+            note="no bound",
+        ),
+        "delay": Key(
+            by_drive(_maybe_unknown(number("nonnegative"), kind, "delay")),
+            "transport delay of the reference",
+            unit="s",
+            note="none",
+        ),
         "disturbance": _DISTURBANCE,
     }
     cls = CONTROLLERS[kind]
@@ -149,6 +216,8 @@ def controller_keys(kind: str) -> Keys:
             required = f.default is MISSING and f.default_factory is MISSING
             plain = flag if f.type in (bool, "bool") else by_drive(number())
             read, doc = _LAW.get(f.name, (plain, "setting of the law"))
+            if f.name in _UNKNOWN:
+                read = by_drive(_maybe_unknown(number(), kind, f.name))
             law[f.name] = Key(read, f"{doc}; it belongs to kind = '{kind}'", required)
     if "estimator" in cls.of_machine:
         law |= {name: entry for name, entry in keys_of(Recursive).items() if name in ON_LINE}

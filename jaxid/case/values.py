@@ -44,7 +44,8 @@ class Value:
         return self.true if at_truth and self.true is not None else self.guess
 
 
-def _keys(info: ParameterInfo) -> Keys:
+def value_keys(info: ParameterInfo) -> Keys:
+    """Return the keys of an unknown value of a parameter."""
     signed = number(info.sign)
     return {
         "guess": Key(signed, "value that the fit starts from", True),
@@ -63,12 +64,12 @@ def value_schema(info: ParameterInfo) -> dict[str, Any]:
     """Return the JSON Schema of one value of a parameter: a number, or a table with its guess."""
     if info.known:
         return dict(number(info.sign).schema)
-    return either(number(info.sign).schema, schema_of(_keys(info)))
+    return either(number(info.sign).schema, schema_of(value_keys(info)))
 
 
 def values_schema(info: ParameterInfo) -> dict[str, Any]:
     """Return the JSON Schema of values for several places: one for all, a list, or a table of lists."""
-    table = schema_of(_keys(info))
+    table = schema_of(value_keys(info))
     table["properties"] = {name: either(entry, list_of(entry)) for name, entry in table["properties"].items()}
     one = number(info.sign).schema
     return (
@@ -100,7 +101,7 @@ def read_value(value: Any, info: ParameterInfo, spot: Spot) -> Value:
             hint = "give a number if it is known, { guess = ... } if it is not"
             raise spot.refuse(value, "is not a number", hint)
         return Value(signed(value, spot))
-    given = read_table(value, _keys(info), spot)
+    given = read_table(value, value_keys(info), spot)
     lower, upper = given.get("min", -math.inf), given.get("max", math.inf)
     if lower > upper:
         raise spot.refuse(value, f"has min {lower:g} above max {upper:g}", "exchange min and max")

@@ -99,7 +99,7 @@ def replayed_law(machine: Machine, log: Log) -> Replayed | None:
 
     Returns:
         The command beside the logged one; None without a controller or a logged reference, and for a law that
-        has a model of the plant or reads other sensors.
+        has a model of the plant, reads other sensors, or has unknowns.
     """
     law = law_at_ticks(machine, log)
     if law is None:
@@ -118,6 +118,8 @@ def law_at_ticks(machine: Machine, log: Log) -> LawAtTicks | None:
     """
     controller = machine.controller
     if not isinstance(controller, _PLAIN) or log.reference is None or not all(log.measured):
+        return None
+    if machine.unknown_controller:
         return None
     if machine.sensor.inertial is not None or machine.sensor.hold > 1:
         return None

@@ -65,11 +65,13 @@ def compare_reference_holds(
         fit: Balance of the prepared log.
 
     Returns:
-        The comparison; None if there is nothing to choose: no controller, no reference in the log, or a row
-        of the log for every tick.
+        The comparison; None if there is nothing to choose: no controller or one with unknowns, no reference
+        in the log, or a row of the log for every tick.
     """
     controller = machine.controller
     if controller is None or log.reference is None or round(log.period / controller.period) <= 1:
+        return None
+    if machine.unknown_controller:
         return None
     if any(e.delays_command() or not e.adds_force for e in machine.plant.effects):
         return ReferenceHold({}, None, "an effect of the drive changes the force in time")

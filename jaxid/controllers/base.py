@@ -85,12 +85,15 @@ class Controller(eqx.Module):
     Args:
         period: Sampling time [s].
         limit: Bound of the magnitude of the command; None: no bound.
+        delay: Transport delay of the reference [s], one for all drives or one each; None: none. Between two
+            ticks the delayed reference is interpolated, so that derivatives by the delay exist.
         velocity_average: Number of samples whose mean is differenced backwards for the velocity.
         own_velocity: Whether the drive measures the velocity, so that no position is differenced for it.
     """
 
     period: float = eqx.field(static=True, kw_only=True)
     limit: Array | None = eqx.field(default=None, kw_only=True)
+    delay: Array | None = eqx.field(default=None, kw_only=True)
     velocity_average: int = eqx.field(static=True, default=1, kw_only=True)
     own_velocity: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -104,7 +107,9 @@ class Controller(eqx.Module):
     separate_drives: ClassVar[bool] = False
 
     def path(self, reference: Float[Array, "ticks m"]) -> Path:
-        """Return the reference with the derivatives that the law needs, by central differences."""
+        """Return the delayed reference with the derivatives that the law needs, by central differences."""
+        if self.delay is not None:
+            reference = delayed(reference, self.delay / self.period)
         if not self.anticipates:
             return Path(reference)
         before = jnp.concatenate([2 * reference[:1] - reference[1:2], reference[:-1]])
@@ -156,3 +161,22 @@ class Controller(eqx.Module):
     def clipped(self, u: Array) -> Array:
         """Clip the command to its limit."""
         return u if self.limit is None else sharp_clip(u, self.limit)
+
+
+def delayed(signal: Float[Array, "ticks m"], shift: Array) -> Float[Array, "ticks m"]:
+    """Delay a signal by a number of ticks, with lines between its ticks; it stood still before the first.
+
+    Args:
+        signal: Values at the ticks, (ticks, m).
+        shift: Delay in ticks, not negative, one for all columns or one each.
+    """
+    ticks, width = signal.shape
+    shift = jnp.broadcast_to(shift, (width,))
+    whole = jnp.floor(shift)
+    part = shift - whole
+    at = jnp.arange(ticks)[:, None] - whole.astype(int)
+
+    def value(k: Array) -> Array:
+        return jnp.take_along_axis(signal, jnp.clip(k, 0, ticks - 1), axis=0)
+
+    return (1 - part) * value(at) + part * value(at - 1)

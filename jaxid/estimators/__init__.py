@@ -16,7 +16,7 @@ import numpy as np
 from jaxid.consistency.absent import need_position
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
-from jaxid.model.unknowns import REFERENCE
+from jaxid.model.unknowns import in_loop
 from jaxid.names import LIKELIHOOD_METHODS, USER_METHODS
 from jaxid.numerics.lanes import Steps
 
@@ -214,7 +214,7 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
     if method == "guess":
         return None
     first = yield from METHODS[method](session)
-    elsewhere = [path[0] == REFERENCE for path, _ in parameters.places]
+    elsewhere = [in_loop(path) for path, _ in parameters.places]
     within = np.isin(np.arange(len(first.theta)), [k for body in parameters.bodies for k in body.places])
     told = first.converged and np.all(first.identifiable | elsewhere | within)
     lower, upper = parameters.bounds
@@ -364,6 +364,7 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
     need_position(method, session.fit.log)
     if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
+        need_known_controller(session, f"{method} does not simulate the loop with them")
     if method == "within_prior":
         steps = METHODS[method]
     else:
@@ -418,6 +419,21 @@ def need_consistent(method: str, case: Case) -> None:
     if hint:
         what, where = f"physically_consistent does not go with {method}", f"{case.where}, [identification]"
         raise InputError(what, where=where, hint=hint)
+
+
+def need_known_controller(session: Session, why: str) -> None:
+    """Refuse a case whose controller has unknowns.
+
+    Raises:
+        InputError: If the controller has any unknown; the message contains `why`.
+    """
+    names = session.machine.unknown_controller
+    if names:
+        raise InputError(
+            f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} unknown, and {why}",
+            where=f"{session.case.where}, [controller]",
+            hint="fit by output_error, and give the numbers found",
+        )
 
 
 def need_known_reference(session: Session, why: str) -> None:

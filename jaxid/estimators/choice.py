@@ -55,6 +55,8 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
         return Choice(case.prior_method, "the case states a prior")
     if machine.unknown_reference is not None:
         return Choice("output_error", "the reference has unknowns, which only a simulated loop shows")
+    if machine.unknown_controller:
+        return Choice("output_error", "the controller has unknowns, which only a simulated loop shows")
     if case.identification.physically_consistent:
         return Choice("output_error", "links are to be physically consistent")
 

@@ -20,8 +20,8 @@ from jaxid.model.units import Units
 # Lower bound of a positive unknown, relative to its guess: it keeps a solver off zero, far below
 # any value that a log can resolve.
 _POSITIVE_FLOOR = 1e-9
-# First step of the path of an unknown of the reference, which belongs to no plant.
-REFERENCE = "reference"
+# First steps of the paths of unknowns of the reference and of the controller, which belong to no plant.
+REFERENCE, CONTROLLER = "reference", "controller"
 
 
 @dataclass(frozen=True)
@@ -130,6 +130,11 @@ class Parameters:
         return Parameters((*self.free, *more), self.bodies)
 
 
+def in_loop(path: tuple[str | int, ...]) -> bool:
+    """Check that an unknown is one of the reference or of the controller."""
+    return path[0] in (REFERENCE, CONTROLLER)
+
+
 def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
     """Return the leaf at the end of a path of attributes and indices."""
     node: Any = plant
@@ -141,12 +146,12 @@ def leaf(plant: Plant, path: tuple[str | int, ...]) -> Array:
 def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
     """Return the plant with theta[k] at places[k], each a path and, if the leaf is a list, an index.
 
-    Unknowns of a reference belong to no plant, and are skipped.
+    Unknowns of a reference or a controller belong to no plant, and are skipped.
     """
     leaves, structure = jax.tree.flatten(plant)
     numbers = jax.tree.unflatten(structure, range(len(leaves)))
     for k, (path, index) in enumerate(places):
-        if path[0] == REFERENCE:
+        if in_loop(path):
             continue
         at, value = leaf(numbers, path), theta[k]
         if isinstance(theta, np.ndarray):
@@ -155,6 +160,21 @@ def scatter(places: tuple, plant: Plant, theta: Float[Array, " p"]) -> Plant:
         else:
             leaves[at] = value if index is None else jnp.asarray(leaves[at]).at[index].set(value)
     return jax.tree.unflatten(structure, leaves)
+
+
+def scatter_controller(places: tuple, controller: Any, theta: Float[Array, " p"]) -> Any:
+    """Return the controller with theta[k] at each places[k] that is one of its unknowns."""
+    for k, (path, index) in enumerate(places):
+        if path[0] == CONTROLLER:
+            name = str(path[1])
+            now = getattr(controller, name)
+            value = theta[k]
+            if isinstance(theta, np.ndarray):
+                value = np.asarray(value) if index is None else _with_entry(now, index, value)
+            elif index is not None:
+                value = jnp.asarray(now).at[index].set(value)
+            controller = replace(controller, **{name: value})
+    return controller
 
 
 def _with_entry(values: Array, index: int | tuple[int, int], value: Array | float) -> np.ndarray:

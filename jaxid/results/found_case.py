@@ -18,12 +18,13 @@ import numpy as np
 from jaxid.arms.pseudo_inertia import TEN
 from jaxid.case.case import Case, load_case
 from jaxid.case.declared import EffectEntry
+from jaxid.case.tables import ControllerTable, at_start
 from jaxid.case.values import Value
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.model.effect import Effect
-from jaxid.model.unknowns import REFERENCE, several_places
+from jaxid.model.unknowns import CONTROLLER, REFERENCE, several_places
 from jaxid.plants.link_tree import LinkTree
 
 if TYPE_CHECKING:
@@ -51,12 +52,14 @@ class Findings:
         plant: New guesses of [plant.parameters] by name and entry.
         effects: New guesses of [[effects]] by number of the table, name, and place among its places.
         reference: New guesses of [reference] by key.
+        controller: New guesses of [controller] by key and drive.
         added: Effects beside those of the case: the object, its place, and its values.
     """
 
     plant: dict[str, dict[Index, float]]
     effects: dict[int, dict[str, dict[int, float]]]
     reference: dict[str, float]
+    controller: dict[str, dict[Index, float]]
     added: tuple[tuple[Effect, tuple[str, int] | None, dict[str, Value]], ...]
 
 
@@ -90,7 +93,21 @@ def found_case(result: FitResult) -> Case:
         effects=tuple(effects),
         reference=reference,
         unknown_reference=unknown,
+        controller=_with_controller(case, findings),
     )
+
+
+def _with_controller(case: Case, findings: Findings) -> ControllerTable | None:
+    """Return [controller] with new guesses."""
+    table = case.controller
+    if table is None or not findings.controller:
+        return table
+    unknown = dict(table.unknown)
+    for name, guesses in findings.controller.items():
+        for index, guess in guesses.items():
+            unknown[name] = _with_guess(unknown[name], index, guess)
+    law = {**table.law, **{name: at_start(value) for name, value in unknown.items()}}
+    return replace(table, law=law, unknown=unknown)
 
 
 def _findings(result: FitResult) -> Findings:
@@ -101,6 +118,7 @@ def _findings(result: FitResult) -> Findings:
     plant: dict[str, dict[Index, float]] = {}
     effects: dict[int, dict[str, dict[int, float]]] = {}
     reference: dict[str, float] = {}
+    controller: dict[str, dict[Index, float]] = {}
     added: dict[int, dict[str, Value]] = {}
 
     rows = zip(machine.parameters.free, result.estimate.theta, result.estimate.identifiable, strict=True)
@@ -116,11 +134,17 @@ def _findings(result: FitResult) -> Findings:
                 effects.setdefault(table, {}).setdefault(name, {})[at] = guess
             case (first, str(name)) if first == REFERENCE and known:
                 reference[name] = guess
+            case (first, str(name)) if first == CONTROLLER and known:
+                controller.setdefault(name, {})[f.index] = guess
             case (str(name),) if known:
                 plant.setdefault(name, {})[f.index] = guess
 
     return Findings(
-        plant, effects, reference, tuple(_added(machine.plant, k, values) for k, values in added.items())
+        plant,
+        effects,
+        reference,
+        controller,
+        tuple(_added(machine.plant, k, values) for k, values in added.items()),
     )
 
 
@@ -235,6 +259,18 @@ def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
             _put(tables["effects"][number], name, guesses, places, case.effects[number].parameters[name])
     for key, guess in findings.reference.items():
         tables["reference"][key]["guess"] = guess
+    for key, guesses in findings.controller.items():
+        assert case.controller is not None, "its unknowns are estimated"
+        values = case.controller.unknown[key]
+        several = isinstance(values, tuple)
+        by_drive = {k if isinstance(k, int) else 0: guess for k, guess in guesses.items()}
+        _put(
+            tables["controller"],
+            key,
+            by_drive,
+            len(values) if several else 1,
+            values if several else (values,),
+        )
 
 
 def _of_file(case: Case, findings: Findings, declared: int) -> list[dict[str, Any]]:

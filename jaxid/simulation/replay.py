@@ -18,6 +18,7 @@ from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.model.unknowns import scatter_controller
 from jaxid.numerics import filters as signals
 from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
@@ -128,10 +129,12 @@ class Replay(eqx.Module):
         return replace(self, position=self.position + self.follow @ start)
 
     def following(self, places: tuple, theta: Float[Array, " p"]) -> Replay:
-        """Return the run with the values theta for the unknowns of its reference."""
-        if not isinstance(self.reference, UnknownReference):
-            return self
-        return replace(self, reference=self.reference.with_unknowns(places, theta))
+        """Return the run with the values theta for the unknowns of its reference and its controller."""
+        controller = scatter_controller(places, self.controller, theta)
+        out = self if controller is self.controller else replace(self, controller=controller)
+        if not isinstance(out.reference, UnknownReference):
+            return out
+        return replace(out, reference=out.reference.with_unknowns(places, theta))
 
 
 def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) -> Replay:

@@ -10,7 +10,7 @@ from jaxid.consistency.weight import least_inertia
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
-from jaxid.model.unknowns import REFERENCE, Free
+from jaxid.model.unknowns import Free, in_loop
 from jaxid.plants.link_tree import LinkTree
 from jaxid.results.report.numbers import plain, pretty_unit, with_std
 from jaxid.session import Session
@@ -55,7 +55,7 @@ def remarks_on(session: Session, estimate: Estimate) -> list[Remark]:
     for k, f in enumerate(estimate.machine.parameters.free):
         if f.name in beyond:
             continue
-        if not estimate.identifiable[k] or not np.isfinite(estimate.theta[k]) or f.path[0] == REFERENCE:
+        if not estimate.identifiable[k] or not np.isfinite(estimate.theta[k]) or in_loop(f.path):
             continue
         value, std, info = float(estimate.theta[k]), float(estimate.std[k]), _info(estimate.machine.plant, f)
         remark = (
