@@ -217,7 +217,8 @@ def controller_keys(kind: str) -> Keys:
             plain = flag if f.type in (bool, "bool") else by_drive(number())
             read, doc = _LAW.get(f.name, (plain, "setting of the law"))
             if f.name in _UNKNOWN:
-                read = by_drive(_maybe_unknown(number(), kind, f.name))
+                known = number("nonnegative") if f.name == "derivative_filter" else number()
+                read = by_drive(_maybe_unknown(known, kind, f.name))
             law[f.name] = Key(read, f"{doc}; it belongs to kind = '{kind}'", required)
     if "estimator" in cls.of_machine:
         law |= {name: entry for name, entry in keys_of(Recursive).items() if name in ON_LINE}
