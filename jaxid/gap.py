@@ -59,6 +59,10 @@ def _force_gap(plant: Plant, data: ForceData) -> tuple[Array, Array]:
 
 def force_gap(machine: Machine, data: Prepared) -> ForceGap:
     """Compute the gap between measured force and inverse dynamics, without samples at rest."""
+    if machine.controller is not None and not data.force.any():
+        # The log has no force: only the position of the simulated loop can be compared.
+        nothing, none = np.full(data.moving.shape, np.nan), np.full(data.moving.shape[1], np.nan)  # pyright: ignore[reportGeneralTypeIssues]  # two axes
+        return ForceGap(residual=nothing, measured=np.zeros_like(nothing), rms=none, relative=none)
     residual, measured = _force_gap(sharpened(machine.plant, data), ForceData.of(data))
     residual = np.where(data.moving, np.asarray(residual), np.nan)
     counted = np.where(data.moving, np.asarray(measured), np.nan)
@@ -104,7 +108,9 @@ def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:
     command, command_relative = None, None
     if replay.controller is not None:
         command = np.asarray(run.command)
-        command_relative = np.linalg.norm(log.force - command, axis=0) / np.linalg.norm(log.force, axis=0)
+        if not log.passive:
+            off = np.linalg.norm(log.force - command, axis=0)
+            command_relative = off / np.linalg.norm(log.force, axis=0)
     return SimulationGap(
         position=position,
         command=command,
@@ -118,6 +124,8 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
     """Compute the RMS force that the sensors' noise alone causes in the band [N or N m], by joint."""
     if log.steady is not None:
         return row_noise(machine, log)
+    if machine.unforced(log):
+        return np.full(log.position.shape[1], np.nan)
     f, power = noise_density(machine, log, data)
     return np.sqrt(np.trapezoid(power, f, axis=0))
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.controllers import Controller
+from jaxid.logs.log import Log
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
 from jaxid.model.unknowns import CONTROLLER, Parameters, scatter_controller
@@ -56,6 +57,10 @@ class Machine:
     def unknown_controller(self) -> tuple[str, ...]:
         """Names of the unknowns of the controller."""
         return tuple(f.name for f in self.parameters.free if f.path[0] == CONTROLLER)
+
+    def unforced(self, log: Log) -> bool:
+        """Check that a log holds no force although a controller drives the machine."""
+        return self.controller is not None and log.passive
 
     def unit(self, quantity: str, joint: int = 0) -> str:
         """Return the unit of a quantity at a joint.

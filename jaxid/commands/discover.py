@@ -23,7 +23,7 @@ from jaxid.discovery.separating.propose import proposals
 from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import need_known_controller, need_known_reference
+from jaxid.estimators import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
@@ -114,6 +114,7 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
+    need_force(session, "a search")
     need_known_controller(session, "a search in forces does not simulate the loop")
     if session.fit.log.steady is not None:
         from jaxid.discovery.steady import explore_steady

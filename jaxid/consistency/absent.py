@@ -107,15 +107,18 @@ def acts_by_position(effect: Effect) -> bool:
 def _need_known_force(case: Case, machine: Machine, log: Log) -> None:
     """Refuse a free motion in which nothing is known that would give forces their scale.
 
-    All unknown masses, frictions and springs may then be multiplied by one factor. A log without a force in
-    a known loop is refused here too, because no method closes such a loop yet.
+    All unknown masses, frictions and springs may then be multiplied by one factor. In a loop the controller
+    gives the force, from its reference.
     """
     missing = "the force is zero throughout"
     if case.log is not None and case.log.force is None:
         missing = "'force' is missing"
     if case.controller is not None:
-        hint = "name the column of the command as force in [log], or leave [controller] out for a free motion"
-        raise InputError(f"{missing}, and [controller] drives the machine", where=log.source, hint=hint)
+        if log.reference is None and machine.unknown_reference is None and case.reference is None:
+            hint = "name the column of the command to the servo as reference in [log], or that of the force"
+            what = f"{missing}, and so is the reference that [controller] follows"
+            raise InputError(what, where=log.source, hint=hint)
+        return
     unscaled = without_scale(machine, log)
     if unscaled:
         listed = ", ".join(unscaled[:6]) + (", ..." if len(unscaled) > 6 else "")

@@ -76,6 +76,8 @@ def _output_error(
         "hessian": demands.hessian if hessian is None else hessian,
         "profile": demands.profile if profile is None else profile,
     }
+    if session.machine.unforced(log):
+        return (yield from _unforced(session, on, minimiser, numerics, precision))
     start = yield from _start(session)
     if solver is not None and numerics is None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
@@ -91,6 +93,35 @@ def _output_error(
         session.machine, log, numerics=numerics, on=on, minimiser=minimiser, **precision
     )
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
+
+
+def _unforced(
+    session: Session,
+    on: str,
+    minimiser: str | Minimiser | None,
+    numerics: Numerics | None,
+    precision: dict[str, Any],
+) -> Steps[Estimate]:
+    """Fit the position of a loop whose force was not logged, from several starts."""
+    from jaxid.estimators.output_error import choose_numerics, output_error_steps
+    from jaxid.estimators.unforced import base_of, coarse_starts, scale_group, with_free_scale, without
+
+    machine, log = session.machine, session.fit.log
+    group = scale_group(machine, log)
+    base = base_of(machine, group) if group else None
+    fitted = machine if base is None else without(machine, base)
+
+    fits = []
+    for start in coarse_starts(fitted, log, numerics or choose_numerics(fitted, log)):
+        fits.append(
+            (
+                yield from output_error_steps(
+                    fitted, log, start=start, numerics=numerics, on=on, minimiser=minimiser, **precision
+                )
+            )
+        )
+    result = min(fits, key=lambda e: (not e.converged, np.nansum(e.residual**2)))
+    return result if base is None else with_free_scale(result, machine, group, base)
 
 
 def _doubts_of_output_error(session: Session) -> list[str]:
@@ -361,6 +392,8 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
             method maximises no likelihood.
     """
     need_likelihood(method, session.case)
+    if method != "output_error":
+        need_force(session, method)
     need_position(method, session.fit.log)
     if method not in ("output_error", "within_prior"):
         need_known_reference(session, f"{method} takes them as they are")
@@ -419,6 +452,21 @@ def need_consistent(method: str, case: Case) -> None:
     if hint:
         what, where = f"physically_consistent does not go with {method}", f"{case.where}, [identification]"
         raise InputError(what, where=where, hint=hint)
+
+
+def need_force(session: Session, what: str) -> None:
+    """Refuse a loop whose force was not logged.
+
+    Raises:
+        InputError: If the log of a loop has no force; the message says that `what` needs it.
+    """
+    for run in session.runs:
+        if session.machine.unforced(run.log):
+            raise InputError(
+                f"the log has no force, which {what} needs",
+                where=run.log.source,
+                hint="fit by output_error, which simulates the loop",
+            )
 
 
 def need_known_controller(session: Session, why: str) -> None:

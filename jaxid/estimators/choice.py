@@ -60,6 +60,8 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
     if case.identification.physically_consistent:
         return Choice("output_error", "links are to be physically consistent")
 
+    if machine.unforced(log):
+        return Choice("output_error", "the log has no force, so that only the simulated loop can be compared")
     if log.passive:
         return Choice(
             "output_error", "nothing drives the machine: the start and the model give the whole motion"

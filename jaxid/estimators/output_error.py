@@ -106,6 +106,18 @@ def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
         )
 
 
+def _need_force(machine: Machine, log: Log, on: str) -> None:
+    """Refuse a fit of a force that was not logged.
+
+    Raises:
+        InputError: If the log has no force.
+    """
+    if machine.unforced(log):
+        raise InputError(
+            f"the log has no force, which a fit on {on} compares", where=log.source, hint="fit position"
+        )
+
+
 def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a log's output, (time, k), and the mask of columns that count; see `output_residual`."""
     force = log.force * machine.gain
@@ -232,6 +244,7 @@ def output_error_steps(
     need_names(profile, machine.parameters.names)
     if on != "position":
         need_loop(machine, log, f"output_error on {on}", "or fit position")
+        _need_force(machine, log, on)
     elif log.integrated:
         on = "velocity"
     machine = machine if start is None else machine.with_estimate(start)

@@ -391,7 +391,7 @@ def _completed(
         width = motion.shape[1] if joints is None else joints
         force = np.zeros((len(motion), width if drives is None else drives))
         groups = {**groups, "force": force}
-        said.append(Assumed("force", 0.0, "the log has none, so that nothing drives the machine"))
+        said.append(Assumed("force", 0.0, "the log has none"))
     return groups, said
 
 

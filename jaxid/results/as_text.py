@@ -112,6 +112,7 @@ def identification_table(result: Identification) -> str:
     below = [
         *_identifiable_combinations(estimate.details.get("directions", [])),
         *_unidentifiable(estimate),
+        *_relative(estimate),
         *within_prior_words(estimate.details),
         *precision_lines(estimate),
         *(_minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []),
@@ -216,6 +217,17 @@ def step_rows(content: Mapping[str, Any]) -> list[list[str]]:
             name += "" if step["added"] else place
         rows.append([name, f"{_number(step['fit'])} {content['gap']['unit']}", _number(step["validation"])])
     return rows
+
+
+def _relative(estimate: Estimate) -> list[str]:
+    """Return the ratios of unknowns whose common scale the log does not determine."""
+    ratios = estimate.details.get("relative")
+    if ratios is None:
+        return []
+    rows = [["over " + ratios["to"], "value", "std", "unit"]]
+    for name, of in ratios["values"].items():
+        rows.append([name, *with_std(of["value"], of["std"]), of["unit"]])
+    return ["", aligned(rows)]
 
 
 def _unidentifiable(estimate: Estimate) -> list[str]:

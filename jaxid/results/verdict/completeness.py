@@ -15,11 +15,13 @@ from jaxtyping import Float
 
 from jaxid.discovery.evidence import Whitener
 from jaxid.discovery.noise import NUMERICS, high_band_force_noise, sensor_colour
-from jaxid.gap import ForceGap, noise_density, row_noise
+from jaxid.gap import ForceGap, SimulationGap, noise_density, row_noise
+from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, inertial_force
+from jaxid.simulation.sensor_noise import position_noise
 
 # Part of the half sampling rate of the kept samples that holds the band of the filter, see
 # `jaxid.logs.prepare.A_PERIOD`. Beyond it the filtered residual is rounding and errors of numerics.
@@ -36,6 +38,8 @@ _RARELY = 1e-3
 # Factor in RMS by which a residual of the right colour may exceed the noise, which is known to a few tenths,
 # and standard deviations of its scatter beyond that.
 _LOUDER, _SCATTER = 1.3, 4.0
+# Part of a count that a joint must move in a sample, so that rounding is white.
+_ROUNDS_WHITE = 0.3
 # Parts of the high band of the logged force that may be noise of its reading. In a loop the rest is the
 # controller's answer to the encoder's noise, which really acts.
 _SHARES = (1.0, 0.3, 0.1, 0.03, 0.0)
@@ -56,6 +60,7 @@ class Residual:
         systematic: RMS of the part at low frequencies that is not noise [N or N m].
         numerics: RMS that errors of filtering and integration may have [N or N m].
         reason: Reason why `complete` is None; empty if it is not.
+        quantity: Quantity of the residual, "force" or "position"; its unit is that of rms and floor.
     """
 
     log: str
@@ -68,6 +73,7 @@ class Residual:
     systematic: float = 0.0
     numerics: float = 0.0
     reason: str = ""
+    quantity: str = "force"
 
     @property
     def coloured(self) -> bool:
@@ -150,6 +156,51 @@ def _of_rows(machine: Machine, run: OpenedLog, gap: ForceGap, joint: int, *, fit
         return Residual(run.name, joint, None, rms, floor, reason="the table has no rows to spare")
     fits = bool(scipy.stats.chi2.sf(np.sum(z**2), freedom) > _RARELY)
     return Residual(run.name, joint, fits, rms, floor)
+
+
+def position_residuals(
+    machine: Machine, run: OpenedLog, gap: SimulationGap | None, *, fitted: bool = True
+) -> list[Residual]:
+    """Compare the position that a simulated loop leaves of a log without a force with the encoder's noise.
+
+    Rounding to a count is white only while the joint moves by a good part of a count in a sample. Slower
+    samples do not count.
+
+    Args:
+        machine: The fitted machine.
+        run: The log.
+        gap: Its gap in simulation; None: the simulation diverges.
+        fitted: Whether the machine was fitted to this log.
+    """
+    joints = np.flatnonzero(run.log.measured).tolist()
+    floor = position_noise(machine, run.log)
+    if gap is None:
+        return [
+            Residual(run.name, k, False, np.nan, float(floor[k]), excess=1.0, quantity="position")
+            for k in joints
+        ]
+    least = _EXCESS if fitted else _EXCESS_ELSEWHERE
+    out = []
+    for k in joints:
+        rms = float(gap.rms[k])
+        e = (run.log.position - gap.position)[:, k]
+        step = position_levels(run.log.position[:, k])[1]
+        moving = np.abs(run.data.qd[:, k]) >= _ROUNDS_WHITE * step * run.log.rate_hz
+        excess, count, power = cumulated_excess(e[moving] / max(float(floor[k]), 1e-300))
+        found = Residual(
+            log=run.name,
+            joint=k,
+            complete=True,
+            rms=rms,
+            floor=float(floor[k]),
+            excess=excess,
+            limit=max(least, float(np.sqrt(-0.5 * np.log(_RARELY) / max(count, 1)))),
+            systematic=rms,
+            quantity="position",
+        )
+        loud = power > _LOUDER**2 + _SCATTER / np.sqrt(max(count, 1))
+        out.append(_decided(found, count, loud=loud, stated=True))
+    return out
 
 
 def _decided(found: Residual, count: int, *, loud: bool, stated: bool) -> Residual:

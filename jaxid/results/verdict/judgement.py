@@ -9,9 +9,10 @@ import numpy as np
 
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap
+from jaxid.machine import Machine
 from jaxid.results.report.numbers import percent, plain, scaled_unit
 from jaxid.results.verdict.absurd import Remark, remarks_on, undetermined
-from jaxid.results.verdict.completeness import Residual, residuals_of
+from jaxid.results.verdict.completeness import Residual, position_residuals, residuals_of
 from jaxid.session import OpenedLog, Session
 
 # A force residual of this part of the measured force, or a distance of the simulated position of this part of
@@ -62,7 +63,7 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
     residuals = tuple(
         found
         for k, (run, gap) in enumerate(zip(session.runs, gaps, strict=True))
-        for found in residuals_of(run.machine(estimate.machine), run, gap.force, fitted=k == 0)
+        for found in _residuals(run.machine(estimate.machine), run, gap, fitted=k == 0)
     )
     complete = _complete(residuals)
     if search == "nothing_missing" and complete is False:
@@ -97,6 +98,13 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
     drifted = _drifted(session, gaps)
     findings += drifted
     return Judgement(complete, not against, identified, tuple(findings), bool(drifted), residuals)
+
+
+def _residuals(machine: Machine, run: OpenedLog, gap: Gap, *, fitted: bool) -> list[Residual]:
+    """Compare what a model leaves of a log with the noise: of the force, or of the position of a loop."""
+    if machine.unforced(run.log):
+        return position_residuals(machine, run, gap.simulation, fitted=fitted)
+    return residuals_of(machine, run, gap.force, fitted=fitted)
 
 
 def _complete(residuals: Sequence[Residual]) -> bool | None:
@@ -211,14 +219,15 @@ def _severity(r: Residual) -> float:
 
 def _residual_words(session: Session, r: Residual) -> str:
     """Return in words how a residual differs from noise."""
-    scale, unit = scaled_unit(session.machine.unit("force", r.joint), [r.rms, r.floor])
+    scale, unit = scaled_unit(session.machine.unit(r.quantity, r.joint), [r.rms, r.floor])
+    gap = "force gap" if r.quantity == "force" else "gap of the simulated position"
     where = _place(session, r.log, r.joint)
     ratio = r.rms / r.floor if np.isfinite(r.floor) and r.floor > 0 else np.nan
     sizes = f"{plain(r.rms / scale)} {unit}"
     if np.isfinite(ratio) and ratio > _CLEARLY:
         noise = f"{plain(r.floor / scale)} {unit} that the sensors' noise leaves"
-        return f"the force gap of {sizes}{where} is {plain(ratio, 2)} times the {noise}"
-    return f"the force gap of {sizes}{where} follows the motion, which noise does not"
+        return f"the {gap} of {sizes}{where} is {plain(ratio, 2)} times the {noise}"
+    return f"the {gap} of {sizes}{where} follows the motion, which noise does not"
 
 
 def _remark_words(remarks: Sequence[Remark]) -> list[str]:

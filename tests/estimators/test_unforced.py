@@ -1,0 +1,115 @@
+"""Loops whose force was not logged: command and encoder of the exact stepper are enough."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.errors import InputError
+from truth.axis.machines import Setup, moves, multisine
+from truth.axis.stepper import Loop, Machine, Sensor
+
+RATE, SECONDS, DELAY = 1000.0, 6.0, 0.02
+TIME = np.arange(round(RATE * SECONDS)) / RATE
+FRICTION = {"viscous_friction": {"coefficient": 4e-3}, "coulomb_friction": {"level": 0.03}}
+TRUE = {
+    "inertia": 2e-3,
+    "viscous_friction.coefficient": 4e-3,
+    "coulomb_friction.level": 0.03,
+    "controller.kd": 0.05,
+    "controller.delay": DELAY,
+}
+CASE = """
+[plant]
+kind = "axis"
+motion = "rotary"
+[plant.parameters]
+inertia = { guess = 5e-3 }
+[[effects]]
+kind = "viscous_friction"
+coefficient = { guess = 1e-3 }
+[[effects]]
+kind = "coulomb_friction"
+level = { guess = 0.1 }
+[controller]
+kind = "pd"
+kp = 2.0
+kd = { guess = 0.02 }
+delay = { guess = 0.005 }
+period = 0.001
+[log]
+time = "t"
+position = "q"
+reference = "r"
+"""
+FREE = CASE.replace("kp = 2.0", "kp = { guess = 0.5 }")
+
+
+def log(seed: int = 0, **more: dict) -> dict[str, np.ndarray]:
+    """A servo of 4096 counts, without its force."""
+    asked = moves(TIME, [0.0, 0.6, -0.4, 0.9], [2.0, 4.0, 1.0, 3.0], 40.0, rest=0.2)
+    asked += multisine(TIME, [0.7, 1.9, 3.1], 0.15, seed)
+    ticks = round(DELAY * RATE)
+    reached = np.concatenate([np.full(ticks, asked[0]), asked])[: TIME.size]
+    loop = Loop(kind="pd", kp=2.0, kd=0.05, limit=np.inf, reference=reached)
+    sensor = Sensor(position_resolution=2 * np.pi / 4096, position_noise=2e-4)
+    machine = Machine(inertia=2e-3, effects={**FRICTION, **more})
+    run = Setup(machine, loop, sensor, RATE, SECONDS, seed).run()
+    return {"t": run["t"], "q": run["position"], "r": asked}
+
+
+def identify(case: str, log: dict[str, np.ndarray]) -> jaxid.Identification:
+    return jaxid.identify(tomllib.loads(case), log)
+
+
+def test_a_known_gain_gives_all_values_from_guesses_four_times_off():
+    result = identify(CASE, log())
+    assert result.estimate.converged
+    assert result.model_complete is True
+    for name, true in TRUE.items():
+        found = result.parameters[name]
+        assert abs(found.value - true) < 4 * found.std, name
+        assert found.std < 0.05 * true, name
+
+
+def test_without_anything_known_the_ratios_stand_and_no_absolute_value(tmp_path):
+    result = identify(FREE, log())
+    result.save(tmp_path)
+    content = json.loads((tmp_path / "result.json").read_text())
+    grouped = ["inertia", "viscous_friction.coefficient", "coulomb_friction.level"]
+    grouped += ["controller.kp", "controller.kd"]
+    assert all(content["parameters"][name]["value"] is None for name in grouped)
+    assert [set(c["combination"]) for c in content["unidentifiable"]] == [set(grouped)]
+    assert content["relative"]["to"] == "inertia"
+    for name in grouped[1:]:
+        true = {**TRUE, "controller.kp": 2.0}[name] / TRUE["inertia"]
+        of = content["relative"]["values"][name]
+        assert abs(of["value"] - true) < 4 * of["std"], name
+        assert of["std"] < 0.05 * true, name
+    assert content["gap"]["fit"] is None
+    assert content["gap"]["noise_floor"] is None
+    assert content["gap"]["simulation"]["fit"] < 6e-4
+    assert "may all be multiplied by one factor" in " ".join(content["notes"])
+
+
+def test_a_missing_ripple_makes_the_model_incomplete():
+    ripple = {"cogging": {"amplitude": 0.02, "period": 2 * np.pi / 12, "phase": 0.3}}
+    result = identify(CASE, log(**ripple))
+    assert result.model_complete is False
+    assert "gap of the simulated position" in result.findings[0]
+
+
+def test_a_loop_without_a_reference_is_refused():
+    given = log()
+    given.pop("r")
+    with pytest.raises(InputError, match="so is the reference that"):
+        identify(CASE.replace('reference = "r"\n', ""), given)
+
+
+@pytest.mark.parametrize("method", ["inverse_dynamics", "prediction_error", "didim"])
+def test_a_method_of_forces_is_refused(method):
+    known = CASE.replace("{ guess = 0.02 }", "0.05").replace("{ guess = 0.005 }", "0.02")
+    with pytest.raises(InputError, match="has no force"):
+        jaxid.identify(tomllib.loads(known), log(), method=method)
