@@ -160,7 +160,7 @@ def coarse_starts(
     moved = np.array([f.sign != "free" for f in unknown.free]) & ((guess > 0) | delays)
     if not moved.any():
         return [guess]
-    sampler = scipy.stats.qmc.Sobol(int(moved.sum()), seed=0)
+    sampler = scipy.stats.qmc.Sobol(int(moved.sum()), scramble=False)
     draws = sampler.random(_POINTS)
     points = np.tile(guess, (_POINTS, 1))
     points[:, moved] = guess[moved] * _SPREAD ** (2 * draws - 1)
