@@ -24,7 +24,7 @@ from jaxid.logs.in_memory import LogLike
 from jaxid.names import METHODS, OUTPUTS, SOLVERS, USER_METHODS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.results.result import FitResult
-from jaxid.session import Session, open_session
+from jaxid.session import Logs, Session, open_session
 
 
 @dataclass(frozen=True, repr=False)
@@ -72,7 +72,7 @@ class Identification(FitResult):
 @named_faults()
 def identify(
     case: CaseLike,
-    log: LogLike,
+    log: Logs = None,
     *,
     method: str | None = None,
     solver: str | None = None,
@@ -83,11 +83,12 @@ def identify(
     validate: Sequence[LogLike] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
-    """Identify the unknowns of a case from a log.
+    """Identify the unknowns of a case from a log, or from several together.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict); or a
+            list of several. They are fitted with the logs of [[fit]]; None: those alone.
         method: One of `jaxid.names.METHODS`, or a registered one; None: chosen from case and log, with the
             reason in `result.json` under `settings`.
         solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between
@@ -197,7 +198,7 @@ def identify_many(
 def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[Estimate]:
     """Fit by a method; beside inverse dynamics, test whether noise in a known loop biases it."""
     estimate = yield from steps_of(method, session, **options)
-    if method != "inverse_dynamics":
+    if method != "inverse_dynamics" or session.more:
         return estimate
     return (yield from with_loop_noise(session, estimate))
 

@@ -216,7 +216,8 @@ def read_log(
     names = _names(table)
     _check_distinct(names)
     wanted = [name for group in names.values() for name in group]
-    content = read_table(path, wanted, table.rows, table) if read is None else read(path, wanted, table.rows)
+    stretch = one_stretch(table, str(path))
+    content = read_table(path, wanted, stretch, table) if read is None else read(path, wanted, stretch)
     content = content if isinstance(content, Table) else Table(*content)
     data, rows = content.columns, content.rows
     _check_finite(data, rows[0], path, content.sparse if table.resample is None else set(data) - {table.time})
@@ -246,6 +247,21 @@ def read_log(
         table=table,
         **groups,
     )
+
+
+def one_stretch(table: LogTable, where: str) -> Rows | None:
+    """Return the rows of a log that is read as one; None: all.
+
+    Raises:
+        InputError: If the table names several stretches.
+    """
+    if table.rows is None:
+        return None
+    first, end = table.rows[0], table.rows[-1]
+    if isinstance(first, tuple) or isinstance(end, tuple):
+        hint = "several are fitted together by jaxid.identify; name one here"
+        raise InputError(f"rows names {len(table.rows)} stretches", where=where, hint=hint)
+    return first, end
 
 
 def _too_short(samples: int, path: Path) -> InputError:

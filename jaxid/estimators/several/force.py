@@ -1,0 +1,114 @@
+"""Least squares on the filtered balances of several logs: inverse dynamics with one set of unknowns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxid.estimators.common.shapes import phase_starts, shape_starts
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.inverse_dynamics import linear_scale
+from jaxid.estimators.several.descent import Descent, Model, descent_steps
+from jaxid.estimators.several.parts import Part, Scale, by_log, parts_of
+from jaxid.estimators.several.weights import start_weights, weighted_steps
+from jaxid.numerics.lanes import SolveRequest, Steps
+from jaxid.numerics.misspecified import std_under_misspecification
+from jaxid.numerics.precision import Rows, assess_together
+from jaxid.session import Session
+from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
+
+# Part of the cost by which a fit has converged, and most evaluations, as of the fit to one log.
+_TOLERANCE, _MOST = 1e-12, 60
+
+
+def inverse_dynamics_steps(session: Session) -> Steps[Estimate]:
+    """Fit the unknowns to several logs by least squares on the balance of forces, as `inverse_dynamics`."""
+    machine, parts = session.machine, parts_of(session)
+    whole = all(all(part.run.data.measured) for part in parts)
+    transform, damping = linear_scale(machine, whole)
+    scale, p = Scale.of(machine, transform), len(machine.parameters.free)
+    data = [ForceData.of(part.run.data, part.run.data.fitted) for part in parts]
+    plants = [sharpened(part.machine.plant, part.run.data) for part in parts]
+    counts = [part.run.data.fitted for part in parts]
+    signals = []
+    for plant, arrays in zip(plants, data, strict=True):
+        signals.append(float((yield SolveRequest(force_size, (plant, arrays)))))
+
+    def fit(x: np.ndarray, weights: np.ndarray) -> Steps[Descent]:
+        def evaluate(x: np.ndarray) -> Steps[Model]:
+            theta, _ = scale.outward(x)
+            logs = []
+            for part, plant, arrays, signal, weight, own in zip(
+                parts, plants, data, signals, weights, counts, strict=True
+            ):
+                places = part.machine.parameters.places
+                arguments = (plant, places, arrays, theta[part.index])
+                e, columns = yield SolveRequest(force_and_columns, arguments)
+                e = np.where(own, np.asarray(e), 0.0)
+                columns = np.where(own[..., None], np.asarray(columns), 0.0)
+                logs.append(Rows(part.widened(columns, p), e, own, signal, float(weight)))
+            return summed(logs, scale.slope(theta))
+
+        options = {"tolerance": (_TOLERANCE, 0.0), "max_steps": _MOST, "damping": damping}
+        return (yield from descent_steps(evaluate, x, scale.bounds, **options))
+
+    first = start_weights(signals, [int(c.sum()) for c in counts])
+    theta = machine.parameters.guess
+    starts = [theta, *phase_starts(machine, theta), *shape_starts(machine, theta)]
+    ends = []
+    for at in starts:
+        ends.append((yield from fit(scale.inward(at), first)))
+    best = min(ends, key=lambda end: np.nan_to_num(end.model.cost, nan=np.inf))
+    found, _ = yield from weighted_steps(fit, lambda end: end.model.content, best.x, first)
+    return _estimate(session, parts, scale, found)
+
+
+def summed(logs: list[Rows], slope: np.ndarray) -> Model:
+    """Return half the weighted sum of squares of some logs, and its model on the scale of the solver.
+
+    Args:
+        logs: Residuals and Jacobians by the physical values; both are zero at samples that do not count.
+        slope: Derivative of the physical values by those of the solver.
+    """
+    cost, q = 0.0, slope.size
+    gradient, normal = np.zeros(q), np.zeros((q, q))
+    for log in logs:
+        e, columns = log.residual.ravel(), log.jacobian.reshape(-1, q) * slope
+        cost += 0.5 * log.weight * float(e @ e)
+        gradient += log.weight * (columns.T @ e)
+        normal += log.weight * (columns.T @ columns)
+    return Model(cost, gradient, normal, logs)
+
+
+def stacked(logs: list[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Jacobian, residual and mask of all logs, one behind the other, over the root of their noise."""
+    roots = [np.sqrt(log.weight) for log in logs]
+    jacobian = np.concatenate([r * log.jacobian for r, log in zip(roots, logs, strict=True)])
+    residual = np.concatenate([r * log.residual for r, log in zip(roots, logs, strict=True)])
+    return jacobian, residual, np.concatenate([log.counts for log in logs])
+
+
+def _estimate(session: Session, parts: list[Part], scale: Scale, found: Descent) -> Estimate:
+    machine, logs = session.machine, found.model.content
+    theta, guess = scale.outward(found.x)[0], machine.parameters.guess
+    natural = np.where(guess != 0, guess, 1.0)
+    precision = assess_together(machine.parameters.names, logs, natural)
+    converged = found.converged and bool(np.all(np.isfinite(theta)))
+    residual = [np.where(log.counts, log.residual, np.nan) for log in logs]
+    return Estimate(
+        method="inverse_dynamics",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=converged,
+        message="converged" if converged else f"no convergence within {found.steps} steps",
+        residual=np.concatenate(residual),
+        samples=sum(int(log.counts.sum()) for log in logs),
+        steps=found.steps,
+        details=by_log(parts, shares(logs)),
+        std_misspecified=std_under_misspecification(*stacked(logs)),
+    )
+
+
+def shares(logs: list[Rows]) -> list[dict[str, float | int]]:
+    """Return for each log its samples, and the standard deviation of white noise that informs as much."""
+    return [{"samples": int(log.counts.sum()), "noise": float(log.weight**-0.5)} for log in logs]
