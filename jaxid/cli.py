@@ -133,7 +133,7 @@ def _logs(parser: argparse.ArgumentParser) -> None:
         "log",
         metavar="LOG",
         nargs="*",
-        help="the log, or several that are fitted together; with the logs of [[fit]], and absent: those alone",
+        help="the log, or several that are fitted together; absent: those of [[fit]]",
     )
     parser.add_argument("-o", metavar="DIR", help="folder for the results; default: only print them")
 

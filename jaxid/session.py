@@ -113,9 +113,15 @@ class Session:
         """The fitted logs."""
         return (self.fit, *self.more)
 
-    def of_log(self, run: OpenedLog) -> Session:
-        """Return the session of one fitted log alone, with the values and the unknowns that hold in it."""
-        return replace(self, machine=run.machine(self.machine), fit=run, more=())
+    def need_one_log(self, what: str) -> None:
+        """Refuse several fitted logs.
+
+        Raises:
+            InputError: If there are several; the message names `what`.
+        """
+        if self.more:
+            hint = "name one log, and the others by validate"
+            raise InputError(f"{what} takes one log, not {len(self.fits)}", where=self.case.where, hint=hint)
 
     def with_machine(self, machine: Machine) -> Session:
         """Return the session with another machine."""
@@ -401,7 +407,9 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
     _check(at_joints(case), measured, machine, held)
     needed = 0 if held else enough(machine)
     name = Path(measured.source).stem
-    run = _run(name, measured, machine, session.recipe, needed, machine.disturbance)
+    own = OwnValues(name) if session.more else None
+    at = machine if own is None else own.machine(machine)
+    run = replace(_run(name, measured, at, session.recipe, needed, machine.disturbance), own=own)
     run = replace(run, data=replace(run.data, force_noise=session.fit.data.force_noise))
     return run if run.log.hold == machine.hold else _under(machine.hold, run, machine)
 

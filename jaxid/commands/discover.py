@@ -34,7 +34,7 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect
-from jaxid.session import Session, open_session
+from jaxid.session import Logs, Session, open_session
 from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.sensor_noise import force_noise
 from jaxid.simulation.solvers import SOLVERS
@@ -52,7 +52,7 @@ _BARRED = 3
 @named_faults()
 def discover(
     case: CaseLike,
-    log: LogLike,
+    log: Logs = None,
     *,
     validate: Sequence[LogLike] = (),
     max_effects: int = 5,
@@ -82,6 +82,7 @@ def discover(
         raise InputError(f"solver {solver!r} is not known", hint=suggest(solver, SOLVERS))
     minimiser_of(minimiser)
     session = open_session(case, log, validate, align_hold=True, method="discover")
+    session.need_one_log("discover")
     session = replace(session, case=_with_numerics(session.case, solver, minimiser))
     return explore(session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress)
 

@@ -76,7 +76,8 @@ def _output_error(
 
         need_no_profile(session, precision["profile"])
         kinds = {"start": start, "solver": solver, "minimiser": minimiser, "on": on}
-        return (yield from together(session, **kinds, hessian=precision["hessian"]))
+        result = yield from together(session, **kinds, hessian=precision["hessian"])
+        return replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
     if solver is not None and numerics is None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, log, solver=solver)

@@ -289,7 +289,7 @@ def _estimate(fit: _Fit, found: Descent, theta: np.ndarray, steps: int) -> Estim
         method="prediction_error",
         machine=machine.with_estimate(theta),
         theta=theta,
-        precision=plain.widened(widening(plain, jacobian, z, counts)),
+        precision=plain.widened(widening(plain, jacobian, z, counts, [len(log.residual) for log in logs])),
         converged=converged,
         message="converged" if converged else f"no convergence within {steps} steps",
         residual=np.where(counts, z, np.nan),
