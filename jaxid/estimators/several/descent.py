@@ -103,7 +103,8 @@ def descent_steps(
         new, steps = (yield from evaluate(trial)), steps + 1
         if new.finite and new.cost < best.cost:
             fall = best.cost - new.cost
-            ratio = fall / max(predicted, 1e-300)
+            # Beside a bound the prediction may be far too small.
+            ratio = min(fall / max(predicted, 1e-300), 2.0)
             damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
             x, best = trial, new
             if fall <= enough and 0 < predicted <= enough:
