@@ -432,6 +432,37 @@ def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None
     return Session(case, _scaled(machine, run.data), run, (), recipe, ())
 
 
+def session_around_several(
+    case: Case,
+    machine: Machine,
+    logs: Sequence[tuple[str, OwnValues | None, Log]],
+    recipe: Recipe | None = None,
+) -> Session:
+    """Open a session on simulated logs that are fitted together; no file checks are needed.
+
+    Args:
+        case: The case.
+        machine: Machine at the start of a fit, with the unknowns of all logs.
+        logs: Name of each log, the values that hold in it, and the log.
+        recipe: Filtering of the logs; None: chosen from the first.
+
+    Raises:
+        InputError: If a log is too short, or moves too little.
+    """
+    recipe = recipe or choose_recipe(logs[0][2], case.preprocess)
+    disturbances = {entry.name: entry.disturbance for entry in case.fits}
+    runs = []
+    for name, own, log in logs:
+        at = machine if own is None else own.machine(machine)
+        needed = 0 if case.fits_within_prior(None) else enough(at)
+        disturbance = disturbances.get(name, machine.disturbance)
+        runs.append(replace(_run(name, log, at, recipe, needed, disturbance), own=own))
+    own = logs[0][1]
+    if len(runs) == 1 and own is not None:
+        machine = own.machine(machine)
+    return Session(case, _scaled(machine, runs[0].data), runs[0], (), recipe, (), more=tuple(runs[1:]))
+
+
 def _read(case: Case, log: LogLike, *, columns: LogTable | None = None, whole: bool = False) -> Log:
     """Return a log, or read it from a file; its forces and positions are those of the joints.
 

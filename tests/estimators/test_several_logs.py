@@ -19,7 +19,7 @@ METHODS = ("inverse_dynamics", "output_error", "prediction_error")
 
 
 def case_of(method: str, **options) -> dict:
-    """Return a case in which the noise of a log is that of its readings alone, as the method takes it."""
+    """Return the case as a method takes it: output error with the loop, the others without."""
     return tomllib.loads(axis_case(closed=method == "output_error", **options))
 
 
@@ -60,8 +60,9 @@ def test_a_log_counts_by_its_information(method):
 def test_a_payload_known_in_one_log_separates_the_gain(method, tmp_path):
     case = case_of(method, gain_unknown=True)
     case["fit"] = [{"name": "empty"}, {"log": "loaded.csv", "set": {"added_mass.mass": LOADED}}]
-    write_log(tmp_path / "loaded.csv", axis_setup(8, added=LOADED))
-    empty = axis_log(7)
+    # Noise in the loop biases output error by its square: -0.17 kg at ten times this noise.
+    write_log(tmp_path / "loaded.csv", axis_setup(8, added=LOADED, noise=0.1))
+    empty = axis_log(7, noise=0.1)
 
     alone = jaxid.identify({k: v for k, v in case.items() if k != "fit"}, empty, method=method).estimate
     case["fit"][1]["log"] = str(tmp_path / "loaded.csv")
@@ -119,9 +120,8 @@ def test_two_halves_of_a_log_inform_as_much_as_the_whole(tmp_path):
     case["log"]["rows"] = [[0, 2000], [2000, 4000]]
     halves = jaxid.identify(case, tmp_path / "log.csv", method="inverse_dynamics")
 
-    assert [run.name for run in halves.session.fits] == ["log, rows 0 to 2000", "log, rows 2000 to 4000"] or [
-        run.name for run in halves.session.fits
-    ] == ["fit, rows 0 to 2000", "fit, rows 2000 to 4000"]
+    names = [run.name for run in halves.session.fits]
+    assert names == ["fit, rows 0 to 2000", "fit, rows 2000 to 4000"]
     assert halves.estimate.std == pytest.approx(whole.estimate.std, rel=0.15)
     assert np.all(np.abs(halves.estimate.theta - TRUE) < 4 * halves.estimate.std)
 
