@@ -135,6 +135,7 @@ def open_session(
     *,
     align_hold: bool | None = None,
     method: str | None = None,
+    piecewise: bool = False,
 ) -> Session:
     """Open a case and its logs, check them and prepare them.
 
@@ -146,6 +147,8 @@ def open_session(
         align_hold: See `jaxid.logs.prepare.Recipe`; None: as the case's recipe implies.
         method: Method that will fit the log, or "discover": a fit within a prior can do with a short log.
             None: within the prior, if the case has one.
+        piecewise: Whether all stretches of a log with gaps are fitted, as logs of their own; if not, its
+            longest one is.
 
     Raises:
         InputError: If anything in case or logs is unsound.
@@ -156,6 +159,9 @@ def open_session(
     case = at_joints(as_logged)
     first, *further = _sources(as_logged, log)
     fit = _read(as_logged, first.log, columns=first.columns)
+    if piecewise:
+        first, *between = _between_gaps(first, fit)
+        further = [*between, *further]
     # The machine of the first log serves them all: only the controller's period depends on the log.
     machine = build_machine(case, period=fit.period)
     several = bool(further or case.fits)
@@ -178,10 +184,22 @@ def open_session(
     opened = [_run(first.name, fit, at_fit, recipe, needed, first.disturbance)]
     opened[0] = replace(opened[0], reference_hold=first.reference_hold, own=first.own)
     more: list[OpenedLog] = []
-    for source in further:
-        measured = read(source.log, source.columns)
-        source = _with_values(case, machine, source, measured)
-        run, doubts = _opened(case, machine, source, measured, recipe, short)
+    waiting = list(further)
+    while waiting:
+        source = waiting.pop(0)
+        try:
+            measured = read(source.log, source.columns)
+            if piecewise and not source.found:
+                source, *between = _between_gaps(source, measured)
+                waiting = [*between, *waiting]
+            source = _with_values(case, machine, source, measured)
+            run, doubts = _opened(case, machine, source, measured, recipe, short)
+        except InputError as error:
+            if not source.found:
+                raise
+            what, hint = f"{source.name} is left out: {error}", "name other stretches in [log] rows"
+            findings.append(Finding("warning", what, case.where, hint))
+            continue
         more.append(run)
         findings += doubts
     names = {run.name for run in (*opened, *more)}
@@ -257,6 +275,7 @@ class _Source:
         reference_hold: Course of the reference that is stated for this log only.
         whole: Name of the log of which this is a piece.
         own: Values that hold in this log only; None: there are none.
+        found: Whether it is a stretch between gaps, which nobody named.
     """
 
     name: str
@@ -267,6 +286,7 @@ class _Source:
     reference_hold: str | None = None
     whole: str = ""
     own: OwnValues | None = None
+    found: bool = False
 
 
 def _sources(case: Case, log: Logs) -> list[_Source]:
@@ -347,6 +367,21 @@ def _pieces(name: str, columns: LogTable) -> list[tuple[str, LogTable]]:
     stretches: Any = columns.rows
     return [
         (f"{name}, rows {first} to {end}", replace(columns, rows=(first, end))) for first, end in stretches
+    ]
+
+
+def _between_gaps(source: _Source, log: Log) -> list[_Source]:
+    """Return the stretches of a log that gaps separate, the longest first; the log itself if it has none."""
+    if not log.others or log.table is None or isinstance(source.log, Log):
+        return [source]
+    return [
+        replace(
+            source,
+            name=f"{source.name}, rows {first} to {end}",
+            columns=replace(log.table, rows=(first, end)),
+            found=k > 0,
+        )
+        for k, (first, end) in enumerate([log.rows, *log.others])
     ]
 
 

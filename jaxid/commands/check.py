@@ -179,7 +179,7 @@ def check(case: CaseLike, log: Logs = None, *, validate: Sequence[LogLike] = ())
     Raises:
         InputError: If the case or the log is invalid.
     """
-    session = open_session(case, log, validate)
+    session = open_session(case, log, validate, piecewise=True)
     floor = noise_floor(session.machine, session.fit.log, session.fit.data)
     if session.more:
         return Check(session, _precision_together(session), floor)

@@ -21,7 +21,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.loop_noise import with_loop_noise
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
-from jaxid.names import METHODS, OUTPUTS, SOLVERS, USER_METHODS
+from jaxid.names import METHODS, OUTPUTS, SEVERAL_LOGS, SOLVERS, USER_METHODS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.results.result import FitResult
 from jaxid.session import Logs, Session, open_session
@@ -127,7 +127,8 @@ def identify(
         if method is not None:
             refuse_without_likelihood("profile", method)
         options["profile"] = (profile,) if isinstance(profile, str) else tuple(profile)
-    session = open_session(case, log, validate, method=method)
+    case = load_case(case)
+    session = open_session(case, log, validate, method=method, piecewise=_piecewise(case, method, options))
     need_names(options.get("profile", session.case.identification.profile), session.machine.parameters.names)
     if not session.machine.parameters.free:
         raise InputError(
@@ -201,6 +202,14 @@ def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[
     if method != "inverse_dynamics" or session.more:
         return estimate
     return (yield from with_loop_noise(session, estimate))
+
+
+def _piecewise(case: Case, method: str | None, options: Collection[str]) -> bool:
+    """Check that a fit can take the stretches of a log with gaps as several logs."""
+    demands = case.identification
+    single = demands.physically_consistent or demands.hessian or demands.profile or case.unknown_reference
+    apart = {"hessian", "profile", "minimiser"} & set(options)
+    return method in (None, *SEVERAL_LOGS) and not (single or apart or case.fits_within_prior(method))
 
 
 def _check_method(method: str) -> None:

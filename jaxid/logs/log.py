@@ -50,6 +50,7 @@ class Log:
         source: Origin of the log, for messages.
         assumed: Everything that was assumed to read it.
         table: The `[log]` table by which it was read; None: it was not read from a file.
+        others: Stretches of rows of the same file that gaps separate from this one, first and end.
     """
 
     time: Column
@@ -66,6 +67,7 @@ class Log:
     source: str = "log"
     assumed: tuple[Assumed, ...] = ()
     table: LogTable | None = None
+    others: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
         """Copy the arrays, make them read-only and check that they fit together.
@@ -235,7 +237,7 @@ def read_log(
         groups |= {"position": position} | ({} if reference is None else {"reference": reference})
     frame = Frame() if frame is None else frame
     groups, units = converted(groups, names, content.units, table, frame, str(path))
-    time, groups, rows, timing = _at_one_rate(groups, table, rows, path)
+    time, groups, rows, timing, others = _at_one_rate(groups, table, rows, path)
     if time.size < MINIMUM_SAMPLES:
         raise _too_short(time.size, path)
     return Log(
@@ -245,6 +247,7 @@ def read_log(
         source=str(path),
         assumed=(*content.assumed, *units, *timing),
         table=table,
+        others=others,
         **groups,
     )
 
@@ -271,11 +274,12 @@ def _too_short(samples: int, path: Path) -> InputError:
 
 def _at_one_rate(
     groups: dict[str, np.ndarray], table: LogTable, rows: Rows, path: Path
-) -> tuple[np.ndarray, dict[str, np.ndarray], Rows, list[Assumed]]:
+) -> tuple[np.ndarray, dict[str, np.ndarray], Rows, list[Assumed], tuple[Rows, ...]]:
     """Bring all columns to one rate.
 
     Returns:
-        Time, columns by quantity, rows of the file, and everything that was assumed.
+        Time, columns by quantity, rows of the file, everything that was assumed, and the rows of other
+        stretches between gaps.
     """
     column = groups.pop("time", None)
     where = str(path) if column is None else f"{path}, column '{table.time}'"
@@ -294,7 +298,7 @@ def _at_one_rate(
     plain = base.time.size == stamps.size
     used = groups if plain else {name: base.of_samples(values) for name, values in groups.items()}
     if whole and base.even and table.resample is None:
-        return base.time, used, kept, list(base.assumed)
+        return base.time, used, kept, list(base.assumed), base.others
 
     own = {name: readings_of(base.time, values, name, str(path)) for name, values in used.items()}
     time, made, said = resampled(
@@ -305,7 +309,7 @@ def _at_one_rate(
         held=table.hold == "zero_order",
         where=str(path),
     )
-    return time, made, kept, [*base.assumed, *_of_rare(own, base), *said]
+    return time, made, kept, [*base.assumed, *_of_rare(own, base), *said], base.others
 
 
 def _of_rare(own: Mapping[str, list[Readings]], base: TimeBase) -> list[Assumed]:

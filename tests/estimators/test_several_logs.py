@@ -126,6 +126,24 @@ def test_two_halves_of_a_log_inform_as_much_as_the_whole(tmp_path):
     assert np.all(np.abs(halves.estimate.theta - TRUE) < 4 * halves.estimate.std)
 
 
+def test_a_log_with_a_gap_is_used_on_both_sides(tmp_path):
+    path = write_log(tmp_path / "log.csv", axis_setup(3, seconds=4.0))
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], *lines[1:1601], *lines[2201:]]) + "\n")
+    case = case_of("inverse_dynamics")
+
+    both = jaxid.identify(case, path, method="inverse_dynamics")
+    longest = jaxid.identify(
+        case | {"log": case["log"] | {"rows": [1600, 3400]}}, path, method="inverse_dynamics"
+    )
+
+    assert [run.log.rows for run in both.session.fits] == [(1600, 3400), (0, 1600)]
+    assert np.all(both.estimate.std < 0.9 * longest.estimate.std)
+    assert np.all(np.abs(both.estimate.theta - TRUE) < 4 * both.estimate.std)
+    # A search takes the longest stretch.
+    assert len(open_session(case, path, method="discover").fits) == 1
+
+
 def test_pieces_of_one_log_share_its_own_values(tmp_path):
     write_log(tmp_path / "log.csv", axis_setup(3, seconds=4.0, offset=2.0))
     case = case_of("inverse_dynamics", offset=True)
