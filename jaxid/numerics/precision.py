@@ -319,22 +319,43 @@ class Rows:
         """2-norm of each column of the Jacobian over the samples that count, (p,)."""
         return np.sqrt(np.sum(np.where(self.counts[..., None], self.jacobian, 0.0) ** 2, axis=(0, 1)))
 
-    def equivalent_variance(self) -> float:
-        """Return the variance of the white residual that would inform as much as this one.
+    def of_one_fit(self) -> tuple[np.ndarray, int]:
+        """Return the residual that a fit of this log alone would leave, (time, n), and its fitted directions.
 
-        It is the mean over the directions that the log shows; of a log that shows none, the mean square.
+        It is that of one Gauss-Newton step. A log that the common fit explains badly would else count as
+        noisy, and be left out of it.
         """
-        squares = float(np.sum(np.where(self.counts, self.residual, 0.0) ** 2))
-        white = squares / max(int(self.counts.sum()), 1)
         size = self.size
         seen = size > 0
         if not seen.any():
+            return self.residual, 0
+        columns = self.jacobian[self.counts][:, seen] / size[seen]
+        values, vectors = np.linalg.eigh(columns.T @ columns)
+        clear = values > _CLEAR * values[-1]
+        basis = columns @ (vectors[:, clear] / np.sqrt(values[clear]))
+        e = self.residual[self.counts]
+        left = np.zeros_like(self.residual)
+        left[self.counts] = e - basis @ (basis.T @ e)
+        return left, int(clear.sum())
+
+    def equivalent_variance(self) -> float:
+        """Return the variance of the white residual that would inform as much as that of this log alone.
+
+        It is the mean over the directions that the log shows; of a log that shows none, the mean square.
+        """
+        left, fitted = self.of_one_fit()
+        count = int(self.counts.sum())
+        white = float(np.sum(np.where(self.counts, left, 0.0) ** 2)) / max(count - fitted, 1)
+        if not fitted:
             return white
-        normal, meat = self.matrices(np.where(seen, size, 1.0))
+        size = self.size
+        own = replace(self, residual=left)
+        normal, meat = own.matrices(np.where(size > 0, size, 1.0))
         values, vectors = np.linalg.eigh(normal)
         clear = values > _CLEAR * values[-1]
         spread = np.einsum("ik,ij,jk->k", vectors, meat, vectors)
-        return float(np.mean(np.maximum(spread[clear], 0.0) / values[clear]))
+        mean = float(np.mean(np.maximum(spread[clear], 0.0) / values[clear]))
+        return mean * count / max(count - fitted, 1)
 
 
 def assess_together(

@@ -9,7 +9,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import linear_scale
 from jaxid.estimators.several.descent import Descent, Model, descent_steps
 from jaxid.estimators.several.parts import Part, Scale, by_log, parts_of
-from jaxid.estimators.several.weights import start_weights, weighted_steps
+from jaxid.estimators.several.weights import disagreement, start_weights, weighted_steps
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Rows, assess_together
@@ -104,6 +104,7 @@ def _estimate(session: Session, parts: list[Part], scale: Scale, found: Descent)
         residual=np.concatenate(residual),
         samples=sum(int(log.counts.sum()) for log in logs),
         steps=found.steps,
+        notes=tuple(disagreement(logs, int(precision.identifiable.sum()))),
         details=by_log(parts, shares(logs)),
         std_misspecified=std_under_misspecification(*stacked(logs)),
     )

@@ -28,6 +28,7 @@ from jaxid.estimators.prediction_error import (
 from jaxid.estimators.several.descent import Descent, Model, descent_steps
 from jaxid.estimators.several.force import stacked
 from jaxid.estimators.several.parts import Part, by_log, parts_of
+from jaxid.estimators.several.weights import disagreement
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import FISHER, Rows, assess_together
@@ -280,6 +281,7 @@ def _estimate(fit: _Fit, found: Descent, theta: np.ndarray, steps: int) -> Estim
             "the innovations are not white (rounding, coloured noise or an incomplete model): the standard "
             "deviations are widened accordingly"
         )
+    notes += disagreement(logs, int(plain.identifiable.sum()))
     entries: list[dict[str, Any]] = [
         {"samples": int(log.counts.sum()), "noise": noise, "whiteness": {"lags": LAGS, "p": p}}
         for log, noise, p in zip(logs, noises, p_values, strict=True)

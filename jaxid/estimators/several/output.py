@@ -28,7 +28,7 @@ from jaxid.estimators.output_error import (
 from jaxid.estimators.several.descent import Descent, Model, descent_steps
 from jaxid.estimators.several.force import shares, stacked, summed
 from jaxid.estimators.several.parts import Part, Scale, by_log, parts_of
-from jaxid.estimators.several.weights import start_weights, weighted_steps
+from jaxid.estimators.several.weights import disagreement, start_weights, weighted_steps
 from jaxid.gap import SHORT
 from jaxid.model.plant import Plant
 from jaxid.numerics.lanes import SolveRequest, Steps
@@ -368,7 +368,7 @@ def _estimate(fit: _Fit, end: _End, on: str, hessian: bool) -> Steps[Estimate]:
         residual=np.concatenate([np.where(log.counts, log.residual, np.nan) for log in logs]),
         samples=sum(int(log.counts.sum()) for log in logs),
         steps=end.descent.steps,
-        notes=(*notes, *hessian_notes(precision, hessian)),
+        notes=(*notes, *hessian_notes(precision, hessian), *disagreement(moving, int(active.sum()))),
         details=by_log([o.part for o in fit.outputs], shares(logs))
         | kept_delay(first.part.machine, first.numerics),
         std_misspecified=std_under_misspecification(*stacked(moving))[:p],

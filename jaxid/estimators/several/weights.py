@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import scipy.stats
 from jaxtyping import Float
 
 from jaxid.estimators.several.descent import Descent
@@ -13,6 +14,8 @@ from jaxid.numerics.precision import Rows
 
 # Rounds of fit and weights, and the relative change of all weights at which they end.
 _ROUNDS, _SETTLED = 8, 0.02
+# Probability with which chance alone makes logs contradict each other.
+_CONTRARY = 1e-6
 # Least variance of a log's noise, as a part of the mean square of its signal: a log without noise would else
 # count alone, by its rounding.
 _LEAST = 1e-18
@@ -65,3 +68,33 @@ def weighted_steps(
         if settled:
             break
     return found, weights
+
+
+def disagreement(logs: Sequence[Rows], unknowns: int) -> list[str]:
+    """Return a note if no one set of unknowns explains all logs; empty if one does.
+
+    Each log's residual at the common fit is compared with that of a fit of its own. The difference over the
+    variance of its noise is distributed as chi-squared if the logs agree.
+
+    Args:
+        logs: Residuals at the common fit, (time, n) each, with their Jacobians.
+        unknowns: Number of directions that the common fit determines.
+
+    Source:
+        Chow (1960), Econometrica 28, 591-605, with a variance for each log.
+    """
+    total, freedom, worst = 0.0, -unknowns, 0
+    parts = []
+    for log in logs:
+        left, fitted = log.of_one_fit()
+        more = float(np.sum(np.where(log.counts, log.residual**2 - left**2, 0.0)))
+        parts.append(more / max(log.equivalent_variance(), 1e-300))
+        total, freedom = total + parts[-1], freedom + fitted
+    if freedom < 1 or scipy.stats.chi2.sf(total, freedom) > _CONTRARY:
+        return []
+    worst = int(np.argmax(parts)) + 1
+    return [
+        f"the logs contradict each other: no one set of values explains them all (chi-squared {total:.3g} "
+        f"with {freedom} degrees of freedom, most of it in log {worst} of {len(logs)}); state what differs "
+        "by set in [[fit]], or by per_log in [identification]"
+    ]
