@@ -257,6 +257,10 @@ def _didim(session: Session, *, numerics: Numerics | None = None) -> Steps[Estim
 
 
 def _power(session: Session) -> Steps[Estimate]:
+    if session.more:
+        from jaxid.estimators.several.force import power_steps as together
+
+        return together(session)
     from jaxid.estimators.power import power_steps
 
     session.fit.log.need_every_encoder("power")
@@ -264,6 +268,12 @@ def _power(session: Session) -> Steps[Estimate]:
 
 
 def _algebraic(session: Session) -> Steps[Estimate]:
+    if session.more:
+        from jaxid.estimators.several.force import algebraic_steps as together
+
+        if session.case.algebraic.window is not None:
+            session.need_one_log("[algebraic] window")
+        return together(session)
     from jaxid.estimators.algebraic.one_window import least_squares_steps
     from jaxid.estimators.algebraic.windows import algebraic_steps
 
