@@ -299,6 +299,7 @@ def _sources(case: Case, log: Logs) -> list[_Source]:
     if not logs and not case.fits:
         hint = "name a log, or add [[fit]] with log to the case"
         raise InputError("there is no log to fit", where=case.where, hint=hint)
+    _check_once([log for log in logs if isinstance(log, str | Path)])
     found: list[_Source] = []
     disturbance = None if case.controller is None else case.controller.disturbance
     alone = len(logs) == 1 and not case.fits
@@ -332,6 +333,15 @@ def _sources(case: Case, log: Logs) -> list[_Source]:
             replace(source, name=piece, whole=name, columns=None if whole else own) for piece, own in pieces
         ]
     return out
+
+
+def _check_once(files: Sequence[str | Path]) -> None:
+    """Refuse a log that is named twice: its information would count twice."""
+    known = [Path(file).resolve() for file in files]
+    for k, file in enumerate(known):
+        if file in known[:k]:
+            hint = "name each log once; stretches of one are rows = [[first, end], ...] in [log]"
+            raise InputError("is named twice", where=str(files[k]), hint=hint)
 
 
 def _names(entry: FitEntry, log: Any) -> bool:

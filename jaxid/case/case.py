@@ -525,6 +525,8 @@ def _fits(tables: Mapping[str, Any], root: Spot) -> tuple[FitEntry, ...]:
             raise spot.fault("has neither name nor log", "add log = <its file>, or name for the first LOG")
         log = root.folder / given["log"] if "log" in given else None
         name = given["name"] if log is None else given.get("name", log.stem)
+        if log is not None and "name" not in given and name in [entry.name for entry in out]:
+            name = f"{log.parent.name}/{name}"
         _check_name(name, out, spot)
         out.append(FitEntry(name, log, *_of_log(tables, table, given, spot, same_file=log is None)))
     return tuple(out)

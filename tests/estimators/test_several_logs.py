@@ -171,6 +171,22 @@ def test_entries_and_arguments_are_joined(tmp_path):
     assert names("b.csv", "a.csv") == ["second", "a", "c"]
 
 
+def test_a_log_named_twice_is_refused(tmp_path):
+    path = write_log(tmp_path / "a.csv", axis_setup(1))
+    with pytest.raises(InputError, match="is named twice; name each log once"):
+        jaxid.identify(case_of("inverse_dynamics"), [path, str(path)])
+
+
+def test_the_found_case_has_one_guess_for_an_unknown_of_each_log():
+    case = case_of("inverse_dynamics", offset=True) | {
+        "identification": {"per_log": ["constant_force.level"]}
+    }
+    logs = [axis_log(k, offset=offset) for k, offset in ((1, 4.0), (2, -3.0))]
+    result = jaxid.identify(case, logs, method="inverse_dynamics")
+    guess = result.case().effects[-1].parameters["level"][0].guess
+    assert guess == pytest.approx(np.mean(result.estimate.theta[-2:]), rel=1e-6)
+
+
 def test_a_controller_gain_that_differs_is_set(tmp_path):
     stiffer = axis_setup(2)
     stiffer = dataclasses.replace(stiffer, loop=dataclasses.replace(stiffer.loop, kp=240.0))
