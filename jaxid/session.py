@@ -232,6 +232,8 @@ def open_session(
             machine.disturbance,
         )
         opened.append(replace(run, own=own))
+    if first.own is not None and not more:
+        machine = first.own.machine(machine)
     machine = _scaled(machine, opened[0].data)
     for run in (opened[0], *more):
         need_finite_effects(run.machine(machine).plant, run.data, run.log.source)

@@ -116,7 +116,7 @@ def test_one_log_among_several_arguments_gives_the_result_of_one(logs):
 
 
 def test_two_stretches_inform_as_much_as_both_alone(tmp_path):
-    write_log(tmp_path / "log.csv", axis_setup(3, seconds=4.0))
+    write_log(tmp_path / "log.csv", axis_setup(3, seconds=8.0))
     case, method = case_of("inverse_dynamics"), "inverse_dynamics"
 
     def of_rows(rows: list):
@@ -124,9 +124,9 @@ def test_two_stretches_inform_as_much_as_both_alone(tmp_path):
             case | {"log": case["log"] | {"rows": rows}}, tmp_path / "log.csv", method=method
         )
 
-    both, first, second = (of_rows(r) for r in ([[0, 2000], [2000, 4000]], [0, 2000], [2000, 4000]))
+    both, first, second = (of_rows(r) for r in ([[0, 4000], [4000, 8000]], [0, 4000], [4000, 8000]))
     names = [run.name for run in both.session.fits]
-    assert names == ["fit, rows 0 to 2000", "fit, rows 2000 to 4000"]
+    assert names == ["fit, rows 0 to 4000", "fit, rows 4000 to 8000"]
     expected = 1 / np.sqrt(1 / first.estimate.std**2 + 1 / second.estimate.std**2)
     assert np.all(both.estimate.std < 1.1 * expected)
     assert np.all(np.abs(both.estimate.theta - TRUE) < 4 * both.estimate.std)
@@ -173,6 +173,13 @@ def test_entries_and_arguments_are_joined(tmp_path):
     assert names() == ["second", "c"]
     assert names("a.csv") == ["a", "second", "c"]
     assert names("b.csv", "a.csv") == ["second", "a", "c"]
+
+
+def test_one_log_with_an_entry_is_fitted_with_its_values():
+    case = case_of("inverse_dynamics") | {"fit": [{"name": "loaded", "set": {"added_mass.mass": LOADED}}]}
+    result = jaxid.identify(case, axis_log(8, added=LOADED), method="inverse_dynamics")
+    assert result.session.fit.name == "loaded"
+    assert np.all(np.abs(result.estimate.theta - TRUE) < 4 * result.estimate.std)
 
 
 def test_a_log_named_twice_is_refused(tmp_path):
