@@ -66,7 +66,8 @@ def test_each_run_simulates_every_entry_with_what_is_set_there():
         return {r["parameter"]: r for r in study.summary}
 
     one, two = rows(alone), rows(both)
-    assert all(r["identifiable"] == 0.0 for r in one.values())
+    # No noise is so small that one log determined the gain.
+    assert all(np.isnan(r["bound"]) for r in one.values())
     assert all(r["identifiable"] == 1.0 for r in two.values())
     # The spread over the runs is what the fits state.
     for r in two.values():
