@@ -12,7 +12,16 @@ from typing import NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
-from jaxid.names import LIKELIHOOD_METHODS, METHODS, MINIMISERS, OUTPUTS, SOLVERS, TARGETS, WHEN
+from jaxid.names import (
+    LIKELIHOOD_METHODS,
+    METHODS,
+    MINIMISERS,
+    OUTPUTS,
+    SEVERAL_LOGS,
+    SOLVERS,
+    TARGETS,
+    WHEN,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -142,8 +151,18 @@ def _design(commands: argparse._SubParsersAction) -> None:
 
 def _logs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("case", metavar="CASE.toml")
-    parser.add_argument("log", metavar="LOG")
+    parser.add_argument(
+        "log",
+        metavar="LOG",
+        nargs="*",
+        help="the log, or several that are fitted together; absent: those of [[fit]]",
+    )
     parser.add_argument("-o", metavar="DIR", help="folder for the results; default: only print them")
+
+
+def _given(args: argparse.Namespace) -> str | list[str] | None:
+    """Return the logs of a command: one, several, or none."""
+    return args.log[0] if len(args.log) == 1 else args.log or None
 
 
 def _validate(parser: argparse.ArgumentParser) -> None:
@@ -299,6 +318,7 @@ def _ready(args: argparse.Namespace, *files: str) -> None:
 def _run_methods(args: argparse.Namespace) -> int:
     width = max(len(name) for name in METHODS)
     print("\n".join(f"{name.ljust(width)}  {WHEN[name]}" for name in METHODS))
+    print(f"\nSeveral logs in one fit: {', '.join(SEVERAL_LOGS)}. The other methods fit one log.")
     return 0
 
 
@@ -370,7 +390,7 @@ def _run_check(args: argparse.Namespace) -> int:
         show("checking")
         from jaxid.commands.check import check
 
-        result = check(args.case, args.log)
+        result = check(args.case, _given(args))
     print(result)
     return _finish(args, result, "check.json")
 
@@ -388,7 +408,7 @@ def _run_identify(args: argparse.Namespace) -> int:
 
         result = identify(
             args.case,
-            args.log,
+            _given(args),
             method=args.method,
             solver=args.solver,
             minimiser=args.minimiser,
@@ -420,7 +440,7 @@ def _run_discover(args: argparse.Namespace) -> int:
 
         result = discover(
             args.case,
-            args.log,
+            _given(args),
             validate=args.validate,
             max_effects=args.max_effects,
             solver=args.solver,

@@ -39,6 +39,8 @@ WHEN = {
     "minimal_model": "a flexible joint of which only motor or load is measured",
     "minimal_model_printed": "`minimal_model` with the coefficients as published",
 }
+# Methods that fit several logs together.
+SEVERAL_LOGS = ("output_error", "prediction_error", "inverse_dynamics", "algebraic", "power")
 # Further entries of [study] estimators: the search, and the estimate of an adaptive controller.
 DISCOVER, IN_LOOP = "discover", "in_loop"
 # Methods that maximise a likelihood, so that it has a Hessian and profiles.

@@ -11,6 +11,7 @@ import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -495,8 +496,43 @@ def _rows(value: Any, spot: Spot) -> tuple[int, int]:
     return value[0], value[1]
 
 
-# First row and end: 0-based, half open.
-rows = Reader(_rows, list_of({"type": "integer", "minimum": 0}, 2, 2))
+def _stretches(value: Any, spot: Spot) -> tuple[int, int] | tuple[tuple[int, int], ...]:
+    if not (is_list(value) and value and all(is_list(v) for v in value)):
+        return _rows(value, spot)
+    pieces = tuple(_rows(v, spot.entry(k)) for k, v in enumerate(value, start=1))
+    if any(end > first for (_, end), (first, _) in pairwise(pieces)):
+        raise spot.refuse(value, "are not in their order, or overlap", "let each begin where one ended")
+    return pieces[0] if len(pieces) == 1 else pieces
+
+
+_STRETCH = list_of({"type": "integer", "minimum": 0}, 2, 2)
+# First row and end: 0-based, half open; or a list of such stretches.
+rows = Reader(_stretches, either(_STRETCH, list_of(_STRETCH)))
+
+
+def _numbers_by_name(value: Any, spot: Spot) -> dict[str, float | tuple[float, ...]]:
+    hint = f'name each parameter and give its value: {spot.key} = {{ "added_mass.mass" = 2.0 }}'
+    if not isinstance(value, Mapping):
+        raise spot.refuse(value, "is not an inline table", hint)
+    read, out = number(), {}
+    for name, given in value.items():
+        if isinstance(given, Mapping):
+            # Without quotes, TOML takes the point of a name for a table in a table.
+            nested = _numbers_by_name(given, spot.inside(str(name)))
+            out |= {f"{name}.{inner}": x for inner, x in nested.items()}
+        elif is_list(given):
+            out[str(name)] = tuple(read(x, spot.inside(f"{name}[{k}]")) for k, x in enumerate(given, start=1))
+        else:
+            out[str(name)] = read(given, spot.inside(str(name)))
+    return out
+
+
+_NUMBER_OR_LIST = either(number().schema, list_of(number().schema))
+# Values of parameters by their names in results; names may be nested tables.
+numbers_by_name = Reader(
+    _numbers_by_name,
+    {"type": "object", "additionalProperties": either(_NUMBER_OR_LIST, {"type": "object"})},
+)
 
 
 def table_of(cls: type) -> Reader:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxid.build import build_machine, drives_of_case, make_plant, motions_of
-from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.case.case import Case, CaseLike, FitEntry, load_case
 from jaxid.consistency.absent import check_absent
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
@@ -31,10 +32,17 @@ from jaxid.logs.units import Frame
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
+from jaxid.own_values import OwnValues, expanded, own_values
 from jaxid.references import make_reference
 from jaxid.settings import Actuator, Disturbance, LogTable
 from jaxid.simulation.finite_effects import need_finite_effects
 from jaxid.simulation.step_size import needed_steps
+
+# One log to fit, or several; None: those of the case.
+Logs = LogLike | Sequence[LogLike] | None
+# Chosen: a further log that would have a cut-off or rest velocity within this factor of those of the first
+# takes the recipe of the first, so that code compiled for one serves both.
+_ALIKE = 1.5
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,7 @@ class OpenedLog:
         disturbance: Signal that was added to the controller's command.
         reference_hold: Course of the reference between samples that is stated for this log only; None: that
             of the machine.
+        own: Values that hold in this log only; None: there are none.
     """
 
     name: str
@@ -55,26 +64,29 @@ class OpenedLog:
     data: Prepared
     disturbance: Disturbance | str | None
     reference_hold: str | None = None
+    own: OwnValues | None = None
 
     def machine(self, machine: Machine) -> Machine:
-        """Return a machine with the disturbance of this log, and the course of its reference."""
+        """Return a machine with the values, the disturbance and the course of the reference of this log."""
         hold = self.reference_hold or machine.reference_hold
-        return replace(machine, disturbance=self.disturbance, reference_hold=hold)
+        own = machine if self.own is None else self.own.machine(machine)
+        return replace(own, disturbance=self.disturbance, reference_hold=hold)
 
 
 @dataclass(frozen=True)
 class Session:
-    """A case, its machine at the guesses, the log to fit and the logs to validate on.
+    """A case, its machine at the guesses, the logs to fit and the logs to validate on.
 
     Args:
         case: The case.
-        machine: Its machine.
-        fit: The log to fit.
+        machine: Its machine; an unknown with a value in each log is one for each of them.
+        fit: The log to fit, or the first of several.
         validations: Further logs with their names, prepared by the same recipe.
         recipe: Filtering of all logs.
         findings: Warnings on the logs.
         given: The case as it was given, where `case` is that of the joints (see `at_joints`).
         settings: Choices made from the log, by name: `value` and `reason`.
+        more: Further logs that are fitted with the first one.
     """
 
     case: Case
@@ -85,6 +97,7 @@ class Session:
     findings: tuple[Finding, ...]
     given: Case | None = None
     settings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    more: tuple[OpenedLog, ...] = ()
 
     @property
     def declared(self) -> Case:
@@ -93,8 +106,23 @@ class Session:
 
     @property
     def runs(self) -> tuple[OpenedLog, ...]:
-        """All logs, the fitted one first."""
-        return (self.fit, *self.validations)
+        """All logs, the fitted ones first."""
+        return (self.fit, *self.more, *self.validations)
+
+    @property
+    def fits(self) -> tuple[OpenedLog, ...]:
+        """The fitted logs."""
+        return (self.fit, *self.more)
+
+    def need_one_log(self, what: str) -> None:
+        """Refuse several fitted logs.
+
+        Raises:
+            InputError: If there are several; the message names `what`.
+        """
+        if self.more:
+            hint = "name one log, and the others by validate"
+            raise InputError(f"{what} takes one log, not {len(self.fits)}", where=self.case.where, hint=hint)
 
     def with_machine(self, machine: Machine) -> Session:
         """Return the session with another machine."""
@@ -103,21 +131,25 @@ class Session:
 
 def open_session(
     case: CaseLike,
-    log: LogLike,
+    log: Logs = None,
     validate: Sequence[LogLike] = (),
     *,
     align_hold: bool | None = None,
     method: str | None = None,
+    piecewise: bool = False,
 ) -> Session:
     """Open a case and its logs, check them and prepare them.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log to fit, its file, or a table with the columns that [log] names.
+        log: The log to fit, its file, or a table with the columns that [log] names; or a list of several.
+            They are fitted with the logs of [[fit]]; None: those alone.
         validate: More logs to validate on, beside those of the case.
         align_hold: See `jaxid.logs.prepare.Recipe`; None: as the case's recipe implies.
         method: Method that will fit the log, or "discover": a fit within a prior can do with a short log.
             None: within the prior, if the case has one.
+        piecewise: Whether all stretches of a log with gaps are fitted, as logs of their own; if not, its
+            longest one is.
 
     Raises:
         InputError: If anything in case or logs is unsound.
@@ -128,48 +160,94 @@ def open_session(
     if as_logged.log is not None and as_logged.log.kind == "steady":
         from jaxid.steady import open_steady
 
-        return open_steady(as_logged, log, validate, _read)
+        return open_steady(as_logged, _one_table(as_logged, log), validate, _read)
     case = at_joints(as_logged)
-    fit = _read(as_logged, log)
+    first, *further = _sources(as_logged, log)
+    fit = _read(as_logged, first.log, columns=first.columns)
+    if piecewise:
+        first, *between = _between_gaps(first, fit)
+        further = [*between, *further]
     # The machine of the first log serves them all: only the controller's period depends on the log.
     machine = build_machine(case, period=fit.period)
+    several = bool(further or case.fits)
+    if several:
+        machine = _with_unknowns_by_log(case, machine, (first, *further))
+        first = _with_values(case, machine, first, fit)
 
     def read(log: LogLike, columns: LogTable | None = None, *, whole: bool = False) -> Log:
         return _followed(case, _read(as_logged, log, columns=columns, whole=whole), machine.plant)
 
     fit = _followed(case, fit, machine.plant)
     short = case.fits_within_prior(method)
-    findings = [*_left_out(case), *_check(case, fit, machine, short)]
+    at_fit = machine if first.own is None else first.own.machine(machine)
+    findings = [*_left_out(case), *_check(case, fit, at_fit, short)]
     recipe = choose_recipe(fit, case.preprocess)
     if align_hold is not None:
         recipe = replace(recipe, align_hold=align_hold)
-    disturbance = machine.disturbance
-    needed = 0 if short else enough(machine)
+    needed = 0 if short else enough(at_fit)
 
-    opened = [_run("fit", fit, machine, recipe, needed, disturbance)]
-    names = {"fit"}
+    opened = [_run(first.name, fit, at_fit, recipe, needed, first.disturbance)]
+    opened[0] = replace(opened[0], reference_hold=first.reference_hold, own=first.own)
+    more: list[OpenedLog] = []
+    waiting = list(further)
+    while waiting:
+        source = waiting.pop(0)
+        try:
+            measured = read(source.log, source.columns)
+            if piecewise and not source.found:
+                source, *between = _between_gaps(source, measured)
+                waiting = [*between, *waiting]
+            source = _with_values(case, machine, source, measured)
+            run, doubts = _opened(case, machine, source, measured, recipe, short)
+        except InputError as error:
+            if not source.found:
+                raise
+            what, hint = f"{source.name} is left out: {error}", "name other stretches in [log] rows"
+            findings.append(Finding("warning", what, case.where, hint))
+            continue
+        more.append(run)
+        findings += doubts
+    names = {run.name for run in (*opened, *more)}
     for entry in case.validations:
         other = fit if entry.log is None else entry.log
         source = other.source if isinstance(other, Log) else other
-        measured = read(source, entry.columns)
-        findings += _check(case, measured, machine, short)
-        run = _run(entry.name, measured, machine, recipe, needed, entry.disturbance)
-        opened.append(replace(run, reference_hold=entry.columns.reference_hold))
-        names.add(entry.name)
+        for name, columns in _pieces(entry.name, entry.columns):
+            measured = read(source, columns)
+            findings += _check(case, measured, machine, short)
+            own = None
+            if entry.known or several:
+                where = f"{case.where}, [[validation]] {entry.name}"
+                own = own_values(case, machine, entry.name, entry.known, measured.period, where)
+            at = machine if own is None else own.machine(machine)
+            run = _run(name, measured, at, recipe, needed, entry.disturbance)
+            opened.append(replace(run, reference_hold=entry.columns.reference_hold, own=own))
+            names.add(name)
     for extra in validate:
         measured = read(extra, whole=True)
         findings += _check(case, measured, machine, short)
-        name = Path(measured.source).stem
-        while name in names:
-            name += "'"
+        name = _unlike(Path(measured.source).stem, names)
         names.add(name)
-        opened.append(_run(name, measured, machine, recipe, needed, disturbance))
+        own = OwnValues(name) if several else None
+        run = _run(
+            name,
+            measured,
+            machine if own is None else own.machine(machine),
+            recipe,
+            needed,
+            machine.disturbance,
+        )
+        opened.append(replace(run, own=own))
+    if first.own is not None and not more:
+        machine = first.own.machine(machine)
     machine = _scaled(machine, opened[0].data)
-    need_finite_effects(machine.plant, opened[0].data, fit.source)
+    for run in (opened[0], *more):
+        need_finite_effects(run.machine(machine).plant, run.data, run.log.source)
     settings = {}
     if not short:
-        free_hold = not isinstance(log, Log) and "hold" not in case.tables.get("log", {})
-        held = _held_against(as_logged, machine, opened[0], free_hold)
+        free_hold = not isinstance(first.log, Log) and "hold" not in case.tables.get("log", {})
+        held = _held_against(
+            as_logged, opened[0].machine(machine) if several else machine, opened[0], free_hold
+        )
         findings += held.findings
         settings = held.settings
         machine = replace(machine, reference_hold=held.reference_hold)
@@ -177,9 +255,205 @@ def open_session(
             machine = replace(machine, hold=held.hold)
             own = [v["name"] for v in case.tables.get("validation", []) if "hold" in v]
             opened = [run if run.name in own else _under(held.hold, run, machine) for run in opened]
+            more = [_under(held.hold, run, machine) for run in more]
         # The other logs are of the same sensors.
         opened = [replace(run, data=replace(run.data, force_noise=held.force_noise)) for run in opened]
-    return Session(case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged, settings)
+        for k, run in enumerate(more):
+            # A further log to fit counts by its own noise.
+            also = _held_against(as_logged, run.machine(machine), run, False)
+            findings += also.findings
+            data = replace(run.data, force_noise=also.force_noise)
+            more[k] = replace(run, data=data, reference_hold=run.reference_hold or also.reference_hold)
+    return Session(
+        case, machine, opened[0], tuple(opened[1:]), recipe, tuple(findings), as_logged, settings, tuple(more)
+    )
+
+
+def _one_table(case: Case, log: Logs) -> LogLike:
+    """Return the only log of a command, for a case whose log is a table of steady speeds.
+
+    Raises:
+        InputError: If there are several, none, or the case has [[fit]].
+    """
+    logs: list[Any] = list(log) if isinstance(log, list | tuple) else [] if log is None else [log]
+    if len(logs) != 1 or case.fits:
+        hint = "put all speeds into one table"
+        raise InputError('kind = "steady" takes one table', where=f"{case.where}, [log]", hint=hint)
+    return logs[0]
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A log to fit, before it is read.
+
+    Args:
+        name: Name of the log in results.
+        log: The log, its file, or a table.
+        columns: Its columns, of one stretch; None: those of [log].
+        disturbance: Signal that was added to the controller's command.
+        entry: The entry of the case that it takes its values from; None: none.
+        reference_hold: Course of the reference that is stated for this log only.
+        whole: Name of the log of which this is a piece.
+        own: Values that hold in this log only; None: there are none.
+        found: Whether it is a stretch between gaps, which nobody named.
+    """
+
+    name: str
+    log: LogLike
+    columns: LogTable | None
+    disturbance: Disturbance | str | None
+    entry: FitEntry | None = None
+    reference_hold: str | None = None
+    whole: str = ""
+    own: OwnValues | None = None
+    found: bool = False
+
+
+def _sources(case: Case, log: Logs) -> list[_Source]:
+    """Return the logs to fit: those of a command, with the entries of [[fit]] that name them, and the others.
+
+    Raises:
+        InputError: If there is none, or an entry lacks its log.
+    """
+    logs: list[Any] = [] if log is None else list(log) if isinstance(log, list | tuple) else [log]
+    if not logs and not case.fits:
+        hint = "name a log, or add [[fit]] with log to the case"
+        raise InputError("there is no log to fit", where=case.where, hint=hint)
+    _check_once([log for log in logs if isinstance(log, str | Path)])
+    found: list[_Source] = []
+    disturbance = None if case.controller is None else case.controller.disturbance
+    alone = len(logs) == 1 and not case.fits
+    taken: set[str] = set()
+    for k, given in enumerate(logs):
+        entries = [e for e in case.fits if _names(e, given) or (k == 0 and e.log is None)]
+        taken |= {e.name for e in entries}
+        if entries:
+            found += [_of_entry(e, given) for e in entries]
+        else:
+            name = "fit" if alone else _name_of(given, k)
+            found.append(_Source(name, given, None, disturbance))
+    for entry in case.fits:
+        if entry.name in taken:
+            continue
+        if entry.log is None:
+            what, hint = "has no log, and none was named", "add log, or name a log for the command"
+            raise InputError(what, where=f"{case.where}, [[fit]] {entry.name}", hint=hint)
+        found.append(_of_entry(entry, entry.log))
+    named: set[str] = set()
+    out = []
+    for source in found:
+        name = _unlike(source.name, named, source.log)
+        named.add(name)
+        columns = source.columns
+        if columns is None and not isinstance(source.log, Log):
+            columns = case.columns
+        pieces = [(name, None)] if columns is None else _pieces(name, columns)
+        whole = len(pieces) == 1 and source.columns is None
+        out += [
+            replace(source, name=piece, whole=name, columns=None if whole else own) for piece, own in pieces
+        ]
+    return out
+
+
+def _check_once(files: Sequence[str | Path]) -> None:
+    """Refuse a log that is named twice: its information would count twice."""
+    known = [Path(file).resolve() for file in files]
+    for k, file in enumerate(known):
+        if file in known[:k]:
+            hint = "name each log once; stretches of one are rows = [[first, end], ...] in [log]"
+            raise InputError("is named twice", where=str(files[k]), hint=hint)
+
+
+def _names(entry: FitEntry, log: Any) -> bool:
+    """Check that a log of a command is the file of an entry."""
+    return entry.log is not None and isinstance(log, str | Path) and Path(log).name == entry.log.name
+
+
+def _of_entry(entry: FitEntry, log: LogLike) -> _Source:
+    hold = entry.columns.reference_hold
+    return _Source(entry.name, log, entry.columns, entry.disturbance, entry, hold)
+
+
+def _name_of(log: Any, number: int) -> str:
+    """Return the name of a log in results: that of its file, or its number."""
+    if isinstance(log, Log):
+        log = log.source
+    return Path(log).stem if isinstance(log, str | Path) else f"log {number + 1}"
+
+
+def _unlike(name: str, names: Collection[str], log: Any = None) -> str:
+    """Return a name that no other log has: with that of its folder, or with a mark."""
+    if name in names and isinstance(log, str | Path):
+        name = f"{Path(log).resolve().parent.name}/{name}"
+    while name in names:
+        name += "'"
+    return name
+
+
+def _pieces(name: str, columns: LogTable) -> list[tuple[str, LogTable]]:
+    """Return name and table of each stretch of rows of a log."""
+    if columns.rows is None or isinstance(columns.rows[0], int):
+        return [(name, columns)]
+    stretches: Any = columns.rows
+    return [
+        (f"{name}, rows {first} to {end}", replace(columns, rows=(first, end))) for first, end in stretches
+    ]
+
+
+def _between_gaps(source: _Source, log: Log) -> list[_Source]:
+    """Return the stretches of a log that gaps separate, the longest first; the log itself if it has none."""
+    if not log.others or log.table is None or isinstance(source.log, Log):
+        return [source]
+    return [
+        replace(
+            source,
+            name=f"{source.name}, rows {first} to {end}",
+            columns=replace(log.table, rows=(first, end)),
+            found=k > 0,
+        )
+        for k, (first, end) in enumerate([log.rows, *log.others])
+    ]
+
+
+def _with_unknowns_by_log(case: Case, machine: Machine, sources: Sequence[_Source]) -> Machine:
+    """Return the machine with the unknowns of all logs; see `jaxid.own_values.expanded`."""
+    known = {}
+    for source in sources:
+        # A set of places does not depend on the sampling of the log.
+        known[source.whole] = set(_own(case, machine, source, 1.0).plant)
+    return expanded(case, machine, case.identification.per_log, known)
+
+
+def _own(case: Case, machine: Machine, source: _Source, period: float) -> OwnValues:
+    stated = {} if source.entry is None else source.entry.known
+    where = f"{case.where}, [[fit]] {source.whole}"
+    return own_values(case, machine, source.whole, stated, period, where)
+
+
+def _with_values(case: Case, machine: Machine, source: _Source, log: Log) -> _Source:
+    """Return a source with the values that hold in its log."""
+    return replace(source, own=_own(case, machine, source, log.period))
+
+
+def _opened(
+    case: Case, machine: Machine, source: _Source, log: Log, recipe: Recipe, short: bool
+) -> tuple[OpenedLog, list[Finding]]:
+    """Open one further log to fit, and return the findings on it."""
+    at = machine if source.own is None else source.own.machine(machine)
+    findings = _check(case, log, at, short)
+    run = _run(
+        source.name, log, at, _recipe_of(log, case, recipe), 0 if short else enough(at), source.disturbance
+    )
+    return replace(run, reference_hold=source.reference_hold, own=source.own), findings
+
+
+def _recipe_of(log: Log, case: Case, recipe: Recipe) -> Recipe:
+    """Return the recipe of a further log: that of the first, unless its rate or noise asks for another."""
+    own = replace(choose_recipe(log, case.preprocess), align_hold=recipe.align_hold)
+    pairs = [(own.cutoff_hz, recipe.cutoff_hz), *zip(own.rest_velocity, recipe.rest_velocity, strict=True)]
+    alike = own.decimation == recipe.decimation and own.median == recipe.median
+    alike &= all(max(a, b) <= _ALIKE * min(a, b) for a, b in pairs)
+    return recipe if alike else own
 
 
 def open_another(session: Session, log: LogLike) -> OpenedLog:
@@ -198,7 +472,9 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
     _check(at_joints(case), measured, machine, held)
     needed = 0 if held else enough(machine)
     name = Path(measured.source).stem
-    run = _run(name, measured, machine, session.recipe, needed, machine.disturbance)
+    own = OwnValues(name) if session.more else None
+    at = machine if own is None else own.machine(machine)
+    run = replace(_run(name, measured, at, session.recipe, needed, machine.disturbance), own=own)
     run = replace(run, data=replace(run.data, force_noise=session.fit.data.force_noise))
     return run if run.log.hold == machine.hold else _under(machine.hold, run, machine)
 
@@ -219,6 +495,37 @@ def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None
     needed = 0 if case.fits_within_prior(None) else enough(machine)
     run = _run("fit", log, machine, recipe, needed, machine.disturbance)
     return Session(case, _scaled(machine, run.data), run, (), recipe, ())
+
+
+def session_around_several(
+    case: Case,
+    machine: Machine,
+    logs: Sequence[tuple[str, OwnValues | None, Log]],
+    recipe: Recipe | None = None,
+) -> Session:
+    """Open a session on simulated logs that are fitted together; no file checks are needed.
+
+    Args:
+        case: The case.
+        machine: Machine at the start of a fit, with the unknowns of all logs.
+        logs: Name of each log, the values that hold in it, and the log.
+        recipe: Filtering of the logs; None: chosen from the first.
+
+    Raises:
+        InputError: If a log is too short, or moves too little.
+    """
+    recipe = recipe or choose_recipe(logs[0][2], case.preprocess)
+    disturbances = {entry.name: entry.disturbance for entry in case.fits}
+    runs = []
+    for name, own, log in logs:
+        at = machine if own is None else own.machine(machine)
+        needed = 0 if case.fits_within_prior(None) else enough(at)
+        disturbance = disturbances.get(name, machine.disturbance)
+        runs.append(replace(_run(name, log, at, recipe, needed, disturbance), own=own))
+    own = logs[0][1]
+    if len(runs) == 1 and own is not None:
+        machine = own.machine(machine)
+    return Session(case, _scaled(machine, runs[0].data), runs[0], (), recipe, (), more=tuple(runs[1:]))
 
 
 def _read(case: Case, log: LogLike, *, columns: LogTable | None = None, whole: bool = False) -> Log:

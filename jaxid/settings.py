@@ -159,7 +159,9 @@ class LogTable:
     decimal: str | None = key(
         choice(DECIMALS), "decimal sign of a text table", note="found in the file, and reported"
     )
-    rows: tuple[int, int] | None = key(rows, "first row and end, 0-based, half open", note="all rows")
+    rows: tuple[int, int] | tuple[tuple[int, int], ...] | None = key(
+        rows, "first row and end, 0-based, half open; or a list of such stretches", note="all rows"
+    )
     velocity: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of the velocity, one a joint; beside a position only its unit is checked"
     )
@@ -249,6 +251,9 @@ class Identification:
         several(text),
         "names of the unknowns whose profile likelihood is computed, by a method that maximises a likelihood",
         default=(),
+    )
+    per_log: tuple[str, ...] = key(
+        several(text), "names of the unknowns that have a value of their own in each log", default=()
     )
 
 

@@ -27,6 +27,7 @@ def files(tmp_path, sound):
         ("", "the following arguments are required: COMMAND; see jaxid --help"),
         ("identfy a b", "invalid choice: 'identfy'"),
         ("identify", "required: CASE.toml, LOG; see jaxid identify --help"),
+        ("check a.toml b.csv c.csv --colour", "unrecognized arguments: --colour"),
         ("check a b --colour", "unrecognized arguments: --colour"),
         ("discover a b --max-effects two", "invalid int value: 'two'"),
         ("discover a b --max-effects -1", "--max-effects is -1; give zero or more"),

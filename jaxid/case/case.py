@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from jaxid.case.tables import (
     ControllerTable,
     controller_keys,
     controller_table,
+    fit_keys,
     validation_keys,
 )
 from jaxid.case.tree import own_effects
@@ -66,12 +67,22 @@ class Validation:
         log: Its file; None: the fitted log.
         columns: Its [log] table, complete: for `jaxid.logs.log.read_log`.
         disturbance: The controller's on this log: a square wave, or the name of a column.
+        known: Values of parameters that are known in this log, by their names in results.
     """
 
     name: str
     log: Path | None
     columns: LogTable
     disturbance: Disturbance | str | None = None
+    known: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FitEntry(Validation):
+    """One of [[fit]]: a log that is fitted with the others.
+
+    Its `log` is None if it takes the first log of the command.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +107,7 @@ class Case:
         sensor: Table [sensor].
         inertial_sensors: Entries of [[inertial_sensors]].
         limits: Table [limits], for `jaxid.experiment_design.limits`.
+        fits: Entries of [[fit]].
         validations: Entries of [[validation]].
         candidates: Effects of [discover] that a search may name beside the registered ones.
         kinds: Kinds of [discover] that a search is limited to; empty: all.
@@ -124,6 +136,7 @@ class Case:
     sensor: SensorTable = SensorTable()
     inertial_sensors: tuple[InertialSensor, ...] = ()
     limits: LimitsTable = LimitsTable()
+    fits: tuple[FitEntry, ...] = ()
     validations: tuple[Validation, ...] = ()
     candidates: tuple[type[Effect], ...] = ()
     kinds: tuple[str, ...] = ()
@@ -303,6 +316,7 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
         sensor=read(SensorTable, "sensor"),
         inertial_sensors=read_inertial_sensors(tables, plant.cls.links(plant.joints), root),
         limits=read(LimitsTable, "limits"),
+        fits=_fits(tables, root),
         validations=_validations(tables, root),
         candidates=candidates,
         kinds=kinds,
@@ -503,23 +517,57 @@ def _controller(tables: Mapping[str, Any], root: Spot) -> ControllerTable | None
 
 
 def _validations(tables: Mapping[str, Any], root: Spot) -> tuple[Validation, ...]:
-    base = tables.get("log", {})
-    of_fit = (tables.get("controller") or {}).get("disturbance")
     out: list[Validation] = []
     for k, table in enumerate(tables.get("validation", []), start=1):
         spot = root.under(f"[[validation]] {k}")
         given = read_table(table, validation_keys(), spot)
-        if given["name"] in [v.name for v in out]:
-            raise spot.at("name").refuse(given["name"], "is taken", "give each a different name")
-        columns = {name: table[name] for name in keys_of(LogTable) if name in table}
-        if "log" not in given and "rows" not in columns:
+        _check_name(given["name"], out, spot)
+        if "log" not in given and "rows" not in table:
             hint = "add log = <its file>, or rows that the fit does not use"
             raise spot.fault("this validation log is identical to the fitted log", hint)
         log = root.folder / given["log"] if "log" in given else None
-        merged = log_table(_merged(base, columns, same_file=log is None), spot)
-        disturbance = given["disturbance"] if "disturbance" in given else _disturbance(of_fit)
-        out.append(Validation(given["name"], log, _time_base(merged, spot), disturbance))
+        out.append(
+            Validation(given["name"], log, *_of_log(tables, table, given, spot, same_file=log is None))
+        )
     return tuple(out)
+
+
+def _fits(tables: Mapping[str, Any], root: Spot) -> tuple[FitEntry, ...]:
+    out: list[FitEntry] = []
+    for k, table in enumerate(tables.get("fit", []), start=1):
+        spot = root.under(f"[[fit]] {k}")
+        given = read_table(table, fit_keys(), spot)
+        if "name" not in given and "log" not in given:
+            raise spot.fault("has neither name nor log", "add log = <its file>, or name for the first LOG")
+        log = root.folder / given["log"] if "log" in given else None
+        name = given["name"] if log is None else given.get("name", log.stem)
+        if log is not None and "name" not in given and name in [entry.name for entry in out]:
+            name = f"{log.parent.name}/{name}"
+        _check_name(name, out, spot)
+        out.append(FitEntry(name, log, *_of_log(tables, table, given, spot, same_file=log is None)))
+    return tuple(out)
+
+
+def _check_name(name: str, others: Sequence[Validation], spot: Spot) -> None:
+    """Refuse the name of another entry."""
+    if name in [entry.name for entry in others]:
+        raise spot.at("name").refuse(name, "is taken", "give each a different name")
+
+
+def _of_log(
+    tables: Mapping[str, Any],
+    table: Mapping[str, Any],
+    given: Mapping[str, Any],
+    spot: Spot,
+    *,
+    same_file: bool,
+) -> tuple[LogTable, Disturbance | str | None, Mapping[str, float | tuple[float, ...]]]:
+    """Return columns, disturbance and known values of an entry that names a log."""
+    columns = {name: table[name] for name in keys_of(LogTable) if name in table}
+    merged = log_table(_merged(tables.get("log", {}), columns, same_file=same_file), spot)
+    of_fit = (tables.get("controller") or {}).get("disturbance")
+    disturbance = given["disturbance"] if "disturbance" in given else _disturbance(of_fit)
+    return _time_base(merged, spot), disturbance, given.get("set", {})
 
 
 def _disturbance(given: Any) -> Disturbance | str | None:
@@ -542,10 +590,11 @@ def _check_loop(case: Case, root: Spot) -> None:
         if case.reference is not None:
             hint = "add [controller], or call it [input] for open loop"
             raise root.under("[reference]").fault("there is no loop to follow it", hint)
-        for k, validation in enumerate(case.validations, start=1):
-            if validation.disturbance is not None:
-                spot = root.under(f"[[validation]] {k}").at("disturbance")
-                raise spot.fault("belongs to a controller", "add [controller], or leave it out")
+        for table, entries in (("fit", case.fits), ("validation", case.validations)):
+            for k, entry in enumerate(entries, start=1):
+                if entry.disturbance is not None:
+                    spot = root.under(f"[[{table}]] {k}").at("disturbance")
+                    raise spot.fault("belongs to a controller", "add [controller], or leave it out")
     if case.reference is not None and case.input is not None:
         hint = "keep [reference] for closed loop, or [input] for open loop"
         raise root.fault("both [reference] and [input] are given", hint)

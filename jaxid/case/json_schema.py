@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from jaxid.case.entries import actuated_key, coupling_key, parameter_keys, search_keys, unit_of
 from jaxid.case.links import LINKED, SHAFT, link_keys
-from jaxid.case.tables import PLANT, TOP, controller_keys, validation_keys
+from jaxid.case.tables import PLANT, TOP, controller_keys, fit_keys, validation_keys
 from jaxid.case.tree import TREE
 from jaxid.case.values import value_schema, values_schema
 from jaxid.controllers import CONTROLLERS
@@ -82,6 +82,7 @@ def case_schema() -> dict[str, Any]:
             "type": "array",
             "items": schema_of(keys_of(InertialSensor), _doc(InertialSensor)),
         },
+        "fit": {"type": "array", "items": schema_of(fit_keys(), "a log that is fitted with others")},
         "validation": {"type": "array", "items": schema_of(validation_keys(), "a log to validate on")},
         "discover": schema_of(search_keys(Spot("")), "[discover]: effects that a search may name"),
         "reference": _signal("reference that the controller follows"),

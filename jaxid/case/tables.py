@@ -24,6 +24,7 @@ from jaxid.schema import (
     inline,
     keys_of,
     number,
+    numbers_by_name,
     schema_of,
     several,
     table_of,
@@ -48,6 +49,7 @@ TOP = {
     "sensor": False,
     "inertial_sensors": True,
     "limits": False,
+    "fit": True,
     "validation": True,
     "discover": False,
     "design": False,
@@ -232,5 +234,15 @@ def validation_keys() -> Keys:
         "name": Key(text, "name in results", True),
         "log": Key(text, "file of the log, relative to the case", note="the fitted log"),
         "disturbance": _DISTURBANCE,
+        "set": Key(numbers_by_name, "values of parameters that are known in this log", note="as in the case"),
         **of_log,
+    }
+
+
+def fit_keys() -> Keys:
+    """Return the keys of [[fit]]: those of [[validation]], of which `name` may be absent beside `log`."""
+    return {
+        **validation_keys(),
+        "name": Key(text, "name in results", note="that of the file, without its suffix"),
+        "log": Key(text, "file of the log, relative to the case", note="the first LOG"),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +16,16 @@ from jaxid.arrays import Array
 from jaxid.case.case import CaseLike
 from jaxid.case.user_faults import named_faults
 from jaxid.estimators.inverse_dynamics import force_precision
+from jaxid.estimators.several.parts import parts_of
+from jaxid.estimators.several.weights import noise_weights
 from jaxid.files import json_text, write_results
 from jaxid.gap import noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.seen import Sight, sights_of
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.lanes import run_alone
-from jaxid.numerics.precision import Precision
-from jaxid.session import Session, open_session
+from jaxid.numerics.precision import Precision, Rows, assess_together
+from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.simulation.force_balance import ForceData, force_residual, force_size, sharpened
 from jaxid.simulation.sensor_noise import force_noise, position_noise
 
@@ -92,38 +94,18 @@ class Check:
 
     def json(self) -> dict[str, Any]:
         """Return the content of check.json."""
-        from jaxid.results.as_json import one_or_list, readings_json, recipe_json
+        from jaxid.results.as_json import readings_json, recipe_json
 
-        session, log = self.session, self.session.fit.log
-        sensor = session.machine.sensor
+        session = self.session
         free = session.machine.parameters.free
         identifiable = self.precision.identifiable
-
-        measures = "velocity" if log.integrated else "position"
-        stated = sensor.velocity_noise if log.integrated else sensor.position_std
-
-        def at_encoders(x: np.ndarray) -> np.ndarray:
-            return np.where(log.measured, x, np.nan)
-
+        every = {run.name: _log_json(session, run) for run in session.fits} if session.more else {}
         return {
             "sound": True,
             "warnings": self.warnings,
             "seen": [{"about": s.about, "text": s.text, "say": s.say or None} for s in self.sights],
-            "log": {
-                "samples": log.samples,
-                "rate_hz": log.rate_hz,
-                "duration_s": log.period * log.samples,
-                "stroke": np.ptp(log.position, axis=0),
-                "peak_velocity": np.abs(at_encoders(session.fit.data.qd)).max(axis=0),
-                "peak_force": np.abs(session.fit.data.force).max(axis=0),
-                "moving": float(session.fit.data.moving.mean()),
-                f"{measures}_noise": at_encoders(position_noise(session.machine, log)),
-                "force_noise": one_or_list(force_noise(session.machine, session.fit.data)),
-                "noise_from": {
-                    measures: "estimated" if stated is None else "stated",
-                    "force": "estimated" if sensor.force_noise is None else "stated",
-                },
-            },
+            "log": _log_json(session, session.fit),
+            **({"fits": every} if every else {}),
             "settings": {**session.settings, **readings_json(session)},
             "preprocess": recipe_json(session),
             "noise_floor": self.noise_floor,
@@ -166,21 +148,52 @@ class Check:
         return folder
 
 
+def _log_json(session: Session, run: OpenedLog) -> dict[str, Any]:
+    """Return what a log holds, as an entry of check.json."""
+    from jaxid.results.as_json import one_or_list
+
+    log, data, sensor = run.log, run.data, session.machine.sensor
+    measures = "velocity" if log.integrated else "position"
+    stated = sensor.velocity_noise if log.integrated else sensor.position_std
+
+    def at_encoders(x: np.ndarray) -> np.ndarray:
+        return np.where(log.measured, x, np.nan)
+
+    return {
+        "samples": log.samples,
+        "rate_hz": log.rate_hz,
+        "duration_s": log.period * log.samples,
+        "stroke": np.ptp(log.position, axis=0),
+        "peak_velocity": np.abs(at_encoders(data.qd)).max(axis=0),
+        "peak_force": np.abs(data.force).max(axis=0),
+        "moving": float(data.moving.mean()),
+        f"{measures}_noise": at_encoders(position_noise(session.machine, log)),
+        "force_noise": one_or_list(force_noise(session.machine, data)),
+        "noise_from": {
+            measures: "estimated" if stated is None else "stated",
+            "force": "estimated" if sensor.force_noise is None else "stated",
+        },
+    }
+
+
 @named_faults()
-def check(case: CaseLike, log: LogLike, *, validate: Sequence[LogLike] = ()) -> Check:
-    """Check a log against a case before any fit.
+def check(case: CaseLike, log: Logs = None, *, validate: Sequence[LogLike] = ()) -> Check:
+    """Check a log against a case before any fit, or several that are to be fitted together.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict); or a
+            list of several. They are checked with the logs of [[fit]]; None: those alone.
         validate: More logs to check, beside those of the case.
 
     Raises:
         InputError: If the case or the log is invalid.
     """
-    session = open_session(case, log, validate)
+    session = open_session(case, log, validate, piecewise=True)
+    floor = noise_floor(session.machine, session.fit.log, session.fit.data)
+    if session.more:
+        return Check(session, _precision_together(session), floor)
     machine, data = session.machine, session.fit.data
-    floor = noise_floor(machine, session.fit.log, data)
     if session.fit.log.steady is not None:
         from jaxid.steady import steady_fit
 
@@ -198,6 +211,22 @@ def check(case: CaseLike, log: LogLike, *, validate: Sequence[LogLike] = ()) -> 
         data.fitted,
     )
     return Check(session, precision, floor)
+
+
+def _precision_together(session: Session) -> Precision:
+    """Return the precision that several logs allow together, each by the noise of its sensors."""
+    guess, rng, logs = session.machine.parameters.guess, np.random.default_rng(0), []
+    for part in parts_of(session):
+        data, machine = part.run.data, part.machine
+        arrays, plant = ForceData.of(data, data.fitted), sharpened(machine.plant, data)
+        jacobian = _jacobian(plant, machine.parameters.places, arrays, guess[part.index])
+        floor = noise_floor(machine, part.run.log, data)
+        wide = part.widened(np.where(data.fitted[..., None], np.asarray(jacobian), 0.0), guess.size)
+        noise = rng.standard_normal(data.fitted.shape) * floor
+        logs.append(Rows(wide, noise, data.fitted, float(force_size(plant, arrays))))
+    weights = noise_weights(logs)
+    weighed = [replace(log, weight=float(weight)) for log, weight in zip(logs, weights, strict=True)]
+    return assess_together(session.machine.parameters.names, weighed, np.where(guess != 0, guess, 1.0))
 
 
 @eqx.filter_jit

@@ -30,13 +30,19 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.output_error import choose_numerics, output_error
 from jaxid.estimators.prediction_error import prediction_error
+from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
+from jaxid.estimators.several.innovations import prediction_error_steps as prediction_error_of_several
+from jaxid.estimators.several.output import output_error_steps as output_error_of_several
 from jaxid.gap import Gap, force_gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect
-from jaxid.session import Session, open_session
+from jaxid.numerics.lanes import run_alone
+from jaxid.numerics.precision import NoiseModel
+from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.sensor_noise import force_noise
 from jaxid.simulation.solvers import SOLVERS
@@ -54,7 +60,7 @@ _BARRED = 3
 @named_faults()
 def discover(
     case: CaseLike,
-    log: LogLike,
+    log: Logs = None,
     *,
     validate: Sequence[LogLike] = (),
     max_effects: int = 5,
@@ -121,13 +127,13 @@ def explore(
 
         return explore_steady(session, max_effects=max_effects, progress=progress)
     if session.case.fits_within_prior("discover"):
+        session.need_one_log("discover within a prior")
         return explore_within(session, max_effects=max_effects, progress=progress)
-    data = session.fit.data
     progress("fitting the declared model")
     baseline, search = start_search(session, progress)
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
-    where = where_of(search, steps[0], session.fit.log)
+    where = where_of(search, steps[0], session)
     final, effects = _final_machine(baseline.machine, search, alternatives, steps)
     progress("simulating the effects")
     while (c := hindering(search, session, final)) is not None:
@@ -137,15 +143,21 @@ def explore(
         final, effects = _final_machine(baseline.machine, search, alternatives, steps)
     verdict = _verdict(effects, where, steps, search)
     before = baseline
-    after = inverse_dynamics(final, data) if effects else before
+    after = _of_force(session.with_machine(final)) if effects else before
     if refit:
         progress("refitting in simulation")
         before = _refit(session.with_machine(before.machine), before)
         after = _refit(session.with_machine(after.machine), after) if effects else before
     designs = session.machine.plant.designs_experiments if experiments is None else experiments
+    if session.more and experiments:
+        session.need_one_log("the design of experiments")
+    designs = designs and not session.more
     separating = proposals(session, search, effects, progress) if designs else ()
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
-    missing = [] if unseen else _break_aways(search)
+    # The trials of a start from rest run one machine.
+    differ = session.more and any(run.own and run.own.plant for run in session.fits)
+    differ = differ or any(f.log is not None for f in session.machine.parameters.free)
+    missing = [] if unseen or differ else _break_aways(search)
     while missing:
         progress("evaluating the starts from rest")
         leaving = break_away(after, session.runs, [c.port for c in missing])
@@ -168,7 +180,7 @@ def explore(
         verdict,
         None if verdict == "nothing_missing" else where,
         effects,
-        _as_refitted([_round(search, s) for s in steps], old, new),
+        _as_refitted([_round(search, s) for s in steps], old, new, len(session.fits)),
         before,
         after,
         old,
@@ -182,20 +194,52 @@ def explore(
 def start_search(
     session: Session, progress: Callable[[str], None] = lambda text: None
 ) -> tuple[Estimate, Search]:
-    """Return the baseline of a session in the force domain, and the search for the effects that it lacks."""
-    machine, log, data = session.machine, session.fit.log, session.fit.data
-    baseline = inverse_dynamics(machine, data)
-    floor = noise_floor(baseline.machine, log, data)
-    colour = sensor_colour(baseline.machine, log, data)
+    """Return the baseline of a session in the force domain, and the search for the effects that it lacks.
+
+    Several logs are searched together: residuals of each further log are scaled so that the noise of its
+    sensors is that of the first, and evidence is the sum over all.
+    """
+    log, data = session.fit.log, session.fit.data
+    baseline = _of_force(session)
+    at_fit = session.fit.machine(baseline.machine) if session.more else baseline.machine
+    floor = noise_floor(at_fit, log, data)
+    colour = sensor_colour(at_fit, log, data)
     searched = session.case.searched
     if log.integrated:
         # Where the machine is was not measured.
-        scales = scales_of(machine.plant, data)[0]
+        scales = scales_of(baseline.machine.plant, data)[0]
         starts: dict[type, dict[str, Any]] = {cls: dict(cls.starts(scales)[0]) for cls in searched}
         searched = tuple(cls for cls in searched if not acts_by_position(cls(**starts[cls])))
     union = build_candidate_model(baseline.machine, data, searched)
     others = tuple(v.data for v in session.validations)
-    return baseline, Search(union, data, floor, colour, others, progress)
+    if not session.more:
+        return baseline, Search(union, data, floor, colour, others, progress)
+
+    def view(run: OpenedLog) -> cand.View:
+        assert run.own is not None, "every log of several has values of its own, or none"
+        own = noise_floor(run.machine(baseline.machine), run.log, run.data)
+        scale = np.where((own > 0) & (floor > 0), floor / np.where(own > 0, own, 1.0), 1.0)
+        return cand.View.of(union.machine, run.own, scale)
+
+    search = Search(
+        union,
+        data,
+        floor,
+        colour,
+        others,
+        progress,
+        view=view(session.fit),
+        more=tuple((run.data, view(run)) for run in session.more),
+        validation_views=tuple(view(run).unscaled() for run in session.validations),
+    )
+    return baseline, search
+
+
+def _of_force(session: Session) -> Estimate:
+    """Return the estimate by inverse dynamics of one log or of several."""
+    if session.more:
+        return run_alone(inverse_dynamics_of_several(session))
+    return inverse_dynamics(session.machine, session.fit.data)
 
 
 def _break_aways(search: Search) -> list[cand.Candidate]:
@@ -254,20 +298,43 @@ def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:
     )
 
 
-def where_of(search: Search, baseline: Step, log: Log) -> Where:
-    """Return the region of the whole log in which the baseline's residual is significant."""
-    whole = [ForceData.of(search.data)]
+def where_of(search: Search, baseline: Step, session: Session) -> Where:
+    """Return the region of a whole log in which the baseline's residual is significant.
+
+    Of several logs it is the one with the most evidence.
+    """
+    first = _where_on(search, baseline, session.fit.log, search.data, search.view, search.colour)
+    if not session.more:
+        return first
+    found = [(first, session.fit.name)]
+    for run, (data, view) in zip(session.more, search.more, strict=True):
+        colour = sensor_colour(run.machine(session.machine), run.log, data)
+        found.append((_where_on(search, baseline, run.log, data, view.unscaled(), colour), run.name))
+    where, name = max(found, key=lambda w: (w[0].significant, w[0].evidence))
+    return replace(where, text=f"{where.text} (log {name})")
+
+
+def _where_on(
+    search: Search,
+    baseline: Step,
+    log: Log,
+    data: Prepared,
+    view: cand.View | None,
+    colour: tuple[NoiseModel, ...],
+) -> Where:
+    """Return the region of one log in which the baseline's residual is significant."""
+    whole = [cand.Viewed(ForceData.of(data), view)]
     e, jacobian = cand.evaluate_on(search.superset, whole, baseline.theta, baseline.active)
     wanted = None
     if log.reference is not None:
         # A mass that is not driven has no wanted motion other than the measured one.
-        wanted = search.data.at_kept(search.data.qd).copy()
+        wanted = data.at_kept(data.qd).copy()
         driven = search.superset.machine.plant.at_drives(np.arange(wanted.shape[1]))
-        wanted[:, driven] = search.data.at_kept(np.gradient(log.reference, log.period, axis=0))
+        wanted[:, driven] = data.at_kept(np.gradient(log.reference, log.period, axis=0))
     # A parameter that joints share cannot change for one of them alone.
     alone = np.sum(search.superset.enters[:, baseline.active], axis=0) == 1
     unshared = jacobian[..., baseline.active[alone]]
-    return locate(-e, unshared, search.data, search.colour, wanted, search.superset.machine.plant)
+    return locate(-e, unshared, data, colour, wanted, search.superset.machine.plant)
 
 
 def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], search: Search) -> str:
@@ -302,6 +369,8 @@ def _final_machine(
 def _refit(session: Session, start: Estimate) -> Estimate:
     """Refit from the force-domain fit by the method that suits; keep the former if the fit fails."""
     blind = not bool(np.all(start.identifiable))
+    if session.more:
+        return start if blind else _refit_together(session, start)
     if not blind and choose_method(session).method == "prediction_error":
         return _refit_innovations(session, start)
     if blind or session.fit.log.reference is None and session.machine.controller is not None:
@@ -321,6 +390,31 @@ def _refit(session: Session, start: Estimate) -> Estimate:
     if new.simulation is None or worse or not nearer:
         note = "output error did not reduce the simulation gap; the parameters are those of inverse dynamics"
         return replace(start, notes=(*start.notes, note))
+    return estimate
+
+
+def _refit_together(session: Session, start: Estimate) -> Estimate:
+    """Refit several logs by the method that suits; keep the force-domain fit if the force gap grows."""
+    method = choose_method(session).method
+    if method == "inverse_dynamics" or (method == "output_error" and session.machine.controller is None):
+        return start
+    fit = {
+        "prediction_error": lambda: prediction_error_of_several(session, start=start.theta),
+        "output_error": lambda: output_error_of_several(session, start=start.theta),
+    }[method]
+    try:
+        estimate = run_alone(fit())
+    except TooStiffError as error:
+        return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
+    what = method.replace("_", " ")
+    if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
+        note = f"{what}: {estimate.message}; the parameters are those of inverse dynamics"
+        return replace(start, notes=(*start.notes, note))
+    for run in session.fits:
+        old, new = (force_gap(run.machine(e.machine), run.data).rms for e in (start, estimate))
+        if np.any(new > _WORSE * old):
+            note = f"{what} did not reduce the force gap; the parameters are those of inverse dynamics"
+            return replace(start, notes=(*start.notes, note))
     return estimate
 
 
@@ -358,10 +452,13 @@ def _round(search: Search, step: Step) -> Round:
     return Round(step, fit, np.max(others, axis=0) if others else None)
 
 
-def _as_refitted(rounds: list[Round], before: tuple[Gap, ...], after: tuple[Gap, ...]) -> tuple[Round, ...]:
+def _as_refitted(
+    rounds: list[Round], before: tuple[Gap, ...], after: tuple[Gap, ...], fits: int
+) -> tuple[Round, ...]:
     """Return the steps with the gaps of the refits at the baseline and from the last change on.
 
-    The search fits by inverse dynamics, so that its gaps differ a little from those of the result.
+    The search fits by inverse dynamics, so that its gaps differ a little from those of the result. The first
+    `fits` of the gaps are those of the fitted logs.
     """
     changes = [k for k, r in enumerate(rounds) if r.step.added or r.step.dropped]
     last = max(changes, default=0)
@@ -370,7 +467,8 @@ def _as_refitted(rounds: list[Round], before: tuple[Gap, ...], after: tuple[Gap,
         if 0 < k < last:
             out.append(r)
             continue
-        fit, *others = ((before if k == 0 and last > 0 else after)[j].force.rms for j in range(len(after)))
+        rms = [gap.force.rms for gap in (before if k == 0 and last > 0 else after)]
+        fit, others = np.max(rms[:fits], axis=0), rms[fits:]
         out.append(replace(r, fit=fit, validation=np.max(others, axis=0) if others else None))
     return tuple(out)
 

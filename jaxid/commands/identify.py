@@ -21,10 +21,10 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.loop_noise import with_loop_noise
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
-from jaxid.names import METHODS, OUTPUTS, SOLVERS, USER_METHODS
+from jaxid.names import METHODS, OUTPUTS, SEVERAL_LOGS, SOLVERS, USER_METHODS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.results.result import FitResult
-from jaxid.session import Session, open_session
+from jaxid.session import Logs, Session, open_session
 
 
 @dataclass(frozen=True, repr=False)
@@ -72,7 +72,7 @@ class Identification(FitResult):
 @named_faults()
 def identify(
     case: CaseLike,
-    log: LogLike,
+    log: Logs = None,
     *,
     method: str | None = None,
     solver: str | None = None,
@@ -83,11 +83,12 @@ def identify(
     validate: Sequence[LogLike] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identification:
-    """Identify the unknowns of a case from a log.
+    """Identify the unknowns of a case from a log, or from several together.
 
     Args:
         case: The case, its file, or a dict with its tables.
-        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
+        log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict); or a
+            list of several. They are fitted with the logs of [[fit]]; None: those alone.
         method: One of `jaxid.names.METHODS`, or a registered one; None: chosen from case and log, with the
             reason in `result.json` under `settings`.
         solver: For `output_error`, one of `jaxid.names.SOLVERS`: diffrax then integrates between
@@ -126,7 +127,8 @@ def identify(
         if method is not None:
             refuse_without_likelihood("profile", method)
         options["profile"] = (profile,) if isinstance(profile, str) else tuple(profile)
-    session = open_session(case, log, validate, method=method)
+    case = load_case(case)
+    session = open_session(case, log, validate, method=method, piecewise=_piecewise(case, method, options))
     need_names(options.get("profile", session.case.identification.profile), session.machine.parameters.names)
     if not session.machine.parameters.free:
         raise InputError(
@@ -197,9 +199,17 @@ def identify_many(
 def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[Estimate]:
     """Fit by a method; beside inverse dynamics, test whether noise in a known loop biases it."""
     estimate = yield from steps_of(method, session, **options)
-    if method != "inverse_dynamics":
+    if method != "inverse_dynamics" or session.more:
         return estimate
     return (yield from with_loop_noise(session, estimate))
+
+
+def _piecewise(case: Case, method: str | None, options: Collection[str]) -> bool:
+    """Check that a fit can take the stretches of a log with gaps as several logs."""
+    demands = case.identification
+    single = demands.physically_consistent or demands.hessian or demands.profile or case.unknown_reference
+    apart = {"hessian", "profile", "minimiser"} & set(options)
+    return method in (None, *SEVERAL_LOGS) and not (single or apart or case.fits_within_prior(method))
 
 
 def _check_method(method: str) -> None:

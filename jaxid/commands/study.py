@@ -20,10 +20,13 @@ from jaxid.errors import InputError
 from jaxid.estimators.output_error import choose_numerics, position_jacobian
 from jaxid.files import check_folder, mark_folder, new_folder, write_json, write_whole
 from jaxid.logs.log import Log
+from jaxid.machine import Machine
 from jaxid.numerics.lanes import run_alone
+from jaxid.scene import Scene
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError
 from jaxid.studies.levels import Level
+from jaxid.studies.logs import machines_of
 from jaxid.studies.plan import Plan, at_once, digest_of, same
 from jaxid.studies.remote import Bundle, Remote
 from jaxid.studies.result import FILES, Study, gathered
@@ -211,15 +214,35 @@ def _unpacked(path: Path, identity: str) -> Arrays:
 def _bound(plan: Plan, level: Level) -> np.ndarray:
     """Return the Cramer-Rao bound on the standard deviation of each parameter at a level.
 
-    The bound holds for an unbiased estimate from the readings of one log with white noise, if the start and
-    the command are known exactly. In a loop too the command follows from the readings so far, so that the
-    derivative of the position under a given command counts. The bound is NaN if the case states no noise of
-    the readings, if nothing is fitted to logs, or if the log does not determine all parameters. If true
-    values are drawn, it is the bound at their median.
+    The bound holds for an unbiased estimate from the readings of all logs of a run with white noise, if the
+    start and the command are known exactly. In a loop too the command follows from the readings so far, so
+    that the derivative of the position under a given command counts. The bound is NaN if the case states no
+    noise of the readings, if nothing is fitted to logs, or if the logs do not determine all parameters. If
+    true values are drawn, it is the bound at their median.
     """
-    none, scene, machine = np.full(len(plan.names), np.nan), level.scene, level.scene.machine
-    if machine.sensor.position_std is None or not plan.fits:
+    none, scene, whole = np.full(len(plan.names), np.nan), level.scene, level.scene.machine
+    if whole.sensor.position_std is None or not plan.fits:
         return none
+    every, names = [], whole.parameters.names
+    for _, _, machine in machines_of(scene.case, whole):
+        own = _rows_of_readings(scene, machine)
+        if own is None:
+            return none
+        rows = np.zeros((len(own), len(names)))
+        rows[:, [names.index(name) for name in machine.parameters.names]] = own
+        every.append(rows)
+    rows = np.concatenate(every)
+    scale = np.linalg.norm(rows, axis=0)
+    if not np.all(np.isfinite(scale)) or np.any(scale == 0):
+        return none
+    values, vectors = np.linalg.eigh((rows / scale).T @ (rows / scale))
+    if values[0] <= 1e-12 * values[-1]:
+        return none
+    return (np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)[plan.own]
+
+
+def _rows_of_readings(scene: Scene, machine: Machine) -> np.ndarray | None:
+    """Return the derivatives of the readings of one log over their noise; None if it cannot be simulated."""
     silent = replace(machine, sensor=replace(machine.sensor, position_noise=None, force_noise=None))
     simulated_log = run_alone(scene.simulated_log(silent, np.random.default_rng(0)))
     # The command of every tick; the log may hold only some of them.
@@ -231,13 +254,6 @@ def _bound(plan: Plan, level: Level) -> np.ndarray:
         numerics = choose_numerics(driven, log, segments=False)
         jacobian = position_jacobian(driven, log, numerics)[:: scene.every]
     except TooStiffError:
-        return none
+        return None
     noise = position_noise(machine, log)
-    rows = (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, jacobian.shape[-1])
-    scale = np.linalg.norm(rows, axis=0)
-    if not np.all(np.isfinite(scale)) or np.any(scale == 0):
-        return none
-    values, vectors = np.linalg.eigh((rows / scale).T @ (rows / scale))
-    if values[0] <= 1e-12 * values[-1]:
-        return none
-    return (np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)[plan.own]
+    return (jacobian / np.where(noise > 0, noise, np.nan)[:, None]).reshape(-1, jacobian.shape[-1])

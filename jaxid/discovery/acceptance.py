@@ -39,6 +39,9 @@ class Acceptance:
         validation: Logs that must confirm an effect, prepared.
         floor: RMS force residual caused by the sensors' noise alone, by joint.
         colour: Model of that noise, by joint.
+        view: View of the log on the superset; None: it is the only one that is fitted.
+        more: Further logs to fit with their views.
+        validation_views: Views of the validation logs; empty: they have none.
     """
 
     superset: cand.CandidateModel
@@ -46,13 +49,19 @@ class Acceptance:
     validation: tuple[Prepared, ...]
     floor: np.ndarray
     colour: tuple[NoiseModel, ...]
+    view: cand.View | None = None
+    more: tuple[tuple[Prepared, cand.View], ...] = ()
+    validation_views: tuple[cand.View, ...] = ()
 
     def __post_init__(self) -> None:
         machine = self.superset.machine
         force_std = machine.sensor.force_noise
         noise = None if force_std is None else np.asarray(force_std) * machine.gain
-        self.samples = cand.CandidateSamples(self.data, noise)
-        self.others = [cand.CandidateSamples(d, noise) for d in self.validation]
+        self.samples = cand.CandidateSamples(self.data, noise, self.view, self.more)
+        views = self.validation_views or (None,) * len(self.validation)
+        self.others = [
+            cand.CandidateSamples(d, noise, view) for d, view in zip(self.validation, views, strict=True)
+        ]
         force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
         rows = len(self.samples.moving) / len(force)
         self._numerics = rows * float(np.sum((NUMERICS * force) ** 2))

@@ -6,8 +6,9 @@ would take longer than the whole search.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,6 +26,7 @@ from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, Parameters, scatter, seeds
 from jaxid.numerics.lanes import in_threads
+from jaxid.own_values import OwnValues
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual
 
 # A candidate with more starts than this is evaluated on a plant without other effects, all starts at once.
@@ -121,23 +123,115 @@ class CandidateModel:
         return self.machine.parameters.guess
 
 
+@dataclass(frozen=True)
+class View:
+    """Unknowns and plant of the superset as one of several logs has them.
+
+    Args:
+        known: Values of unknowns that are known in this log, by index.
+        values: Other values of the plant that are known in this log, by their places.
+        shared: For each unknown with a value in each log, the indices of all of them.
+        own: For each of these, the index of that of this log; None: it has none, and takes their mean.
+        scale: Factor of the residual by joint, with which its noise is that of the first log, (n,).
+    """
+
+    known: Mapping[int, float]
+    values: Mapping[tuple, float]
+    shared: tuple[tuple[int, ...], ...]
+    own: tuple[int | None, ...]
+    scale: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, machine: Machine, own: OwnValues, scale: Float[np.ndarray, " n"]) -> View:
+        """Return the view of a log on a machine with all candidates."""
+        free = machine.parameters.free
+        known = {k: own.plant[f.path, f.index] for k, f in enumerate(free) if (f.path, f.index) in own.plant}
+        unknown = {(f.path, f.index) for f in free}
+        groups: dict[tuple, list[int]] = {}
+        for k, f in enumerate(free):
+            if f.log is not None:
+                groups.setdefault((f.path, f.index), []).append(k)
+        mine = [next((k for k in group if free[k].log == own.log), None) for group in groups.values()]
+        values = {place: value for place, value in own.plant.items() if place not in unknown}
+        return cls(known, values, tuple(map(tuple, groups.values())), tuple(mine), scale)
+
+    def unscaled(self) -> View:
+        """Return the view with residuals in their unit."""
+        return replace(self, scale=np.ones_like(self.scale))
+
+    def superset(self, superset: CandidateModel) -> CandidateModel:
+        """Return the superset with the values of the plant that are known in this log."""
+        if not self.values:
+            return superset
+        machine = superset.machine
+        plant = scatter(tuple(self.values), machine.plant, np.array(list(self.values.values())))
+        return replace(superset, machine=machine.with_plant(plant, machine.parameters))
+
+    def theta(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Return all unknowns as they hold in this log."""
+        out = theta.copy()
+        for group, own in zip(self.shared, self.own, strict=True):
+            out[list(group)] = np.mean(theta[list(group)]) if own is None else theta[own]
+        for k, value in self.known.items():
+            out[k] = value
+        return out
+
+    def jacobian(self, jacobian: Float[np.ndarray, "kept n p"]) -> Float[np.ndarray, "kept n p"]:
+        """Return derivatives by the unknowns of all logs, from those by the unknowns as they hold here."""
+        out = jacobian.copy()
+        for group, own in zip(self.shared, self.own, strict=True):
+            # The plant holds one value, the last that was put there.
+            out[..., list(group)] = 0.0
+            if own is not None:
+                out[..., own] = jacobian[..., group[-1]]
+        out[..., list(self.known)] = 0.0
+        return out * self.scale[:, None]
+
+
+class Viewed(NamedTuple):
+    """A log or a piece of one, and its view of the superset.
+
+    Args:
+        data: Its arrays.
+        view: The view; None: the log is the only one.
+    """
+
+    data: ForceData
+    view: View | None
+
+
 class CandidateSamples:
-    """The samples of a log that a search uses: all of them, or pieces spread over a long log.
+    """The samples of a log, or of several, that a search uses: all, or pieces spread over a long log.
 
     Args:
         data: The log, prepared.
         force_noise: Standard deviation of the declared force, (m,); None if it is not known.
+        view: Its view of the superset; None: it is the only one.
+        more: Further logs with their views, whose samples follow.
     """
 
-    def __init__(self, data: Prepared, force_noise: Float[np.ndarray, " m"] | None = None) -> None:
-        self.parts = data.parts(_MOST // data.q.shape[1], _PIECES)
-        self.arrays = [ForceData.of(p) for p in self.parts]
-        self.noisier = [] if force_noise is None else [_noisier(a, force_noise) for a in self.arrays]
+    def __init__(
+        self,
+        data: Prepared,
+        force_noise: Float[np.ndarray, " m"] | None = None,
+        view: View | None = None,
+        more: Sequence[tuple[Prepared, View]] = (),
+    ) -> None:
+        logs = [(data, view), *more]
+        most = _MOST // data.q.shape[1] // len(logs)
+        cut = [(part, own) for log, own in logs for part in log.parts(most, _PIECES)]
+        self.parts = [part for part, _ in cut]
+        self.arrays = [Viewed(ForceData.of(part), own) for part, own in cut]
+        self.noisier = (
+            []
+            if force_noise is None
+            else [Viewed(_noisier(a.data, force_noise), a.view) for a in self.arrays]
+        )
         moving = [p.moving.copy() for p in self.parts]
         for m in moving[1:]:
             m[0] = False  # a piece does not continue the one before it
         self.moving = np.concatenate(moving)
-        self.weight = np.concatenate([np.asarray(a.weight) for a in self.arrays])
+        self.weight = np.concatenate([np.asarray(a.data.weight) for a in self.arrays])
 
 
 def _noisier(arrays: ForceData, force_noise: np.ndarray) -> ForceData:
@@ -165,27 +259,41 @@ def evaluate(
 
 def evaluate_on(
     superset: CandidateModel,
-    logs: list[ForceData],
+    logs: Sequence[Viewed],
     theta: Float[np.ndarray, " p"],
     wanted: Sequence[int] | np.ndarray | None = None,
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """Compute residual and Jacobian, as `evaluate` does, on several logs or pieces, one after the other."""
     colours = np.asarray(superset.colours, int)
     directions = seeds(superset.colours)
+    views = [log.view for log in logs]
+    if wanted is not None:
+        last = [group[-1] for view in views if view for group in view.shared if set(group) & {*wanted}]
+        wanted = [*wanted, *last]
     # The choice of directions is data: with a fixed number of columns one compiled function serves all.
     ask = np.unique(colours if wanted is None else colours[np.asarray(wanted, int)])
     parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]
-    calls = [(superset, log, theta, directions, part) for log in logs for part in parts]
+    calls = []
+    for log in logs:
+        own = superset if log.view is None else log.view.superset(superset)
+        at = theta if log.view is None else log.view.theta(theta)
+        calls += [(own, log.data, at, directions, part) for part in parts]
     results = in_threads(_directional_derivatives, calls)
 
     by_log = [results[k : k + len(parts)] for k in range(0, len(results), len(parts))]
-    e = np.concatenate([some[0][0] for some in by_log])
+    scales = [1.0 if view is None else view.scale for view in views]
+    e = np.concatenate([some[0][0] * scale for some, scale in zip(by_log, scales, strict=True)])
     derivatives = np.concatenate([np.concatenate([c for _, c in some], axis=-1) for some in by_log])
     jacobian = np.zeros((*e.shape, directions.shape[1]))
     jacobian[..., ask] = derivatives
     # From colours to unknowns: an unknown has the column of its colour, in the balances that it enters.
     jacobian = jacobian[..., colours]
-    return e, jacobian if directions.shape[1] == len(theta) else jacobian * superset.enters
+    jacobian = jacobian if directions.shape[1] == len(theta) else jacobian * superset.enters
+    if not any(views):
+        return e, jacobian
+    ends = np.cumsum([len(some[0][0]) for some in by_log])[:-1]
+    rows = zip(np.split(jacobian, ends), views, strict=True)
+    return e, np.concatenate([part if view is None else view.jacobian(part) for part, view in rows])
 
 
 def _directional_derivatives(
@@ -309,9 +417,10 @@ def grid_points(superset: CandidateModel, candidate: Candidate, data: CandidateS
     places = tuple((("effects", 0, n), None) for n in names)
     probes = np.stack([candidate.probe(k) for k in range(len(candidate.starts))])
     results = []
-    for arrays in data.arrays:
+    for arrays, view in data.arrays:
         chunks = [np.asarray(_columns(alone, places, arrays, jnp.asarray(s))) for s in _chunks(probes)]
-        results.append(np.concatenate(chunks)[: len(candidate.starts)])
+        columns = np.concatenate(chunks)[: len(candidate.starts)]
+        results.append(columns if view is None else columns * view.scale[:, None])
     columns = np.concatenate(results, axis=1)
     zero = np.zeros(columns.shape[1:3])
     return [Point(candidate, k, zero, c) for k, c in enumerate(columns)]

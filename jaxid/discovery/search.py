@@ -79,6 +79,9 @@ class Search:
         validation: Logs that must confirm each effect, prepared.
         progress: Called with a line of text at every stage.
         barred: Effects that were taken out for good.
+        view: View of the log on the superset; None: it is the only one that is fitted.
+        more: Further logs to fit with their views.
+        validation_views: Views of the validation logs; empty: they have none.
     """
 
     superset: cand.CandidateModel
@@ -88,9 +91,21 @@ class Search:
     validation: tuple[Prepared, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     barred: list[cand.Candidate] = field(default_factory=list)
+    view: cand.View | None = None
+    more: tuple[tuple[Prepared, cand.View], ...] = ()
+    validation_views: tuple[cand.View, ...] = ()
 
     def __post_init__(self) -> None:
-        self.acceptance = Acceptance(self.superset, self.data, self.validation, self.floor, self.colour)
+        self.acceptance = Acceptance(
+            self.superset,
+            self.data,
+            self.validation,
+            self.floor,
+            self.colour,
+            self.view,
+            self.more,
+            self.validation_views,
+        )
         self.samples = self.acceptance.samples
         self.model = Model((), self.superset.neutral)
         self._grid_points: dict[tuple[str, int], list[cand.Point]] = {}

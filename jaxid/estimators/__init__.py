@@ -17,7 +17,7 @@ from jaxid.consistency.absent import need_position
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.unknowns import in_loop
-from jaxid.names import LIKELIHOOD_METHODS, USER_METHODS
+from jaxid.names import LIKELIHOOD_METHODS, SEVERAL_LOGS, USER_METHODS
 from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 
 
 def _inverse_dynamics(session: Session) -> Steps[Estimate]:
+    if session.more:
+        from jaxid.estimators.several.force import inverse_dynamics_steps as together
+
+        return (yield from together(session))
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 
     if session.fit.log.steady is not None:
@@ -79,6 +83,13 @@ def _output_error(
     if session.machine.unforced(log):
         return (yield from _unforced(session, on, minimiser, numerics, precision))
     start = yield from _start(session)
+    if session.more:
+        from jaxid.estimators.several.output import output_error_steps as together
+
+        need_no_profile(session, precision["profile"])
+        kinds = {"start": start, "solver": solver, "minimiser": minimiser, "on": on}
+        result = yield from together(session, **kinds, hessian=precision["hessian"])
+        return replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
     if solver is not None and numerics is None:
         machine = session.machine if start is None else session.machine.with_estimate(start)
         numerics = choose_numerics(machine, log, solver=solver)
@@ -198,6 +209,13 @@ def _prediction_error(
     from jaxid.simulation.sensor_noise import force_noise
 
     machine, run, demands = session.machine, session.fit, session.case.identification
+    if session.more:
+        from jaxid.estimators.several.innovations import prediction_error_steps as together
+
+        need_no_profile(session, demands.profile if profile is None else profile)
+        need_no_hessian(session, demands.hessian if hessian is None else hessian)
+        first = yield from _inverse_dynamics(session)
+        return (yield from together(session, start=first.theta if first.all_identified else None))
     first = yield from inverse_dynamics_steps(machine, run.data)
     return (
         yield from prediction_error_steps(
@@ -280,6 +298,10 @@ def _didim(session: Session, *, numerics: Numerics | None = None) -> Steps[Estim
 
 
 def _power(session: Session) -> Steps[Estimate]:
+    if session.more:
+        from jaxid.estimators.several.force import power_steps as together
+
+        return together(session)
     from jaxid.estimators.power import power_steps
 
     session.fit.log.need_every_encoder("power")
@@ -287,6 +309,12 @@ def _power(session: Session) -> Steps[Estimate]:
 
 
 def _algebraic(session: Session) -> Steps[Estimate]:
+    if session.more:
+        from jaxid.estimators.several.force import algebraic_steps as together
+
+        if session.case.algebraic.window is not None:
+            session.need_one_log("[algebraic] window")
+        return together(session)
     from jaxid.estimators.algebraic.one_window import least_squares_steps
     from jaxid.estimators.algebraic.windows import algebraic_steps
 
@@ -392,10 +420,11 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
             method maximises no likelihood.
     """
     need_likelihood(method, session.case)
+    need_one_log(session, method)
     if method != "output_error":
         need_force(session, method)
     need_position(method, session.fit.log)
-    if method not in ("output_error", "within_prior"):
+    if method not in ("output_error", "within_prior") or session.more:
         need_known_reference(session, f"{method} takes them as they are")
         need_known_controller(session, f"{method} does not simulate the loop with them")
     if method == "within_prior":
@@ -436,6 +465,46 @@ def refuse_without_likelihood(option: str, method: str, where: str = "") -> None
             where=where,
             hint=f"choose one of {', '.join(LIKELIHOOD_METHODS)}, or leave out {option}",
         )
+
+
+def need_one_log(session: Session, method: str) -> None:
+    """Refuse several logs for a method that fits one.
+
+    Raises:
+        InputError: If the session has several logs, and the method is none of `jaxid.names.SEVERAL_LOGS`.
+    """
+    if not session.more:
+        return
+    where, several = session.case.where, ", ".join(SEVERAL_LOGS)
+    if method not in SEVERAL_LOGS:
+        what = f"{method} fits one log, and there are {len(session.fits)}"
+        raise InputError(what, where=where, hint=f"take one of {several}, or name one log")
+    if session.case.identification.physically_consistent:
+        what = "physically_consistent goes with one log"
+        raise InputError(what, where=f"{where}, [identification]", hint="leave it out, or name one log")
+
+
+def need_no_profile(session: Session, asked: Sequence[str]) -> None:
+    """Refuse profiles of a fit to several logs.
+
+    Raises:
+        InputError: If any is asked for.
+    """
+    if asked:
+        hint = "leave profile out, or name one log"
+        raise InputError("profile goes with one log", where=session.case.where, hint=hint)
+
+
+def need_no_hessian(session: Session, asked: bool) -> None:
+    """Refuse the full Hessian of innovations of several logs.
+
+    Raises:
+        InputError: If it is asked for.
+    """
+    if asked:
+        hint = "take output_error, or leave hessian out"
+        what = "prediction_error gives no full Hessian for several logs"
+        raise InputError(what, where=session.case.where, hint=hint)
 
 
 def need_consistent(method: str, case: Case) -> None:

@@ -78,8 +78,8 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
     long = ""
     if not plant.filters_fast:
         long = "a filter along the log of such a plant takes long"
-    elif log.samples > _LONG:
-        long = f"a filter along {log.samples} samples takes long"
+    elif (samples := sum(run.log.samples for run in session.fits)) > _LONG:
+        long = f"a filter along {samples} samples takes long"
     if long and (curvature or case.identification.hessian or case.identification.profile):
         return Choice(
             "output_error", f"{long}, and inverse_dynamics has no likelihood with a Hessian or profile"

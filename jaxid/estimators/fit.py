@@ -19,9 +19,9 @@ from jaxid.estimators.common.levenberg_marquardt import Transform, eliminated
 from jaxid.estimators.common.minimise import minimise
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.output_error import output_residual
-from jaxid.model.parameter import ParameterInfo, parameters_of
+from jaxid.model.by_name import Place, parameters_by_name
 from jaxid.model.plant import Plant
-from jaxid.model.unknowns import effect_name, leaf, scatter
+from jaxid.model.unknowns import leaf, scatter
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Drive
 from jaxid.simulation.replay import Replay
@@ -33,8 +33,6 @@ _SLOPE = 10
 _POSITIVE_FLOOR = 1e-9
 # Relative difference of sampling steps beyond which a time is not equally spaced.
 _UNEQUAL = 1e-6
-
-Place = tuple[tuple[str | int, ...], int | tuple[int, int] | None]
 
 
 class Fit(eqx.Module):
@@ -69,7 +67,7 @@ class Fit(eqx.Module):
 
 def parameter_names(plant: Plant) -> tuple[str, ...]:
     """Return the names of all parameters of a plant and its effects, as results and `fit` use them."""
-    return tuple(_parameters(plant))
+    return tuple(parameters_by_name(plant))
 
 
 def fit(
@@ -247,35 +245,11 @@ def _period(time: Array | float, samples: int) -> float:
     return period
 
 
-def _parameters(plant: Plant) -> dict[str, tuple[Place, ParameterInfo]]:
-    """Return place and description of every parameter by its name in results."""
-    out: dict[str, tuple[Place, ParameterInfo]] = {}
-
-    def add(name: str, path: tuple[str | int, ...], info: ParameterInfo) -> None:
-        value = leaf(plant, path)
-        if value is None:
-            return
-        if jnp.ndim(value) == 0:
-            out[name] = (path, None), info
-        for index in np.ndindex(jnp.shape(value)) if jnp.ndim(value) else ():
-            at = index[0] if len(index) == 1 else (index[0], index[1])
-            out[f"{name}[{', '.join(str(k + 1) for k in index)}]"] = (path, at), info
-
-    for name, info in parameters_of(type(plant)).items():
-        add(name, (name,), info)
-    before = eqx.tree_at(lambda p: p.effects, plant, ())
-    for k, effect in enumerate(plant.effects):
-        for field, info in parameters_of(type(effect)).items():
-            add(f"{effect_name(before, effect)}.{field}", ("effects", k, field), info)
-        before = before.with_effect(effect)
-    return out
-
-
 def _places(
     plant: Plant, free: Sequence[str] | Callable[[Plant], object]
 ) -> tuple[tuple[Place, ...], tuple[str, ...]]:
     """Return places and signs of the free parameters."""
-    every = _parameters(plant)
+    every = parameters_by_name(plant)
     if callable(free):
         leaves, structure = jax.tree.flatten(plant)
         numbers = jax.tree.unflatten(structure, range(len(leaves)))

@@ -51,8 +51,8 @@ _LOST = 0.5
 # The start of an open-loop run is fitted with the unknowns only if the residual's RMS is within this
 # factor of the position noise. Otherwise the error of the model would bias the start, which the first
 # samples determine far better.
-_NOISE_LIMITED = 3.0
-_CLEARLY = 10.0
+NOISE_LIMITED = 3.0
+CLEARLY = 10.0
 # See `turning_steps`: factor of a step's error, its allowed part of the noise, and the most steps.
 _TURNING = 0.04
 _LITTLE = 0.1
@@ -263,7 +263,7 @@ def output_error_steps(
         minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active), solver))
         problem = (*problem[:5], minimum.theta, *problem[6:])
     minimum = yield SolveRequest(_fit, (*problem, active, solver))
-    while chosen and _forgets(machine, numerics, np.asarray(minimum.theta)[:p]):
+    while chosen and forgets(machine, numerics, np.asarray(minimum.theta)[:p]):
         # Beyond the past commands that are kept a longer delay has no effect: keep more, and go on.
         numerics = replace(numerics, longest_delay=2 * numerics.longest_delay)
         longer = make_replay(machine, log, numerics)
@@ -286,7 +286,7 @@ def output_error_steps(
     if nuisance and looped:
         every = np.ones(p + nuisance, bool)
         freed = yield SolveRequest(_fit, (*problem, every, solver))
-        spare = _CLEARLY * nuisance / max(problem[3].size - p - nuisance, 1)
+        spare = CLEARLY * nuisance / max(problem[3].size - p - nuisance, 1)
         if bool(freed.converged) and float(freed.cost) * (1 + spare) < float(minimum.cost):
             minimum, active = freed, every
     elif nuisance:
@@ -397,7 +397,7 @@ def _profiles(
     return profiles, notes
 
 
-def _forgets(machine: Machine, numerics: Numerics, theta: np.ndarray) -> bool:
+def forgets(machine: Machine, numerics: Numerics, theta: np.ndarray) -> bool:
     """Check that a fitted delay reaches the end of the past commands, and that a loop can keep more."""
     if machine.controller is None or not 0 < numerics.longest_delay <= LONGEST_MEMORY // 2:
         return False
@@ -431,7 +431,7 @@ def _with_start(machine: Machine, log: Log, problem: tuple, minimum: Minimum) ->
     problem = (replay, *problem[1:5], minimum.theta, *problem[6:])
     rms = np.sqrt(np.mean(np.square(minimum.residual)))
     noise = position_noise(machine, log)
-    free = bool(rms <= _NOISE_LIMITED * np.max(noise))
+    free = bool(rms <= NOISE_LIMITED * np.max(noise))
     active = (np.arange(len(minimum.theta)) < p) | free
     return problem, active
 

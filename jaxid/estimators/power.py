@@ -160,6 +160,20 @@ def _solve(
     return levenberg_marquardt(residual, theta, transform, *bounds, damping=damping)
 
 
+@eqx.filter_jit
+def power_and_columns(
+    plant: Plant, places: tuple, windows: PowerData, theta: Float[Array, " p"]
+) -> tuple[Float[Array, "window k"], Float[Array, "window k p"]]:
+    """Return the weighted residual of the energy balance in every window, and its Jacobian."""
+
+    def residual(theta: Array) -> tuple[Array, Array]:
+        e = power_residual(scatter(places, plant, theta), windows)
+        return e, e
+
+    jacobian, e = jax.jacfwd(residual, has_aux=True)(theta)
+    return e, jacobian
+
+
 def power(machine: Machine, data: Prepared) -> Estimate:
     """Fit the unknowns to balances of energy over windows by least squares.
 
@@ -178,7 +192,7 @@ def power(machine: Machine, data: Prepared) -> Estimate:
 
 def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
     """Run `power` as a generator of solve requests."""
-    windows, unit = _windows(machine, data)
+    windows, unit = windows_of(machine, data)
     plant, parameters = sharpened(machine.plant, data), machine.parameters
     transform, damping = linear_scale(machine)
     fit = yield SolveRequest(
@@ -220,7 +234,7 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
     )
 
 
-def _windows(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
+def windows_of(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     """Return the windows over a log, and the RMS force of its drives [N or N m].
 
     The energy of a window is divided by the root of the product of its integrals of w^2 and (w qd)^2. The

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import needed_steps
 
 # Evaluations that show which start is the best one.
-_SCREENING = 12
+SCREENING = 12
 # Noise of the force at the start, as a part of the force; a large one makes a wrong model possible.
 _FORCE_NOISE = 0.1
 # Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow
@@ -44,11 +44,11 @@ _QUIET = 1e-3
 # Steps of the last fit of such a log for each one before.
 _FINER = 4
 # Pairs of simulated noise for the correction of the bias by noise of the command's reading.
-_PAIRS = 4
+PAIRS = 4
 # Eigenvalue of the scaled information, relative to the largest, below which a direction is not corrected.
-_BLIND = 1e-10
+BLIND = 1e-10
 # Lags of the test of whiteness, and the probability at which it rejects.
-_LAGS, _REJECTS = 20, 1e-3
+LAGS, REJECTS = 20, 1e-3
 
 
 def prediction_error(
@@ -110,24 +110,62 @@ def prediction_error(
     )
 
 
-def prediction_error_steps(
+@dataclass(frozen=True)
+class Likelihood:
+    """The likelihood of a log with what a fit of it starts from.
+
+    Args:
+        problem: The likelihood, at the highest floor of the noise.
+        machine: The machine at its guesses.
+        log: The log, whose force is the command that drives the filter.
+        numerics: Settings of the integration.
+        applied: Command of the declared law, if it explains the logged one; None: the logged one drives.
+        slow: Mask of the samples at rest, which do not count; None: all count.
+        force: Size of the logged force, (m,).
+        noise: Logarithms of the noise at the start, of the force and then of the readings, (m + k,).
+        floors: Lower bounds on them, in turn.
+    """
+
+    problem: Innovations
+    machine: Machine
+    log: Log
+    numerics: Numerics
+    applied: np.ndarray | None
+    slow: np.ndarray | None
+    force: np.ndarray
+    noise: np.ndarray
+    floors: Sequence[np.ndarray]
+
+    def sticks_surely(self, noise: np.ndarray) -> bool:
+        """Check that there is so little noise of the force that it is known when a joint sticks."""
+        if self.slow is None or self.applied is None:
+            return False
+        return bool(np.all(np.exp(noise[: len(self.force)]) < _QUIET * self.force))
+
+    def at_rest_too(self, problem: Innovations) -> Innovations:
+        """Return the likelihood with the samples at rest."""
+        # So precise a fit shows the error of a step in which a joint comes to rest.
+        finer = replace(self.numerics, substeps=_FINER * self.numerics.substeps)
+        kalman = make_filter(self.machine, self.log, finer)
+        counts = np.asarray(kalman.used)[:: kalman.every][:, list(self.log.measured)]
+        return problem._replace(kalman=kalman, counts=counts)
+
+
+def likelihood_of(
     machine: Machine,
     log: Log,
     *,
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
     rest_velocity: np.ndarray | None = None,
-    command_noise: np.ndarray | None = None,
-    alone: bool = False,
-    hessian: bool = False,
-    profile: Sequence[str] = (),
-) -> Steps[Estimate]:
-    """Run `prediction_error` as a generator of solve requests."""
-    need_names(profile, machine.parameters.names)
+) -> Likelihood:
+    """Return the likelihood of a log; see `prediction_error` for the arguments.
+
+    Raises:
+        InputError: If too few readings count.
+    """
     if numerics is None:
-        # Guesses that are far off, such as inertias of no possible body, may need many more steps.
-        near = machine if start is None else machine.with_estimate(np.clip(start, *machine.parameters.bounds))
-        numerics = exact_numerics(machine, log, needed_steps(near, log))
+        numerics = needed_numerics(machine, log, start)
     parameters, measured = machine.parameters, list(log.measured)
     applied = noise_free_command(machine, log)
     driven = log if applied is None else replace(log, force=applied)
@@ -150,17 +188,43 @@ def prediction_error_steps(
     reading = np.maximum(position_noise(machine, log), 1e-9 * stroke)[measured]
     noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
     floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
-    transform, bounds = Transform.of(parameters), parameters.bounds
     problem = Innovations(
         kalman=kalman,
         places=parameters.places,
         plant=machine.plant,
         counts=counts,
-        transform=transform,
-        bounds=bounds,
+        transform=Transform.of(parameters),
+        bounds=parameters.bounds,
         low=floors[0],
         high=np.log(np.concatenate([_MOST * force, _READING_RANGE[1] * reading])),
     )
+    return Likelihood(problem, machine, driven, numerics, applied, slow, force, noise, floors)
+
+
+def needed_numerics(machine: Machine, log: Log, start: np.ndarray | None) -> Numerics:
+    """Return the settings of the integration that a machine needs at its start."""
+    # Guesses that are far off, such as inertias of no possible body, may need many more steps.
+    near = machine if start is None else machine.with_estimate(np.clip(start, *machine.parameters.bounds))
+    return exact_numerics(machine, log, needed_steps(near, log))
+
+
+def prediction_error_steps(
+    machine: Machine,
+    log: Log,
+    *,
+    start: np.ndarray | None = None,
+    numerics: Numerics | None = None,
+    rest_velocity: np.ndarray | None = None,
+    command_noise: np.ndarray | None = None,
+    alone: bool = False,
+    hessian: bool = False,
+    profile: Sequence[str] = (),
+) -> Steps[Estimate]:
+    """Run `prediction_error` as a generator of solve requests."""
+    need_names(profile, machine.parameters.names)
+    begun = likelihood_of(machine, log, start=start, numerics=numerics, rest_velocity=rest_velocity)
+    parameters, problem, noise, force = machine.parameters, begun.problem, begun.noise, begun.force
+    transform, bounds, applied = problem.transform, problem.bounds, begun.applied
 
     # Beside another method's start the guesses matter for shapes only, whose likelihood has several maxima.
     p, m, steps = len(parameters.free), len(force), 0
@@ -170,14 +234,14 @@ def prediction_error_steps(
         starts.insert(0, np.clip(start, *bounds))
     theta, trials = starts[0], []
     for at in starts if len(starts) > 1 else ():
-        trials.append((yield SolveRequest(fit, (problem, at, noise, np.asarray(_SCREENING)))))
+        trials.append((yield SolveRequest(fit, (problem, at, noise, np.asarray(SCREENING)))))
     if trials:
         best = min(trials, key=lambda trial: np.nan_to_num(float(trial.cost), nan=np.inf))
         theta, noise = np.asarray(transform.outward(best.x[:p])), best.x[p:]
         steps = sum(int(trial.steps) for trial in trials)
 
     scored = None
-    for floor in floors:
+    for floor in begun.floors:
         problem = problem._replace(low=floor)
         scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(STEPS)))
         theta, noise = np.asarray(transform.outward(scored.x[:p])), np.asarray(scored.x[p:])
@@ -187,12 +251,8 @@ def prediction_error_steps(
     assert scored is not None, "there is at least one floor"
 
     # Without noise of the force it is known when a joint sticks, and samples at rest count too.
-    if slow is not None and applied is not None and np.all(np.exp(noise[:m]) < _QUIET * force):
-        # So precise a fit shows the error of a step in which a joint comes to rest.
-        finer = replace(numerics, substeps=_FINER * numerics.substeps)
-        kalman = make_filter(machine, driven, finer)
-        counts = np.asarray(kalman.used)[:: kalman.every][:, measured]
-        problem = problem._replace(kalman=kalman, counts=counts)
+    if begun.sticks_surely(noise):
+        problem = begun.at_rest_too(problem)
         scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(STEPS)))
         theta, steps = np.asarray(transform.outward(scored.x[:p])), steps + int(scored.steps)
 
@@ -254,7 +314,7 @@ def _corrected_steps(
     command, every = np.asarray(kalman.command), kalman.every
     information = np.asarray((yield at(command)).information)
     rng, gradients = np.random.default_rng(0), []
-    for _ in range(_PAIRS):
+    for _ in range(PAIRS):
         more = read * rng.standard_normal((len(command[::every]), drives))
         more = np.repeat(more, every, axis=0)[: len(command)]
         for sign in (1.0, -1.0):
@@ -263,7 +323,7 @@ def _corrected_steps(
         return x[:p], np.zeros(drives)
 
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information / np.outer(size, size), rcond=_BLIND, hermitian=True)
+    inverse = np.linalg.pinv(information / np.outer(size, size), rcond=BLIND, hermitian=True)
     shift = -inverse @ (np.mean(gradients, axis=0) / size) / size
     return x[:p] - shift[:p], read
 
@@ -326,7 +386,7 @@ def _estimate(
             "the command was computed by the declared law from the logged readings: the logged one is the "
             "same but for white noise of its reading"
         )
-    if min(p_values) < _REJECTS:
+    if min(p_values) < REJECTS:
         notes.append(
             "the innovations are not white (rounding, coloured noise or an incomplete model): the standard "
             "deviations are widened accordingly"
@@ -351,7 +411,7 @@ def _estimate(
                 "velocity" if problem.kalman.of_velocity else "position": noise[drives:],
             },
             "log_likelihood": -float(scored.cost),
-            "whiteness": {"lags": _LAGS, "p": p_values},
+            "whiteness": {"lags": LAGS, "p": p_values},
         },
     )
 
@@ -413,7 +473,7 @@ def _precision(
     return replace(precision, kind=FULL_HESSIAN if precision.kind == FULL_HESSIAN else FISHER)
 
 
-def whiteness(z: Float[np.ndarray, " time"], lags: int = _LAGS) -> float:
+def whiteness(z: Float[np.ndarray, " time"], lags: int = LAGS) -> float:
     """Return the probability that white noise has autocorrelations as large as these.
 
     Source:

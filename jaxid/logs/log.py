@@ -74,6 +74,7 @@ class Log:
         table: The `[log]` table by which it was read; None: it was not read from a file.
         integrated: Whether the velocity was measured, and the position is its integral.
         steady: Precision of the rows of a table of steady speeds; None: the rows are samples over time.
+        others: Stretches of rows of the same file that gaps separate from this one, first and end.
     """
 
     time: Column
@@ -92,6 +93,7 @@ class Log:
     table: LogTable | None = None
     integrated: bool = False
     steady: SteadyRows | None = None
+    others: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
         """Copy the arrays, make them read-only and check that they fit together.
@@ -340,7 +342,8 @@ def read_log(
     names = _names(table)
     _check_distinct(names)
     wanted = [name for group in names.values() for name in group]
-    content = read_table(path, wanted, table.rows, table) if read is None else read(path, wanted, table.rows)
+    stretch = one_stretch(table, str(path))
+    content = read_table(path, wanted, stretch, table) if read is None else read(path, wanted, stretch)
     content = content if isinstance(content, Table) else Table(*content)
     data, rows = content.columns, content.rows
     _check_finite(data, rows[0], path, content.sparse if table.resample is None else set(data) - {table.time})
@@ -363,7 +366,7 @@ def read_log(
     frame = Frame() if frame is None else frame
     groups, units = converted(groups, names, content.units, table, frame, str(path))
     groups, absent = _completed(groups, joints, drives)
-    time, groups, rows, timing = _at_one_rate(groups, table, rows, path)
+    time, groups, rows, timing, others = _at_one_rate(groups, table, rows, path)
     if time.size < MINIMUM_SAMPLES:
         raise _too_short(time.size, path)
     return Log(
@@ -373,6 +376,7 @@ def read_log(
         source=str(path),
         assumed=(*content.assumed, *absent, *units, *wraps, *timing),
         table=table,
+        others=others,
         **{"position": None, **groups},
     )
 
@@ -410,6 +414,21 @@ def _joins(position: np.ndarray, stated: bool | float) -> list[Assumed]:
     ]
 
 
+def one_stretch(table: LogTable, where: str) -> Rows | None:
+    """Return the rows of a log that is read as one; None: all.
+
+    Raises:
+        InputError: If the table names several stretches.
+    """
+    if table.rows is None:
+        return None
+    first, end = table.rows[0], table.rows[-1]
+    if isinstance(first, tuple) or isinstance(end, tuple):
+        hint = "several are fitted together by jaxid.identify; name one here"
+        raise InputError(f"rows names {len(table.rows)} stretches", where=where, hint=hint)
+    return first, end
+
+
 def _too_short(samples: int, path: Path) -> InputError:
     hint = f"at least {MINIMUM_SAMPLES} are needed: log for longer, or widen rows"
     return InputError(f"is too short: {samples} samples", where=str(path), hint=hint)
@@ -417,11 +436,12 @@ def _too_short(samples: int, path: Path) -> InputError:
 
 def _at_one_rate(
     groups: dict[str, np.ndarray], table: LogTable, rows: Rows, path: Path
-) -> tuple[np.ndarray, dict[str, np.ndarray], Rows, list[Assumed]]:
+) -> tuple[np.ndarray, dict[str, np.ndarray], Rows, list[Assumed], tuple[Rows, ...]]:
     """Bring all columns to one rate.
 
     Returns:
-        Time, columns by quantity, rows of the file, and everything that was assumed.
+        Time, columns by quantity, rows of the file, everything that was assumed, and the rows of other
+        stretches between gaps.
     """
     column = groups.pop("time", None)
     where = str(path) if column is None else f"{path}, column '{table.time}'"
@@ -440,7 +460,7 @@ def _at_one_rate(
     plain = base.time.size == stamps.size
     used = groups if plain else {name: base.of_samples(values) for name, values in groups.items()}
     if whole and base.even and table.resample is None:
-        return base.time, used, kept, list(base.assumed)
+        return base.time, used, kept, list(base.assumed), base.others
 
     own = {name: readings_of(base.time, values, name, str(path)) for name, values in used.items()}
     time, made, said = resampled(
@@ -451,7 +471,7 @@ def _at_one_rate(
         held=table.hold == "zero_order",
         where=str(path),
     )
-    return time, made, kept, [*base.assumed, *_of_rare(own, base), *said]
+    return time, made, kept, [*base.assumed, *_of_rare(own, base), *said], base.others
 
 
 def _of_rare(own: Mapping[str, list[Readings]], base: TimeBase) -> list[Assumed]:

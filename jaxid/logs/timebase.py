@@ -40,6 +40,7 @@ class TimeBase:
         even: Whether the samples are at one rate as they are.
         missing: Samples that are missing between others.
         assumed: Everything that the log decided.
+        others: Other stretches of rows between gaps, first and end, the longest first, without short ones.
     """
 
     time: Float[np.ndarray, " samples"]
@@ -48,6 +49,7 @@ class TimeBase:
     even: bool
     missing: int
     assumed: tuple[Assumed, ...]
+    others: tuple[tuple[int, int], ...] = ()
 
     @property
     def rows(self) -> tuple[int, int]:
@@ -108,7 +110,7 @@ def time_base(
         what = f"{again.sum()} row(s) have the time of the row before, first row {first + np.argmax(again)}"
         assumed.append(Assumed("doubled_rows", int(again.sum()), f"{what}: their readings are averaged"))
     period = _period(np.diff(time))
-    start, end, said = _longest(time, period, rows, first)
+    start, end, said, others = _longest(time, period, rows, first)
     assumed += said
     time = time[start:end]
     rows = np.where((rows >= start) & (rows < end), rows - start, -1)
@@ -126,7 +128,7 @@ def time_base(
         )
         what += f"; {missing} sample(s) are missing" if missing else ""
         assumed.append(Assumed("uneven_time", late, what))
-    return TimeBase(time, rows, period, even, missing, tuple(assumed))
+    return TimeBase(time, rows, period, even, missing, tuple(assumed), others)
 
 
 def _check_forward(time: np.ndarray, step: np.ndarray, first: int, where: str) -> None:
@@ -171,8 +173,10 @@ def _period(step: np.ndarray) -> float:
     return float(step[near].sum() / many[near].sum())
 
 
-def _longest(time: np.ndarray, period: float, rows: np.ndarray, first: int) -> tuple[int, int, list[Assumed]]:
-    """Return the longest stretch of samples without a gap, and words on the others."""
+def _longest(
+    time: np.ndarray, period: float, rows: np.ndarray, first: int
+) -> tuple[int, int, list[Assumed], tuple[tuple[int, int], ...]]:
+    """Return the longest stretch of samples without a gap, words on the others, and their rows."""
     step = np.diff(time)
     gaps = np.flatnonzero(step > _GAP * period)
     # A missing sample beside the ends is no reason to invent one.
@@ -180,7 +184,7 @@ def _longest(time: np.ndarray, period: float, rows: np.ndarray, first: int) -> t
     ends = holes[(holes < _EDGE) | (holes >= step.size - _EDGE)]
     cuts = np.union1d(gaps, ends).astype(int)
     if not cuts.size:
-        return 0, time.size, []
+        return 0, time.size, [], ()
     edges = np.concatenate([[0], cuts + 1, [time.size]])
     lengths = np.diff(edges)
     k = int(np.argmax(lengths))
@@ -195,4 +199,5 @@ def _longest(time: np.ndarray, period: float, rows: np.ndarray, first: int) -> t
     if others:
         listed = ", ".join(f"[{row[n]}, {row[n + 1]}]" for n in others[:4])
         what += f"; others are rows = {listed}"
-    return int(edges[k]), int(edges[k + 1]), [Assumed("rows", [row[k], row[k + 1]], what)]
+    said = [Assumed("rows", [row[k], row[k + 1]], what)]
+    return int(edges[k]), int(edges[k + 1]), said, tuple((row[n], row[n + 1]) for n in others)

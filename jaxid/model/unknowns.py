@@ -37,6 +37,7 @@ class Free:
         lower, upper: Bounds that the case states.
         index: Entry of the leaf if it is a list; row and entry if it is a list of lists.
         true: Value for simulation and studies, if it differs from the guess.
+        log: Name of the log in which this value holds; None: it is that of all logs.
     """
 
     name: str
@@ -48,6 +49,12 @@ class Free:
     upper: float = np.inf
     index: int | tuple[int, int] | None = None
     true: float | None = None
+    log: str | None = None
+
+    @property
+    def parameter(self) -> str:
+        """Name of the parameter in results, without that of a log."""
+        return self.name if self.log is None else self.name.removesuffix(of_log("", self.log))
 
     @property
     def effect(self) -> int | None:
@@ -61,6 +68,11 @@ class Free:
     def get(self, plant: Plant) -> Array:
         """Return the leaf that holds this unknown."""
         return leaf(plant, self.path)
+
+
+def of_log(name: str, log: str) -> str:
+    """Return the name of an unknown that has a value of its own in a log."""
+    return f"{name} @ {log}"
 
 
 @dataclass(frozen=True)

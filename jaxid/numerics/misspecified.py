@@ -8,6 +8,8 @@ stretches that are far apart are independent.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float, Int
@@ -56,6 +58,7 @@ def widening(
     jacobian: Float[np.ndarray, "time n p"],
     residual: Float[np.ndarray, "time n"],
     counts: Bool[np.ndarray, "time n"],
+    logs: Sequence[int] = (),
 ) -> Float[np.ndarray, " p"]:
     """Return the factors of standard deviations that make them as large as the scores of long blocks imply.
 
@@ -67,15 +70,23 @@ def widening(
         jacobian: Jacobian of the residual, (time, n, p).
         residual: Residual at the fit, (time, n).
         counts: Mask of the samples that count, (time, n).
+        logs: Samples of each log, if several stand one behind the other.
 
     Returns:
         Factors of at least one, (p,); one where the log is too short or the unknown is not identifiable.
     """
     keep, factor = precision.identifiable, np.ones(len(precision.identifiable))
-    if not keep.any() or len(residual) < 2 * _BLOCKS:
+    lengths = tuple(logs) or (len(residual),)
+    if not keep.any() or min(lengths) < 2 * _BLOCKS:
         return factor
-    # Blocks of equal time.
-    edges = np.array([part[0] for part in np.array_split(np.arange(len(residual)), _BLOCKS)[1:]])
+    # Blocks of equal time in each log.
+    ends = np.cumsum(lengths).tolist()
+    blocks = [
+        part[0]
+        for length, end in zip(lengths, ends, strict=True)
+        for part in np.array_split(np.arange(end - length, end), _BLOCKS)
+    ]
+    edges = np.array(blocks[1:])
     covariance = block_covariance(jacobian[..., keep], residual, counts, edges)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(np.diag(covariance)) / precision.std[keep]

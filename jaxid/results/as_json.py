@@ -56,6 +56,9 @@ def parameters_json(
     for k, (f, value, std, told) in enumerate(rows):
         if names is not None and f.name not in names:
             continue
+        if f.log is not None:
+            _add_of_log(out, f, value, std, told)
+            continue
         entry = {
             "value": float(value) if told else None,
             "std": float(std) if told else None,
@@ -73,6 +76,19 @@ def parameters_json(
             *row, at = np.atleast_1d(f.index)
             (listed[key][row[0]] if row else listed[key])[at] = entry[key]
     return out
+
+
+def _add_of_log(out: dict[str, Any], f: Free, value: float, std: float, told: bool) -> None:
+    """Add the value of an unknown in one log to its entry."""
+    entry = out.setdefault(
+        f.parameter, {"value": None, "std": None, "unit": f.unit, "identifiable": True, "by_log": {}}
+    )
+    entry["identifiable"] = bool(entry["identifiable"] and told)
+    entry["by_log"][f.log] = {
+        "value": float(value) if told else None,
+        "std": float(std) if told else None,
+        "identifiable": bool(told),
+    }
 
 
 def _key(f: Free) -> str:
@@ -108,40 +124,40 @@ def _pick(gap: Gap, what: str) -> np.ndarray | None:
 
 
 def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[str, Any]:
-    """Return the object `gap` of result.json."""
-    fit, others = gaps[0], gaps[1:]
+    """Return the object `gap` of result.json.
+
+    Of several fitted logs `fit` holds the worst, and `fits` each by its name.
+    """
+    fitted, others = gaps[: len(session.fits)], gaps[len(session.fits) :]
     unit, measured = session.machine.unit_by_joint, np.flatnonzero(session.fit.log.measured).tolist()
     out: dict[str, Any] = {
         "unit": unit("force"),
         "band_hz": _band(session),
-        "fit": one_or_list(fit.force.rms),
+        "fit": _worst(fitted, "force.rms"),
         "validation": _worst(others, "force.rms"),
         "noise_floor": one_or_list(floor),
-        "relative": {"fit": one_or_list(fit.force.relative), "validation": _worst(others, "force.relative")},
+        "relative": {
+            "fit": _worst(fitted, "force.relative"),
+            "validation": _worst(others, "force.relative"),
+        },
         "simulation": {
             "unit": unit("position", None if len(measured) > 1 else measured),
-            "fit": one_or_list(_pick(fit, "simulation.rms")),
+            "fit": _worst(fitted, "simulation.rms"),
             "validation": _worst(others, "simulation.rms"),
             "relative": {
-                "fit": one_or_list(_pick(fit, "simulation.relative")),
+                "fit": _worst(fitted, "simulation.relative"),
                 "validation": _worst(others, "simulation.relative"),
             },
             "command_relative": {
-                "fit": one_or_list(_pick(fit, "simulation.command_relative")),
+                "fit": _worst(fitted, "simulation.command_relative"),
                 "validation": _worst(others, "simulation.command_relative"),
             },
         },
     }
+    if len(fitted) > 1:
+        out["fits"] = {g.name: _of_one(g) for g in fitted}
     if len(others) > 1:
-        out["validations"] = {
-            g.name: {
-                "force": one_or_list(g.force.rms),
-                "relative": one_or_list(g.force.relative),
-                "simulation": one_or_list(_pick(g, "simulation.rms")),
-                "simulation_relative": one_or_list(_pick(g, "simulation.relative")),
-            }
-            for g in others
-        }
+        out["validations"] = {g.name: _of_one(g) for g in others}
     return out
 
 
@@ -149,6 +165,16 @@ def _band(session: Session) -> float | None:
     """Return the edge of the band in which forces are compared [Hz]; None for a table, which has no time."""
     log = session.fit.log
     return None if log.steady is not None else session.recipe.band_hz(log.rate_hz)
+
+
+def _of_one(gap: Gap) -> dict[str, Any]:
+    """Return the gap of one of several logs."""
+    return {
+        "force": one_or_list(gap.force.rms),
+        "relative": one_or_list(gap.force.relative),
+        "simulation": one_or_list(_pick(gap, "simulation.rms")),
+        "simulation_relative": one_or_list(_pick(gap, "simulation.relative")),
+    }
 
 
 def versions() -> dict[str, str]:
@@ -333,8 +359,9 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
     """Return the content of discovery.json."""
     declared = {_key(f) for f in result.session.machine.parameters.free}
     before, after = result.gaps_before, result.gaps_after
-    on = "validation" if len(after) > 1 else "fit"
-    judged = slice(1, None) if len(after) > 1 else slice(0, 1)
+    fits = len(result.session.fits)
+    on = "validation" if len(after) > fits else "fit"
+    judged = slice(fits, None) if len(after) > fits else slice(0, fits)
     machine = result.session.machine
     measured = np.flatnonzero(result.session.fit.log.measured).tolist()
     return {

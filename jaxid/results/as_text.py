@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from jaxid.estimators.common.derived import Derived
     from jaxid.estimators.estimate import Estimate
     from jaxid.gap import Gap
+    from jaxid.machine import Machine
     from jaxid.results.result import FitResult
     from jaxid.session import Session
     from jaxid.studies.result import Study
@@ -90,6 +91,17 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
     ]
 
 
+def logs_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[list[str]]:
+    """Return a header, and the disagreement of a model with each of several fitted logs."""
+    gap = results.gap_json(session, gaps, floor)
+    units = joined(gap["unit"]), joined(gap["simulation"]["unit"])
+    rows = [["fitted log", "samples", f"force [{units[0]}]", f"simulated position [{units[1]}]"]]
+    for run in session.fits:
+        own = gap["fits"][run.name]
+        rows.append([run.name, str(run.log.samples), _number(own["force"]), _number(own["simulation"])])
+    return rows
+
+
 def _parameters_text(result: FitResult) -> str:
     """Return the table of parameters, with a line below it if the model is incomplete."""
     derived = results.derived(result.session, result.estimate)
@@ -118,6 +130,8 @@ def identification_table(result: Identification) -> str:
         *(_minimal(estimate.details["minimal"]) if "minimal" in estimate.details else []),
     ]
     gap = aligned(gap_rows(session, result.gaps, result.noise_floor))
+    if session.more:
+        gap += "\n\n" + aligned(logs_rows(session, result.gaps, result.noise_floor)) + "\n"
     notes = _notes(results.notes(session, estimate))
     seen = results.reading_lines(session)
     lines = [*result.findings, "", *seen, head, "", parameters, *below, "", gap, _FLOOR_WORDS, *notes]
@@ -257,15 +271,11 @@ def check_table(result: Check) -> str:
     """Return the text that `check` prints."""
     content = result.json()
     log, machine = content["log"], result.session.machine
-    driven = machine.plant.driven(machine.plant.joints)
     unit = lambda quantity, joints=None: joined(machine.unit_by_joint(quantity, joints))
     one = results.one_or_list
-    head = (
-        f"{log['samples']} samples at {log['rate_hz']:.6g} Hz, {log['duration_s']:.4g} s; stroke "
-        f"{_number(one(log['stroke']))} {unit('position')}, up to "
-        f"{_number(one(log['peak_velocity']))} {unit('position/time')} and "
-        f"{_number(one(log['peak_force']))} {unit('force', driven)}; {100 * log['moving']:.0f} % moving"
-    )
+    heads = [_motion_line(log, machine)]
+    if "fits" in content:
+        heads = [f"{name}: {_motion_line(own, machine)}" for name, own in content["fits"].items()]
     recipe = content["preprocess"]
     what = f"{recipe['cutoff_hz']:.4g} Hz"
     if "reach" in recipe:
@@ -283,20 +293,34 @@ def check_table(result: Check) -> str:
         f"noise of a reading: {what} {_number(one(log[f'{what}_noise']))} {unit(of)} "
         f"({source[what]}), force {_number(log['force_noise'])} in units of the log ({source['force']})"
     )
-    lines = [head, how, noise]
+    lines = [*heads, how, noise]
     if result.session.fit.log.steady is not None:
         peaks = f"{_number(one(log['peak_velocity']))} {unit('position/time')}"
-        peaks += f" and {_number(one(log['peak_force']))} {unit('force', driven)}"
+        peaks += f" and {_number(one(log['peak_force']))} {unit('force')}"
         lines = [f"{log['samples']} steady speeds, up to {peaks}"]
     rows = check_rows(content)
     combinations = _unidentifiable_lines([c["combination"] for c in content["unidentifiable"]])
     table = ["", aligned(rows)] if len(rows) > 1 else []
     session = result.session
+    sound = "the logs are sound" if "fits" in content else "the log is sound"
     seen = [str(sight) for sight in result.sights]
     doubts = [f for f in session.findings if not f.about]
     others = [f"log {run.name}: {sight}" for run in session.runs[1:] for sight in sights_of(run.log)]
     notes = _notes([f"{f.where}: {f.what}; {f.hint}" for f in doubts])
-    return "\n".join([*seen, *others, "the log is sound", *lines, *table, *combinations, *notes])
+    return "\n".join([*seen, *others, sound, *lines, *table, *combinations, *notes])
+
+
+def _motion_line(log: Mapping[str, Any], machine: Machine) -> str:
+    """Return length, stroke, speed and force of a log in one line."""
+    driven = machine.plant.driven(machine.plant.joints)
+    unit = lambda quantity, joints=None: joined(machine.unit_by_joint(quantity, joints))
+    one = results.one_or_list
+    return (
+        f"{log['samples']} samples at {log['rate_hz']:.6g} Hz, {log['duration_s']:.4g} s; stroke "
+        f"{_number(one(log['stroke']))} {unit('position')}, up to "
+        f"{_number(one(log['peak_velocity']))} {unit('position/time')} and "
+        f"{_number(one(log['peak_force']))} {unit('force', driven)}; {100 * log['moving']:.0f} % moving"
+    )
 
 
 def check_rows(content: Mapping[str, Any]) -> list[list[str]]:

@@ -8,7 +8,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.model.effect import Effect
-from jaxid.model.unknowns import CONTROLLER, REFERENCE, several_places
+from jaxid.model.unknowns import CONTROLLER, REFERENCE, Free, several_places
 from jaxid.plants.link_tree import LinkTree
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _findings(result: FitResult) -> Findings:
     added: dict[int, dict[str, Value]] = {}
 
     rows = zip(machine.parameters.free, result.estimate.theta, result.estimate.identifiable, strict=True)
-    for f, estimate, identifiable in rows:
+    for f, estimate, identifiable in _by_place(rows):
         guess = _rounded(estimate)
         known = bool(identifiable) and math.isfinite(guess)
         match f.path:
@@ -146,6 +146,16 @@ def _findings(result: FitResult) -> Findings:
         controller,
         tuple(_added(machine.plant, k, values) for k, values in added.items()),
     )
+
+
+def _by_place(rows: Iterable[tuple[Free, float, bool]]) -> Iterator[tuple[Free, float, bool]]:
+    """Yield unknowns with estimate and identifiability; one with a value in each log has their mean."""
+    places: dict[Any, list[tuple[Free, float, bool]]] = {}
+    for f, estimate, identifiable in rows:
+        places.setdefault((f.path, f.index), []).append((f, estimate, identifiable))
+    for of_logs in places.values():
+        known = [row for row in of_logs if row[2]] or of_logs
+        yield known[0][0], float(np.mean([row[1] for row in known])), known[0][2]
 
 
 def _added(plant: Any, number: int, values: dict[str, Value]) -> tuple:

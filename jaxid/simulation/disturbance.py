@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
-from jaxid.logs.log import Log
+from jaxid.logs.log import Log, one_stretch
 from jaxid.logs.readers import read_columns, read_table
 from jaxid.logs.units import time_factor
 from jaxid.settings import Disturbance
@@ -71,7 +71,7 @@ def _rows_of(name: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
     table = log.table
     assert table is not None, "only a log from a file is resampled"
     time = [] if table.time is None else [table.time]
-    content = read_table(log.source, [*time, name], table.rows, table)
+    content = read_table(log.source, [*time, name], one_stretch(table, log.source), table)
     values = content.columns[name]
     if table.time is None:
         return np.arange(*content.rows) / (table.sample_rate or 1.0), values

@@ -12,6 +12,7 @@ from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.machine import Machine
 from jaxid.scene import Scene, sampling_of
+from jaxid.studies.logs import with_logs
 from jaxid.studies.settings import SETTINGS
 
 
@@ -71,7 +72,8 @@ def levels_of(case: Case, model: Case, longer_delays: float) -> tuple[Level, ...
         chosen = dict(zip(others, values, strict=True))
         scene = Scene.of(_under(case, chosen), longer_delays=longer_delays)
         of_model = _under(model, chosen)
-        machine = build_machine(of_model, period=1 / sampling_of(of_model)[0])
+        scene = replace(scene, machine=with_logs(scene.case, scene.machine))
+        machine = with_logs(of_model, build_machine(of_model, period=1 / sampling_of(of_model)[0]))
         for noise in noises:
             noisy = replace(scene, machine=_noisier(scene.machine, noise))
             levels.append(Level(chosen | {"noise": noise}, of_model, noisy, _noisier(machine, noise)))

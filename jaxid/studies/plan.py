@@ -17,7 +17,7 @@ from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.estimators import need_consistent, need_likelihood
 from jaxid.machine import Machine
-from jaxid.names import DISCOVER, IN_LOOP
+from jaxid.names import DISCOVER, IN_LOOP, SEVERAL_LOGS, USER_METHODS
 from jaxid.numerics.lanes import cores
 from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
@@ -87,7 +87,11 @@ class Plan:
                 "no parameter is unknown", where=where, hint="give at least one parameter as { guess = ... }"
             )
         estimators = setting.estimators
+        several = len(case.fits) > 1
         for method in estimators:
+            if several and method != DISCOVER and method not in (*SEVERAL_LOGS, *USER_METHODS):
+                what, hint = f"{method} fits one log", f"take one of {', '.join(SEVERAL_LOGS)}"
+                raise InputError(what, where=f"{where}, [study] estimators", hint=hint)
             if method == IN_LOOP:
                 _need_learner(case, levels[0].scene)
             elif method != DISCOVER:

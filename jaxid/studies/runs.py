@@ -16,9 +16,10 @@ from jaxid.estimators.output_error import choose_numerics
 from jaxid.logs.prepare import Recipe
 from jaxid.names import DISCOVER, IN_LOOP
 from jaxid.numerics.lanes import Steps, run_alone, run_batched
-from jaxid.session import Session, session_around
+from jaxid.session import Session, session_around, session_around_several
 from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics
+from jaxid.studies.logs import machines_of
 from jaxid.studies.loop_fits import LoopFits
 from jaxid.studies.plan import Plan
 from jaxid.studies.rows import COLUMNS, Arrays, RunRow, stacked
@@ -61,8 +62,12 @@ class Runner:
     def _chosen(self, level: int) -> Ways:
         """Choose as `identify` does on the log of the nominal machine."""
         at = self.plan.levels[level]
-        log = run_alone(at.scene.simulated_log(at.scene.machine, self.plan.drawn(0)[2])).log
-        session = session_around(at.model, at.machine, log)
+        _, _, simulated = machines_of(at.scene.case, at.scene.machine)[0]
+        log = run_alone(at.scene.simulated_log(simulated, self.plan.drawn(0)[2])).log
+        _, _, fitted = machines_of(at.model, at.machine)[0]
+        session = session_around(at.model, fitted, log)
+        if len(at.model.fits) > 1:
+            return Ways(session.recipe, None)
         if not set(SIMULATING) & set(self.plan.estimators):
             return Ways(session.recipe, None)
         first = inverse_dynamics(session.machine, session.fit.data)
@@ -100,14 +105,24 @@ class Runner:
         truth, start, rng = plan.drawn(number)
         machine = at.machine.with_estimate(start)
         rows: list[RunRow] = []
-        simulated_log = yield from at.scene.simulated_log(at.scene.machine.with_estimate(truth), rng)
-        # A reference with unknowns is not in the log.
-        log = (
-            simulated_log.log
-            if machine.unknown_reference is None
-            else replace(simulated_log.log, reference=None)
-        )
-        session = None if ways is None else session_around(at.model, machine, log, ways.recipe)
+        logs = []
+        for _, _, own in machines_of(at.scene.case, at.scene.machine.with_estimate(truth)):
+            logs.append((yield from at.scene.simulated_log(own, rng)))
+        simulated_log = logs[0]
+
+        def around(recipe: Recipe) -> Session:
+            # A reference with unknowns is not in the log.
+            read = [
+                made.log if machine.unknown_reference is None else replace(made.log, reference=None)
+                for made in logs
+            ]
+            if not at.model.fits:
+                return session_around(at.model, machine, read[0], recipe)
+            seen = machines_of(at.model, machine)
+            named = [(name, own, log) for (name, own, _), log in zip(seen, read, strict=True)]
+            return session_around_several(at.model, machine, named, recipe)
+
+        session = None if ways is None else around(ways.recipe)
         for method in plan.estimators:
             try:
                 if method == IN_LOOP:
@@ -117,10 +132,10 @@ class Runner:
                 assert session is not None
                 if method == DISCOVER:
                     aligned = replace(ways.recipe, align_hold=True)
-                    whole = session_around(at.model, machine, log, aligned)
+                    whole = around(aligned)
                     rows.append(_row_of_search(plan, whole))
                     continue
-                options = {"numerics": ways.numerics} if method in SIMULATING else {}
+                options = {"numerics": ways.numerics} if method in SIMULATING and not session.more else {}
                 estimate = yield from steps_of(method, session, **options)
                 moved = np.asarray(simulated_log.trajectory.position)[0] - session.fit.log.filled[0]
                 rows.append(_row(estimate, _combinations(session, estimate, truth[plan.own], moved)))

@@ -199,7 +199,7 @@ def test_where_points_at_the_spring(tmp_path):
     _, search = start_search(session)
     theta = cand.refine(search.superset, search.samples, search.theta, search.active)[0]
     step = Step(None, None, (), 0.0, theta, search.active)
-    where = where_of(search, step, session.fit.log)
+    where = where_of(search, step, session)
     assert where.significant
     assert where.variable == "elongation of spring 2"
     assert where.joint in (1, 2)

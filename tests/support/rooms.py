@@ -26,6 +26,7 @@ ROOMS = {
     "machine": "a plant with its actuator, controller and sensors",
     "build": "a machine, built from its case",
     "first_case": "a first case from a raw log: columns, units, rough guesses",
+    "own_values": "values that differ between logs that are fitted together",
     "simulation": "loops, solvers, and replays of a log",
     "consistency": "a prepared log held against its case: sign, noise, hold, control law",
     "session": "a case with its logs, opened and checked",

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.dynamics.residuals import drive_ratio, integrate_internal_states
@@ -164,6 +164,45 @@ def _solve(
     return levenberg_marquardt(residual, theta, transform, *bounds, damping=damping)
 
 
+@eqx.filter_jit
+def windows_and_columns(
+    plant: Plant, places: tuple, data: ForceData, raw: Array, length: int, theta: Float[Array, " p"]
+) -> tuple[Float[Array, "window n"], Float[Array, "window n p"]]:
+    """Return the residual of each window, see `weak_residual`, and its Jacobian."""
+
+    def residual(theta: Array) -> tuple[Array, Array]:
+        e = weak_residual(scatter(places, plant, theta), data, raw, length)
+        return e, e
+
+    jacobian, e = jax.jacfwd(residual, has_aux=True)(theta)
+    return e, jacobian
+
+
+def windows_without_rest(
+    machine: Machine, log: Log, data: Prepared
+) -> tuple[int, Bool[np.ndarray, "window n"]]:
+    """Return the samples of a window, and the mask of the windows in which a joint hardly rests.
+
+    Raises:
+        InputError: If too few windows remain.
+    """
+    cutoff = data.recipe.motion_hz(log.rate_hz)
+    length = int(min(_WINDOW_PERIODS / (cutoff * log.period), log.samples / 8))
+    starts = np.arange(0, log.samples - length + 1, length // 2)
+
+    # Windows with a rest do not count.
+    slow = np.abs(data.qd) < np.asarray(data.recipe.rest_velocity)
+    rests = np.stack([slow[k : k + length].mean(axis=0) for k in starts])
+    rows = rests < _LARGEST_REST
+    if rows.sum() < 2 * len(machine.parameters.free):
+        raise InputError(
+            f"only {int(rows.sum())} windows of {length * log.period:.3g} s are without a rest",
+            where=log.source,
+            hint="take a log with longer motion, or use inverse_dynamics",
+        )
+    return length, rows
+
+
 def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
     """Fit the unknowns to windows of iterated integrals by least squares.
 
@@ -185,22 +224,8 @@ def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
 def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimate]:
     """Estimate like `algebraic`, one solve request at a time."""
     plant, arrays = sharpened(machine.plant, data), ForceData.of(data)
-    cutoff = data.recipe.motion_hz(log.rate_hz)
-    length = int(min(_WINDOW_PERIODS / (cutoff * log.period), log.samples / 8))
-    starts = np.arange(0, log.samples - length + 1, length // 2)
-
-    # Windows with a rest do not count.
-    slow = np.abs(data.qd) < np.asarray(data.recipe.rest_velocity)
-    rests = np.stack([slow[k : k + length].mean(axis=0) for k in starts])
-    rows = rests < _LARGEST_REST
+    length, rows = windows_without_rest(machine, log, data)
     parameters = machine.parameters
-    if rows.sum() < 2 * len(parameters.free):
-        raise InputError(
-            f"only {int(rows.sum())} windows of {length * log.period:.3g} s are without a rest",
-            where=log.source,
-            hint="take a log with longer motion, or use inverse_dynamics",
-        )
-
     fit = yield SolveRequest(
         _solve,
         (

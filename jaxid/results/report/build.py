@@ -133,7 +133,7 @@ def _judged(result: Identification | Discovery) -> dict:
 def _common(session: Session, estimate: Estimate, notes: Sequence[str], *, incomplete: bool) -> dict:
     return {
         "case_name": session.case.name,
-        "log_name": Path(session.fit.log.source).name,
+        "log_name": ", ".join(dict.fromkeys(Path(run.log.source).name for run in session.fits)),
         "parameters": _rows(estimate, incomplete=incomplete),
         "precision": precision_content(estimate),
         "derived": _derived(session, estimate),

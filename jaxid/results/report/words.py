@@ -332,14 +332,14 @@ def _gap_rows(data: ReportData) -> list[GapRow]:
 
 def _fitted_rows(gap: Mapping, shared: Mapping) -> list[GapRow]:
     relative = gap.get("relative") or {}
-    each = gap.get("validations") or {}
     rows = []
     for log in ("fit", "validation"):
-        if gap.get(log) is not None and not (log == "validation" and each):
+        each = gap.get(f"{log}s") or {}
+        if gap.get(log) is not None and not each:
             rows += _by_joint(log=log, after=gap[log], relative=relative.get(log), **shared)
-    for name, value in each.items():
-        worst = relative.get("validation") if value == gap.get("validation") else None
-        rows += _by_joint(log=f"validation: {name}", after=value, relative=worst, **shared)
+        for name, value in each.items():
+            worst = relative.get(log) if value == gap.get(log) else None
+            rows += _by_joint(log=f"{log}: {name}", after=value, relative=worst, **shared)
     return rows
 
 

@@ -63,7 +63,7 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
     residuals = tuple(
         found
         for k, (run, gap) in enumerate(zip(session.runs, gaps, strict=True))
-        for found in _residuals(run.machine(estimate.machine), run, gap, fitted=k == 0)
+        for found in _residuals(run.machine(estimate.machine), run, gap, fitted=k < len(session.fits))
     )
     complete = _complete(residuals)
     if search == "nothing_missing" and complete is False:
@@ -119,7 +119,7 @@ def _place(session: Session, log: str, joint: int) -> str:
     """Return the place of a number in words: joint and log, where there are several."""
     joints = int(np.sum(session.fit.log.measured))
     at = f" at joint {joint + 1}" if joints > 1 else ""
-    on = f" on the log {log}" if log != session.fit.name else ""
+    on = f" on the log {log}" if log != session.fit.name or session.more else ""
     return at + on
 
 
@@ -144,7 +144,7 @@ def _left(session: Session, gaps: Sequence[Gap]) -> list[str]:
     for run, gap in zip(session.runs, gaps, strict=True):
         if not _looped(session, run):
             continue
-        on = "" if run.name == session.fit.name else f" on the log {run.name}"
+        on = "" if run.name == session.fit.name and not session.more else f" on the log {run.name}"
         if gap.simulation is None:
             out.append(f"the simulated loop diverges{on}.")
             continue

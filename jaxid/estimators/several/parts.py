@@ -1,0 +1,99 @@
+"""The logs of a fit, each with its machine and its unknowns among those of all logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.estimators.common.levenberg_marquardt import Transform
+from jaxid.machine import Machine
+from jaxid.session import OpenedLog, Session
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of several logs that are fitted together.
+
+    Args:
+        run: The log.
+        machine: Its machine, with the values and the unknowns that hold in it.
+        index: Number of each of its unknowns among those of all logs, (own,).
+    """
+
+    run: OpenedLog
+    machine: Machine
+    index: np.ndarray
+
+    def at(self, theta: Float[np.ndarray, " p"]) -> Machine:
+        """Return the machine of this log with its unknowns at values of those of all logs, (p,)."""
+        return self.machine.with_estimate(theta[self.index])
+
+    def widened(self, own: Float[np.ndarray, "... own"], width: int) -> Float[np.ndarray, "... p"]:
+        """Return derivatives by the unknowns of this log as those by `width` unknowns of all logs."""
+        out = np.zeros((*own.shape[:-1], width))
+        out[..., self.index] = own
+        return out
+
+
+def parts_of(session: Session) -> list[Part]:
+    """Return the fitted logs of a session."""
+    names = session.machine.parameters.names
+    parts = []
+    for run in session.fits:
+        machine = run.machine(session.machine)
+        index = np.array([names.index(name) for name in machine.parameters.names], dtype=int)
+        parts.append(Part(run, machine, index))
+    return parts
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The scale on which several logs are fitted.
+
+    Args:
+        transform: Scale of the unknowns of all logs.
+        lower, upper: Bounds on the physical values, (p,).
+        more: Number of further unknowns of single logs behind them, which are free.
+    """
+
+    transform: Transform
+    lower: Float[np.ndarray, " p"]
+    upper: Float[np.ndarray, " p"]
+    more: int = 0
+
+    @classmethod
+    def of(cls, machine: Machine, transform: Transform | None = None, more: int = 0) -> Scale:
+        """Return the scale of the unknowns of a machine."""
+        transform = Transform.of(machine.parameters) if transform is None else transform
+        return cls(transform, *machine.parameters.bounds, more)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds on the scale of the solver, (p + more,) each."""
+        lower, upper = (np.asarray(b) for b in self.transform.bounds(self.lower, self.upper))
+        free = np.full(self.more, np.inf)
+        return np.concatenate([lower, -free]), np.concatenate([upper, free])
+
+    def inward(self, theta: np.ndarray, more: np.ndarray | None = None) -> np.ndarray:
+        """Return physical values, and the further unknowns, on the scale of the solver."""
+        more = np.zeros(self.more) if more is None else more
+        theta = np.clip(theta, self.lower, self.upper)
+        return np.concatenate([np.asarray(self.transform.inward(theta)), more])
+
+    def outward(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return physical values and the further unknowns."""
+        p = self.lower.size
+        return np.asarray(self.transform.outward(x[:p])), x[p:]
+
+    def slope(self, theta: np.ndarray) -> np.ndarray:
+        """Return the derivative of all physical values by those of the solver, (p + more,)."""
+        return np.concatenate([np.asarray(self.transform.slope(theta)), np.ones(self.more)])
+
+
+def by_log(parts: Sequence[Part], entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return results of each log by its name, as details of an estimate."""
+    return {"fits": {part.run.name: entry for part, entry in zip(parts, entries, strict=True)}}
