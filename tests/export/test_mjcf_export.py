@@ -178,15 +178,15 @@ def test_a_wrong_file_becomes_that_of_the_log(tmp_path, capsys):
     text = (tmp_path / "found.xml").read_text()
     u, q = (np.stack([log[f"{x}_{n}"] for n in CART_JOINTS], axis=-1) for x in "uq")
     model = mujoco.MjModel.from_xml_string(text)
-    np.testing.assert_allclose(model.dof_frictionloss, [2.0, 0.15, 0.0, 0.0], atol=5e-3)
-    np.testing.assert_allclose(model.dof_damping, [4.0, 0.1, 0.2, 3.0], rtol=1e-2)
-    assert model.jnt_stiffness[2] == pytest.approx(8.0, rel=1e-2)
-    assert model.qpos_spring[2] == pytest.approx(0.2, rel=2e-2)
+    np.testing.assert_allclose(model.dof_frictionloss, [2.0, 0.15, 0.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(model.dof_damping, [4.0, 0.1, 0.2, 3.0], rtol=1e-3)
+    assert model.jnt_stiffness[2] == pytest.approx(8.0, rel=1e-3)
+    assert model.qpos_spring[2] == pytest.approx(0.2, rel=1e-3)
     # In open loop the first second under the logged forces: before, and after.
     part = 250
     off = [np.abs(forward(t, u[:part], q[0], 250) - q[:part]).max() for t in (wrong, text)]
-    assert off[0] > 0.02
-    assert off[1] < 1e-3
+    assert off[0] > 1.0
+    assert off[1] < 1e-4
 
 
 def run_export(capsys, *argv) -> str:
