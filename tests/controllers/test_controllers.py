@@ -48,6 +48,8 @@ def plain(name: str, reading: np.ndarray) -> np.ndarray:
         velocity = (q[k + 1 : k + back + 1].mean() - q[k : k + back].mean()) / PERIOD
         error = REFERENCE[k] - reading[k]
         aim = (REFERENCE[k] - REFERENCE[max(k - 1, 0)]) / PERIOD
+        # A loop that starts in motion starts with a reference that moves as fast.
+        aim = START[1] if k == 0 else aim
         if name.startswith("cascade"):
             u = law["kv"] * (law["kp"] * error - velocity)
         elif name.startswith("pid"):

@@ -126,7 +126,6 @@ FAULTS = {
     "no kv": (swapped("kv = 243.45", ""), ["[controller]", "'kv' is missing", "cascade_pd"]),
     "no controller kind": (swapped('kind = "cascade_pd"', ""), ["[controller]", "pid"]),
     "no position": (swapped('position = "q"', ""), ["[log]", "'position'", "column"]),
-    "no force": (swapped('force = "u"', ""), ["[log]", "'force'", "column"]),
     "no guess": (swapped("guess = 80.0", "min = 0.0").replace("min = 10.0, ", ""), ["'guess'"]),
     "no validation name": (more("[[validation]]\nrows = [0, 9]"), ["[[validation]] 1", "'name'"]),
     "no reference kind": (more("[reference]\namplitude = 1"), ["[reference]", "'kind'", "csv"]),
