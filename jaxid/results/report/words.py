@@ -338,8 +338,11 @@ def _fitted_rows(gap: Mapping, shared: Mapping) -> list[GapRow]:
         if gap.get(log) is not None and not each:
             rows += _by_joint(log=log, after=gap[log], relative=relative.get(log), **shared)
         for name, value in each.items():
-            worst = relative.get(log) if value == gap.get(log) else None
-            rows += _by_joint(log=f"{log}: {name}", after=value, relative=worst, **shared)
+            if isinstance(value, Mapping):
+                known = {"after": value.get("force"), "relative": value.get("relative")}
+            else:
+                known = {"after": value, "relative": relative.get(log) if value == gap.get(log) else None}
+            rows += _by_joint(log=f"{log}: {name}", **known, **shared)
     return rows
 
 
