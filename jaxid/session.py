@@ -180,7 +180,7 @@ def open_session(
     fit = _followed(case, fit, machine.plant)
     short = case.fits_within_prior(method)
     at_fit = machine if first.own is None else first.own.machine(machine)
-    findings = [*_left_out(case), *_check(case, fit, at_fit, short)]
+    findings = [*_left_out(case), *_check(case, fit, at_fit, short, alone=not several)]
     recipe = choose_recipe(fit, case.preprocess)
     if align_hold is not None:
         recipe = replace(recipe, align_hold=align_hold)
@@ -440,7 +440,7 @@ def _opened(
 ) -> tuple[OpenedLog, list[Finding]]:
     """Open one further log to fit, and return the findings on it."""
     at = machine if source.own is None else source.own.machine(machine)
-    findings = _check(case, log, at, short)
+    findings = _check(case, log, at, short, alone=False)
     run = _run(
         source.name, log, at, _recipe_of(log, case, recipe), 0 if short else enough(at), source.disturbance
     )
@@ -601,8 +601,16 @@ def _followed(case: Case, log: Log, plant: Plant) -> Log:
     return replace(log, reference=np.broadcast_to(reference, (log.samples, case.plant.drives)))
 
 
-def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]:
-    """Check a log, and return the findings; short: a fit within a prior needs two positions only."""
+def _check(case: Case, log: Log, machine: Machine, short: bool, *, alone: bool = True) -> list[Finding]:
+    """Check a log, and return the findings.
+
+    Args:
+        case: The case.
+        log: The log.
+        machine: The machine on this log.
+        short: Whether a fit within a prior needs two positions only.
+        alone: Whether no other log is fitted with it.
+    """
     limit = None if case.controller is None else case.controller.limit
     units, plant = machine.units, machine.plant
     motions = [plant.motion(j) or units.motion for j in range(plant.joints)]
@@ -618,7 +626,7 @@ def _check(case: Case, log: Log, machine: Machine, short: bool) -> list[Finding]
         resolution_stated=stated,
         free=True,
     )
-    check_absent(case, machine, log)
+    check_absent(case, machine, log, alone=alone)
     impossible = plant.impossible(log.position) if all(log.measured) else None
     if impossible is not None:
         row, what = impossible
