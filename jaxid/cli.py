@@ -272,6 +272,13 @@ def _ready(args: argparse.Namespace, *files: str) -> None:
         check_folder(Path(args.o), files, overwrite=args.force)
 
 
+def _sound(args: argparse.Namespace) -> None:
+    """Refuse an unsound case before JAX is loaded, which takes longer than all that is checked here."""
+    from jaxid.case.case import refuse_unsound
+
+    refuse_unsound(Path(args.case))
+
+
 def _run_methods(args: argparse.Namespace) -> int:
     width = max(len(name) for name in METHODS)
     print("\n".join(f"{name.ljust(width)}  {WHEN[name]}" for name in METHODS))
@@ -307,6 +314,7 @@ def _run_simulate(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}", hint="give zero or more")
     path = ready_file(Path(args.o), overwrite=args.force)
+    _sound(args)
     with _progress(args, 2) as show:
         show("simulating")
         from jaxid.commands.simulate import simulate
@@ -321,6 +329,7 @@ def _run_design(args: argparse.Namespace) -> int:
     from jaxid.files import ready_file
 
     path = ready_file(Path(args.o), overwrite=args.force)
+    _sound(args)
     with _progress(args, 4) as show:
         from jaxid.commands.design import design
 
@@ -332,6 +341,7 @@ def _run_design(args: argparse.Namespace) -> int:
 
 def _run_check(args: argparse.Namespace) -> int:
     _ready(args, "check.json")
+    _sound(args)
     with _progress(args, 2) as show:
         show("checking")
         from jaxid.commands.check import check
@@ -348,6 +358,7 @@ def _run_identify(args: argparse.Namespace) -> int:
     if args.on is not None and args.on not in OUTPUTS:
         raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
     _ready(args, "result.json", "report.html")
+    _sound(args)
     with _progress(args, 4) as show:
         show("starting")
         from jaxid.commands.identify import identify
@@ -380,6 +391,7 @@ def _run_discover(args: argparse.Namespace) -> int:
         experiments = [p.name for p in folder.glob("separate_*.csv")]
         corrected = found_case_file(Path(args.case), folder)
         _ready(args, "discovery.json", "report.html", corrected, *experiments)
+    _sound(args)
     with _progress(args, 40) as show:
         show("starting")
         from jaxid.commands.discover import discover
@@ -403,6 +415,7 @@ def _run_discover(args: argparse.Namespace) -> int:
 def _run_study(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
+    _sound(args)
     from jaxid.commands.study import study
 
     with tqdm(disable=args.quiet or not sys.stderr.isatty(), leave=False, unit="run") as bar:

@@ -114,3 +114,20 @@ SIGN_OF = UNIT_OF[1:]
 SIDES = ("load", "motor")
 # Ways to resample: lines between readings, or cubic splines.
 RESAMPLINGS = ("linear", "band_limited")
+# Names of ports in case files and results; ports of each kind count from 1.
+PLACES = ("joint", "spring", "shaft", "passive", "tool")
+# Kinds of the joints of an arm.
+JOINTS = ("revolute", "prismatic")
+# Inertial parameters of a link, in the order of the fields of an arm.
+TEN = (
+    "mass",
+    "first_moment_x",
+    "first_moment_y",
+    "first_moment_z",
+    "inertia_xx",
+    "inertia_xy",
+    "inertia_xz",
+    "inertia_yy",
+    "inertia_yz",
+    "inertia_zz",
+)

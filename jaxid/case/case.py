@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.entries import check_kinds, read_effects, read_kind, read_plant, read_search
+from jaxid.case.kinds import Kinds, NeedsClassesError, declared_kinds, loaded_kinds
 from jaxid.case.reference import read_signal, read_unknown_reference
 from jaxid.case.sensors import read_inertial_sensors
 from jaxid.case.tables import (
@@ -23,12 +26,9 @@ from jaxid.case.tables import (
     validation_keys,
 )
 from jaxid.case.values import Value
-from jaxid.controllers import CONTROLLERS
-from jaxid.effects import EFFECTS
 from jaxid.errors import InputError, suggest
 from jaxid.logs.log import log_table
 from jaxid.logs.units import parse_unit
-from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
 from jaxid.names import DISCOVER, HOLDS
 from jaxid.schema import Counts, Spot, keys_of, plain, read_settings, read_table
@@ -49,6 +49,9 @@ from jaxid.settings import (
     StudyTable,
     WithinPrior,
 )
+
+if TYPE_CHECKING:
+    from jaxid.model.effect import Effect
 
 # Kinds of units that convert to the SI units of a machine.
 _MECHANICAL = ("length", "angle", "force", "torque")
@@ -163,12 +166,15 @@ class Case:
     @property
     def own_effects(self) -> tuple[type[Effect], ...]:
         """User-defined effects that the case names: those that it declares, and the candidates."""
-        classes = (*(entry.cls for entry in self.effects), *self.candidates)
-        return tuple(dict.fromkeys(c for c in classes if EFFECTS.get(c.kind) is not c))
+        from jaxid.effects import EFFECTS
+
+        return _others(self, EFFECTS)
 
     @property
     def searched(self) -> tuple[type[Effect], ...]:
         """Effects that `discover` may name."""
+        from jaxid.effects import EFFECTS
+
         asked = {*self.kinds, *(cls.kind for cls in self.candidates)}
         registered = [
             cls for kind, cls in EFFECTS.items() if kind in asked or not (self.kinds or cls.on_request)
@@ -260,20 +266,40 @@ def load_case(source: CaseLike) -> Case:
     return read_case(_toml(path), path, path.parent)
 
 
-def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Case:
+def refuse_unsound(path: Path) -> None:
+    """Refuse a case before JAX is imported, as far as that needs no classes of plants and effects.
+
+    Args:
+        path: A TOML file.
+
+    Raises:
+        InputError: If the file cannot be read, or a table or key is unknown, missing or impossible.
+    """
+    if "jax" not in sys.modules:
+        with contextlib.suppress(NeedsClassesError):
+            read_case(_toml(path), path, path.parent, declared_kinds())
+
+
+def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path, kinds: Kinds | None = None) -> Case:
     """Check the tables of a case.
 
     Args:
         tables: Tables as TOML gives them.
         path: File that they came from; None: no file.
         folder: Folder from which relative file names start.
+        kinds: Plants, effects and control laws that it may name; None: all that are registered.
+
+    Returns:
+        The case; with stand-ins in place of classes, if the kinds are such.
 
     Raises:
         InputError: If a table or key is unknown, missing or impossible.
+        NeedsClassesError: If the kinds are stand-ins, and only a class can check the case further.
     """
+    kinds = loaded_kinds() if kinds is None else kinds
     top = Spot(UNNAMED if path is None else str(path), folder=folder)
     _check_top(tables, top)
-    plant = read_plant(tables["plant"], top)
+    plant = read_plant(tables["plant"], top, kinds)
     drives = plant.drives
     root = replace(top, counts=Counts(plant.joints, drives, plant.names))
 
@@ -281,14 +307,14 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
         return read_settings(cls, tables.get(name, {}), root.under(f"[{name}]"))
 
     at_guess, unknown = read_unknown_reference(tables, drives, root)
-    candidates, kinds = read_search(tables.get("discover", {}), root)
+    candidates, searched = read_search(tables.get("discover", {}), root, kinds)
     output_error = read(OutputError, "output_error")
     case = Case(
         path=path,
         base=folder,
         tables=tables,
         plant=plant,
-        effects=read_effects(tables.get("effects", []), plant, root),
+        effects=read_effects(tables.get("effects", []), plant, root, kinds),
         actuator=read(Actuator, "actuator"),
         log=_log(tables, root),
         preprocess=read(Preprocess, "preprocess"),
@@ -297,13 +323,13 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
         output_error=output_error,
         within_prior=_within_prior(tables, output_error, root),
         recursive=read(Recursive, "recursive"),
-        controller=_controller(tables, root),
+        controller=_controller(tables, root, kinds),
         sensor=read(SensorTable, "sensor"),
         inertial_sensors=read_inertial_sensors(tables, plant.cls.links(plant.joints), root),
         limits=read(LimitsTable, "limits"),
         validations=_validations(tables, root),
         candidates=candidates,
-        kinds=kinds,
+        kinds=searched,
         design=read(DesignTable, "design") if tables.get("design") else None,
         reference=read_signal("reference", {**tables, **at_guess}, drives, root),
         unknown_reference=unknown,
@@ -318,9 +344,15 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
     _check_labels(case, root)
     _check_preprocess(tables.get("preprocess", {}), root)
     _check_recursive(tables.get("recursive", {}), root)
-    check_kinds(case.own_effects, root)
+    check_kinds(_others(case, kinds.effects), root)
     _check_loop(case, root)
     return case
+
+
+def _others(case: Case, registered: Mapping[str, type[Effect]]) -> tuple[type[Effect], ...]:
+    """Return the effects that a case declares or searches for, and that are not registered."""
+    classes = (*(entry.cls for entry in case.effects), *case.candidates)
+    return tuple(dict.fromkeys(c for c in classes if registered.get(c.kind) is not c))
 
 
 def _check_top(tables: Mapping[str, Any], top: Spot) -> None:
@@ -478,12 +510,12 @@ def _time_base(table: LogTable, spot: Spot) -> LogTable:
     return table
 
 
-def _controller(tables: Mapping[str, Any], root: Spot) -> ControllerTable | None:
+def _controller(tables: Mapping[str, Any], root: Spot, kinds: Kinds) -> ControllerTable | None:
     if "controller" not in tables:
         return None
     table, spot = tables["controller"], root.under("[controller]")
-    kind = read_kind(table, CONTROLLERS, spot)
-    return controller_table(read_table(table, controller_keys(kind), spot))
+    kind = read_kind(table, kinds.laws, spot)
+    return controller_table(read_table(table, controller_keys(kind, kinds), spot))
 
 
 def _validations(tables: Mapping[str, Any], root: Spot) -> tuple[Validation, ...]:

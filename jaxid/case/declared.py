@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxid.case.values import Value
-from jaxid.model.effect import Effect
-from jaxid.model.plant import Plant
 from jaxid.model.units import Units
+
+if TYPE_CHECKING:
+    from jaxid.model.effect import Effect
+    from jaxid.model.plant import Plant
 
 
 @dataclass(frozen=True)

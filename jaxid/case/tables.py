@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
-from jaxid.controllers import CONTROLLERS, Controller
+from jaxid.case.kinds import Kinds
 from jaxid.names import LAW_DERIVATIVES, MOTIONS, ORIENTATIONS
 from jaxid.schema import (
     Key,
@@ -133,7 +133,7 @@ def controller_table(given: Mapping[str, Any]) -> ControllerTable:
     return ControllerTable(**{name: given[name] for name in apart if name in given}, law=law)
 
 
-def controller_keys(kind: str) -> Keys:
+def controller_keys(kind: str, kinds: Kinds) -> Keys:
     """Return the keys of [controller]: those of every controller, and the fields of this kind's class."""
     keys = {
         "period": Key(number("positive"), "sampling time", unit="s", note="the log's"),
@@ -141,8 +141,8 @@ def controller_keys(kind: str) -> Keys:
         "limit": Key(by_drive(number("positive")), "bound of the command", note="no bound"),
         "disturbance": _DISTURBANCE,
     }
-    cls = CONTROLLERS[kind]
-    unstated = {f.name for f in fields(Controller)} | set(cls.of_machine)
+    cls = kinds.laws[kind]
+    unstated = {*keys, *cls.of_machine}
     law = {}
     for f in fields(cls):
         if f.name not in unstated:
