@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from jaxid.names import (
     AXES,
@@ -43,6 +44,7 @@ from jaxid.schema import (
     key,
     number,
     odd,
+    read_settings,
     rows,
     several,
     sign,
@@ -472,3 +474,25 @@ class InertialSensor:
         number("positive"), "readings per second", unit="Hz", note="one a tick of the loop"
     )
     calibrated: bool = key(flag, "whether rotation, scale and bias are known to the loop", default=True)
+
+
+_LOG = Spot("", "[log]")
+
+
+def log_table(columns: LogTable | Mapping[str, Any], spot: Spot = _LOG) -> LogTable:
+    """Read a [log] table.
+
+    Args:
+        columns: The table, checked already or as it stands in a case.
+        spot: Position of the table, for messages.
+
+    Raises:
+        InputError: If a key is unknown, missing or impossible, or there is no time base.
+    """
+    if isinstance(columns, LogTable):
+        return columns
+    table = read_settings(LogTable, dict(columns), spot)
+    if table.time is None and table.sample_rate is None:
+        hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
+        raise spot.fault("neither time nor sample_rate is given", hint)
+    return table

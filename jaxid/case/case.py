@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.entries import check_kinds, read_effects, read_kind, read_plant, read_search
 from jaxid.case.kinds import Kinds, NeedsClassesError, declared_kinds, loaded_kinds
@@ -27,8 +25,6 @@ from jaxid.case.tables import (
 )
 from jaxid.case.values import Value
 from jaxid.errors import InputError, suggest
-from jaxid.logs.log import log_table
-from jaxid.logs.units import parse_unit
 from jaxid.model.parameter import parameters_of
 from jaxid.names import DISCOVER, HOLDS
 from jaxid.schema import Counts, Spot, keys_of, plain, read_settings, read_table
@@ -48,6 +44,7 @@ from jaxid.settings import (
     SimulationTable,
     StudyTable,
     WithinPrior,
+    log_table,
 )
 
 if TYPE_CHECKING:
@@ -398,6 +395,7 @@ def _toml(path: Path) -> dict[str, Any]:
         raise InputError(what, where=str(path), hint="name a TOML file that may be read") from error
 
 
+# Only a transmission needs numpy, and only stated units their reader: neither should delay other refusals.
 def _check_transmission(case: Case, root: Spot) -> None:
     rows, spot = case.actuator.transmission, root.under("[actuator]").at("transmission")
     if rows is None:
@@ -409,6 +407,8 @@ def _check_transmission(case: Case, root: Spot) -> None:
     if plant.drives < joints:
         hint = "leave it out, and take a log of the joints"
         raise spot.fault(f"is for plants with a drive for each joint, not {plant.drives} for {joints}", hint)
+    import numpy as np
+
     if {len(rows), *map(len, rows)} != {joints} or np.linalg.matrix_rank(rows) < joints:
         hint = f"give {joints} rows of {joints} numbers, none a sum of others"
         raise spot.fault("is not an invertible square matrix", hint)
@@ -435,6 +435,8 @@ def _check_drive(case: Case, tables: Mapping[str, Any], root: Spot) -> None:
                 hint = "state gain (ratio times efficiency for a logged motor torque) or torque_constant"
                 raise spot.at(key).fault("leaves open what the logged command is", hint)
     if case.log is not None and case.log.counts_per_revolution is not None and case.log.units is not None:
+        from jaxid.logs.units import parse_unit
+
         given = case.log.units.values()
         texts = [text for unit in given for text in ((unit,) if isinstance(unit, str) else unit)]
         if "count" not in {unit.kind for unit in map(parse_unit, texts) if unit is not None}:
@@ -446,7 +448,11 @@ def _check_labels(case: Case, root: Spot) -> None:
     """Refuse labels of [plant] units that look as if they converted: mm, deg, kN."""
     for quantity in ("position", "force"):
         label = getattr(case.plant.units, quantity)
-        unit = None if label is None else parse_unit(label)
+        if label is None:
+            continue
+        from jaxid.logs.units import parse_unit
+
+        unit = parse_unit(label)
         mechanical = (
             unit is not None and unit.kind in ("length", "angle", "force", "torque") and unit.factor != 1.0
         )

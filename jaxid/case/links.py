@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from jaxid.case.kinds import Kinds
 from jaxid.case.places import check_places
 from jaxid.case.values import Value, read_values, value_reader, value_schema, values_schema
@@ -118,6 +116,8 @@ def read_links_of_urdf(
     if "links" in given:
         raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
     kinds.need_classes()
+    import numpy as np
+
     from jaxid.arms.base_by_rules import base_parameters_by_rules
     from jaxid.case.urdf import read_urdf
     from jaxid.plants.serial_arm import SerialArm

@@ -1,12 +1,13 @@
 """Measured logs: the columns that a case names, checked and in SI units."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers import read_table
@@ -18,8 +19,10 @@ from jaxid.logs.timebase import TimeBase, time_base
 from jaxid.logs.units import Frame, converted
 from jaxid.logs.wrap import joined
 from jaxid.names import HOLDS, OPTIONAL_COLUMNS, RESAMPLINGS
-from jaxid.schema import Spot, read_settings
-from jaxid.settings import LogTable
+from jaxid.settings import LogTable, log_table
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Chosen: with fewer samples nothing remains after filtering and trimming.
 MINIMUM_SAMPLES = 50
@@ -314,28 +317,6 @@ def _check_rate(time: np.ndarray, table: LogTable, where: str) -> None:
         what = f"the time column gives {logged:.6g} Hz, but sample_rate is {rate:.6g} Hz"
         hint = "remove one of them; is time in seconds?"
         raise InputError(what, where=where, hint=hint)
-
-
-_LOG = Spot("", "[log]")
-
-
-def log_table(columns: LogTable | Mapping[str, Any], spot: Spot = _LOG) -> LogTable:
-    """Read a [log] table.
-
-    Args:
-        columns: The table, checked already or as it stands in a case.
-        spot: Position of the table, for messages.
-
-    Raises:
-        InputError: If a key is unknown, missing or impossible, or there is no time base.
-    """
-    if isinstance(columns, LogTable):
-        return columns
-    table = read_settings(LogTable, dict(columns), spot)
-    if table.time is None and table.sample_rate is None:
-        hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
-        raise spot.fault("neither time nor sample_rate is given", hint)
-    return table
 
 
 def _names(table: LogTable) -> dict[str, list[str]]:
