@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -32,7 +32,7 @@ _SLOWER = 1.1
 # Columns whose readings decide the rate: those that the dynamics are in.
 _RATED = ("position", "velocity", "force", "load_position", "load_acceleration", "acceleration")
 
-Operator = Callable[[Float[np.ndarray, "readings _"]], Float[np.ndarray, "samples _"]]
+Operator: TypeAlias = "Callable[[Float[np.ndarray, 'readings _']], Float[np.ndarray, 'samples _']]"
 
 
 @dataclass(frozen=True)

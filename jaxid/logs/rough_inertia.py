@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # damper to a constant reference. It does not determine the inertia.
 _SHARE = 0.01
 
-Signal = Float[np.ndarray, " samples"]
+Signal: TypeAlias = "Float[np.ndarray, ' samples']"
 
 
 def smooth(values: Signal, window: int) -> Float[np.ndarray, " fewer"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Each reader: (path, names, rows) -> ({name: (samples, width)}, rows that were read), or a `Table`. One that
 # has a fourth argument, `settings`, is also given the [log] table.
-Read = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows] | Table
+Read: TypeAlias = "tuple[dict[str, Float[np.ndarray, 'samples _']], Rows] | Table"
 Reader = Callable[..., Read]
 READERS: dict[str, Reader] = {
     ".csv": read_csv,

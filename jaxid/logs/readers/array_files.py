@@ -8,7 +8,7 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.lib import format as npy
@@ -22,7 +22,7 @@ from jaxid.logs.readers.table import Table
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-Columns = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]
+Columns: TypeAlias = "tuple[dict[str, Float[np.ndarray, 'samples _']], Rows]"
 _INDEXED = re.compile(r"(.+)\[(\d+)\]$")
 # Largest array that is read [bytes]; chosen: 20 hours at 1 kHz and 7 columns.
 _LARGEST = 4 * 2**30
