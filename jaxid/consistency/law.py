@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.interpolate
 from jaxtyping import Float
@@ -124,8 +123,7 @@ def law_at_ticks(machine: Machine, log: Log) -> LawAtTicks | None:
         return None
     position, reference, extra, every = ticks
     driven = machine.plant.driven(position.shape[1])
-    arrays = (jnp.asarray(a) for a in (position, reference, extra, start_velocity(log)))
-    made = np.asarray(commands(controller, driven, *arrays))
+    made = np.asarray(commands(controller, driven, position, reference, extra, start_velocity(log)))
     if isinstance(controller, PID):
         # The integral before the first row is not known.
         made = made + np.median(log.force - made[::every], axis=0)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -68,6 +69,12 @@ def fit(problem: Innovations, theta: Array, noise: Array, max_steps: Array) -> S
     start = jnp.concatenate([transform.inward(theta), noise])
     outputs = lambda x: problem.outputs(transform.outward(x[:p]), x[p:])
     return maximise_likelihood(outputs, problem.counts, start, lower, upper, max_steps)
+
+
+def fit_steps(problem: Innovations, theta: Array, noise: Array, max_steps: int) -> Steps[Scored]:
+    """Run `fit` as a solve request; the result holds arrays of numpy, with which nothing more is compiled."""
+    scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(max_steps)))
+    return jax.tree.map(np.asarray, scored)
 
 
 @eqx.filter_jit
@@ -155,8 +162,7 @@ def _refit(
             return at, np.nan
         bounds = (np.where(own, held, lower), np.where(own, held, upper))
         start = np.where(own, held, np.asarray(problem.transform.outward(at[:p])))
-        arguments = (problem._replace(bounds=bounds), start, at[p:], np.asarray(STEPS))
-        there = yield SolveRequest(fit, arguments)
+        there = yield from fit_steps(problem._replace(bounds=bounds), start, at[p:], STEPS)
         rise = 2 * (float(there.cost) - float(scored.cost)) / factor
         return np.asarray(there.x), rise if bool(there.converged) else np.nan
 

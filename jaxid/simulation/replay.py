@@ -243,7 +243,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     count = min(samples, log.samples)
     assert replay.command is not None, "make_replay gives an open loop its command"
     short = eqx.tree_at(lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1])
-    nudge = _start(short, plant, jnp.asarray(log.filled[:count]), log.measured)
+    nudge = _start(short, plant, log.filled[:count], log.measured)
     n = replay.position.size
     moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
     if not bool(jnp.all(jnp.isfinite(nudge))):

@@ -45,7 +45,7 @@ def needed_steps(machine: Machine, log: Log) -> int:
     """
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
-    q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    q, u = log.filled[picks], log.force[picks] * np.asarray(machine.gain)
     steps = float(_fastest(machine.plant, q, u)) * period / _FINE
     if not np.isfinite(steps):
         raise TooStiffError(
