@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -268,9 +269,7 @@ class Decimator:
         return _through(x, int(32 / self.pass_band), gain, self.factor)
 
 
-def _through(
-    x: Array, pad: int, response: Callable[[np.ndarray], Array | np.ndarray], every: int = 1
-) -> Array:
+def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every: int = 1) -> Array:
     """Pass the columns of x through a frequency response, without transients at the ends.
 
     An odd extension at both ends keeps value and slope; a half cosine joins the two extensions over the
@@ -287,7 +286,8 @@ def _through(
     few = fast_length(-(-(n + lead + 2 * pad) // every))
     gain = response(np.fft.rfftfreq(every * few))
     plain = isinstance(x, np.ndarray) and isinstance(gain, np.ndarray)
-    xp, forwards, backwards = (np, rfft, irfft) if plain else (jnp, jnp.fft.rfft, jnp.fft.irfft)
+    tools: Any = (np, rfft, irfft) if plain else (jnp, jnp.fft.rfft, jnp.fft.irfft)
+    xp, forwards, backwards = tools
 
     head, tail = 2 * x[0] - x[lead:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
     gap = every * few - n - lead - pad
