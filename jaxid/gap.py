@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -14,8 +13,10 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.numerics.kept import kept_jit
 from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, force_residual, measured_force, sharpened
+from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import (
     Replay,
     exact_numerics,
@@ -51,7 +52,7 @@ class ForceGap:
     relative: Float[np.ndarray, " n"]
 
 
-@eqx.filter_jit
+@kept_jit
 def _force_gap(plant: Plant, data: ForceData) -> tuple[Array, Array]:
     """Compute residual and measured force at the kept samples."""
     return -force_residual(plant, data), measured_force(plant, data)
@@ -93,7 +94,9 @@ class SimulationGap:
     command_relative: Float[np.ndarray, " m"] | None
 
 
-_run = eqx.filter_jit(lambda replay, plant: replay(plant))
+@kept_jit
+def _run(replay: Replay, plant: Plant) -> Trajectory:
+    return replay(plant)
 
 
 def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:

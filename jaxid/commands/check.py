@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from jaxid.files import json_text, write_results
 from jaxid.gap import noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.precision import Precision
 from jaxid.session import Session, open_session
 from jaxid.simulation.force_balance import ForceData, force_residual, force_size, sharpened
@@ -185,7 +185,7 @@ def check(case: CaseLike, log: LogLike, *, validate: Sequence[LogLike] = ()) -> 
     return Check(session, precision, floor)
 
 
-@eqx.filter_jit
+@kept_jit
 def _jacobian(plant: Any, places: tuple, data: ForceData, theta: Array) -> Array:
     if theta.size == 0:
         return jnp.zeros((*data.weight.shape, 0))

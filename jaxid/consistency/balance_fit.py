@@ -16,6 +16,7 @@ from jaxid.model.effect import Effect, carries_force
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.force_balance import ForceData, force_and_columns, measured_force, sharpened
 
@@ -161,7 +162,7 @@ def balance_fits(
     return out
 
 
-measured = eqx.filter_jit(measured_force)
+measured = kept_jit(measured_force)
 
 
 def _is_force(plant: Plant, free: Free) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from jaxid.estimators.common.scoring import Scored, maximise_likelihood, observe
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import Precision, profiled_out
 from jaxid.simulation.kalman import KalmanFilter
@@ -57,7 +57,7 @@ class Innovations(NamedTuple):
         return self.kalman(fitted, jnp.exp(noise[:m]), jnp.exp(noise[m:]))
 
 
-@eqx.filter_jit
+@kept_jit
 def fit(problem: Innovations, theta: Array, noise: Array, max_steps: Array) -> Scored:
     """Maximise a likelihood from physical values and logarithms of the noise; one step only evaluates it."""
     transform, p = problem.transform, theta.size
@@ -77,7 +77,7 @@ def fit_steps(problem: Innovations, theta: Array, noise: Array, max_steps: int) 
     return jax.tree.map(np.asarray, scored)
 
 
-@eqx.filter_jit
+@kept_jit
 def whole_hessian(problem: Innovations, theta: Array, noise: Array) -> Float[Array, "q q"]:
     """Return the Hessian of the negative log-likelihood by physical values and logarithms of the noise."""
     p = theta.size

@@ -16,6 +16,7 @@ from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
+from jaxid.numerics.kept import kept_jit
 
 
 class ForceData(eqx.Module):
@@ -77,7 +78,7 @@ def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array,
     return complete_motion(plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps)
 
 
-@eqx.filter_jit
+@kept_jit
 def force_and_columns(
     plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array | None = None
 ) -> tuple[Float[Array, "kept n"], Float[Array, "kept n c"]]:
@@ -122,4 +123,4 @@ def _size(plant: Plant, data: ForceData) -> Float[Array, ""]:
     return jnp.linalg.norm(jnp.where(data.weight > 0, measured_force(plant, data), 0.0))
 
 
-force_size = eqx.filter_jit(_size)
+force_size = kept_jit(_size)

@@ -19,6 +19,7 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
+from jaxid.numerics.kept import kept_jit
 from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
@@ -251,7 +252,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     return eqx.tree_at(lambda r: (r.position, r.velocity), replay, moved)
 
 
-@eqx.filter_jit
+@kept_jit
 def _start(replay: Replay, plant: Plant, position: Array, measured: tuple[bool, ...]) -> Array:
     def residual(nudge: Array) -> Array:
         return ((replay(plant, nudge).position - position) * np.array(measured)).ravel()

@@ -26,6 +26,7 @@ from jaxid.machine import Machine
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.session import OpenedLog
 from jaxid.simulation.loops import Drive, open_loop
 from jaxid.simulation.sensor_noise import position_noise
@@ -228,7 +229,7 @@ def _unresolved_friction(estimate: Estimate, data: Prepared, joint: int) -> str:
     return ""
 
 
-@eqx.filter_jit
+@kept_jit
 def _runs(
     plant: Plant, places: tuple, drive: Drive, starts: Starts, joint: Array, levels: Array, theta: Array
 ) -> tuple[Array, Array]:

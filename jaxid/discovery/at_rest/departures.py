@@ -18,6 +18,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
+from jaxid.numerics.kept import kept_jit
 from jaxid.session import OpenedLog
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.force_balance import ForceData
@@ -197,7 +198,7 @@ def _departures(q: Float[np.ndarray, " time"], noise: float, still: int, after: 
     return ends[moved]
 
 
-@eqx.filter_jit
+@kept_jit
 def _internal_states(plant: Plant, data: ForceData) -> tuple:
     """Integrate the internal states of the effects along a log, under the delayed command."""
     delays = plant.command_delays(data.force.shape[1])
