@@ -15,12 +15,12 @@ else:
 
 
 def library(*values: Any) -> Any:
-    """Return `jax.numpy` if any value is an array of JAX, traced ones included, else `numpy`.
+    """Return `jax.numpy` if any value is traced, else `numpy`.
 
     Outside of compiled code JAX compiles every single operation, which takes longer than a small one itself.
     """
     jax = sys.modules.get("jax")
-    if jax is not None and any(isinstance(value, jax.Array) for value in values):
+    if jax is not None and any(isinstance(value, jax.core.Tracer) for value in values):
         return jax.numpy
     import numpy
 

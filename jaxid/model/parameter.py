@@ -64,8 +64,11 @@ def as_array(value: Any) -> Any:
     # Anything that is neither number nor list passes, because JAX fills trees with internal markers.
     if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool):
         import jax.numpy as jnp
+        import numpy as np
 
-        return jnp.asarray(value, dtype=jnp.float64)
+        # A number of numpy is copied; for one of Python JAX would compile a conversion.
+        number = np.float64(value) if isinstance(value, (int, float)) else value
+        return jnp.asarray(number, dtype=jnp.float64)
     return value
 
 

@@ -123,7 +123,8 @@ def _read(path: Path) -> Callable[[list], Any] | None:
 
     try:
         content, count, skeleton = pickle.loads(path.read_bytes())
-        _register_lapack()
+        if b"lapack" in content:
+            _register_lapack()
         trees = (jax.tree.structure((([0] * count,), {})), jax.tree.structure([0] * _arrays_in(skeleton)))
         return _calling(deserialize_and_load(content, *trees), skeleton)
     except FileNotFoundError:

@@ -169,16 +169,16 @@ class _Trial:
         """
         machine, count = self.estimate.machine, starts.count
         filled = starts.padded(self.padded)
-        drive = Drive(jnp.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
+        drive = Drive(np.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
         plant = machine.plant
         for joint in self.joints:
             plant = plant.with_effect(StaticFriction(level=as_array(0.0), port=joint))
         prior = _prior(self.estimate)
-        places, theta = machine.parameters.places, jnp.asarray(self.estimate.theta)
+        places, theta = machine.parameters.places, np.asarray(self.estimate.theta)
 
         def at(levels: np.ndarray) -> list[_Fit]:
-            by_joint = jnp.asarray(levels)[:, None] * jnp.asarray(np.eye(len(self.joints))[which])
-            both = _runs(plant, places, drive, filled, jnp.asarray(self.joints[which]), by_joint, theta)
+            by_joint = np.asarray(levels)[:, None] * np.eye(len(self.joints))[which]
+            both = _runs(plant, places, drive, filled, np.asarray(self.joints[which]), by_joint, theta)
             e, jacobian = (np.asarray(a)[:, :count, :length] for a in both)
             return [_Fit(x, j, prior, noise) for x, j in zip(e, jacobian, strict=True)]
 
