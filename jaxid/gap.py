@@ -53,14 +53,15 @@ class ForceGap:
 
 
 @kept_jit
-def _force_gap(plant: Plant, data: ForceData) -> tuple[Array, Array]:
-    """Compute residual and measured force at the kept samples."""
-    return -force_residual(plant, data), measured_force(plant, data)
+def _unexplained(plant: Plant, data: ForceData) -> Array:
+    """Compute the measured force minus that of the model at the kept samples."""
+    return -force_residual(plant, data)
 
 
 def force_gap(machine: Machine, data: Prepared) -> ForceGap:
     """Compute the gap between measured force and inverse dynamics, without samples at rest."""
-    residual, measured = _force_gap(sharpened(machine.plant, data), ForceData.of(data))
+    plant, arrays = sharpened(machine.plant, data), ForceData.of(data)
+    residual, measured = _unexplained(plant, arrays), measured_force(plant, arrays)
     residual = np.where(data.moving, np.asarray(residual), np.nan)
     counted = np.where(data.moving, np.asarray(measured), np.nan)
     norm, size = (np.sqrt(np.nansum(x**2, axis=0)) for x in (residual, counted))

@@ -16,7 +16,6 @@ from jaxid.model.effect import Effect, carries_force
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free
-from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.force_balance import ForceData, force_and_columns, measured_force, sharpened
 
@@ -137,7 +136,7 @@ def balance_fits(
     needed = sorted({k for drives in turned for k in drives})
     # Each drive acts on the balance independently of the others.
     changes = {k: evaluate(np.where(np.arange(drives) == k, -1.0, 1.0)) for k in needed}
-    force = np.asarray(measured(plant, arrays))
+    force = np.asarray(measured_force(plant, arrays))
     potential = _potential(machine, data)
     velocity = np.asarray(data.recipe.decimator(data.qd))
     typical = np.abs(declared[1] * np.asarray(theta)[linear]).max(axis=2, initial=0.0)
@@ -160,9 +159,6 @@ def balance_fits(
         )
         out.append(replace(base, known=known, columns=columns))
     return out
-
-
-measured = kept_jit(measured_force)
 
 
 def _is_force(plant: Plant, free: Free) -> bool:

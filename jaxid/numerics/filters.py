@@ -14,7 +14,7 @@ import scipy.optimize
 import scipy.signal
 from jaxtyping import Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.numerics.fft import fast_length, irfft, rfft
 
 # Periods of the cut-off over which a signal fades out beyond its ends. After as many periods the impulse
@@ -322,7 +322,7 @@ def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: flo
     def response(f: np.ndarray) -> Array:
         # The mean of the held command over its hold time adds a lag and a roll-off. This is exact in the
         # band, while interpolation between samples is 1 % off at a sixth of the sampling rate.
-        lag = jnp.exp(-2j * jnp.pi * jnp.asarray(f)[:, None] * (delay + 0.5 * hold) / period)
+        lag = library(delay).exp(-2j * np.pi * f[:, None] * (delay + 0.5 * hold) / period)
         return lag * np.sinc(f * hold / period)[:, None]
 
     return _through(u, 200, response)

@@ -51,7 +51,7 @@ def kept_jit(function: Callable[P, T]) -> Callable[P, T]:
     """
     plain = eqx.filter_jit(function)
     calls: dict[bytes, Callable[[list], T] | None] = {}
-    lock = threading.Lock()
+    locks: dict[bytes, threading.Lock] = {}
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -66,7 +66,7 @@ def kept_jit(function: Callable[P, T]) -> Callable[P, T]:
         if key is None:
             return plain(*args, **kwargs)
         # Two threads may ask for one function at once: the second waits for the first.
-        with lock:
+        with locks.setdefault(key, threading.Lock()):
             if key not in calls:
                 calls[key] = _ready(function, structure, leaves, arrays, key)
         own = calls[key]

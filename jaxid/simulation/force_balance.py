@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.dynamics.hidden_joints import complete_motion
 from jaxid.dynamics.residuals import residual_along
 from jaxid.logs.prepare import Prepared
+from jaxid.model.drives import Drives
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
@@ -104,8 +105,16 @@ def force_and_columns(
 
 def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     """Return the filtered declared force by joint [N or N m]; zero for a joint without a drive."""
-    u = signals.delayed(data.force, jnp.zeros(()), data.period, hold=data.hold)
-    return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
+    u = data.decimator(signals.delayed(data.force, np.zeros(()), data.period, hold=data.hold))
+    joints = data.q.shape[1]
+    if type(plant).applied is not Drives.applied:
+        return jax.vmap(lambda u: plant.applied(u, joints))(u)
+    # Without a map the arrays of a prepared log stay numpy's, and nothing is compiled.
+    if plant.actuated is None:
+        return u
+    xp = library(u)
+    drives = [plant.drive_of(j, u.shape[1]) for j in range(joints)]
+    return xp.stack([xp.zeros(len(u)) if k is None else u[:, k] for k in drives], axis=1)
 
 
 def sharpened(plant: Plant, data: Prepared) -> Plant:
