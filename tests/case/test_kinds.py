@@ -34,7 +34,7 @@ stiffness = [10.0, 20.0, 0.0]
 
 [[effects]]
 kind = "cubic_stiffness"
-spring = 2
+spring = 3
 coefficient = 1.0
 
 [[effects]]
