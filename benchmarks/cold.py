@@ -102,7 +102,7 @@ def rows_of(repeats: int, cases: int, only: str) -> list[Row]:
     }.items():
         if only in what:
             first, again = first_and_again(words, repeats)
-            group = "identify" if what in ("identify, demo", "identify, demo, -o") else "other"
+            group = "identify" if what == "identify, demo" else "other"
             add(f"{what}, first", f"{group} first", first)
             add(f"{what}, again", f"{group} again", again)
     if only in "discover":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -43,6 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def entry() -> None:
     """Entry point of the installed command."""
+    # Imports make many objects that stay: looking for garbage after every 700 takes a tenth of their time.
+    gc.set_threshold(100_000, 50, 50)
     _cache.configure()
     sys.exit(main())
 
