@@ -1,7 +1,8 @@
 """Compiled code that commands keep on disk, so that the second run of a command compiles nothing.
 
-It is the persistent cache of JAX. This module chooses its folder, limits its size, and removes entries that
-cannot be read because another run is writing them or was killed while it did.
+It is the persistent cache of JAX, and beside it whole functions, see `jaxid.numerics.kept`. This module
+chooses the folder, limits its size, and removes entries that cannot be read because another run is writing
+them or was killed while it did.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ def configure() -> None:
     except (OSError, RuntimeError):
         return  # no home, or one that cannot be written to: all works, only slower
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ.setdefault("JAXID_KEPT", str(folder))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_SECONDS))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
     _heal(folder)

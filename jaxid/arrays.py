@@ -1,6 +1,9 @@
-"""The array type of annotations: an array of JAX or of NumPy, as JAX's own functions take them."""
+"""Arrays: their type in annotations, and the library that computes with them."""
 
-from typing import TYPE_CHECKING
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import jax
@@ -9,3 +12,16 @@ if TYPE_CHECKING:
     Array = jax.Array | np.ndarray
 else:
     from jaxtyping import Array as Array
+
+
+def library(*values: Any) -> Any:
+    """Return `jax.numpy` if any value is traced, else `numpy`.
+
+    Outside of compiled code JAX compiles every single operation, which takes longer than a small one itself.
+    """
+    jax = sys.modules.get("jax")
+    if jax is not None and any(isinstance(value, jax.core.Tracer) for value in values):
+        return jax.numpy
+    import numpy
+
+    return numpy

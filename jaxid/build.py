@@ -7,7 +7,6 @@ from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Array
@@ -26,6 +25,7 @@ from jaxid.model.plant import Plant
 from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import CONTROLLER, REFERENCE, Free, Parameters, effect_name, label
 from jaxid.names import AXES
+from jaxid.numerics.kept import kept_jit
 from jaxid.references import REFERENCES
 from jaxid.references.unknown import UnknownReference
 from jaxid.schema import stated
@@ -114,7 +114,7 @@ def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:
     return Sensor(**given, hold=hold)
 
 
-@eqx.filter_jit
+@kept_jit
 def _identifiable(sensors: InertialSensors, plant: Plant, q: Array, readings: Array, zero: Array) -> Array:
     return sensors.fused(plant, q, readings, zero, zero)[2]
 

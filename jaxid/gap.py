@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -14,8 +13,10 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.numerics.kept import kept_jit
 from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, force_residual, measured_force, sharpened
+from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import (
     Replay,
     exact_numerics,
@@ -51,10 +52,10 @@ class ForceGap:
     relative: Float[np.ndarray, " n"]
 
 
-@eqx.filter_jit
-def _force_gap(plant: Plant, data: ForceData) -> tuple[Array, Array]:
-    """Compute residual and measured force at the kept samples."""
-    return -force_residual(plant, data), measured_force(plant, data)
+@kept_jit
+def _unexplained(plant: Plant, data: ForceData) -> Array:
+    """Compute the measured force minus that of the model at the kept samples."""
+    return -force_residual(plant, data)
 
 
 def force_gap(machine: Machine, data: Prepared) -> ForceGap:
@@ -63,7 +64,8 @@ def force_gap(machine: Machine, data: Prepared) -> ForceGap:
         # The log has no force: only the position of the simulated loop can be compared.
         nothing, none = np.full(data.moving.shape, np.nan), np.full(data.moving.shape[1], np.nan)  # pyright: ignore[reportGeneralTypeIssues]  # two axes
         return ForceGap(residual=nothing, measured=np.zeros_like(nothing), rms=none, relative=none)
-    residual, measured = _force_gap(sharpened(machine.plant, data), ForceData.of(data))
+    plant, arrays = sharpened(machine.plant, data), ForceData.of(data)
+    residual, measured = _unexplained(plant, arrays), measured_force(plant, arrays)
     residual = np.where(data.moving, np.asarray(residual), np.nan)
     counted = np.where(data.moving, np.asarray(measured), np.nan)
     norm, size = (np.sqrt(np.nansum(x**2, axis=0)) for x in (residual, counted))
@@ -97,7 +99,9 @@ class SimulationGap:
     command_relative: Float[np.ndarray, " m"] | None
 
 
-_run = eqx.filter_jit(lambda replay, plant: replay(plant))
+@kept_jit
+def _run(replay: Replay, plant: Plant) -> Trajectory:
+    return replay(plant)
 
 
 def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:

@@ -85,6 +85,8 @@ OPTIONAL_COLUMNS = (
     "load_acceleration",
     "temperature",
 )
+# Columns that only a table of steady speeds has.
+STEADY_COLUMNS = ("scatter", "samples")
 # Kinds of a log: samples over time, or a table of steady speeds.
 LOG_KINDS = ("time", "steady")
 # Ways to differentiate a position, see `jaxid.logs.prepare`.
@@ -120,3 +122,20 @@ SIDES = ("load", "motor")
 RESAMPLINGS = ("linear", "band_limited")
 # Files of other programs that `export` writes.
 TARGETS = ("mjcf",)
+# Names of ports in case files and results; ports of each kind count from 1.
+PLACES = ("joint", "spring", "shaft", "passive", "tool")
+# Kinds of the joints of an arm.
+JOINTS = ("revolute", "prismatic")
+# Inertial parameters of a link, in the order of the fields of an arm.
+TEN = (
+    "mass",
+    "first_moment_x",
+    "first_moment_y",
+    "first_moment_z",
+    "inertia_xx",
+    "inertia_xy",
+    "inertia_xz",
+    "inertia_yy",
+    "inertia_yz",
+    "inertia_zz",
+)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.case.case import Case
+from jaxid.case.kinds import loaded_kinds
 from jaxid.case.tables import controller_keys
 from jaxid.controllers import Controller
 from jaxid.errors import suggest
@@ -116,7 +117,7 @@ def _of_controller(case: Case, key: str, value: Any, where: str) -> Any:
     spot = Spot(where, key=f"set {_CONTROLLER}{key}")
     if case.controller is None:
         raise spot.fault("belongs to a controller", "add [controller], or leave it out")
-    keys = controller_keys(case.controller.kind)
+    keys = controller_keys(case.controller.kind, loaded_kinds())
     known = [name for name in case.controller.law if name in keys]
     if key not in known:
         raise spot.fault("is not stated in [controller]", suggest(key, known))

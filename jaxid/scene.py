@@ -13,7 +13,8 @@ import numpy as np
 from jaxid.arrays import Array
 from jaxid.build import build_machine
 from jaxid.case.case import Case
-from jaxid.case.user_faults import is_user_class, where_not_finite
+from jaxid.case.kinds import is_user_class
+from jaxid.case.user_faults import where_not_finite
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.logs.log import Log

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from jaxid.names import (
     AXES,
@@ -28,6 +29,7 @@ from jaxid.names import (
     SIGN_OF,
     SOLVERS,
     STARTS,
+    STEADY_COLUMNS,
     UNIT_OF,
     USER_METHODS,
 )
@@ -44,6 +46,7 @@ from jaxid.schema import (
     key,
     number,
     odd,
+    read_settings,
     rows,
     several,
     sign,
@@ -502,3 +505,55 @@ class InertialSensor:
         number("positive"), "readings per second", unit="Hz", note="one a tick of the loop"
     )
     calibrated: bool = key(flag, "whether rotation, scale and bias are known to the loop", default=True)
+
+
+_LOG = Spot("", "[log]")
+
+
+def log_table(columns: LogTable | Mapping[str, Any], spot: Spot = _LOG) -> LogTable:
+    """Read a [log] table.
+
+    Args:
+        columns: The table, checked already or as it stands in a case.
+        spot: Position of the table, for messages.
+
+    Raises:
+        InputError: If a key is unknown, missing or impossible, or there is no time base.
+    """
+    if isinstance(columns, LogTable):
+        return columns
+    table = read_settings(LogTable, dict(columns), spot)
+    _check_kind(table, dict(columns), spot)
+    if table.kind == "steady":
+        return table
+    if table.time is None and table.sample_rate is None:
+        hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
+        raise spot.fault("neither time nor sample_rate is given", hint)
+    return table
+
+
+# Keys that a table of steady speeds may have.
+_STEADY_KEYS = (
+    *("kind", "velocity", "force", *STEADY_COLUMNS),
+    *("units", "sign", "position_at", "rows", "format", "separator", "decimal"),
+    *("temperature", "counts_per_revolution"),
+)
+
+
+def _check_kind(table: LogTable, given: dict[str, Any], spot: Spot) -> None:
+    """Refuse columns that the kind of the log does not have, or lacks."""
+    if table.kind == "steady":
+        for name in ("velocity", "force"):
+            if name not in given:
+                hint = f"add {name} = its column: a steady table has a velocity and the force that holds it"
+                raise spot.fault(f"'{name}' is missing", hint)
+        other = next((name for name in given if name not in _STEADY_KEYS), None)
+        if other is not None:
+            raise spot.at(other).fault('does not go with kind = "steady"', "leave it out, or remove kind")
+        return
+    other = next((name for name in STEADY_COLUMNS if name in given), None)
+    if other is not None:
+        raise spot.at(other).fault('goes with kind = "steady" only', "leave it out")
+    if table.position is None and table.velocity is None and table.loop_velocity is None:
+        hint = "add position: the name of its column; or velocity, where only the velocity was logged"
+        raise spot.fault("'position' is missing", hint)

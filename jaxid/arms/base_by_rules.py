@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arms.base_parameters import BaseParameters, standard_places, tidied
-from jaxid.arms.pseudo_inertia import TEN, moved
+from jaxid.arms.pseudo_inertia import moved
+from jaxid.names import TEN
 from jaxid.plants import LinkTree
 
 _MASS, _X, _Y, _Z, _XX, _XY, _XZ, _YY, _YZ, _ZZ = range(10)

@@ -9,20 +9,6 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.plants import rigid_tree
 
-# Fields of an arm in the order of the ten parameters.
-TEN = (
-    "mass",
-    "first_moment_x",
-    "first_moment_y",
-    "first_moment_z",
-    "inertia_xx",
-    "inertia_xy",
-    "inertia_xz",
-    "inertia_yy",
-    "inertia_yz",
-    "inertia_zz",
-)
-
 
 def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
     """Compute the integral of (x y z 1)' (x y z 1) over the mass of a body.
@@ -30,7 +16,7 @@ def pseudo_inertia(ten: Float[Array, "*n 10"]) -> Float[Array, "*n 4 4"]:
     It is positive definite if and only if some body of positive density everywhere has these parameters.
 
     Args:
-        ten: Inertial parameters in the order of `TEN`; products of inertia are -sum m x y.
+        ten: Inertial parameters in the order of `jaxid.names.TEN`; products of inertia are -sum m x y.
     Source:
         Wensing, Kim & Slotine (2018), IEEE RA-L 3(1). (2.9) of the PA-10 report holds the sums +sum m x y.
     """
@@ -85,7 +71,7 @@ def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
     the mass): the logarithms of its diagonal, and its entries 12, 13, 23.
 
     Args:
-        ten: Inertial parameters of a body, in the order of `TEN`.
+        ten: Inertial parameters of a body, in the order of `jaxid.names.TEN`.
 
 
     Source:

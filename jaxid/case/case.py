@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from jaxid.case.declared import EffectEntry, PlantEntry
+from jaxid.case.declared import EffectEntry, PlantEntry, own_effects
 from jaxid.case.entries import check_kinds, read_effects, read_kind, read_plant, read_search
+from jaxid.case.kinds import Kinds, NeedsClassesError, declared_kinds, loaded_kinds
 from jaxid.case.reference import read_signal, read_unknown_reference
 from jaxid.case.sensors import read_inertial_sensors
 from jaxid.case.tables import (
@@ -23,14 +24,8 @@ from jaxid.case.tables import (
     fit_keys,
     validation_keys,
 )
-from jaxid.case.tree import own_effects
 from jaxid.case.values import Value
-from jaxid.controllers import CONTROLLERS
-from jaxid.effects import EFFECTS
 from jaxid.errors import InputError, suggest
-from jaxid.logs.log import log_table
-from jaxid.logs.units import parse_unit
-from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
 from jaxid.names import DISCOVER, HOLDS
 from jaxid.schema import Counts, Spot, keys_of, plain, read_settings, read_table
@@ -50,7 +45,11 @@ from jaxid.settings import (
     SimulationTable,
     StudyTable,
     WithinPrior,
+    log_table,
 )
+
+if TYPE_CHECKING:
+    from jaxid.model.effect import Effect
 
 # Kinds of units that convert to the SI units of a machine.
 _MECHANICAL = ("length", "angle", "force", "torque")
@@ -177,12 +176,15 @@ class Case:
     @property
     def own_effects(self) -> tuple[type[Effect], ...]:
         """User-defined effects that the case names: those that it declares, and the candidates."""
-        classes = (*(entry.cls for entry in self.effects), *self.candidates)
-        return tuple(dict.fromkeys(c for c in classes if EFFECTS.get(c.kind) is not c))
+        from jaxid.effects import EFFECTS
+
+        return _others(self, EFFECTS)
 
     @property
     def searched(self) -> tuple[type[Effect], ...]:
         """Effects that `discover` may name."""
+        from jaxid.effects import EFFECTS
+
         asked = {*self.kinds, *(cls.kind for cls in self.candidates)}
         registered = [
             cls for kind, cls in EFFECTS.items() if kind in asked or not (self.kinds or cls.on_request)
@@ -274,20 +276,40 @@ def load_case(source: CaseLike) -> Case:
     return read_case(_toml(path), path, path.parent)
 
 
-def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Case:
+def refuse_unsound(path: Path) -> None:
+    """Refuse a case before JAX is imported, as far as that needs no classes of plants and effects.
+
+    Args:
+        path: A TOML file.
+
+    Raises:
+        InputError: If the file cannot be read, or a table or key is unknown, missing or impossible.
+    """
+    if "jax" not in sys.modules:
+        with contextlib.suppress(NeedsClassesError):
+            read_case(_toml(path), path, path.parent, declared_kinds())
+
+
+def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path, kinds: Kinds | None = None) -> Case:
     """Check the tables of a case.
 
     Args:
         tables: Tables as TOML gives them.
         path: File that they came from; None: no file.
         folder: Folder from which relative file names start.
+        kinds: Plants, effects and control laws that it may name; None: all that are registered.
+
+    Returns:
+        The case; with stand-ins in place of classes, if the kinds are such.
 
     Raises:
         InputError: If a table or key is unknown, missing or impossible.
+        NeedsClassesError: If the kinds are stand-ins, and only a class can check the case further.
     """
+    kinds = loaded_kinds() if kinds is None else kinds
     top = Spot(UNNAMED if path is None else str(path), folder=folder)
     _check_top(tables, top)
-    plant, given = read_plant(tables["plant"], top), tables
+    plant, given = read_plant(tables["plant"], top, kinds), tables
     tables = _with_defaults(tables, plant)
     drives = plant.drives
     root = replace(top, counts=Counts(plant.joints, drives, plant.names))
@@ -296,14 +318,14 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
         return read_settings(cls, tables.get(name, {}), root.under(f"[{name}]"))
 
     at_guess, unknown = read_unknown_reference(tables, drives, root)
-    candidates, kinds = read_search(tables.get("discover", {}), root)
+    candidates, searched = read_search(tables.get("discover", {}), root, kinds)
     output_error = read(OutputError, "output_error")
     case = Case(
         path=path,
         base=folder,
         tables=given,
         plant=plant,
-        effects=_all_effects(tables, plant, root),
+        effects=_all_effects(tables, plant, root, kinds),
         actuator=read(Actuator, "actuator"),
         log=_log(tables, root),
         preprocess=read(Preprocess, "preprocess"),
@@ -312,14 +334,14 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
         output_error=output_error,
         within_prior=_within_prior(tables, output_error, root),
         recursive=read(Recursive, "recursive"),
-        controller=_controller(tables, root),
+        controller=_controller(tables, root, kinds),
         sensor=read(SensorTable, "sensor"),
         inertial_sensors=read_inertial_sensors(tables, plant.cls.links(plant.joints), root),
         limits=read(LimitsTable, "limits"),
         fits=_fits(tables, root),
         validations=_validations(tables, root),
         candidates=candidates,
-        kinds=kinds,
+        kinds=searched,
         design=read(DesignTable, "design") if tables.get("design") else None,
         reference=read_signal("reference", {**tables, **at_guess}, drives, root),
         unknown_reference=unknown,
@@ -334,7 +356,7 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path) -> Cas
     _check_labels(case, root)
     _check_preprocess(tables.get("preprocess", {}), root)
     _check_recursive(tables.get("recursive", {}), root)
-    check_kinds(case.own_effects, root)
+    check_kinds(_others(case, kinds.effects), root)
     _check_loop(case, root)
     return case
 
@@ -347,10 +369,18 @@ def _with_defaults(tables: Mapping[str, Any], plant: PlantEntry) -> Mapping[str,
     return {**defaults, **tables}
 
 
-def _all_effects(tables: Mapping[str, Any], plant: PlantEntry, root: Spot) -> tuple[EffectEntry, ...]:
+def _all_effects(
+    tables: Mapping[str, Any], plant: PlantEntry, root: Spot, kinds: Kinds
+) -> tuple[EffectEntry, ...]:
     """Return the effects of the case, and behind them those of the plant's file that it does not replace."""
-    declared = read_effects(tables.get("effects", []), plant, root)
+    declared = read_effects(tables.get("effects", []), plant, root, kinds)
     return (*declared, *own_effects(declared, plant.effects))
+
+
+def _others(case: Case, registered: Mapping[str, type[Effect]]) -> tuple[type[Effect], ...]:
+    """Return the effects that a case declares or searches for, and that are not registered."""
+    classes = (*(entry.cls for entry in case.effects), *case.candidates)
+    return tuple(dict.fromkeys(c for c in classes if registered.get(c.kind) is not c))
 
 
 def _check_top(tables: Mapping[str, Any], top: Spot) -> None:
@@ -396,6 +426,7 @@ def _toml(path: Path) -> dict[str, Any]:
         raise InputError(what, where=str(path), hint="name a TOML file that may be read") from error
 
 
+# Only a transmission needs numpy, and only stated units their reader: neither should delay other refusals.
 def _check_transmission(case: Case, root: Spot) -> None:
     rows, spot = case.actuator.transmission, root.under("[actuator]").at("transmission")
     if rows is None:
@@ -407,6 +438,8 @@ def _check_transmission(case: Case, root: Spot) -> None:
     if plant.drives < joints:
         hint = "leave it out, and take a log of the joints"
         raise spot.fault(f"is for plants with a drive for each joint, not {plant.drives} for {joints}", hint)
+    import numpy as np
+
     if {len(rows), *map(len, rows)} != {joints} or np.linalg.matrix_rank(rows) < joints:
         hint = f"give {joints} rows of {joints} numbers, none a sum of others"
         raise spot.fault("is not an invertible square matrix", hint)
@@ -433,6 +466,8 @@ def _check_drive(case: Case, tables: Mapping[str, Any], root: Spot) -> None:
                 hint = "state gain (ratio times efficiency for a logged motor torque) or torque_constant"
                 raise spot.at(key).fault("leaves open what the logged command is", hint)
     if case.log is not None and case.log.counts_per_revolution is not None and case.log.units is not None:
+        from jaxid.logs.units import parse_unit
+
         given = case.log.units.values()
         texts = [text for unit in given for text in ((unit,) if isinstance(unit, str) else unit)]
         if "count" not in {unit.kind for unit in map(parse_unit, texts) if unit is not None}:
@@ -444,7 +479,11 @@ def _check_labels(case: Case, root: Spot) -> None:
     """Refuse labels of [plant] units that look as if they converted: mm, deg, kN."""
     for quantity in ("position", "force"):
         label = getattr(case.plant.units, quantity)
-        unit = None if label is None else parse_unit(label)
+        if label is None:
+            continue
+        from jaxid.logs.units import parse_unit
+
+        unit = parse_unit(label)
         mechanical = (
             unit is not None and unit.kind in ("length", "angle", "force", "torque") and unit.factor != 1.0
         )
@@ -508,12 +547,12 @@ def _time_base(table: LogTable, spot: Spot) -> LogTable:
     return table
 
 
-def _controller(tables: Mapping[str, Any], root: Spot) -> ControllerTable | None:
+def _controller(tables: Mapping[str, Any], root: Spot, kinds: Kinds) -> ControllerTable | None:
     if "controller" not in tables:
         return None
     table, spot = tables["controller"], root.under("[controller]")
-    kind = read_kind(table, CONTROLLERS, spot)
-    return controller_table(read_table(table, controller_keys(kind), spot))
+    kind = read_kind(table, kinds.laws, spot)
+    return controller_table(read_table(table, controller_keys(kind, kinds), spot))
 
 
 def _validations(tables: Mapping[str, Any], root: Spot) -> tuple[Validation, ...]:

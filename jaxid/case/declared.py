@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxid.case.values import Value
-from jaxid.model.effect import Effect
-from jaxid.model.plant import Plant
 from jaxid.model.units import Units
+
+if TYPE_CHECKING:
+    from jaxid.model.effect import Effect
+    from jaxid.model.plant import Plant
 
 
 @dataclass(frozen=True)
@@ -65,3 +67,17 @@ class EffectEntry:
     cls: type[Effect]
     parameters: dict[str, tuple[Value, ...]]
     ports: tuple[int, ...]
+
+
+def own_effects(
+    effects: tuple[EffectEntry, ...], of_file: tuple[EffectEntry, ...]
+) -> tuple[EffectEntry, ...]:
+    """Return the effects of a file that the case does not declare itself, at the joints where it does not."""
+    declared = {(entry.cls.kind, port) for entry in effects for port in entry.ports}
+    out = []
+    for entry in of_file:
+        stay = [k for k, port in enumerate(entry.ports) if (entry.cls.kind, port) not in declared]
+        if stay:
+            parameters = {n: tuple(values[k] for k in stay) for n, values in entry.parameters.items()}
+            out.append(EffectEntry(entry.cls, parameters, tuple(entry.ports[k] for k in stay)))
+    return tuple(out)

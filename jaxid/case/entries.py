@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from jaxid.case.declared import EffectEntry, PlantEntry
+from jaxid.case.kinds import Kinds, is_user_class, names_a_file
 from jaxid.case.links import LINKED, check_links, read_links, read_links_of_urdf, read_shafts
 from jaxid.case.places import check_places, read_ports
 from jaxid.case.tables import PLANT
-from jaxid.case.tree import read_tree
-from jaxid.case.user_effect import user_effect
-from jaxid.case.user_faults import check_action, is_user_class
-from jaxid.case.user_file import names_a_file
-from jaxid.case.user_plant import check_user_plant, user_plant
+from jaxid.case.tree_keys import TREE_KIND, read_tree_keys
 from jaxid.case.values import Value, read_value, read_values, values_schema
-from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.model.effect import Effect
-from jaxid.model.interface import PLACES
 from jaxid.model.parameter import ParameterInfo, parameters_of
-from jaxid.model.plant import Plant
 from jaxid.model.units import Units
-from jaxid.names import MOTIONS
-from jaxid.plants import PLANTS, LinkTree
+from jaxid.names import MOTIONS, PLACES
 from jaxid.schema import (
     Key,
     Reader,
@@ -41,6 +33,10 @@ from jaxid.schema import (
     whole,
 )
 
+if TYPE_CHECKING:
+    from jaxid.model.effect import Effect
+    from jaxid.model.plant import Plant
+
 # Most joints of a plant whose lists give their number.
 _MOST_JOINTS = 50
 
@@ -56,29 +52,37 @@ def read_kind(table: dict[str, Any], known: Any, spot: Spot) -> str:
     return choice(known)(table["kind"], spot.at("kind"))
 
 
-def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
+def read_plant(table: dict[str, Any], root: Spot, kinds: Kinds) -> PlantEntry:
     """Read [plant].
 
     Raises:
         InputError: If it has a key or value that the plant cannot have, or lacks one.
+        NeedsClassesError: If a file describes the plant, and the kinds are stand-ins.
     """
     spot = root.under("[plant]")
     kind = str(table.get("kind", ""))
     users = names_a_file(kind)
     if users:
+        kinds.need_classes()
+        from jaxid.case.user_plant import user_plant
+
         cls = user_plant(kind, root.folder, spot.at("kind"))
     else:
-        cls = PLANTS[read_kind(table, PLANTS, spot)]
+        cls = kinds.plants[read_kind(table, kinds.plants, spot)]
     keys = {"kind": Key(anything), **PLANT}
-    if cls is LinkTree:
-        return read_tree(table, keys, spot)
+    if kind == TREE_KIND:
+        given = read_tree_keys(table, keys, spot)
+        kinds.need_classes()
+        from jaxid.case.tree import read_tree
+
+        return read_tree(given, table, spot)
     if cls.linked:
-        return _linked(table, cls, keys, spot)
+        return _linked(table, cls, keys, spot, kinds)
     if cls.couplings:
         keys["coupling"] = coupling_key(cls)
         if "coupling" in table:
             coupling = keys["coupling"].read(table["coupling"], spot.at("coupling"))
-            cls = cast(type[Plant], cls.couplings[coupling])
+            cls = cast("type[Plant]", cls.couplings[coupling])
     joints = _count_joints(table.get("parameters"), cls, spot)
     if "actuated" in cls.__dataclass_fields__:
         keys["actuated"] = actuated_key(joints)
@@ -103,25 +107,29 @@ def read_plant(table: dict[str, Any], root: Spot) -> PlantEntry:
         actuated=given.get("actuated", cls.actuated),
     )
     if users:
+        from jaxid.case.user_plant import check_user_plant
+
         check_user_plant(entry, kind, spot.at("kind"))
     return entry
 
 
-def _linked(table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot) -> PlantEntry:
+def _linked(
+    table: dict[str, Any], cls: type[Plant], keys: dict[str, Key], spot: Spot, kinds: Kinds
+) -> PlantEntry:
     """Read [plant] of an arm, which [[plant.links]] or a URDF file describe."""
     # For an arm weight is a vector, and acts in every pose.
     taken = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
     given = read_table(table, {**taken, **LINKED}, spot)
     names: tuple[str, ...] = ()
     if "urdf" in given:
-        parameters, arm = read_links_of_urdf(given, cls, spot)
+        parameters, arm = read_links_of_urdf(given, cls, spot, kinds)
         geometry, names = arm.geometry, arm.names
     else:
         of_file = [name for name in ("tip", "unknown") if name in given]
         if of_file:
             raise spot.at(of_file[0]).fault("goes with urdf only", 'add urdf = "<its file>", or leave it out')
         check_links(table, spot)
-        parameters, geometry = read_links(table["links"], cls, spot)
+        parameters, geometry = read_links(table["links"], cls, spot, kinds)
     options = {name: given[name] for name in ("gravity_vector",) if name in given}
     if "shafts" in table:
         options["shafts"] = read_shafts(table["shafts"], geometry, spot)
@@ -253,21 +261,25 @@ def _row(value: Any, info: ParameterInfo, spot: Spot) -> tuple[Value, ...]:
     return read_values(value, info, info.width, spot, "component")
 
 
-def read_effects(tables: list, plant: PlantEntry, root: Spot) -> tuple[EffectEntry, ...]:
+def read_effects(tables: list, plant: PlantEntry, root: Spot, kinds: Kinds) -> tuple[EffectEntry, ...]:
     """Read [[effects]], in the order of the drive.
 
     Raises:
         InputError: If an effect is unknown, or has a key or value that it cannot have, or lacks one.
+        NeedsClassesError: If an effect is a class in a file, and the kinds are stand-ins.
     """
-    return tuple(_effect(table, k, plant, root) for k, table in enumerate(tables, start=1))
+    return tuple(_effect(table, k, plant, root, kinds) for k, table in enumerate(tables, start=1))
 
 
-def _effect(table: dict[str, Any], index: int, plant: PlantEntry, root: Spot) -> EffectEntry:
+def _effect(table: dict[str, Any], index: int, plant: PlantEntry, root: Spot, kinds: Kinds) -> EffectEntry:
     spot = root.under(f"[[effects]] {index}")
     if names_a_file(table.get("kind", "")):
+        kinds.need_classes()
+        from jaxid.case.user_effect import user_effect
+
         cls = user_effect(str(table["kind"]), root.folder, spot.at("kind"))
     else:
-        cls = EFFECTS[read_kind(table, EFFECTS, spot)]
+        cls = kinds.effects[read_kind(table, kinds.effects, spot)]
     spot = root.under(f"[[effects]] {index} ({cls.kind})")
     infos = parameters_of(cls)
     _check_keys(table, cls, spot)
@@ -287,7 +299,7 @@ def _effect(table: dict[str, Any], index: int, plant: PlantEntry, root: Spot) ->
     return EffectEntry(cls, parameters, ports)
 
 
-def read_search(table: Any, root: Spot) -> tuple[tuple[type[Effect], ...], tuple[str, ...]]:
+def read_search(table: Any, root: Spot, kinds: Kinds) -> tuple[tuple[type[Effect], ...], tuple[str, ...]]:
     """Read [discover].
 
     Returns:
@@ -295,20 +307,25 @@ def read_search(table: Any, root: Spot) -> tuple[tuple[type[Effect], ...], tuple
 
     Raises:
         InputError: If a kind is unknown, or a candidate is no class of a file, or takes part in every search.
+        NeedsClassesError: If a candidate is a class in a file, and the kinds are stand-ins.
     """
-    given = read_table(table, search_keys(root), root.under("[discover]"))
+    given = read_table(table, search_keys(root, kinds), root.under("[discover]"))
     return given.get("candidates", ()), given.get("kinds", ())
 
 
-def search_keys(root: Spot) -> dict[str, Key]:
+def search_keys(root: Spot, kinds: Kinds) -> dict[str, Key]:
     """Return the keys of [discover]."""
+    effects = kinds.effects
 
     def candidate(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
-        if kind in EFFECTS and EFFECTS[kind].on_request:
-            return EFFECTS[kind]
-        if kind in EFFECTS:
+        if kind in effects and effects[kind].on_request:
+            return effects[kind]
+        if kind in effects:
             raise spot.refuse(kind, "takes part in every search", "leave it out")
+        kinds.need_classes()
+        from jaxid.case.user_effect import user_effect
+
         return user_effect(kind, root.folder, spot)
 
     return {
@@ -318,7 +335,7 @@ def search_keys(root: Spot) -> dict[str, Key]:
             default=(),
         ),
         "kinds": Key(
-            several(choice(tuple(EFFECTS))),
+            several(choice(tuple(effects))),
             "the only effects that discover may name, out of `jaxid effects`",
             note="all of them",
         ),
@@ -367,4 +384,6 @@ def _check_together(cls: type[Effect], parameters: dict[str, tuple[Value, ...]],
         text = " ".join(str(error).split()).rstrip(".")
         raise spot.fault(text or type(error).__name__, _takes(cls)) from error
     if is_user_class(cls):
+        from jaxid.case.user_faults import check_action
+
         check_action(effect, f"{spot.file}, {spot.table}")

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from jaxid.case.entries import actuated_key, coupling_key, parameter_keys, search_keys, unit_of
+from jaxid.case.kinds import known_kinds
 from jaxid.case.links import LINKED, SHAFT, link_keys
 from jaxid.case.tables import PLANT, TOP, controller_keys, fit_keys, validation_keys
-from jaxid.case.tree import TREE
+from jaxid.case.tree_keys import TREE, TREE_KIND
 from jaxid.case.values import value_schema, values_schema
-from jaxid.controllers import CONTROLLERS
-from jaxid.effects import EFFECTS
-from jaxid.model.effect import Effect
-from jaxid.model.interface import PLACES
 from jaxid.model.parameter import parameters_of
-from jaxid.model.plant import Plant
-from jaxid.plants import PLANTS, LinkTree
+from jaxid.names import PLACES
 from jaxid.references import REFERENCES
 from jaxid.schema import Key, Keys, Reader, Spot, either, flag, keys_of, list_of, schema_of, text
 from jaxid.settings import (
@@ -34,6 +30,10 @@ from jaxid.settings import (
     StudyTable,
     WithinPrior,
 )
+
+if TYPE_CHECKING:
+    from jaxid.model.effect import Effect
+    from jaxid.model.plant import Plant
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 # Tables whose keys do not depend on a kind.
@@ -70,21 +70,25 @@ def case_schema() -> dict[str, Any]:
     It holds types, required keys, names, bounds and descriptions with units. Checks that span several tables
     (lengths of lists, keys that exclude each other) are made by `jaxid.case.case.load_case` alone.
     """
+    kinds = known_kinds()
     tables = {name: schema_of(keys_of(cls), _doc(cls)) for name, cls in _TABLES.items()}
     for table, (name, others) in _WITH.items():
         tables[table]["dependentRequired"] = dict.fromkeys(others, [name])
     tables |= {
-        "plant": _by_kind([variant for cls in PLANTS.values() for variant in _plant(cls)]),
-        "effects": {"type": "array", "items": _by_kind([*map(_effect, EFFECTS.values()), _user_effect()])},
+        "plant": _by_kind([variant for cls in kinds.plants.values() for variant in _plant(cls)]),
+        "effects": {
+            "type": "array",
+            "items": _by_kind([*map(_effect, kinds.effects.values()), _user_effect()]),
+        },
         "log": _log(),
-        "controller": _by_kind([_kind(kind, controller_keys(kind)) for kind in CONTROLLERS]),
+        "controller": _by_kind([_kind(kind, controller_keys(kind, kinds)) for kind in kinds.laws]),
         "inertial_sensors": {
             "type": "array",
             "items": schema_of(keys_of(InertialSensor), _doc(InertialSensor)),
         },
         "fit": {"type": "array", "items": schema_of(fit_keys(), "a log that is fitted with others")},
         "validation": {"type": "array", "items": schema_of(validation_keys(), "a log to validate on")},
-        "discover": schema_of(search_keys(Spot("")), "[discover]: effects that a search may name"),
+        "discover": schema_of(search_keys(Spot(""), kinds), "[discover]: effects that a search may name"),
         "reference": _signal("reference that the controller follows"),
         "input": _signal("command in open loop"),
     }
@@ -119,7 +123,7 @@ def _unread(value: Any, spot: Spot) -> Any:
 
 def _plant(cls: type[Plant]) -> list[dict[str, Any]]:
     """Return the schemas of a plant: one for each of its couplings, or one."""
-    if cls is LinkTree:
+    if cls.kind == TREE_KIND:
         return [_robot(cls)]
     if cls.linked:
         return [_arm(cls)]
@@ -129,7 +133,7 @@ def _plant(cls: type[Plant]) -> list[dict[str, Any]]:
     for k, (coupling, variant) in enumerate(cls.couplings.items()):
         schema = _kind(
             cls.kind,
-            {**_plant_keys(cast(type[Plant], variant)), "coupling": coupling_key(cls)},
+            {**_plant_keys(cast("type[Plant]", variant)), "coupling": coupling_key(cls)},
             _doc(variant),
         )
         schema["properties"]["coupling"] = {"const": coupling}

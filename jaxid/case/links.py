@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from jaxid.arms.base_by_rules import base_parameters_by_rules
-from jaxid.arms.pseudo_inertia import TEN
+from jaxid.case.kinds import Kinds
 from jaxid.case.places import check_places
-from jaxid.case.urdf import Urdf, read_urdf
 from jaxid.case.values import Value, read_values, value_reader, value_schema, values_schema
 from jaxid.model.parameter import ParameterInfo, parameters_of
-from jaxid.model.plant import Plant
-from jaxid.plants.denavit_hartenberg import DenavitHartenberg
-from jaxid.plants.geometry import JOINTS, Geometry
-from jaxid.plants.serial_arm import SerialArm
+from jaxid.names import JOINTS, TEN
 from jaxid.schema import (
     Key,
     Keys,
@@ -33,6 +26,11 @@ from jaxid.schema import (
     text,
     whole,
 )
+
+if TYPE_CHECKING:
+    from jaxid.case.urdf import Urdf
+    from jaxid.model.plant import Plant
+    from jaxid.plants.geometry import Geometry
 
 # Chosen: more links than any arm has, and most robots.
 MOST_LINKS = 50
@@ -80,8 +78,8 @@ def check_links(table: dict[str, Any], spot: Spot) -> None:
 
 
 def read_links(
-    links: list[dict[str, Any]], cls: type[Plant], root: Spot
-) -> tuple[dict[str, tuple[Value, ...]], DenavitHartenberg]:
+    links: list[dict[str, Any]], cls: type[Plant], root: Spot, kinds: Kinds
+) -> tuple[dict[str, tuple[Value, ...]], Geometry]:
     """Read the inertial parameters of the links by name, one value a link, and their geometry.
 
     Raises:
@@ -100,11 +98,11 @@ def read_links(
                 parameters.setdefault(name, []).append(values)
         if any("rotor_inertia" in other for other in links) and "rotor_inertia" not in given:
             parameters.setdefault("rotor_inertia", []).append(Value(0.0))
-    return {name: tuple(values) for name, values in parameters.items()}, DenavitHartenberg.of_rows(rows)
+    return {name: tuple(values) for name, values in parameters.items()}, kinds.geometry(rows)
 
 
 def read_links_of_urdf(
-    given: dict[str, Any], cls: type[Plant], spot: Spot
+    given: dict[str, Any], cls: type[Plant], spot: Spot, kinds: Kinds
 ) -> tuple[dict[str, tuple[Value, ...]], Urdf]:
     """Read the parameters of the links from the URDF file that [plant] names.
 
@@ -113,9 +111,17 @@ def read_links_of_urdf(
 
     Raises:
         InputError: If [plant] describes the links as well, or the file does not describe an arm.
+        NeedsClassesError: If the kinds are stand-ins.
     """
     if "links" in given:
         raise spot.fault("both urdf and [[plant.links]] are given", "keep one of them")
+    kinds.need_classes()
+    import numpy as np
+
+    from jaxid.arms.base_by_rules import base_parameters_by_rules
+    from jaxid.case.urdf import read_urdf
+    from jaxid.plants.serial_arm import SerialArm
+
     arm = read_urdf(spot.folder / given["urdf"], given.get("tip"))
     if len(arm.names) > MOST_LINKS:
         raise spot.at("urdf").fault(f"has {len(arm.names)} joints", f"an arm has 1 to {MOST_LINKS}")

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from jaxid.errors import suggest
-from jaxid.model.effect import Effect
-from jaxid.model.interface import PLACES
+from jaxid.names import PLACES
 from jaxid.schema import Spot, count, several, whole
 
 if TYPE_CHECKING:
     from jaxid.case.declared import PlantEntry
+    from jaxid.model.effect import Effect
 
 
 # Nouns of places that differ from their keys.

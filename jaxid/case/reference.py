@@ -8,7 +8,6 @@ from typing import Any
 from jaxid.case.entries import read_kind
 from jaxid.case.values import Value, read_value
 from jaxid.model.parameter import ParameterInfo
-from jaxid.references import REFERENCES
 from jaxid.schema import Key, Spot
 
 
@@ -23,6 +22,9 @@ def read_signal(name: str, tables: Mapping[str, Any], drives: int, root: Spot) -
     """
     if not tables.get(name):
         return None
+    # Each family imports numpy, which cases without a signal do without.
+    from jaxid.references import REFERENCES
+
     table, spot = tables[name], root.under(f"[{name}]")
     kind = read_kind(table, REFERENCES, spot)
     read = REFERENCES[kind].read(table, f"{root.file}, [{name}]")
@@ -46,6 +48,8 @@ def read_unknown_reference(
     given = {k: v for k, v in table.items() if isinstance(v, dict)}
     if not given:
         return {}, {}
+    from jaxid.references import REFERENCES
+
     family = REFERENCES[read_kind(table, REFERENCES, spot)]
     for name in given:
         if name not in family.unknown:

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
+from jaxid.case.kinds import Kinds
 from jaxid.case.values import Value, read_value, value_keys
-from jaxid.controllers import CONTROLLERS, Controller
 from jaxid.model.parameter import ParameterInfo
 from jaxid.names import LAW_DERIVATIVES, MOTIONS, ORIENTATIONS
 from jaxid.schema import (
@@ -92,6 +92,8 @@ _UNKNOWN = {
     "limit": ("force", "positive"),
     "delay": ("time", "nonnegative"),
 }
+# Fields of every controller that the columns of a log decide.
+_OF_LOG = ("own_velocity",)
 # Laws whose gains may be unknown.
 _LINEAR = ("cascade_pd", "pd", "pid")
 # Laws whose gains act on a velocity that is itself a gain times the position error.
@@ -192,7 +194,7 @@ def at_start(value: Any, at_truth: bool = False) -> Any:
     return value.start(at_truth) if isinstance(value, Value) else value
 
 
-def controller_keys(kind: str) -> Keys:
+def controller_keys(kind: str, kinds: Kinds) -> Keys:
     """Return the keys of [controller]: those of every controller, and the fields of this kind's class."""
     keys = {
         "period": Key(number("positive"), "sampling time", unit="s", note="the log's"),
@@ -210,8 +212,8 @@ def controller_keys(kind: str) -> Keys:
         ),
         "disturbance": _DISTURBANCE,
     }
-    cls = CONTROLLERS[kind]
-    unstated = {f.name for f in fields(Controller)} | set(cls.of_machine)
+    cls = kinds.laws[kind]
+    unstated = {*keys, *_OF_LOG, *cls.of_machine}
     law = {}
     for f in fields(cls):
         if f.name not in unstated:

@@ -10,7 +10,6 @@ import numpy as np
 
 from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.base_parameters import base_parameters
-from jaxid.arms.pseudo_inertia import TEN
 from jaxid.case.declared import EffectEntry, PlantEntry
 from jaxid.case.links import ANGLE, MOST_LINKS, read_shafts
 from jaxid.case.mjcf import read_mjcf
@@ -21,95 +20,9 @@ from jaxid.effects import EFFECTS
 from jaxid.errors import InputError, suggest
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.units import Units
+from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
-from jaxid.schema import (
-    Key,
-    Keys,
-    Reader,
-    Spot,
-    anything,
-    choice,
-    either,
-    flag,
-    is_list,
-    list_of,
-    number,
-    read_table,
-    several,
-    text,
-)
-
-# Parameters of links that may be unknown, and further words for values that a file states of its joints.
-LINKS_UNKNOWN = ("base", "all")
-JOINTS_UNKNOWN = ("armature", "damping", "frictionloss", "stiffness")
-UNKNOWN = ("none", *LINKS_UNKNOWN, *JOINTS_UNKNOWN)
-
-
-def _unknown_reader() -> Reader:
-    one = choice(UNKNOWN)
-
-    def read(value: Any, spot: Spot) -> tuple[str, ...]:
-        words = several(one)(value, spot) if is_list(value) else (one(value, spot),)
-        if "base" in words and "all" in words:
-            raise spot.fault("has base and all", "keep one of them")
-        return tuple(word for word in words if word != "none")
-
-    return Reader(read, either(one.schema, list_of(one.schema)))
-
-
-def _by_name(inner: Reader) -> Reader:
-    """Return the reader of a table with an entry for some joints."""
-
-    def read(value: Any, spot: Spot) -> dict[str, Any]:
-        if not isinstance(value, Mapping):
-            raise spot.refuse(value, "is not a table", f"write {{ <joint> = ... }}: {spot.key}")
-        return {name: inner(entry, spot.inside(name)) for name, entry in value.items()}
-
-    return Reader(read, {"type": "object", "additionalProperties": inner.schema})
-
-
-def _ratios_reader() -> Reader:
-    """Return the reader of one ratio for all joints, or of a table by joint."""
-    table = _by_name(number("nonzero"))
-
-    def read(value: Any, spot: Spot) -> float | dict[str, float]:
-        return table(value, spot) if isinstance(value, Mapping) else number("nonzero")(value, spot)
-
-    return Reader(read, either(number("nonzero").schema, table.schema))
-
-
-# Keys of [plant] that only a tree has.
-TREE: Keys = {
-    "urdf": Key(text, "URDF file that describes the robot, relative to the case"),
-    "mjcf": Key(text, "MJCF file that describes the robot, relative to the case"),
-    "joints": Key(several(text), "names of the joints that move, in the order of the file", note="all"),
-    "held": Key(_by_name(number()), "positions of joints that are held", unit="position", note="zero"),
-    "unknown": Key(
-        _unknown_reader(),
-        "values of the file that are unknown: parameters of its links (base, all), and those of its joints",
-        default=(),
-        note="none",
-    ),
-    "gear_ratio": Key(
-        _ratios_reader(),
-        "turns of each motor for one of its joint; rotor_inertia is then that of the motor",
-        note="rotor_inertia is seen at the joint",
-    ),
-    "actuated": Key(
-        several(text), "names of the driven joints, in the order of the force columns", note="as in the file"
-    ),
-    "actuators": Key(
-        flag, "whether gains, drag, limits and servos of an MJCF's actuators are taken over", default=True
-    ),
-    "shafts": Key(anything, "a table [[plant.shafts]] for each"),
-    "gravity_vector": Key(
-        several(number(), shortest=3, longest=3),
-        "gravity in the frame of the base",
-        unit="m/s^2",
-        note="as in the file",
-    ),
-    "parameters": Key(anything, "values in place of the file's, by joint: mass = { elbow = 2.0 }"),
-}
+from jaxid.schema import Spot, is_list
 
 
 @dataclass(frozen=True)
@@ -141,24 +54,24 @@ class Tree:
         return bool(self.robot.drives) and self.given.get("actuators", True)
 
 
-def read_tree(table: dict[str, Any], keys: Keys, spot: Spot) -> PlantEntry:
-    """Read [plant] of a tree.
+def read_tree(given: Mapping[str, Any], table: Mapping[str, Any], spot: Spot) -> PlantEntry:
+    """Read the file of a tree, and return the plant.
+
+    Args:
+        given: The checked keys of [plant], as `jaxid.case.tree_keys.read_tree_keys` returns them.
+        table: [plant] as it stands in the case.
+        spot: Place of [plant], for messages.
 
     Raises:
-        InputError: If a key or value is impossible, or the file cannot be read.
+        InputError: If a value is impossible, or the file cannot be read.
     """
-    general = {name: key for name, key in keys.items() if name not in ("orientation", "gravity")}
-    given = read_table(table, {**general, **TREE}, spot)
-    files = [name for name in ("urdf", "mjcf") if name in given]
-    if len(files) != 1:
-        what = "both urdf and mjcf are given" if files else "'urdf' or 'mjcf' is missing"
-        raise spot.fault(what, "keep one of them" if files else 'add urdf = "<its file>", or mjcf')
-    path = spot.folder / given[files[0]]
-    whole = read_urdf_tree(path) if files[0] == "urdf" else read_mjcf(path)
+    file = "urdf" if "urdf" in given else "mjcf"
+    path = spot.folder / given[file]
+    whole = read_urdf_tree(path) if file == "urdf" else read_mjcf(path)
     robot = kept(whole, given.get("joints"), given.get("held", {}))
     if len(robot.joints) > MOST_LINKS:
         hint = f"name those that move by joints; a plant has 1 to {MOST_LINKS}"
-        raise spot.at(files[0]).fault(f"has {len(robot.joints)} joints", hint)
+        raise spot.at(file).fault(f"has {len(robot.joints)} joints", hint)
     tree = Tree(robot, given, spot)
     _check_mass(tree)
 
@@ -390,17 +303,3 @@ def _servo(tree: Tree) -> tuple[dict[str, Any], list[str]]:
     elif any(limits):
         notes.append("some servos have a force range, others none: state limit in [controller]")
     return {"controller": law}, notes
-
-
-def own_effects(
-    effects: tuple[EffectEntry, ...], of_file: tuple[EffectEntry, ...]
-) -> tuple[EffectEntry, ...]:
-    """Return the effects of a file that the case does not declare itself, at the joints where it does not."""
-    declared = {(entry.cls.kind, port) for entry in effects for port in entry.ports}
-    out = []
-    for entry in of_file:
-        stay = [k for k, port in enumerate(entry.ports) if (entry.cls.kind, port) not in declared]
-        if stay:
-            parameters = {n: tuple(values[k] for k in stay) for n, values in entry.parameters.items()}
-            out.append(EffectEntry(entry.cls, parameters, tuple(entry.ports[k] for k in stay)))
-    return tuple(out)

@@ -17,8 +17,8 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.model.effect import Action, Effect, Signals
-from jaxid.model.interface import PLACES
 from jaxid.model.parameter import ParameterInfo, parameters_of
+from jaxid.names import PLACES
 from jaxid.numerics.affine import depends
 from jaxid.schema import Spot
 
@@ -94,11 +94,6 @@ def named_faults() -> Iterator[None]:
         raise InputError(
             what, where=str(path), hint=f"correct {path.name}, or the values in the case"
         ) from error
-
-
-def is_user_class(cls: type) -> bool:
-    """Check that a class comes from outside of jaxid."""
-    return not cls.__module__.startswith("jaxid.")
 
 
 def check_declaration(cls: type[Effect], kind: str, spot: Spot) -> None:

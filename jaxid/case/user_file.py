@@ -28,11 +28,6 @@ T = TypeVar("T")
 _LOADED: dict[Path, tuple[int, ModuleType]] = {}
 
 
-def names_a_file(kind: object) -> bool:
-    """Check that a `kind` names a class in a file rather than one of the package."""
-    return ":" in str(kind) or str(kind).endswith(".py")
-
-
 def class_of_file(
     kind: str,
     folder: Path,

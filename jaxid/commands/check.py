@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +22,7 @@ from jaxid.gap import noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.seen import Sight, sights_of
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import Precision, Rows, assess_together
 from jaxid.session import Logs, OpenedLog, Session, open_session
@@ -229,7 +229,7 @@ def _precision_together(session: Session) -> Precision:
     return assess_together(session.machine.parameters.names, weighed, np.where(guess != 0, guess, 1.0))
 
 
-@eqx.filter_jit
+@kept_jit
 def _jacobian(plant: Any, places: tuple, data: ForceData, theta: Array) -> Array:
     if theta.size == 0:
         return jnp.zeros((*data.weight.shape, 0))

@@ -136,7 +136,7 @@ def balance_fits(
     needed = sorted({k for drives in turned for k in drives})
     # Each drive acts on the balance independently of the others.
     changes = {k: evaluate(np.where(np.arange(drives) == k, -1.0, 1.0)) for k in needed}
-    force = np.asarray(measured(plant, arrays))
+    force = np.asarray(measured_force(plant, arrays))
     potential = _potential(machine, data)
     velocity = np.asarray(data.recipe.decimator(data.qd))
     typical = np.abs(declared[1] * np.asarray(theta)[linear]).max(axis=2, initial=0.0)
@@ -159,9 +159,6 @@ def balance_fits(
         )
         out.append(replace(base, known=known, columns=columns))
     return out
-
-
-measured = eqx.filter_jit(measured_force)
 
 
 def _is_force(plant: Plant, free: Free) -> bool:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.consistency.balance_fit import BalanceFit, measured
+from jaxid.consistency.balance_fit import BalanceFit
 from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.simulation.force_balance import ForceData
+from jaxid.simulation.force_balance import ForceData, measured_force
 
 # Part of the gap under one hold that the other leaves at most, to be the better one.
 _CLEARLY = 0.9
@@ -50,9 +50,8 @@ def better_hold(
         return None
     other = holds[log.hold]
     held = data.recipe.hold(replace(log, hold=other), machine.hold_period)
-    now, then = (
-        np.asarray(measured(machine.plant, ForceData.of(replace(data, hold=h)))) for h in (data.hold, held)
-    )
+    arrays = (ForceData.of(replace(data, hold=h)) for h in (data.hold, held))
+    now, then = (np.asarray(measured_force(machine.plant, a)) for a in arrays)
     wider = with_friction(fit)
     residuals = [wider.fit(bounded=False)[1]]
     moved = replace(wider, known=wider.known + now - then)

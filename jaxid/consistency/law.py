@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.interpolate
 from jaxtyping import Float
@@ -128,15 +127,13 @@ def law_at_ticks(machine: Machine, log: Log) -> LawAtTicks | None:
         return None
     position, reference, extra, every = ticks
     driven = machine.plant.driven(position.shape[1])
-    arrays = (jnp.asarray(a) for a in (position, reference, extra, start_velocity(log)))
     own = None
     if controller.own_velocity and log.velocity is not None:
         own = log.velocity
         if every > 1:
             times = log.time[0] + controller.period * np.arange((log.samples - 1) * every + 1)
             own = scipy.interpolate.CubicSpline(log.time, own, axis=0)(np.minimum(times, log.time[-1]))
-        own = jnp.asarray(own)
-    made = np.asarray(commands(controller, driven, *arrays, own=own))
+    made = np.asarray(commands(controller, driven, position, reference, extra, start_velocity(log), own=own))
     if isinstance(controller, PID):
         # The integral before the first row is not known.
         made = made + np.median(log.force - made[::every], axis=0)

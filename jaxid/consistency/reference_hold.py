@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 from jaxtyping import Float
 
-from jaxid.consistency.balance_fit import BalanceFit, measured
+from jaxid.consistency.balance_fit import BalanceFit
 from jaxid.consistency.hold import clearly_better, with_friction
 from jaxid.consistency.law import law_at_ticks
 from jaxid.logs.finding import Finding
@@ -17,7 +16,7 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.names import HOLDS
-from jaxid.simulation.force_balance import ForceData
+from jaxid.simulation.force_balance import ForceData, measured_force
 
 # Factor on the gap of the logged force up to which the law's command explains the motion.
 _EXPLAINS = 1.5
@@ -80,12 +79,14 @@ def compare_reference_holds(
     if len(commands) < len(laws):
         return ReferenceHold({}, None, "the declared law cannot be computed from the log alone")
 
-    logged = np.asarray(measured(machine.plant, ForceData.of(data)))
+    logged = np.asarray(measured_force(machine.plant, ForceData.of(data)))
     wider = with_friction(fit)
     acting, residuals = {}, {}
     for hold, made in commands.items():
-        force = jnp.asarray(_between_samples(made.command, made.every)[: log.samples] * machine.gain)
-        acting[hold] = np.asarray(measured(machine.plant, ForceData.of(replace(data, force=force, hold=0.0))))
+        force = _between_samples(made.command, made.every)[: log.samples] * np.asarray(machine.gain)
+        acting[hold] = np.asarray(
+            measured_force(machine.plant, ForceData.of(replace(data, force=force, hold=0.0)))
+        )
         moved = replace(wider, known=wider.known + logged - acting[hold])
         residuals[hold] = moved.fit(bounded=False)[1]
     return _compared(machine, wider, acting, residuals)

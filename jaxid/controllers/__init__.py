@@ -1,6 +1,6 @@
 """Sampled controllers, by the names of the case file.
 
-To add one: write its class and register it here.
+To add one: write its class, register it here, and run `python -m jaxid.case.kinds`.
 """
 
 from jaxid.controllers.adaptive import Adaptive as Adaptive

@@ -25,6 +25,7 @@ from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, Parameters, scatter, seeds
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import in_threads
 from jaxid.own_values import OwnValues
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual
@@ -434,7 +435,7 @@ def _chunks(starts: np.ndarray, size: int = 37) -> Iterator[np.ndarray]:
         yield np.concatenate([chunk, fill])
 
 
-@eqx.filter_jit
+@kept_jit
 def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array) -> Array:
     def columns(start: Array) -> Array:
         return jax.jacfwd(lambda s: force_residual(scatter(places, plant, s), data))(start)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool
@@ -21,6 +20,7 @@ from jaxid.model.effect import Effect, Scales, carries_force
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, Parameters, colours, free_effect, label
+from jaxid.numerics.kept import kept_jit
 from jaxid.simulation.force_balance import ForceData, sharpened, whole_motion
 
 
@@ -54,7 +54,7 @@ def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
     return tuple(scales)
 
 
-@eqx.filter_jit
+@kept_jit
 def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
     motion = whole_motion(plant, data, data.force)
     return jax.vmap(lambda *now: port_motion(plant, *now))(*motion)

@@ -6,7 +6,6 @@ otherwise spoil the baseline silently, or fail in the middle of compiled code.
 
 from __future__ import annotations
 
-import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Array
@@ -18,6 +17,7 @@ from jaxid.model.effect import Effect, Scales
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, free_effect
+from jaxid.numerics.kept import kept_jit
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual, sharpened
 
 # Number of kept samples on which an effect is checked.
@@ -102,4 +102,4 @@ def _with_effect(plant: Plant, effect: Effect, machine: Machine) -> tuple[Plant,
     return plant, unknown.places, unknown.guess
 
 
-_force = eqx.filter_jit(force_residual)
+_force = kept_jit(force_residual)

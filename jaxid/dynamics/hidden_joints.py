@@ -24,6 +24,7 @@ from jaxid.model.balance import Balance
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import Smoothing
 from jaxid.numerics.affine import Affine
+from jaxid.numerics.kept import kept_jit
 
 Motion = tuple[Array, Array, Array]
 
@@ -172,7 +173,7 @@ def resting(
     return np.asarray(rest), np.asarray(follow)
 
 
-@eqx.filter_jit
+@kept_jit
 def _resting(carried: HiddenJoints, known: Array, drives: int) -> tuple[Array, Array]:
     n, u = len(carried.measured) + len(carried.hidden), jnp.zeros(drives)
     still, memory = jnp.zeros(len(carried.hidden)), carried.plant.initial_states(u)

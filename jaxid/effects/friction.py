@@ -48,20 +48,17 @@ class CoulombFriction(Effect):
     """-F sign v, set-valued at rest; F is `level`, or `friction_coefficient` times normal force."""
 
     sliding_level = "level"
+    alternatives = ("level", "friction_coefficient")
 
     level: Array | None = parameter("force", "nonnegative", "F, sliding friction", optional=True)
     friction_coefficient: Array | None = parameter(
         "1", "nonnegative", "mu, in place of the level: F = mu m g", optional=True
     )
 
-    def __check_init__(self) -> None:
-        if (self.level is None) == (self.friction_coefficient is None):
-            raise ValueError("coulomb_friction takes either level or friction_coefficient.")
-
     def act(self, x: Signals, state: None) -> Action:
         if self.level is not None:
             return Action(dry=self.level)
-        assert self.friction_coefficient is not None, "__check_init__ asks for one of the two"
+        assert self.friction_coefficient is not None, "one of the alternatives is given"
         return Action(dry=self.friction_coefficient * x.normal)
 
     @classmethod

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from jaxid.estimators.common.scoring import Scored, maximise_likelihood, observe
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.precision import Precision, profiled_out
 from jaxid.simulation.kalman import KalmanFilter
@@ -56,7 +57,7 @@ class Innovations(NamedTuple):
         return self.kalman(fitted, jnp.exp(noise[:m]), jnp.exp(noise[m:]))
 
 
-@eqx.filter_jit
+@kept_jit
 def fit(problem: Innovations, theta: Array, noise: Array, max_steps: Array) -> Scored:
     """Maximise a likelihood from physical values and logarithms of the noise; one step only evaluates it."""
     transform, p = problem.transform, theta.size
@@ -70,7 +71,13 @@ def fit(problem: Innovations, theta: Array, noise: Array, max_steps: Array) -> S
     return maximise_likelihood(outputs, problem.counts, start, lower, upper, max_steps)
 
 
-@eqx.filter_jit
+def fit_steps(problem: Innovations, theta: Array, noise: Array, max_steps: int) -> Steps[Scored]:
+    """Run `fit` as a solve request; the result holds arrays of numpy, with which nothing more is compiled."""
+    scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(max_steps)))
+    return jax.tree.map(np.asarray, scored)
+
+
+@kept_jit
 def whole_hessian(problem: Innovations, theta: Array, noise: Array) -> Float[Array, "q q"]:
     """Return the Hessian of the negative log-likelihood by physical values and logarithms of the noise."""
     p = theta.size
@@ -155,8 +162,7 @@ def _refit(
             return at, np.nan
         bounds = (np.where(own, held, lower), np.where(own, held, upper))
         start = np.where(own, held, np.asarray(problem.transform.outward(at[:p])))
-        arguments = (problem._replace(bounds=bounds), start, at[p:], np.asarray(STEPS))
-        there = yield SolveRequest(fit, arguments)
+        there = yield from fit_steps(problem._replace(bounds=bounds), start, at[p:], STEPS)
         rise = 2 * (float(there.cost) - float(scored.cost)) / factor
         return np.asarray(there.x), rise if bool(there.converged) else np.nan
 

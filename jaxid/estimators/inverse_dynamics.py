@@ -22,6 +22,7 @@ from jaxid.model.effect import Effect, carries_force
 from jaxid.model.parameter import ParameterInfo, parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess
@@ -33,7 +34,7 @@ _UNDAMPED = 1e-10
 _SHARES = (0.2, 0.5, 0.8)
 
 
-@eqx.filter_jit
+@kept_jit
 def solve_balance(
     plant: Plant,
     places: tuple,

@@ -27,6 +27,7 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE, scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, assess, full_hessian, hessian_notes
@@ -128,7 +129,7 @@ def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np
     return np.concatenate(outputs[on], axis=1), np.array(counts[on])
 
 
-@eqx.filter_jit
+@kept_jit
 def _fit(
     replay: Replay,
     places: tuple,
@@ -146,14 +147,14 @@ def _fit(
     return minimise(residual, theta, transform, *bounds, active, minimiser)
 
 
-@eqx.filter_jit
+@kept_jit
 def _hessian(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array, on: str
 ) -> Array:
     return full_hessian(output_residual(replay, places, plant, measured, weight, on), theta)
 
 
-@eqx.filter_jit
+@kept_jit
 def _residual(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array, on: str
 ) -> Array:
@@ -174,7 +175,7 @@ def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndar
     return -np.asarray(_jacobian(replay, unknown.places, machine.plant, measured, unknown.guess))
 
 
-@eqx.filter_jit
+@kept_jit
 def _jacobian(replay: Replay, places: tuple, plant: Plant, measured: Array, theta: Array) -> Array:
     residual = output_residual(replay, places, plant, measured, jnp.ones(measured.shape))
     return jax.jacfwd(residual)(theta)
@@ -519,7 +520,7 @@ def turning_steps(machine: Machine, log: Log) -> int:
     return int(np.clip(np.ceil(np.sqrt(off / (_LITTLE * np.min(noise[noise > 0])))), 1, _MOST))
 
 
-@eqx.filter_jit
+@kept_jit
 def _levels(plant: Plant, q: Array, v: Array, u: Array) -> Array:
     """Return the level of dry friction at rest by port, including break-away [N or N m]."""
     levels = plant.balance(q, v, v, u, jnp.zeros(()), plant.initial_states(u))

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Transform
@@ -18,10 +20,11 @@ from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.common.scoring import Scored
 from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.innovations import STEPS, Innovations, fit, hessian_steps, profile_steps
+from jaxid.estimators.innovations import STEPS, Innovations, fit_steps, hessian_steps, profile_steps
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.model.balance import Balance
+from jaxid.numerics.lanes import Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, assess, hessian_notes
 from jaxid.simulation.kalman import make_filter, slow_samples, smooth_steps
@@ -234,7 +237,7 @@ def prediction_error_steps(
         starts.insert(0, np.clip(start, *bounds))
     theta, trials = starts[0], []
     for at in starts if len(starts) > 1 else ():
-        trials.append((yield SolveRequest(fit, (problem, at, noise, np.asarray(SCREENING)))))
+        trials.append((yield from fit_steps(problem, at, noise, SCREENING)))
     if trials:
         best = min(trials, key=lambda trial: np.nan_to_num(float(trial.cost), nan=np.inf))
         theta, noise = np.asarray(transform.outward(best.x[:p])), best.x[p:]
@@ -243,7 +246,7 @@ def prediction_error_steps(
     scored = None
     for floor in begun.floors:
         problem = problem._replace(low=floor)
-        scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(STEPS)))
+        scored = yield from fit_steps(problem, theta, noise, STEPS)
         theta, noise = np.asarray(transform.outward(scored.x[:p])), np.asarray(scored.x[p:])
         steps += int(scored.steps)
         if np.all(noise[:m] > floor[:m] + 1e-3) or not np.isfinite(float(scored.cost)):
@@ -253,7 +256,7 @@ def prediction_error_steps(
     # Without noise of the force it is known when a joint sticks, and samples at rest count too.
     if begun.sticks_surely(noise):
         problem = begun.at_rest_too(problem)
-        scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(STEPS)))
+        scored = yield from fit_steps(problem, theta, noise, STEPS)
         theta, steps = np.asarray(transform.outward(scored.x[:p])), steps + int(scored.steps)
 
     read = np.zeros(m)
@@ -265,7 +268,7 @@ def prediction_error_steps(
     true = [free.true for free in parameters.free]
     if true and None not in true and estimate.converged:
         truth = np.array(true, dtype=np.float64)
-        there = yield SolveRequest(fit, (problem, truth, noise, np.asarray(1)))
+        there = yield from fit_steps(problem, truth, noise, 1)
         bound = _precision(parameters.names, problem, truth, there).std
         values = dict(zip(parameters.names, bound.tolist(), strict=True))
         estimate = replace(estimate, details={**estimate.details, "least_std": values})
@@ -307,18 +310,18 @@ def _corrected_steps(
     noise = x[p:].copy()
     noise[:drives] += 0.5 * np.log1p((read / np.exp(noise[:drives])) ** 2)
 
-    def at(command: np.ndarray) -> SolveRequest:
+    def at(command: np.ndarray) -> Steps[Scored]:
         shifted = problem._replace(kalman=eqx.tree_at(lambda k: k.command, kalman, command))
-        return SolveRequest(fit, (shifted, theta, noise, np.asarray(1)))
+        return fit_steps(shifted, theta, noise, 1)
 
     command, every = np.asarray(kalman.command), kalman.every
-    information = np.asarray((yield at(command)).information)
+    information = (yield from at(command)).information
     rng, gradients = np.random.default_rng(0), []
     for _ in range(PAIRS):
         more = read * rng.standard_normal((len(command[::every]), drives))
         more = np.repeat(more, every, axis=0)[: len(command)]
         for sign in (1.0, -1.0):
-            gradients.append(np.asarray((yield at(command + sign * more)).gradient))
+            gradients.append((yield from at(command + sign * more)).gradient)
     if not np.all(np.isfinite(information)) or not np.all(np.isfinite(gradients)):
         return x[:p], np.zeros(drives)
 
@@ -347,10 +350,14 @@ def _force_scale(machine: Machine, log: Log) -> Float[np.ndarray, " m"]:
 
 def slides(machine: Machine, log: Log) -> bool:
     """Check that dry friction acts somewhere."""
-    plant, n = machine.plant, log.position.shape[1]
-    zero, u = jnp.zeros(n), jnp.zeros(log.force.shape[1])
-    balance = plant.balance(jnp.asarray(log.filled[0]), zero, zero, u, jnp.zeros(()), plant.initial_states(u))
-    return bool(balance.slides)
+    plant = machine.plant
+
+    def balance(q: Array, u: Array) -> Balance:
+        zero = jnp.zeros_like(q)
+        return plant.balance(q, zero, zero, u, jnp.zeros(()), plant.initial_states(u))
+
+    # Shapes tell: no operation is compiled.
+    return bool(jax.eval_shape(balance, log.filled[0], log.force[0]).slides)
 
 
 def _estimate(

@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.base_parameters import BaseParameters, base_parameters
-from jaxid.arms.pseudo_inertia import TEN, log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 
 # Sines of angles, and lengths [m], that count as zero: files state a right angle as 1.5708.

@@ -11,12 +11,12 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arms.pseudo_inertia import TEN
 from jaxid.case.mjcf import is_one_of, need_mujoco, robot_of_spec
 from jaxid.case.robot import Robot, RobotJoint, body_in, kept, moved_by, projected
 from jaxid.errors import InputError
 from jaxid.export.bodies import Bodies, are_bodies, bodies_of
 from jaxid.export.xml_text import Element, XmlText
+from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 
 # Relative change below which a value of the file stays as it is written.

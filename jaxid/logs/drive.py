@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.logs.units import command_kind
 from jaxid.settings import Actuator, LogTable
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Keys that only a drive with a torque constant uses for its force.
 _OF_MOTOR = ("resistance", "back_emf", "efficiency")

@@ -1,12 +1,13 @@
 """Measured logs: the columns that a case names, checked and in SI units."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers import read_table
@@ -17,9 +18,11 @@ from jaxid.logs.resample import Readings, readings_of, resampled
 from jaxid.logs.timebase import TimeBase, time_base
 from jaxid.logs.units import Frame, converted
 from jaxid.logs.wrap import find_wrap, joined
-from jaxid.names import HOLDS, OPTIONAL_COLUMNS, RESAMPLINGS
-from jaxid.schema import Spot, read_settings
-from jaxid.settings import LogTable
+from jaxid.names import HOLDS, OPTIONAL_COLUMNS, RESAMPLINGS, STEADY_COLUMNS
+from jaxid.settings import LogTable, log_table
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Chosen: with fewer samples nothing remains after filtering and trimming.
 MINIMUM_SAMPLES = 50
@@ -219,7 +222,7 @@ def steady_log(
         InputError: If a unit does not go with the machine, or a scatter or number of samples is not positive.
     """
     groups = dict(groups)
-    apart = {name: groups.pop(name) for name in _OF_STEADY if name in groups}
+    apart = {name: groups.pop(name) for name in STEADY_COLUMNS if name in groups}
     for name, values in apart.items():
         if not np.all(values > 0):
             row = content.rows[0] + int(np.flatnonzero(~np.all(values > 0, axis=1))[0])
@@ -498,59 +501,9 @@ def _check_rate(time: np.ndarray, table: LogTable, where: str) -> None:
         raise InputError(what, where=where, hint=hint)
 
 
-_LOG = Spot("", "[log]")
-
-
-def log_table(columns: LogTable | Mapping[str, Any], spot: Spot = _LOG) -> LogTable:
-    """Read a [log] table.
-
-    Args:
-        columns: The table, checked already or as it stands in a case.
-        spot: Position of the table, for messages.
-
-    Raises:
-        InputError: If a key is unknown, missing or impossible, or there is no time base.
-    """
-    if isinstance(columns, LogTable):
-        return columns
-    table = read_settings(LogTable, dict(columns), spot)
-    _check_kind(table, dict(columns), spot)
-    if table.kind == "steady":
-        return table
-    if table.time is None and table.sample_rate is None:
-        hint = 'add time = "<name of the column>", or sample_rate = <Hz>'
-        raise spot.fault("neither time nor sample_rate is given", hint)
-    return table
-
-
-# Keys that only a table of steady speeds has, and keys that it may have.
-_OF_STEADY = ("scatter", "samples")
-_STEADY_KEYS = ("kind", "velocity", "force", "units", "sign", "position_at", "rows", "format", *_OF_STEADY)
-_STEADY_KEYS = (*_STEADY_KEYS, "separator", "decimal", "temperature", "counts_per_revolution")
-
-
-def _check_kind(table: LogTable, given: dict[str, Any], spot: Spot) -> None:
-    """Refuse columns that the kind of the log does not have, or lacks."""
-    if table.kind == "steady":
-        for name in ("velocity", "force"):
-            if name not in given:
-                hint = f"add {name} = its column: a steady table has a velocity and the force that holds it"
-                raise spot.fault(f"'{name}' is missing", hint)
-        other = next((name for name in given if name not in _STEADY_KEYS), None)
-        if other is not None:
-            raise spot.at(other).fault('does not go with kind = "steady"', "leave it out, or remove kind")
-        return
-    other = next((name for name in _OF_STEADY if name in given), None)
-    if other is not None:
-        raise spot.at(other).fault('goes with kind = "steady" only', "leave it out")
-    if table.position is None and table.velocity is None and table.loop_velocity is None:
-        hint = "add position: the name of its column; or velocity, where only the velocity was logged"
-        raise spot.fault("'position' is missing", hint)
-
-
 def _names(table: LogTable) -> dict[str, list[str]]:
     """Return the names of columns by quantity."""
-    quantities = ("time", "position", "force", *OPTIONAL_COLUMNS, *_OF_STEADY)
+    quantities = ("time", "position", "force", *OPTIONAL_COLUMNS, *STEADY_COLUMNS)
     given = {quantity: getattr(table, quantity) for quantity in quantities}
     if given["velocity"] is None:
         given["velocity"] = table.loop_velocity

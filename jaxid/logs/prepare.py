@@ -8,15 +8,18 @@ other steps, see `Recipe.cleaned`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
-from jaxtyping import Bool, Float
 
 from jaxid.errors import InputError
 from jaxid.logs.log import Log, integral
 from jaxid.numerics import filters as signals
 from jaxid.settings import Preprocess
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 # The omitted samples around reversals are at most this part of the motion.
 _MOSTLY = 0.5

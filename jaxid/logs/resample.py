@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.logs.readers.table import Assumed
 from jaxid.names import RESAMPLINGS
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # A column with so many times the readings of the new rate is averaged, one with so few is held.
 _DENSE, _RARE = 1.5, 1.0 / 1.5
@@ -29,7 +32,7 @@ _SLOWER = 1.1
 # Columns whose readings decide the rate: those that the dynamics are in.
 _RATED = ("position", "velocity", "force", "load_position", "load_acceleration", "acceleration")
 
-Operator = Callable[[Float[np.ndarray, "readings _"]], Float[np.ndarray, "samples _"]]
+Operator: TypeAlias = "Callable[[Float[np.ndarray, 'readings _']], Float[np.ndarray, 'samples _']]"
 
 
 @dataclass(frozen=True)

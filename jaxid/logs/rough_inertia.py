@@ -4,17 +4,22 @@ These checks do not need the accuracy of the package's filters; they must run at
 loaded.
 """
 
+from __future__ import annotations
+
 import math
 from itertools import pairwise
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # A force of which the acceleration explains less than this part comes from the controller: a spring and a
 # damper to a constant reference. It does not determine the inertia.
 _SHARE = 0.01
 
-Signal = Float[np.ndarray, " samples"]
+Signal: TypeAlias = "Float[np.ndarray, ' samples']"
 
 
 def smooth(values: Signal, window: int) -> Float[np.ndarray, " fewer"]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.logs.readers.table import Assumed
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Chosen: a deviation of 1 % of the period shifts a derivative by 1 %, which is about the size of a friction
 # that differs by direction. A few rows do not matter.

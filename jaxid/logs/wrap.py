@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.logs.finding import Finding
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # A step between neighbouring samples beyond this part of the whole range is a jump.
 _JUMP = 0.5

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 
 from jaxid.arrays import Array
-from jaxid.model.parameter import ParameterInfo, parameters_of
+from jaxid.model.parameter import ParameterInfo, need_one, parameters_of
 
 # Acceleration of gravity [m/s^2] of a case that does not state one.
 STANDARD_GRAVITY = 9.81
@@ -119,6 +119,13 @@ class Effect(eqx.Module):
 
     kind: ClassVar[str]
     port: int = eqx.field(static=True, default=0, kw_only=True)
+
+    # Optional parameters that replace each other: exactly one of them is given.
+    alternatives: ClassVar[tuple[str, ...]] = ()
+
+    def __check_init__(self) -> None:
+        given = {name for name in self.alternatives if getattr(self, name) is not None}
+        need_one(getattr(self, "kind", type(self).__name__), self.alternatives, given)
 
     def act(self, x: Signals, state: Any) -> Action:
         """Compute the action at one instant; `state` is as `initial_state` gives it, or None."""

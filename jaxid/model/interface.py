@@ -17,9 +17,6 @@ from jaxid.arrays import Array
 from jaxid.errors import InputError
 from jaxid.model.search_hints import SearchHints
 
-# Names of ports in case files and results; ports of each kind count from 1.
-PLACES = ("joint", "spring", "shaft", "passive", "tool")
-
 
 class PlantInterface(SearchHints):
     """The interface with the defaults of a plant without springs, gears and links."""
@@ -55,7 +52,7 @@ class PlantInterface(SearchHints):
         return [tuple(k for k, m in enumerate(motions) if m == kind) for kind in dict.fromkeys(motions)]
 
     def place(self, port: int) -> tuple[str, int]:
-        """Return the name of a port: one of `PLACES`, and its number from 1."""
+        """Return the name of a port: one of `jaxid.names.PLACES`, and its number from 1."""
         parts = self.bodies(self.joints)
         return ("joint", port + 1) if port < parts else ("spring", port - parts + 1)
 

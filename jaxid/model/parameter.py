@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
-
+# Equinox and JAX are imported where a class or an array is made: cases are checked without them.
 SIGNS = ("free", "nonnegative", "positive")
 
 
@@ -51,6 +50,8 @@ def parameter(
 
     The conversion matters: a Python float is no array leaf and would silently count as known.
     """
+    import equinox as eqx
+
     info = ParameterInfo(dimension, sign, doc, optional, more, motion, width, known)
     convert = _optional_array if optional else as_array
     if optional:
@@ -62,12 +63,32 @@ def as_array(value: Any) -> Any:
     """Convert a number or list to a float64 array; return anything else unchanged."""
     # Anything that is neither number nor list passes, because JAX fills trees with internal markers.
     if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool):
-        return jnp.asarray(value, dtype=jnp.float64)
+        import jax.numpy as jnp
+        import numpy as np
+
+        # A number of numpy is copied; for one of Python JAX would compile a conversion.
+        number = np.float64(value) if isinstance(value, (int, float)) else value
+        return jnp.asarray(number, dtype=jnp.float64)
     return value
 
 
 def _optional_array(value: Any) -> Any:
     return None if value is None else as_array(value)
+
+
+def need_one(kind: str, alternatives: tuple[str, ...], given: Container[str]) -> None:
+    """Refuse none, or several, of parameters that replace each other.
+
+    Args:
+        kind: Name of the effect.
+        alternatives: Names of its parameters that replace each other; empty if there are none.
+        given: Names of the parameters that have a value.
+
+    Raises:
+        ValueError: If it is not one.
+    """
+    if alternatives and sum(name in given for name in alternatives) != 1:
+        raise ValueError(f"{kind} takes either {' or '.join(alternatives)}.")
 
 
 def parameters_of(cls: type) -> dict[str, ParameterInfo]:

@@ -80,7 +80,7 @@ class Body:
     """Unknowns that are the ten inertial parameters of a body, and are fitted as such.
 
     Args:
-        places: Index of each among the unknowns, in the order of `jaxid.arms.pseudo_inertia.TEN`.
+        places: Index of each among the unknowns, in the order of `jaxid.names.TEN`.
         lower, upper: Bounds on the coordinates of `jaxid.arms.pseudo_inertia.log_cholesky`.
     """
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ import scipy.optimize
 import scipy.signal
 from jaxtyping import Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.numerics.fft import fast_length, irfft, rfft
 
 # Periods of the cut-off over which a signal fades out beyond its ends. After as many periods the impulse
@@ -282,14 +283,14 @@ class Decimator:
         def gain(f: np.ndarray) -> np.ndarray:
             return self.response(f, 1.0)[:, None]
 
-        return _through(x, int(32 / self.pass_band), lambda f: jnp.asarray(gain(f)), self.factor)
+        return _through(x, int(32 / self.pass_band), gain, self.factor)
 
 
 def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every: int = 1) -> Array:
     """Pass the columns of x through a frequency response, without transients at the ends.
 
     An odd extension at both ends keeps value and slope; a half cosine joins the two extensions over the
-    rest of the period.
+    rest of the period. Signals that are numpy's stay so: JAX would compile every single operation.
 
     Args:
         x: Signals by column, (time, k).
@@ -299,21 +300,26 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
     """
     n = x.shape[0]
     lead, pad = min(n - 1, pad + every - 1) // every * every, min(n - 1, pad)
-    head, tail = 2 * x[0] - x[lead:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
     few = fast_length(-(-(n + lead + 2 * pad) // every))
+    gain = response(np.fft.rfftfreq(every * few))
+    plain = isinstance(x, np.ndarray) and isinstance(gain, np.ndarray)
+    tools: Any = (np, rfft, irfft) if plain else (jnp, jnp.fft.rfft, jnp.fft.irfft)
+    xp, forwards, backwards = tools
+
+    head, tail = 2 * x[0] - x[lead:0:-1], 2 * x[-1] - x[-2 : -pad - 2 : -1]
     gap = every * few - n - lead - pad
-    s = 0.5 * (1 - jnp.cos(jnp.pi * (jnp.arange(gap) + 1) / (gap + 1)))[:, None]
+    s = 0.5 * (1 - np.cos(np.pi * (np.arange(gap) + 1) / (gap + 1)))[:, None]
     ahead = head[0] if lead else x[0]
     bridge = tail[-1] + s * (ahead - tail[-1])
-    whole = jnp.concatenate([head, x, tail, bridge])
-    spectrum = jnp.fft.rfft(whole, axis=0) * response(np.fft.rfftfreq(every * few))
+    whole = xp.concatenate([head, x, tail, bridge])
+    spectrum = forwards(whole, axis=0) * gain
     if every > 1:
         # Decimation folds the spectrum, so that the inverse transform needs the decimated length only.
-        mirrored = jnp.conj(spectrum[1 : every * few - spectrum.shape[0] + 1][::-1])
-        both = jnp.concatenate([spectrum, mirrored]).reshape(every, few, -1)
-        spectrum = jnp.sum(both, axis=0)[: few // 2 + 1] / every
+        mirrored = xp.conj(spectrum[1 : every * few - spectrum.shape[0] + 1][::-1])
+        both = xp.concatenate([spectrum, mirrored]).reshape(every, few, -1)
+        spectrum = xp.sum(both, axis=0)[: few // 2 + 1] / every
     first = lead // every
-    return jnp.fft.irfft(spectrum, few, axis=0)[first : first - (-n // every)]
+    return backwards(spectrum, few, axis=0)[first : first - (-n // every)]
 
 
 def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: float) -> Float[Array, "time m"]:
@@ -333,7 +339,7 @@ def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: flo
     def response(f: np.ndarray) -> Array:
         # The mean of the held command over its hold time adds a lag and a roll-off. This is exact in the
         # band, while interpolation between samples is 1 % off at a sixth of the sampling rate.
-        lag = jnp.exp(-2j * jnp.pi * jnp.asarray(f)[:, None] * (delay + 0.5 * hold) / period)
+        lag = library(delay).exp(-2j * np.pi * f[:, None] * (delay + 0.5 * hold) / period)
         return lag * np.sinc(f * hold / period)[:, None]
 
     return _through(u, 200, response)

@@ -1,6 +1,7 @@
 """The plants, by the names of the case file.
 
 A new plant is one file here and one name in `PLANTS`; docs/adding_a_plant.md shows how to write it.
+Then run `python -m jaxid.case.kinds`, which declares it to checks that do without JAX.
 """
 
 from jaxid.model.plant import Plant

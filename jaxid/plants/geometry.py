@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.model.parameter import as_array
-
-JOINTS = ("revolute", "prismatic")
+from jaxid.names import JOINTS
 
 
 class Geometry(eqx.Module):

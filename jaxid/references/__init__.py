@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
 from jaxid.references.bezier import BEZIER
@@ -21,6 +20,8 @@ from jaxid.references.quarter_sine import QUARTER_SINE
 from jaxid.references.synchronized import SYNCHRONIZED
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
+
     from jaxid.model.plant import Plant
 
 __all__ = ["REFERENCES", "Family", "make_reference"]

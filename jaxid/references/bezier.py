@@ -1,12 +1,16 @@
 """Polynomials in Bernstein form over one stretch of time."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, is_number_list, number_list
 from jaxid.schema import Key, flag, number
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Two points stand for a move from rest to rest: five control points at the start and six at the
 # end, which is z^5 (252 - 1050 z + 1800 z^2 - 1575 z^3 + 700 z^4 - 126 z^5), the profile of

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.logs.readers import read_columns
 from jaxid.references.family import Family, Grid
 from jaxid.schema import Key, number, text
 
@@ -12,6 +11,8 @@ from jaxid.schema import Key, number, text
 def _sample(values: dict[str, Any], grid: Grid) -> np.ndarray:
     path = grid.base_dir / values["file"]
     names = [values["column"]] + ([values["time"]] if values["time"] else [])
+    from jaxid.logs.readers import read_columns
+
     data, _ = read_columns(path, names)
     for name in names:
         bad = np.flatnonzero(~np.isfinite(data[name]).all(axis=1))

@@ -1,16 +1,20 @@
 """Sequences of moves from rest to rest: trapezoids of velocity and S-curves."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, is_number_list, number_list
 from jaxid.references.s_curve import MotionBounds, SCurve, plan_s_curve
 from jaxid.schema import Key, flag, number
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 _NO_TIME = 1e-300
 

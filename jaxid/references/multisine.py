@@ -1,12 +1,16 @@
 """Periodic sums of sines with a flat spectrum."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, is_number_list, number_list
 from jaxid.schema import Key, choice, flag, number, whole
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 def _lines(values: dict[str, Any], samples: int, grid: Grid) -> np.ndarray:

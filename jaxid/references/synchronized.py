@@ -9,14 +9,16 @@ is the shortest time along the line, at least that of the slowest joint alone.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.references.family import Family, Grid, about_zero, for_all_joints, is_about_zero, point_list
 from jaxid.references.s_curve import MotionBounds, SCurve, plan_s_curve
 from jaxid.schema import Key, choice, flag, number, whole
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 def plan_line(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.logs.seen import sights_of
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
+from jaxid.results.aligned import aligned
 from jaxid.results.parameters import lines_of
 from jaxid.results.precision import precision_lines
 from jaxid.results.report.numbers import with_std
@@ -44,13 +45,6 @@ _EVIDENCE_WORDS = (
     "evidence: gain in log-likelihood on stretches of the log that a fit did not use, in nats (natural "
     "logarithm): e to that power is the odds in favour"
 )
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows of text with every column padded to its widest entry."""
-    widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
-    lines = ["  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)) for r in rows]
-    return "\n".join(line.rstrip() for line in lines)
 
 
 def parameter_rows(

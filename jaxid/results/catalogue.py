@@ -1,27 +1,28 @@
-"""Tables of all plants and effects with their parameters and units, read from the registries."""
+"""Tables of all plants and effects with their parameters and units; no JAX is needed for them."""
 
 from __future__ import annotations
 
-from jaxid.effects import EFFECTS
+from collections.abc import Mapping
+
+from jaxid.case.kinds import known_kinds
 from jaxid.model.parameter import parameters_of
 from jaxid.model.units import Units
-from jaxid.plants import PLANTS
-from jaxid.results.as_text import aligned
+from jaxid.results.aligned import aligned
 
 _SIGNS = {"free": "any", "nonnegative": ">= 0", "positive": "> 0"}
 
 
 def effects_table() -> str:
     """Return the table of all registered effects, with their parameters, signs and units."""
-    return _table(EFFECTS, "effect")
+    return _table(known_kinds().effects, "effect")
 
 
 def plants_table() -> str:
     """Return the table of all plants, with their parameters, signs and units."""
-    return _table(PLANTS, "plant")
+    return _table(known_kinds().plants, "plant")
 
 
-def _table(registry: dict[str, type], noun: str) -> str:
+def _table(registry: Mapping[str, type], noun: str) -> str:
     linear, rotary = Units("linear"), Units("rotary")
     rows = [[noun, "parameter", "sign", "linear", "rotary", "description"]]
     for kind, cls in registry.items():

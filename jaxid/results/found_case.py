@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.arms.pseudo_inertia import TEN
 from jaxid.case.case import Case, load_case
 from jaxid.case.declared import EffectEntry
 from jaxid.case.tables import ControllerTable, at_start
@@ -25,6 +24,7 @@ from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.model.effect import Effect
 from jaxid.model.unknowns import CONTROLLER, REFERENCE, Free, several_places
+from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 
 if TYPE_CHECKING:

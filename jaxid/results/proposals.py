@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.model.interface import PLACES
 from jaxid.model.units import joined
+from jaxid.names import PLACES
 
 if TYPE_CHECKING:
     from jaxid.discovery.separating.propose import Proposal

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.sensors.inertial import InertialSensors
 
 # Noise of this many counts makes the rounding error independent of the signal
@@ -68,9 +68,9 @@ class Sensor(eqx.Module):
     @property
     def position_std(self) -> Array | None:
         """Standard deviation of the reading, rounding included; None if it is not known."""
-        parts = []
+        parts, xp = [], library(self.position_noise, self.position_resolution)
         if self.position_noise is not None:
-            parts.append(jnp.square(self.position_noise))
+            parts.append(xp.square(self.position_noise))
         if self.position_resolution is not None:
-            parts.append(jnp.square(self.position_resolution) / 12)
-        return jnp.sqrt(sum(parts)) if parts else None
+            parts.append(xp.square(self.position_resolution) / 12)
+        return xp.sqrt(sum(parts)) if parts else None

@@ -8,14 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.dynamics.hidden_joints import complete_motion
 from jaxid.dynamics.residuals import residual_along
 from jaxid.logs.prepare import Prepared
+from jaxid.model.drives import Drives
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
+from jaxid.numerics.kept import kept_jit
 
 
 class ForceData(eqx.Module):
@@ -80,7 +82,7 @@ def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array,
     return complete_motion(plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps)
 
 
-@eqx.filter_jit
+@kept_jit
 def force_and_columns(
     plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array | None = None
 ) -> tuple[Float[Array, "kept n"], Float[Array, "kept n c"]]:
@@ -106,8 +108,16 @@ def force_and_columns(
 
 def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     """Return the filtered declared force by joint [N or N m]; zero for a joint without a drive."""
-    u = signals.delayed(data.force, jnp.zeros(()), data.period, hold=data.hold)
-    return jax.vmap(lambda u: plant.applied(u, data.q.shape[1]))(data.decimator(u))
+    u = data.decimator(signals.delayed(data.force, np.zeros(()), data.period, hold=data.hold))
+    joints = data.q.shape[1]
+    if type(plant).applied is not Drives.applied:
+        return jax.vmap(lambda u: plant.applied(u, joints))(u)
+    # Without a map the arrays of a prepared log stay numpy's, and nothing is compiled.
+    if plant.actuated is None:
+        return u
+    xp = library(u)
+    drives = [plant.drive_of(j, u.shape[1]) for j in range(joints)]
+    return xp.stack([xp.zeros(len(u)) if k is None else u[:, k] for k in drives], axis=1)
 
 
 def sharpened(plant: Plant, data: Prepared) -> Plant:
@@ -133,4 +143,4 @@ def inertial_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
     return data.decimator(force(jnp.asarray(data.q), jnp.asarray(data.qdd)))
 
 
-force_size = eqx.filter_jit(size_of_force)
+force_size = kept_jit(size_of_force)

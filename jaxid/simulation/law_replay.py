@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from jaxid.arrays import Array
 from jaxid.controllers import Controller, Tick
+from jaxid.numerics.kept import kept_jit
 
 
-@eqx.filter_jit
+@kept_jit
 def commands(
     controller: Controller,
     driven: tuple[int, ...],

@@ -20,6 +20,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter_controller
 from jaxid.numerics import filters as signals
+from jaxid.numerics.kept import kept_jit
 from jaxid.references.unknown import UnknownReference
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
@@ -285,7 +286,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     count = min(samples, log.samples)
     assert replay.command is not None, "make_replay gives an open loop its command"
     short = eqx.tree_at(lambda r: r.command, replay, replay.command[: (count - 1) * replay.every + 1])
-    nudge = _start(short, plant, jnp.asarray(log.readings[:count]), log.measured, log.integrated)
+    nudge = _start(short, plant, log.readings[:count], log.measured, log.integrated)
     n = replay.position.size
     moved = (replay.position + nudge[:n], replay.velocity + nudge[n:])
     if not bool(jnp.all(jnp.isfinite(nudge))):
@@ -293,7 +294,7 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     return eqx.tree_at(lambda r: (r.position, r.velocity), replay, moved)
 
 
-@eqx.filter_jit
+@kept_jit
 def _start(
     replay: Replay, plant: Plant, readings: Array, measured: tuple[bool, ...], of_velocity: bool
 ) -> Array:

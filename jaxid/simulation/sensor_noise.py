@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
+from jaxid.numerics.kept import kept_jit
 from jaxid.simulation.force_balance import ForceData
 
 
@@ -127,7 +127,7 @@ def _measured_joints(impedance: np.ndarray, exact: np.ndarray, measured: tuple[b
     return out
 
 
-@eqx.filter_jit
+@kept_jit
 def _impedance(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
     """Linearise the balance at median position and RMS velocity: mass, damping and stiffness, (n, n)."""
     q, v = jnp.median(data.q, axis=0), jnp.sqrt(jnp.mean(data.qd**2, axis=0))

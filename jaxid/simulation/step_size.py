@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
+from jaxid.numerics.kept import kept_jit
 
 # Largest product of step and fastest rate that a fourth-order step follows to 1e-5.
 _FINE = 0.2
@@ -45,7 +45,7 @@ def needed_steps(machine: Machine, log: Log) -> int:
     """
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
-    q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
+    q, u = log.filled[picks], log.force[picks] * np.asarray(machine.gain)
     steps = float(_fastest(machine.plant, q, u)) * period / _FINE
     if not np.isfinite(steps):
         raise TooStiffError(
@@ -71,7 +71,7 @@ def _rounded(steps: int) -> int:
     return int(np.ceil(_EACH * 2**octave))
 
 
-@eqx.filter_jit
+@kept_jit
 def _fastest(plant: Plant, q: Array, u: Array) -> Array:
     """Return the fastest rate of the plant without dry friction, linearised at rest at some positions."""
 

@@ -4,7 +4,7 @@ A newcomer reads the package in this order. A room is a folder or a module direc
 """
 
 ROOMS = {
-    "arrays": "the array type of annotations",
+    "arrays": "the array type of annotations, and the library that computes with arrays",
     "errors": "one-line errors with a hint",
     "names": "methods, outputs, solvers and other names that users write",
     "schema": "readers of the keys of a case, and their JSON Schema",

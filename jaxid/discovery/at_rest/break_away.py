@@ -26,6 +26,7 @@ from jaxid.machine import Machine
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.session import OpenedLog
 from jaxid.simulation.loops import Drive, open_loop
 from jaxid.simulation.sensor_noise import position_noise
@@ -168,16 +169,16 @@ class _Trial:
         """
         machine, count = self.estimate.machine, starts.count
         filled = starts.padded(self.padded)
-        drive = Drive(jnp.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
+        drive = Drive(np.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
         plant = machine.plant
         for joint in self.joints:
             plant = plant.with_effect(StaticFriction(level=as_array(0.0), port=joint))
         prior = _prior(self.estimate)
-        places, theta = machine.parameters.places, jnp.asarray(self.estimate.theta)
+        places, theta = machine.parameters.places, np.asarray(self.estimate.theta)
 
         def at(levels: np.ndarray) -> list[_Fit]:
-            by_joint = jnp.asarray(levels)[:, None] * jnp.asarray(np.eye(len(self.joints))[which])
-            both = _runs(plant, places, drive, filled, jnp.asarray(self.joints[which]), by_joint, theta)
+            by_joint = np.asarray(levels)[:, None] * np.eye(len(self.joints))[which]
+            both = _runs(plant, places, drive, filled, np.asarray(self.joints[which]), by_joint, theta)
             e, jacobian = (np.asarray(a)[:, :count, :length] for a in both)
             return [_Fit(x, j, prior, noise) for x, j in zip(e, jacobian, strict=True)]
 
@@ -228,7 +229,7 @@ def _unresolved_friction(estimate: Estimate, data: Prepared, joint: int) -> str:
     return ""
 
 
-@eqx.filter_jit
+@kept_jit
 def _runs(
     plant: Plant, places: tuple, drive: Drive, starts: Starts, joint: Array, levels: Array, theta: Array
 ) -> tuple[Array, Array]:

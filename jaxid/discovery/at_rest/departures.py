@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -18,6 +17,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
+from jaxid.numerics.kept import kept_jit
 from jaxid.session import OpenedLog
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.force_balance import ForceData
@@ -74,8 +74,8 @@ class Starts(eqx.Module):
     def padded(self, count: int) -> Starts:
         """Repeat the last start up to a number, so that one compiled shape serves any number."""
         more = count - len(self.time)
-        spread = eqx.tree_at(lambda s: s.still, self, jnp.full(len(self.time), self.still))
-        return jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]), spread)
+        spread = eqx.tree_at(lambda s: s.still, self, np.full(len(self.time), self.still))
+        return jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[-1:], more, axis=0)]), spread)
 
 
 def starts_from_rest(
@@ -122,7 +122,7 @@ def _concatenated(cuts: list[Starts]) -> Starts:
     """Concatenate the starts of several logs."""
 
     def together(name: str) -> Array:
-        return jnp.concatenate([getattr(c, name) for c in cuts])
+        return np.concatenate([getattr(c, name) for c in cuts])
 
     return Starts(
         past=together("past"),
@@ -131,9 +131,9 @@ def _concatenated(cuts: list[Starts]) -> Starts:
         rest=together("rest"),
         velocity=together("velocity"),
         time=together("time"),
-        internal_states=jax.tree.map(lambda *a: jnp.concatenate(a), *[c.internal_states for c in cuts]),
+        internal_states=jax.tree.map(lambda *a: np.concatenate(a), *[c.internal_states for c in cuts]),
         still=cuts[0].still,
-        log=jnp.repeat(jnp.arange(len(cuts)), jnp.asarray([c.count for c in cuts])),
+        log=np.repeat(np.arange(len(cuts)), [c.count for c in cuts]),
     )
 
 
@@ -159,15 +159,15 @@ def _cut(
     rest[:, joint] = log.position[rows[:, :still], joint].mean(axis=1)
     velocity[:, joint] = 0.0
     return Starts(
-        past=jnp.asarray(log.force[earlier]),
-        command=jnp.asarray(log.force[rows]),
-        position=jnp.asarray(log.position[rows]),
-        rest=jnp.asarray(rest),
-        velocity=jnp.asarray(velocity),
-        time=jnp.asarray(log.time[rows[:, 0]] - log.time[0]),
-        internal_states=jax.tree.map(lambda a: a[rows[:, 0]], internal_states),
-        still=jnp.asarray(still),
-        log=jnp.zeros(len(rows), int),
+        past=log.force[earlier],
+        command=log.force[rows],
+        position=log.position[rows],
+        rest=rest,
+        velocity=velocity,
+        time=log.time[rows[:, 0]] - log.time[0],
+        internal_states=jax.tree.map(lambda a: np.asarray(a)[rows[:, 0]], internal_states),
+        still=np.asarray(still),
+        log=np.zeros(len(rows), int),
     )
 
 
@@ -197,7 +197,7 @@ def _departures(q: Float[np.ndarray, " time"], noise: float, still: int, after: 
     return ends[moved]
 
 
-@eqx.filter_jit
+@kept_jit
 def _internal_states(plant: Plant, data: ForceData) -> tuple:
     """Integrate the internal states of the effects along a log, under the delayed command."""
     delays = plant.command_delays(data.force.shape[1])
@@ -216,7 +216,7 @@ def _applied_command(machine: Machine, log: Log) -> np.ndarray:
     extra = disturbance_at(machine.disturbance, log.time, log)
     arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
     driven = machine.plant.driven(log.position.shape[1])
-    made = np.asarray(commands(machine.controller, driven, *(jnp.asarray(a) for a in arrays)))
+    made = np.asarray(commands(machine.controller, driven, *arrays))
     size = np.sqrt(np.mean(log.force**2, axis=0))
     stated = machine.sensor.force_noise
     noise = 0.0 if stated is None else np.asarray(stated)

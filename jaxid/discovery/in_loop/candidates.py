@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +24,7 @@ from jaxid.estimators.within_prior.quantisation import quantisation_samples
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.model.plant import Plant
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import Session
@@ -385,7 +385,7 @@ def _follows(effect: type[Effect]) -> bool:
     return effect.break_away_level is None and not effect.adds_spring and not effect.opens_spring
 
 
-@eqx.filter_jit
+@kept_jit
 def _columns(
     replay: Replay,
     places: tuple,

@@ -20,6 +20,7 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Recipe, prepare
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.numerics.kept import kept_jit
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import Trajectory
 
@@ -104,7 +105,7 @@ class Playback:
 _MOTION = ("position", "velocity", "command")
 
 
-@eqx.filter_jit
+@kept_jit
 def _simulated(
     experiment: Experiment, plant: Plant, sensor: Sensor, signal: Array, noise: Array
 ) -> Trajectory:

@@ -23,6 +23,7 @@ from jaxid.experiment_design.limits import LimitCost
 from jaxid.experiment_design.shapes import Shapes
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.force_balance import ForceData, force_residual
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, open_loop
@@ -261,7 +262,7 @@ def _absorbed(difference, theta: Array, mask: Array) -> Array:
     return -(vectors @ (inverse * (vectors.T @ ((jacobian / norm).T @ d)))) / norm
 
 
-@eqx.filter_jit
+@kept_jit
 def loss(
     p: Float[Array, " p"], experiment: Experiment, models: ModelPair, shapes: Shapes, bounds: LimitCost
 ) -> tuple[Array, Array]:

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arms.pseudo_inertia import TEN, log_cholesky, pseudo_inertia
+from jaxid.arms.pseudo_inertia import log_cholesky, pseudo_inertia
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Body, Free
+from jaxid.names import TEN
 from jaxid.numerics.lanes import Steps
 from jaxid.session import Session
 

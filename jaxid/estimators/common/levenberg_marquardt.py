@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, PyTree, Scalar
 
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.estimators.common.interior import inner_start
 from jaxid.model.unknowns import Parameters
 
@@ -76,15 +76,18 @@ class Transform(eqx.Module):
 
     def inward(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
         """Transform physical values to the solver's scale."""
-        return self._with_bodies(
-            jnp.where(self.log, jnp.log(jnp.where(self.log, theta, 1.0)), theta), log_cholesky, theta
-        )
+        xp = library(self.log, theta)
+        # A bound of zero has no logarithm, which is meant; JAX does not warn of it either.
+        with np.errstate(divide="ignore"):
+            logs = xp.log(xp.where(self.log, theta, 1.0))
+        return self._with_bodies(xp.where(self.log, logs, theta), log_cholesky, theta)
 
     def outward(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Transform values on the solver's scale to physical values."""
-        return self._with_bodies(
-            jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x), of_log_cholesky, x
-        )
+        xp = library(self.log, x)
+        with np.errstate(over="ignore"):
+            values = xp.exp(xp.where(self.log, x, 0.0))
+        return self._with_bodies(xp.where(self.log, values, x), of_log_cholesky, x)
 
     def bounds(self, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> tuple[Array, Array]:
         """Transform bounds on the physical values to the solver's scale; bodies have separate bounds."""
@@ -99,9 +102,13 @@ class Transform(eqx.Module):
 
     def physical(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
         """Convert a Jacobian by the solver's values to one by the physical values theta."""
-        out = jnp.asarray(jacobian / self.slope(theta))
+        out = jacobian / self.slope(theta)
         for places in map(np.array, self.bodies):
-            out = out.at[:, places].set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
+            out = (
+                jnp.asarray(out)
+                .at[:, places]
+                .set(jacobian[:, places] @ jax.jacfwd(log_cholesky)(theta[places]))
+            )
         return out
 
     def _with_bodies(self, out: Array, f: Callable[[Array], Array], values: Array) -> Array:
@@ -111,7 +118,7 @@ class Transform(eqx.Module):
 
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
         """Return the derivative of physical by solver values, (p,), for unknowns that belong to no body."""
-        return jnp.where(self.log, theta, 1.0)
+        return library(self.log, theta).where(self.log, theta, 1.0)
 
 
 class Minimum(eqx.Module):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -15,6 +14,7 @@ from jaxid.logs.prepare import Prepared, prepare
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters, scatter
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.simulation.replay import Numerics, Replay, exact_numerics, make_replay, with_fitted_start
 
@@ -105,7 +105,7 @@ def lost(run: Prepared, log: Log) -> bool:
     return bool(np.any(off > _LOST * np.std(log.filled, axis=0)))
 
 
-@eqx.filter_jit
+@kept_jit
 def _simulated(replay: Replay, places: tuple, plant: Plant, theta: Array) -> tuple[Array, Array]:
     """Return the position, (time, n), and command, (time, m), at the samples of the log."""
     run = replay(scatter(places, plant, theta))
@@ -136,7 +136,7 @@ def best_step(
     return np.asarray(minimum.theta) - theta
 
 
-@eqx.filter_jit
+@kept_jit
 def _best_bodies(triangle: Array, transform: Transform, guess: Array, bounds: tuple[Array, Array]) -> Minimum:
     linear = replace(transform, log=np.zeros(guess.size, bool), affine=True)
     residual = lambda theta: triangle[:, :-1] @ theta + triangle[:, -1]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 
 # The fit has converged if the log-likelihood can rise by no more than this [nats]: about a hundredth of a
 # standard deviation.
@@ -48,7 +48,7 @@ class Scored(eqx.Module):
     @property
     def converged(self) -> Array:
         """True if the likelihood is finite and can rise no further."""
-        return self.done & jnp.isfinite(self.cost) & (self.damping < _STUCK)
+        return self.done & library(self.cost).isfinite(self.cost) & (self.damping < _STUCK)
 
     @property
     def information(self) -> Float[Array, "p p"]:

@@ -1,11 +1,13 @@
 """Named columns of numbers from the file formats that logs come in."""
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.errors import InputError, suggest
 from jaxid.logs.readers.array_files import read_mat, read_npz, read_parquet
@@ -19,9 +21,12 @@ from jaxid.logs.readers.table import Table
 from jaxid.logs.readers.tdms_file import read_tdms
 from jaxid.settings import LogTable
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 # Each reader: (path, names, rows) -> ({name: (samples, width)}, rows that were read), or a `Table`. One that
 # has a fourth argument, `settings`, is also given the [log] table.
-Read = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows] | Table
+Read: TypeAlias = "tuple[dict[str, Float[np.ndarray, 'samples _']], Rows] | Table"
 Reader = Callable[..., Read]
 READERS: dict[str, Reader] = {
     ".csv": read_csv,

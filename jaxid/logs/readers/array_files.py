@@ -1,15 +1,16 @@
 """Columns of files that hold arrays: NumPy, MATLAB and Parquet."""
 
+from __future__ import annotations
+
 import math
 import re
 import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 from numpy.lib import format as npy
 
 from jaxid.errors import InputError, suggest
@@ -18,7 +19,10 @@ from jaxid.logs.readers.mat_file import MatFile
 from jaxid.logs.readers.rows import Rows, resolve_rows
 from jaxid.logs.readers.table import Table
 
-Columns = tuple[dict[str, Float[np.ndarray, "samples _"]], Rows]
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+Columns: TypeAlias = "tuple[dict[str, Float[np.ndarray, 'samples _']], Rows]"
 _INDEXED = re.compile(r"(.+)\[(\d+)\]$")
 # Largest array that is read [bytes]; chosen: 20 hours at 1 kHz and 7 columns.
 _LARGEST = 4 * 2**30

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 _TIME = r"(?P<time>\d{1,2}:\d{2}(:\d{2}([.,:]\d{1,9})?)?)"
 _ZONE = r"\s*(?P<zone>Z|[+-]\d{2}:?\d{2})?"

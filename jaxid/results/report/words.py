@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxid.model.interface import PLACES
+from jaxid.names import PLACES
 from jaxid.results.report.data import ParameterRow, ReportData, SearchStep
 from jaxid.results.report.numbers import (
     ABSENT,
