@@ -81,6 +81,7 @@ def _output_error(
         "profile": demands.profile if profile is None else profile,
     }
     if session.machine.unforced(log):
+        session.need_one_log("a fit without a force")
         return (yield from _unforced(session, on, minimiser, numerics, precision))
     start = yield from _start(session)
     if session.more:
