@@ -423,10 +423,15 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
     need_one_log(session, method)
     if method != "output_error":
         need_force(session, method)
+    elif any(session.machine.unforced(run.log) for run in session.fits):
+        session.need_one_log("a fit without a force")
     need_position(method, session.fit.log)
     if method not in ("output_error", "within_prior") or session.more:
         need_known_reference(session, f"{method} takes them as they are")
-        need_known_controller(session, f"{method} does not simulate the loop with them")
+        why = (
+            "does not take them with several logs" if session.more else "does not simulate the loop with them"
+        )
+        need_known_controller(session, f"{method} {why}")
     if method == "within_prior":
         steps = METHODS[method]
     else:

@@ -278,7 +278,7 @@ def output_error_steps(
         minimum = yield SolveRequest(_fit, (*problem, active, solver))
     if looped and not nuisance and not numerics.segment:
         left = np.asarray(minimum.residual).reshape(problem[3].shape)
-        if start_shows(left[:, problem[4][0] > 0]):
+        if start_shows(left[:, np.any(problem[4] > 0, axis=0)]):
             # The log may begin with a jerk from rest, so that its first readings give no velocity.
             rested = (from_rest(problem[0]), *problem[1:5], minimum.theta, *problem[6:])
             other = yield SolveRequest(_fit, (*rested, active, solver))

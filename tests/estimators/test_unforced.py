@@ -113,3 +113,8 @@ def test_a_method_of_forces_is_refused(method):
     known = CASE.replace("{ guess = 0.02 }", "0.05").replace("{ guess = 0.005 }", "0.02")
     with pytest.raises(InputError, match="has no force"):
         jaxid.identify(tomllib.loads(known), log(), method=method)
+
+
+def test_two_logs_at_once_are_refused():
+    with pytest.raises(InputError, match="a fit without a force takes one log, not 2"):
+        jaxid.identify(tomllib.loads(CASE), [log(), log(seed=1)])

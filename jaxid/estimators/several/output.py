@@ -314,7 +314,7 @@ def _with_starts(fit: _Fit, end: _End) -> Steps[tuple[_Fit, _End]]:
             outputs.append(replace(output, replay=replay, start=bool(rms <= NOISE_LIMITED * noise)))
             tried = True
         elif part.run.log.samples > SHORT:
-            shows = start_shows(log.residual[:, output.weight[0] > 0])
+            shows = start_shows(log.residual[:, np.any(output.weight > 0, axis=0)])
             outputs.append(replace(output, replay=from_rest(output.replay)) if shows else output)
             tried |= shows
         else:
