@@ -302,7 +302,9 @@ def test_what_is_refused(tmp_path, capsys):
 # Logs as people have them.
 
 
-FIELD = """decimal_comma empty_cells pwm_counts sign_flipped sign_good slow_log swing_kick target_and_position
+FIELD = """decimal_comma empty_cells pwm_counts sign_flipped sign_good slow_log swing_kick swing_no_torque
+swing_zero_torque
+target_and_position velocity_only velocity_table
 test_quasistatic-forward test_quasistatic-reverse time_doubled time_gaps time_irregular time_microseconds
 time_milliseconds time_ros_jitter time_seconds wrapped""".split()
 MEASURED = [
