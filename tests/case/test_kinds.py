@@ -98,7 +98,69 @@ kind = "adaptive"
 kp = 10.0
 kd = 1.0
 """
-TEXTS = {"chain": CHAIN, "arm": ARM, "stage": STAGE} | {
+LOOP = """
+[plant]
+kind = "axis"
+motion = "rotary"
+
+[plant.parameters]
+inertia = 1e-4
+
+[[effects]]
+kind = "unbalance"
+moment = { guess = 0.02 }
+phase = 0.0
+
+[log]
+sample_rate = 1000.0
+position = "q"
+loop_velocity = "v"
+rows = [[0, 500], [600, 1200]]
+
+[controller]
+kind = "pid"
+kp = { guess = 10.0, min = 1.0, max = 100.0 }
+ki = 1.0
+kd = { guess = 0.1 }
+limit = { guess = 5.0 }
+delay = { guess = 1e-3 }
+
+[[fit]]
+name = "loaded"
+log = "loaded.csv"
+rows = [0, 1000]
+set = { "axis.inertia" = 2e-4 }
+"""
+STEADY = """
+[plant]
+kind = "axis"
+
+[plant.parameters]
+inertia = { guess = 1.0 }
+
+[[effects]]
+kind = "coulomb_friction"
+level = { guess = 1.0 }
+
+[log]
+kind = "steady"
+velocity = "v"
+force = "f"
+scatter = "s"
+"""
+TREE = """
+[plant]
+kind = "tree"
+mjcf = "robot.xml"
+joints = ["shoulder", "elbow"]
+held = { wrist = 0.5 }
+unknown = ["base", "damping"]
+gear_ratio = { shoulder = 50.0 }
+actuated = ["shoulder"]
+actuators = false
+gravity_vector = [0.0, 0.0, -9.81]
+"""
+TEXTS = {"chain": CHAIN, "arm": ARM, "stage": STAGE, "loop": LOOP, "steady": STEADY} | {
     str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in CASES
 }
 # Values that hardly any key may have.
@@ -169,7 +231,24 @@ def test_the_classes_decide_only_where_files_are_named():
     undecided = [name for name, text in TEXTS.items() if outcome(tomllib.loads(text), ROOT, known)]
     assert undecided
     for name in undecided:
-        assert ".py:" in TEXTS[name] or "urdf" in TEXTS[name], name
+        assert any(word in TEXTS[name] for word in (".py:", "urdf", "mjcf")), name
+
+
+def test_keys_of_a_tree_are_refused_before_its_file_is_read():
+    tables, known = tomllib.loads(TREE), kinds.declared_kinds()
+    assert outcome(tables, ROOT, known) == "classes"
+    faults = [(outcome(t, ROOT, known), outcome(t, ROOT, kinds.loaded_kinds())) for t in spoilt(tables)]
+    early = [pair for pair in faults if pair[0] != "classes"]
+    assert len(early) > len(faults) / 2
+    assert all(first == later for first, later in early)
+
+
+@pytest.mark.parametrize("name", ["own_velocity", "integral"])
+@pytest.mark.parametrize("known", [kinds.declared_kinds, kinds.loaded_kinds])
+def test_what_a_log_decides_of_a_controller_is_no_key(name, known):
+    tables = tomllib.loads(LOOP)
+    tables["controller"][name] = True
+    assert f"[controller]: unknown key '{name}'" in outcome(tables, ROOT, known())
 
 
 def test_effects_that_only_classes_can_check_are_not_declared(monkeypatch):
