@@ -198,6 +198,10 @@ def check(case: CaseLike, log: Logs = None, *, validate: Sequence[LogLike] = ())
         from jaxid.steady import steady_fit
 
         return Check(session, run_alone(steady_fit(session)).precision, floor)
+    if machine.unforced(session.fit.log):
+        from jaxid.estimators.unforced import precision_at_guesses
+
+        return Check(session, precision_at_guesses(machine, session.fit.log), floor)
     arrays = ForceData.of(data, data.fitted)
     theta = machine.parameters.guess
     jacobian = _jacobian(sharpened(machine.plant, data), machine.parameters.places, arrays, theta)

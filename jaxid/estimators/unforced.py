@@ -20,13 +20,14 @@ from jaxid.arrays import Array
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import output_residual
+from jaxid.estimators.output_error import choose_numerics, output_residual, position_jacobian
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import CONTROLLER, Parameters
-from jaxid.numerics.precision import Precision
+from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.replay import Numerics, Replay, make_replay
+from jaxid.simulation.sensor_noise import position_noise
 
 # Points of the coarse search, their spread about the guesses as a factor, and lanes of a compiled call.
 _POINTS, _SPREAD, _LANES = 512, 6.0, 64
@@ -101,25 +102,7 @@ def with_free_scale(estimate: Estimate, machine: Machine, group: tuple[int, ...]
         for k in group
         if k != base
     }
-    old = estimate.precision
-    covariance = np.insert(np.insert(old.covariance, base, np.nan, axis=0), base, np.nan, axis=1)
-    identifiable = np.insert(old.identifiable, base, False)
-    for k in group:
-        identifiable[k] = False
-        covariance[k], covariance[:, k] = np.nan, np.nan
-    # Relative to their values all of the group move by the same part.
-    weight = 1 / np.sqrt(len(group))
-    combination = {free[k].name: weight for k in group}
-    white = old.equivalent_variance
-    precision = Precision(
-        covariance,
-        identifiable,
-        [*old.unidentifiable, combination],
-        np.append(0.0, old.information),
-        old.kind,
-        old.curvature,
-        None if white is None else np.insert(white, base, np.nan),
-    )
+    precision = free_precision(estimate.precision, machine, group, base)
     beside = estimate.std_misspecified
     if beside is not None:
         beside = np.insert(beside, base, np.nan)
@@ -138,6 +121,52 @@ def with_free_scale(estimate: Estimate, machine: Machine, group: tuple[int, ...]
         notes=(*estimate.notes, note),
         details={**estimate.details, "relative": {"to": free[base].name, "values": relative}},
     )
+
+
+def free_precision(old: Precision, machine: Machine, group: tuple[int, ...], base: int) -> Precision:
+    """Return a precision with one unknown held as one in which the scale of a group is free."""
+    covariance = np.insert(np.insert(old.covariance, base, np.nan, axis=0), base, np.nan, axis=1)
+    identifiable = np.insert(old.identifiable, base, False)
+    for k in group:
+        identifiable[k] = False
+        covariance[k], covariance[:, k] = np.nan, np.nan
+    # Relative to their values all of the group move by the same part.
+    weight = 1 / np.sqrt(len(group))
+    combination = {machine.parameters.free[k].name: weight for k in group}
+    white = old.equivalent_variance
+    return Precision(
+        covariance,
+        identifiable,
+        [*old.unidentifiable, combination],
+        np.append(0.0, old.information),
+        old.kind,
+        old.curvature,
+        None if white is None else np.insert(white, base, np.nan),
+    )
+
+
+def precision_at_guesses(machine: Machine, log: Log) -> Precision:
+    """Return the precision that a log without a force allows at best, by its simulated loop at the guesses.
+
+    Args:
+        machine: The machine at its guesses.
+        log: The log, whose encoders have white noise.
+    """
+    group = scale_group(machine, log)
+    base = base_of(machine, group) if group else None
+    fitted = machine if base is None else without(machine, base)
+    jacobian = position_jacobian(fitted, log, choose_numerics(fitted, log))
+    noise = np.random.default_rng(0).standard_normal(log.filled.shape) * position_noise(machine, log)
+    guess = fitted.parameters.guess
+    precision = assess(
+        fitted.parameters.names,
+        jacobian,
+        noise,
+        np.broadcast_to(np.array(log.measured), noise.shape),
+        float(np.linalg.norm(log.filled - log.filled.mean(axis=0))),
+        np.where(guess != 0, guess, 1.0),
+    )
+    return precision if base is None else free_precision(precision, machine, group, base)
 
 
 def coarse_starts(

@@ -28,6 +28,8 @@ from jaxid.numerics.filters import high_band_std
 _GRAVITY = 9.81
 # Mass times distance of a swing that nothing states [kg m].
 _MOMENT = 0.1
+# Bandwidth of a servo's loop [Hz] and time between its ticks [s] that nothing states.
+_BANDWIDTH, _TICK = 5.0, 1e-3
 # Smallest guesses over the size of the force: friction is positive.
 _LEAST = 0.01
 # Noise beyond that of the rounding, as a variance over it, from which it is stated.
@@ -98,8 +100,10 @@ class Draft:
         return [plant, *frictions, table, *self._sensor(log)]
 
     def without_force(self) -> list[Section]:
-        """Return the case of a free swing, whose weight is the only force."""
+        """Return the case of a servo that follows its reference, or of a free swing under its weight."""
         chosen, measures = self._chosen, self._measures
+        if self._joints == 1 and chosen.position and chosen.reference:
+            return self._servo()
         swing = None
         if self._joints == 1 and chosen.position and not chosen.reference and measures.motion == "rotary":
             time, position, _ = self._by_hand()
@@ -107,6 +111,52 @@ class Draft:
         if swing is None:
             raise InputError(no_force(chosen), where=self._raw.source, hint=NO_FORCE_HINT)
         return [*self._swing(swing), self._log_table()]
+
+    def _servo(self) -> list[Section]:
+        """Return the case of a joint under a position loop, of which only command and position are logged.
+
+        The guesses are those of a loop of 5 Hz about an inertia that is known, because nothing else in such a
+        log has an absolute scale.
+        """
+        units, rotary = self._units(), self._measures.motion == "rotary"
+        inertia, rate = (0.01 if rotary else 1.0), 2 * np.pi * _BANDWIDTH
+        stroke = float(np.ptp(self._by_hand()[1]))
+        table = self._log_table()
+        log = self._read(table)
+        plant = Section("[plant]", {"kind": "axis", "motion": self._measures.motion})
+        plant.assumed.append("no force is logged: a position loop is taken to follow the reference")
+        values = Section("[plant.parameters]", {"inertia": inertia}, {"inertia": units.label("inertia")})
+        values.questions.append(
+            "how large is the inertia that the joint moves? All forces and gains are in proportion to it"
+        )
+
+        def effect(kind: str, key: str, value: float, dimension: str) -> Section:
+            keys = {"kind": kind, key: {"guess": rounded(value)}}
+            return Section("[[effects]]", keys, {key: units.label(dimension)})
+
+        loop = Section(
+            "[controller]",
+            {
+                "kind": "pd",
+                "derivative": "velocity",
+                "kp": {"guess": rounded(inertia * rate**2)},
+                "kd": {"guess": rounded(1.4 * inertia * rate)},
+                "delay": {"guess": 0.02},
+                "period": rounded(log.period / max(round(log.period / _TICK), 1), 9),
+            },
+            {"delay": "s, between the command and the loop", "period": "s, of the servo's own loop"},
+        )
+        loop.assumed.append("the law is kp (reference - position) - kd velocity")
+        loop.questions.append("at which rate does the servo's own loop run? Then period")
+        return [
+            plant,
+            values,
+            effect("viscous_friction", "coefficient", 0.3 * inertia * rate, "force*time/position"),
+            effect("coulomb_friction", "level", 0.01 * inertia * rate**2 * stroke, "force"),
+            loop,
+            table,
+            *self._sensor(log),
+        ]
 
     # the tables
 
@@ -145,7 +195,7 @@ class Draft:
         section.assumed += [*lines, *measures.said]
         asked = {**chosen.questions, **{q: t for q, t in measures.questions.items() if q not in ("force",)}}
         section.questions += [t for q, t in asked.items() if not (steady and q == "time")]
-        if chosen.reference:
+        if chosen.reference and chosen.force:
             section.offers.append(
                 "[controller] with the law of the loop (docs/case_file.md) makes simulations closed-loop"
             )

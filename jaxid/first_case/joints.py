@@ -48,8 +48,8 @@ def of_arm(chosen: Chosen, arm: Urdf, urdf: str, where: str) -> Chosen:
 
 
 def need_forces(chosen: Chosen, where: str) -> None:
-    """Refuse a log of several joints without a force."""
-    if not chosen.force:
+    """Refuse a log of several joints with neither a force nor a reference."""
+    if not chosen.force and not chosen.reference:
         raise InputError(no_force(chosen), where=where, hint=NO_FORCE_HINT)
 
 
@@ -57,10 +57,7 @@ def no_force(chosen: Chosen) -> str:
     """Return in words why a log has no force."""
     reasons = [line for line in chosen.said if line.startswith("'") and "passed over" in line]
     why = f" ({reasons[0]})" if reasons else ""
-    what = f"no column is a force with a sign{why}"
-    if chosen.reference:
-        what += "; a fit of the servo's loop from reference and position alone is not built yet"
-    return what
+    return f"no column is a force with a sign{why}"
 
 
 def most_moved(chosen: Chosen) -> Chosen:

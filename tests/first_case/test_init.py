@@ -313,12 +313,12 @@ MEASURED = [
     *(f"dfki_pendulum/{name}.csv" for name in ("pd", "swingup_1nm")),
     *(f"emps/{name}.mat" for name in ("DATA_EMPS", "DATA_EMPS_PULSES")),
     "silverbox/SNLS80mV.mat",
+    "so101/chirp_sweep.csv",
 ]
 # Logs that cannot be a case yet, each with the reason that `init` gives.
 NO_CASE = {
     "tx40/curr_data.csv": "no column is a position or a velocity by its name: 'Joint_1'",
     "tx40/pos_read_data.csv": "no column is a position or a velocity by its name: 'Joint_1'",
-    "so101/wave_motion.csv": "'load1' is passed over: it is never negative, so it is a magnitude",
 }
 
 
