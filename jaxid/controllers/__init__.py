@@ -51,10 +51,10 @@ def check_drives(kind: str, plant: type[Plant], drives: int, joints: int, where:
         InputError: If the law needs a drive at every joint, or at every joint that others accelerate.
     """
     law = CONTROLLERS[kind]
-    if drives == joints or kind in laws_with_model(plant, drives, joints) or not law.of_machine:
+    if drives == joints or kind in laws_with_model(plant, drives, joints) or "model" not in law.of_machine:
         return
     alternatives = laws_with_model(plant, drives, joints)
-    without = ", ".join(name for name, cls in CONTROLLERS.items() if not cls.of_machine)
+    without = ", ".join(name for name, cls in CONTROLLERS.items() if "model" not in cls.of_machine)
     hint = f"take kind = '{alternatives[0]}'" if alternatives else f"take a law without a model: {without}"
     reason = "of a plant whose joints accelerate each other"
     if law.every_drive:

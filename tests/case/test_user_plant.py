@@ -229,3 +229,11 @@ def test_advice_on_controllers_holds_for_a_joint_without_a_drive(tmp_path, law, 
     assert words in told
     assert "take a law without a model: cascade_pd, pd, pid" in told
     assert "flatness" not in told.split("take")[1]
+
+
+@pytest.mark.parametrize("law", ['"pid"\nkp = 1.0\nki = 1.0\nkd = 1.0', '"cascade_pd"\nkp = 1.0\nkv = 1.0'])
+def test_laws_without_a_model_take_a_joint_without_a_drive(tmp_path, law):
+    write(tmp_path, CART, "cart.py")
+    plant = '[plant]\nkind = "cart.py:Cart"\n[plant.parameters]\nmass = { guess = 3.0 }\n'
+    path = write(tmp_path, f"{plant}[controller]\nkind = {law}\nperiod = 0.001\n")
+    assert build_machine(load_case(path)).controller is not None
