@@ -67,8 +67,10 @@ def test_plants_and_effects_with_parameters_and_units(capsys):
 
 def test_every_method_has_a_line_that_says_when_to_take_it(capsys):
     assert cli.main(["methods"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    table, several = capsys.readouterr().out.split("\n\n")
+    lines = table.splitlines()
     assert tuple(line.split()[0] for line in lines) == names.METHODS
+    assert all(name in several for name in names.SEVERAL_LOGS)
     assert all(len(line.split()) > 4 for line in lines)
 
 

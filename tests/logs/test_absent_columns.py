@@ -197,8 +197,8 @@ def test_a_swing_without_scale_is_refused():
 
 def test_a_swing_with_a_controller_is_refused():
     loop = {"kind": "pd", "kp": 1.0, "kd": 0.1}
-    with pytest.raises(InputError, match="drives the machine"):
-        identify(case_of({**SWUNG, "reference": "q"}, controller=loop), swing(0))
+    with pytest.raises(InputError, match=r"so is the reference that \[controller\] follows"):
+        identify(case_of(SWUNG, controller=loop), swing(0))
 
 
 @needs_files

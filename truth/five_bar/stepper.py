@@ -139,7 +139,9 @@ def _run(l, c, m, friction, gains, law, reference, noise, resolution, period, st
                 before[j] = reading - period * v[j]
             speed = (reading - before[j]) / period
             before[j] = reading
-            slope = (reference[k, j] - reference[max(k - 1, 0), j]) / period
+            # A loop that starts in motion follows a reference that moved before.
+            last = max(k, 1)
+            slope = (reference[last, j] - reference[last - 1, j]) / period
             u = law[0] * (reference[k, j] - reading) + law[1] * (slope - speed)
             torque[j] = gains[j] * u
             out[k, j], out[k, 2 + j], out[k, 4 + j] = reading, u, v[j]
