@@ -253,7 +253,7 @@ def test_the_validation_log_may_ask_for_a_search(axis):
         assert search.acceptance.at_floor(search.theta)
         shown = cand.CandidateSamples(session.fit.data)
         moved = session.fit.data.force + 1.0
-        shown.arrays = [ForceData.of(dataclasses.replace(session.fit.data, force=moved))]
+        shown.arrays = [cand.Viewed(ForceData.of(dataclasses.replace(session.fit.data, force=moved)), None)]
         patch.setattr(search.acceptance, "others", [shown])
         assert not search.acceptance.at_floor(search.theta)
     assert not search.acceptance.at_floor(off)

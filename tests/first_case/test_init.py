@@ -328,7 +328,14 @@ def measured(name: str) -> Path:
     return Path(os.environ["JAXID_DATA"]) / name
 
 
-@pytest.mark.parametrize("name", MEASURED)
+# One of each kind runs always; the others are slow together.
+ALWAYS = ("decimal_comma", "swing_no_torque", "velocity_only", "velocity_table", "wrapped", "chirp_sweep")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if Path(name).stem in ALWAYS else pytest.mark.slow) for name in MEASURED],
+)
 def test_a_measured_log_becomes_a_case_that_runs(name):
     log = measured(name)
     first = jaxid.init(log)
