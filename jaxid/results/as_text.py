@@ -12,7 +12,7 @@ from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.aligned import aligned
 from jaxid.results.parameters import lines_of
-from jaxid.results.precision import precision_lines
+from jaxid.results.precision import precision_lines, ratio_rows
 from jaxid.results.report.numbers import with_std
 from jaxid.results.report.words import SLIGHT, place_words, within_prior_words
 
@@ -71,11 +71,14 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
     """Return a header, and the disagreement of a model with its logs in force and in position."""
     gap = results.gap_json(session, gaps, floor)
     simulation = gap["simulation"]
-    return [
-        ["gap", "fit", "validation", "unit"],
+    forces = [
         ["force", _number(gap["fit"]), _number(gap["validation"]), joined(gap["unit"])],
         ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
         [FLOOR, _number(gap["noise_floor"]), "", joined(gap["unit"])],
+    ]
+    return [
+        ["gap", "fit", "validation", "unit"],
+        *([] if session.machine.unforced(session.fit.log) else forces),
         [
             "simulated position",
             _number(simulation["fit"]),
@@ -128,7 +131,8 @@ def identification_table(result: Identification) -> str:
         gap += "\n\n" + aligned(logs_rows(session, result.gaps, result.noise_floor)) + "\n"
     notes = _notes(results.notes(session, estimate))
     seen = results.reading_lines(session)
-    lines = [*result.findings, "", *seen, head, "", parameters, *below, "", gap, _FLOOR_WORDS, *notes]
+    floor = [] if session.machine.unforced(session.fit.log) else [_FLOOR_WORDS]
+    lines = [*result.findings, "", *seen, head, "", parameters, *below, "", gap, *floor, *notes]
     return "\n".join(lines)
 
 
@@ -228,14 +232,9 @@ def step_rows(content: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _relative(estimate: Estimate) -> list[str]:
-    """Return the ratios of unknowns whose common scale the log does not determine."""
-    ratios = estimate.details.get("relative")
-    if ratios is None:
-        return []
-    rows = [["over " + ratios["to"], "value", "std", "unit"]]
-    for name, of in ratios["values"].items():
-        rows.append([name, *with_std(of["value"], of["std"]), of["unit"]])
-    return ["", aligned(rows)]
+    """Return the table of `ratio_rows` with a blank line before it; empty without ratios."""
+    rows = ratio_rows(estimate)
+    return ["", aligned(rows)] if rows else []
 
 
 def _unidentifiable(estimate: Estimate) -> list[str]:

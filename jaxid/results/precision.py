@@ -42,6 +42,17 @@ def profile_words(name: str, entry: Mapping[str, Any]) -> str:
     return f"profile of {name}: {', '.join(intervals)}; rise {rises} at {at} σ"
 
 
+def ratio_rows(estimate: Estimate) -> list[list[str]]:
+    """Return the ratios of unknowns without an absolute scale, a head first; empty without such."""
+    ratios = estimate.details.get("relative")
+    if ratios is None:
+        return []
+    rows = [[f"over {ratios['to']}", "value", "std", "unit"]]
+    for name, of in ratios["values"].items():
+        rows.append([name, *with_std(of["value"], of["std"]), of["unit"]])
+    return rows
+
+
 def _interval(ends: list[float | None], std: float) -> str:
     low, high = ("open" if x is None else with_std(x, std)[0] for x in ends)
     return f"{low} to {high}"

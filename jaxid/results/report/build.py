@@ -12,7 +12,7 @@ import numpy as np
 from jaxid.estimators.minimal.report import minimal_rows
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
-from jaxid.results.precision import precision_content
+from jaxid.results.precision import precision_content, ratio_rows
 from jaxid.results.proposals import sentence
 from jaxid.results.report.data import (
     CandidateScore,
@@ -47,6 +47,7 @@ def identification_report(result: Identification) -> str:
             verdict=None,
             gap=content["gap"],
             unidentifiable=tuple(content["unidentifiable"]),
+            ratios=tuple(tuple(row) for row in ratio_rows(result.estimate)),
             views=_views(session, None, result.gaps, drives="directions" in content),
             converged=result.converged,
             within_prior=content if "directions" in content else None,
@@ -212,7 +213,8 @@ def _driven(session: Session, run: OpenedLog, gap: Gap, joint: int) -> dict[str,
 
 def _view(run: OpenedLog, before: Gap | None, after: Gap, joint: int, joints: int) -> LogView:
     data, log = run.data, run.log
-    rows = data.moving[:, joint]
+    # Without a force in the log there is nothing to draw of forces.
+    rows = data.moving[:, joint] & bool(np.isfinite(after.force.rms[joint]))
     name = run.name if joints == 1 else f"{run.name}, joint {joint + 1}"
 
     def simulated(gap: Gap | None) -> np.ndarray | None:

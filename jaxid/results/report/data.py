@@ -185,6 +185,7 @@ class ReportData:
         gap: The `gap` object of the JSON result.
         parameters: The case's unknowns after the last fit.
         unidentifiable: `{"combination": {name: weight}}`, one for each.
+        ratios: Rows of a table of ratios of unknowns without a scale, its head first; empty without one.
         effects: The effects that were found, in the order in which they were added.
         where: The `where` object of the JSON result, or None.
         steps: The search, step by step.
@@ -218,6 +219,7 @@ class ReportData:
     gap: Mapping
     parameters: tuple[ParameterRow, ...]
     unidentifiable: tuple[Mapping, ...] = ()
+    ratios: tuple[tuple[str, ...], ...] = ()
     effects: tuple[Mapping, ...] = ()
     where: Mapping | None = None
     steps: tuple[SearchStep, ...] = ()

@@ -130,6 +130,7 @@ def gap_table(data: ReportData) -> dict:
     return {
         "heads": [heads[i] for i in kept],
         "lines": [[cells[i] for i in kept] for cells in lines],
+        "forces": any(row.quantity.startswith("force") for row in rows),
         "band": short(data.gap["band_hz"]) if is_number(data.gap.get("band_hz")) else None,
     }
 
@@ -332,7 +333,11 @@ def _gap_rows(data: ReportData) -> list[GapRow]:
 
 def _fitted_rows(gap: Mapping, shared: Mapping) -> list[GapRow]:
     relative = gap.get("relative") or {}
-    rows = []
+    rows: list[GapRow] = []
+    known = [x for x in (gap.get("fit"), gap.get("validation")) if x is not None]
+    if known and all(np.all(np.isnan(np.asarray(x, float))) for x in known):
+        # A log without a force has no gap in it.
+        return rows
     for log in ("fit", "validation"):
         each = gap.get(f"{log}s") or {}
         if gap.get(log) is not None and not each:
