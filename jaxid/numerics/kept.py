@@ -104,7 +104,16 @@ def _surroundings() -> bytes:
     files = sorted((str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in root.rglob("*.py"))
     versions = [version(name) for name in _KNOWN if name != "jaxid"]
     told = (files, versions, platform.python_version(), os.environ.get("XLA_FLAGS"), jax.default_backend())
-    return repr((*told, jax.device_count(), jax.config.read("jax_enable_x64"))).encode()
+    return repr((*told, _processor(), jax.device_count(), jax.config.read("jax_enable_x64"))).encode()
+
+
+def _processor() -> tuple[str, ...]:
+    """Return the kind of processor and its instructions: a home folder may serve several machines."""
+    named = ("model name", "flags", "Features")
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        return (platform.machine(), *sorted({line for line in lines if line.startswith(named)}))
+    return (platform.machine(), platform.processor())
 
 
 def _ready(
