@@ -114,6 +114,10 @@ def _need_known_force(case: Case, machine: Machine, log: Log) -> None:
     if case.log is not None and case.log.force is None:
         missing = "'force' is missing"
     if case.controller is not None:
+        if case.log is not None and case.log.force is not None:
+            what = f"{missing}, and [controller] drives the machine"
+            hint = "check that force names the right column, or leave it out to fit the loop by its reference"
+            raise InputError(what, where=log.source, hint=hint)
         if log.reference is None and machine.unknown_reference is None and case.reference is None:
             hint = "name the column of the command to the servo as reference in [log], or that of the force"
             what = f"{missing}, and so is the reference that [controller] follows"

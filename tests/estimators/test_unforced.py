@@ -108,6 +108,12 @@ def test_a_loop_without_a_reference_is_refused():
         identify(CASE.replace('reference = "r"\n', ""), given)
 
 
+def test_a_named_force_of_zero_is_refused():
+    given = log() | {"u": np.zeros(TIME.size)}
+    with pytest.raises(InputError, match="the force is zero throughout, and .controller. drives"):
+        identify(CASE + 'force = "u"\n', given)
+
+
 @pytest.mark.parametrize("method", ["inverse_dynamics", "prediction_error", "didim"])
 def test_a_method_of_forces_is_refused(method):
     known = CASE.replace("{ guess = 0.02 }", "0.05").replace("{ guess = 0.005 }", "0.02")
