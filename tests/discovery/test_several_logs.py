@@ -3,6 +3,7 @@
 import tomllib
 
 import numpy as np
+import pytest
 
 import jaxid
 from jaxid import Log
@@ -16,6 +17,7 @@ def sprung(seed: int, **options: float):
     return axis_setup(seed, **options).with_effect("linear_stiffness", coefficient=SPRING)
 
 
+@pytest.mark.slow
 def test_an_effect_is_found_in_logs_of_which_one_has_a_known_payload(tmp_path):
     write_log(tmp_path / "loaded.csv", sprung(8, added=LOADED))
     case = tomllib.loads(axis_case(closed=True, gain_unknown=True))

@@ -130,6 +130,7 @@ def arm_bag(folder: Path, arm: TwoLinks) -> tuple[Path, Path]:
     return bag, urdf
 
 
+@pytest.mark.slow
 def test_a_bag_with_a_urdf(tmp_path, capsys):
     arm = TwoLinks()
     (tmp_path / "cases").mkdir()
