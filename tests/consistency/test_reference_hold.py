@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.consistency.law import loop_velocity_findings
 from jaxid.errors import InputError
 from jaxid.results.as_json import identification_json
 from jaxid.session import Session, open_session
@@ -132,6 +133,17 @@ def test_the_right_law_is_not_refused_where_the_reference_jumps_every_20_ticks()
     assert session.machine.reference_hold == "zero_order"
     # The case states how the loop averages positions, so nothing is asked about its velocity.
     assert [f.where for f in session.findings] == ["arrays, reference"]
+
+
+def test_a_loop_may_use_a_velocity_that_its_drive_measures():
+    run = setup().run()
+    session = open_session(case(), {column: run[field][::20] for column, field in NAMES.items()})
+    assert session.machine.controller is not None
+    controller = dataclasses.replace(session.machine.controller, velocity_average=1)
+    machine = dataclasses.replace(session.machine, controller=controller)
+    (finding,) = loop_velocity_findings(machine, session.fit.log)
+    assert finding.what.startswith("the loop is taken to difference positions")
+    assert loop_velocity_findings(session.machine, session.fit.log) == []
 
 
 def test_a_log_of_every_tick_has_nothing_to_choose():
