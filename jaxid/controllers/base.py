@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.numerics.delays import shifted
 from jaxid.numerics.smooth import sharp_clip
 
 
@@ -109,7 +110,7 @@ class Controller(eqx.Module):
     def path(self, reference: Float[Array, "ticks m"]) -> Path:
         """Return the delayed reference with the derivatives that the law needs, by central differences."""
         if self.delay is not None:
-            reference = delayed(reference, self.delay / self.period)
+            reference = shifted(reference, self.delay / self.period)
         if not self.anticipates:
             return Path(reference)
         before = jnp.concatenate([2 * reference[:1] - reference[1:2], reference[:-1]])
@@ -161,22 +162,3 @@ class Controller(eqx.Module):
     def clipped(self, u: Array) -> Array:
         """Clip the command to its limit."""
         return u if self.limit is None else sharp_clip(u, self.limit)
-
-
-def delayed(signal: Float[Array, "ticks m"], shift: Array) -> Float[Array, "ticks m"]:
-    """Delay a signal by a number of ticks, with lines between its ticks; it stood still before the first.
-
-    Args:
-        signal: Values at the ticks, (ticks, m).
-        shift: Delay in ticks, not negative, one for all columns or one each.
-    """
-    ticks, width = signal.shape
-    shift = jnp.broadcast_to(shift, (width,))
-    whole = jnp.floor(shift)
-    part = shift - whole
-    at = jnp.arange(ticks)[:, None] - whole.astype(int)
-
-    def value(k: Array) -> Array:
-        return jnp.take_along_axis(signal, jnp.clip(k, 0, ticks - 1), axis=0)
-
-    return (1 - part) * value(at) + part * value(at - 1)

@@ -22,6 +22,7 @@ from jaxid.controllers import Controller, Tick
 from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, step, vector_field
 from jaxid.model.plant import Plant
+from jaxid.numerics.delays import shifted
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.solvers import RELATIVE, AdaptiveStep
 
@@ -167,19 +168,11 @@ def interval_forces(plant: Plant, drive: Drive, command: Float[Array, "time m"])
     gradient with respect to the delay.
     """
     force = drive.gain * command
-    n, drives = force.shape
-    shift = plant.command_delays(drives) / drive.period
-    whole = jnp.floor(shift).astype(int)
-    part = shift - whole
-    k = jnp.arange(n)[:, None] - whole
-
-    def at(k: Array) -> Array:
-        return jnp.take_along_axis(force, jnp.clip(k, 0, n - 1), axis=0)
-
-    start = (1 - part) * at(k) + part * at(k - 1)
+    shift = plant.command_delays(force.shape[1]) / drive.period
+    start = shifted(force, shift)
     if drive.hold == "zero_order":
         return start, start
-    return start, (1 - part) * at(k + 1) + part * at(k)
+    return start, shifted(force, shift, ahead=1)
 
 
 def closed_loop(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.controllers.base import delayed
 from jaxid.errors import InputError
+from jaxid.numerics.delays import shifted
 from truth.axis.machines import Setup, moves, multisine
 from truth.axis.stepper import Loop, Machine, Sensor
 
@@ -73,8 +73,8 @@ def test_a_fit_passes_its_gains_on_to_the_case():
 
 def test_a_delay_between_two_ticks_is_a_line_between_them():
     signal = jnp.asarray([[0.0], [1.0], [4.0], [9.0]])
-    assert delayed(signal, jnp.asarray(1.25))[:, 0].tolist() == [0.0, 0.0, 0.75, 3.25]
-    assert delayed(signal, jnp.asarray(0.0)).tolist() == signal.tolist()
+    assert shifted(signal, jnp.asarray(1.25))[:, 0].tolist() == [0.0, 0.0, 0.75, 3.25]
+    assert shifted(signal, jnp.asarray(0.0)).tolist() == signal.tolist()
 
 
 @pytest.mark.parametrize(

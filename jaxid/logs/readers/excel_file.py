@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,22 @@ _HEADER, _BELOW = 50, 5
 
 def read_excel(path: Path, names: list[str], rows: Rows | None) -> Table:
     """Read columns of the first sheet whose header has them; see `read_table`. Needs openpyxl."""
+    with _opened(path) as book:
+        return _of_book(book, path, names, rows)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a workbook, and close it whatever happens.
+
+    Raises:
+        InputError: If the file is no workbook, or is damaged.
+    """
     openpyxl = need("openpyxl", path, "Excel")
     book = None
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-        return _of_book(book, path, names, rows)
+        yield book
     except (InputError, OSError):
         raise
     except Exception as error:
@@ -44,10 +56,8 @@ def header_of_book(path: Path) -> list[str]:
     Raises:
         InputError: If the file is no workbook.
     """
-    openpyxl = need("openpyxl", path, "Excel")
-    book, best = None, []
-    try:
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+    best: list[str] = []
+    with _opened(path) as book:
         for sheet in book.worksheets:
             rows = list(sheet.iter_rows(values_only=True, max_row=_HEADER + _BELOW + 1))
             numbers = [any(_is_number(c) for c in row) for row in rows]
@@ -55,14 +65,6 @@ def header_of_book(path: Path) -> list[str]:
                 header = ["" if c is None else str(c).strip() for c in row]
                 if any(numbers[k + 1 : k + 2 + _BELOW]) and not numbers[k] and _width(header) > _width(best):
                     best = header
-    except (InputError, OSError):
-        raise
-    except Exception as error:
-        what = f"cannot be read ({str(error) or type(error).__name__})"
-        raise InputError(what, where=str(path), hint="is it an .xlsx file? save it again") from error
-    finally:
-        if book is not None:
-            book.close()
     return best
 
 
