@@ -74,6 +74,25 @@ def test_a_known_gain_gives_all_values_from_guesses_four_times_off():
         assert found.std < 0.05 * true, name
 
 
+def test_guesses_five_times_off_lead_to_the_same_optimum():
+    """From these guesses alone a fit ends elsewhere."""
+    far = CASE
+    for name, old, new in (
+        ("inertia", "5e-3", 4e-4),
+        ("coefficient", "1e-3", 2e-2),
+        ("level", "0.1", 0.15),
+        ("kd", "0.02", 0.25),
+        ("delay", "0.005", 0.1),
+    ):
+        assert f"{name} = {{ guess = {old} }}" in far
+        far = far.replace(f"{name} = {{ guess = {old} }}", f"{name} = {{ guess = {new} }}")
+    result = identify(far, log())
+    assert result.estimate.converged
+    for name, true in TRUE.items():
+        found = result.parameters[name]
+        assert abs(found.value - true) < 4 * found.std, name
+
+
 def test_without_anything_known_the_ratios_stand_and_no_absolute_value(tmp_path):
     result = identify(FREE, log())
     result.save(tmp_path)
