@@ -309,7 +309,9 @@ def _references(
         if column.meaning.reference and column.meaning.quantity in ("position", ""):
             wanted.setdefault(" ".join(column.meaning.joint), column)
     named = _matched(wanted, tuple(position))
-    if named and all(_follows(position[j].values, c.values) for j, c in named.items()):
+    # Small moves may end within the play of a servo; names that count the joints alike then say enough.
+    alike = len(named) > 1 and all(_overlap(position[j].values, c.values) for j, c in named.items())
+    if alike or (named and all(_follows(position[j].values, c.values) for j, c in named.items())):
         return named
     if position and set(spare) == set(position):
         first = next(iter(spare.values()))
@@ -317,6 +319,10 @@ def _references(
         questions["reference"] = f"is '{first.name}' the wanted position, or a second encoder?"
         return dict(spare)
     return {}
+
+
+def _overlap(position: np.ndarray, reference: np.ndarray) -> bool:
+    return bool(max(position.min(), reference.min()) <= min(position.max(), reference.max()))
 
 
 def _follows(position: np.ndarray, reference: np.ndarray) -> bool:

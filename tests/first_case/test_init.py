@@ -315,6 +315,7 @@ MEASURED = [
     *(f"emps/{name}.mat" for name in ("DATA_EMPS", "DATA_EMPS_PULSES")),
     "silverbox/SNLS80mV.mat",
     "so101/chirp_sweep.csv",
+    "so101/backlash_detection.csv",
 ]
 # Logs that cannot be a case yet, each with the reason that `init` gives.
 NO_CASE = {
