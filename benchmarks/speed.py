@@ -20,6 +20,8 @@ from pathlib import Path
 # One BLAS thread: the problems are small, and more would only compete with what is measured.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["NUMBA_NUM_THREADS"] = "2"
+# Compiled code that a user keeps on disk would make the cold rows too kind.
+os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
 
 import jax.numpy as jnp
 import numpy as np
