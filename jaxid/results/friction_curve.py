@@ -62,7 +62,7 @@ def _curve(machine: Machine, estimate: Estimate, view: LogView, incomplete: bool
     half = _half_width(machine, estimate, effects, grid, incomplete)
     some = thinned(len(view.velocity), _SAMPLES)
     at, left = view.velocity[some], view.residual_after
-    seen = None if left is None else left[some] + _friction(machine.plant, effects, at)
+    seen = None if left is None or not len(at) else left[some] + _friction(machine.plant, effects, at)
     return FrictionView(
         name=view.name,
         joint=view.joint,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.case.case import UNNAMED
 from jaxid.results.report.numbers import short
 
 if TYPE_CHECKING:
@@ -44,7 +45,9 @@ def run_facts(result: Identification | Discovery, command: str) -> tuple[tuple[s
 def _machine(session: Session) -> str:
     plant = session.machine.plant
     joints = "" if plant.joints == 1 else f", {plant.joints} joints"
-    return f"{session.case.title} ({plant.kind.replace('_', ' ')}{joints})"
+    kind = f"{plant.kind.replace('_', ' ')}{joints}"
+    # A file that is called case.toml does not name its machine.
+    return kind if session.case.title.startswith(UNNAMED) else f"{session.case.title} ({kind})"
 
 
 def _log(run: OpenedLog) -> str:

@@ -106,8 +106,11 @@ def draw_friction(ax: Axes, view: FrictionView, units: Mapping[str, str]) -> Non
     if view.velocity_measured is not None and view.force_measured is not None:
         x, y = view.velocity_measured / speed, drawable(view.force_measured) / factor
         few = len(x) <= 200
-        style = {"ms": 6.0, "alpha": 0.7} if few else {"ms": 2.8, "alpha": 0.35}
-        ax.plot(x, y, ".", color=MEASURED, mew=0, rasterized=not few, label="samples", **style)
+        # A few rows are drawn on the curve, thousands of samples below it.
+        style = (
+            {"ms": 6.0, "color": TEXT, "zorder": 3} if few else {"ms": 2.8, "color": MEASURED, "alpha": 0.35}
+        )
+        ax.plot(x, y, ".", mew=0, rasterized=not few, label="samples", **style)
         if not few:
             mean = binned_mean(x, y, bins=60, group=(x >= 0).astype(int))
             ax.plot(*mean, color=TEXT, lw=1.2, ls=(0, (4, 2)), label="their mean")

@@ -42,6 +42,7 @@ def render(data: ReportData) -> str:
     lines, more = first_page.first_values(data)
     main = first_page.main_view(data)
     entries = [_view_entry(data, view, i) for i, view in enumerate(data.views)]
+    telling = _telling(data, main)
     return filled(
         "page.html",
         data=data,
@@ -51,7 +52,7 @@ def render(data: ReportData) -> str:
         answer=tables.answer(data),
         findings=[tables.unbroken(finding) for finding in data.findings[1:]],
         found=first_page.found_entries(data),
-        telling=_telling(data, main),
+        telling=telling,
         friction=_friction(data),
         facts=[(name, tables.unbroken(text)) for name, text in data.facts],
         first_values=lines,
@@ -72,7 +73,7 @@ def render(data: ReportData) -> str:
         history=_history(data),
         precision=_precision(data),
         experiments=[_experiment(data, view) for view in data.experiments],
-        main=None if main is None else entries[main],
+        main=None if main is None else _beside(entries[main], telling),
         views=[entry for i, entry in enumerate(entries) if i != main],
         steady=any(view.steady for view in data.views),
     )
@@ -103,14 +104,22 @@ def _telling(data: ReportData, main: int | None) -> dict | None:
         if view.steady or not _simulated(view):
             return None
         words = f"{view.name}: measured and simulated position over time"
-        return {"title": f"Measured and simulated position: {view.name}"} | image(
-            plots.plot_fit(view, units, size=_HALF), words
-        )
+        figure = image(plots.plot_fit(view, units, size=_HALF), words)
+        return {"title": f"Measured and simulated position: {view.name}", "variable": None} | figure
     variable = telling_variable(view)
     figure = plots.plot_residual_against(view, units, variables=(variable,), size=_HALF)
     title = f"{'Before and after: force' if both else 'Force'} residual over {variable}"
     title += f" ({view.name})" if len(data.views) > 1 else ""
-    return {"title": title} | image(figure, f"{view.name}: force residual over {variable}")
+    drawn = image(figure, f"{view.name}: force residual over {variable}")
+    return {"title": title, "variable": variable} | drawn
+
+
+def _beside(entry: dict, telling: dict | None) -> dict | None:
+    """Return the entry of a log without the figure that the first page has; None if nothing is left."""
+    shown = telling["variable"] if telling else None
+    against = [figure for figure in entry["against"] if figure["variable"] != shown]
+    left = any(entry[name] for name in ("fit", "drive", "force")) or against
+    return {**entry, "against": against} if left else None
 
 
 def _friction(data: ReportData) -> dict | None:

@@ -38,16 +38,17 @@ def study_report(result: Study) -> str:
             image(plot_errors(rows), "RMS error of every estimator, by parameter"),
         ),
         (
-            "Do the intervals hold the truth?",
+            "Part of the intervals that hold the truth",
             "Bars are the uncertainty (95 %) from the number of runs."
             + (f" Of each estimator from left to right: {'; '.join(others)}." if len(others) > 1 else ""),
             image(plot_coverage(rows), "Coverage of 95 % intervals, by parameter"),
         ),
     ]
+    folded = []
     for setting, own in conditions(table):
         title = f"Errors in units of their reported σ: {words_of(setting)}"
         words = "Beyond 4.5 σ everything is counted in the outermost bar."
-        figures.append((title, words, image(plot_scatter(own), title)))
+        folded.append((title, words, image(plot_scatter(own), title)))
         if own.sizes["run"] >= FEWEST:
             title = f"Where the truth lies in the reported distribution: {words_of(setting)}"
             words = (
@@ -56,7 +57,7 @@ def study_report(result: Study) -> str:
                 "estimator with most, at all points at once in 95 of 100 studies. An arch below on the left "
                 "and above on the right: too wide; the other way round: too narrow; all on one side: biased."
             )
-            figures.append((title, words, image(plot_ecdf(own), title)))
+            folded.append((title, words, image(plot_ecdf(own), title)))
     settings = [name for name in SETTINGS if name in table.dims]
     tried = "; ".join(
         f"{name.replace('_', ' ')} {', '.join(f'{x:g}' for x in table[name].values)}" for name in settings
@@ -67,7 +68,8 @@ def study_report(result: Study) -> str:
         rows=[_line(r) for r in rows],
         settings=settings,
         failures=[f | {"where": words_of(f)} for f in result.failures],
-        verdicts=result.verdicts,
+        doubtful=[line for line in result.verdicts if "do not rely" in line],
+        verdicts=[line for line in result.verdicts if "do not rely" not in line],
         partial=[
             p | {"where": words_of(p), "without": ", ".join(p["unidentifiable"])} for p in result.partial
         ],
@@ -76,6 +78,7 @@ def study_report(result: Study) -> str:
         runs=table.sizes["run"],
         seconds=short(result.seconds, 3),
         figures=figures,
+        folded=folded,
         tried=tried,
         answer=_answer(result),
         tracking=[_followed(r) for r in result.tracking],

@@ -78,7 +78,7 @@ def draw_errors(ax: Axes, rows: Sequence[dict], name: str) -> None:
             dash = "--" if len(others) == 1 else dash
             label = None if o else "Cramér–Rao bound"
             ax.plot(at, bound, color=TEXT, lw=0.8 * width, ls=dash, label=label)
-    dress(ax, _AXES[against], f"{name}\nRMS error [{pretty_unit(of_name[0]['unit'])}]")
+    _named(ax, name, _AXES[against], f"RMS error [{pretty_unit(of_name[0]['unit'])}]")
     _logarithmic(ax, at)
 
 
@@ -121,7 +121,7 @@ def draw_coverage(ax: Axes, rows: Sequence[dict], name: str) -> None:
         ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=style["color"], lw=1.2)
         ax.plot(at, 100 * held, ls="", label=None if o else estimator, **style)
     ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
-    dress(ax, _AXES[against], f"{name}\nin the 95 % interval [%]")
+    _named(ax, name, _AXES[against], "in the 95 % interval [%]")
     ax.set_ylim(0, 103)
     ax.set_xlim(-0.5, len(places) - 0.5)
     ax.set_xticks(range(len(places)), [f"{x:g}" for x in places])
@@ -160,7 +160,7 @@ def draw_scatter(ax: Axes, table: xr.Dataset, name: str) -> None:
             style = {"color": _look(i)["color"], "lw": 1.4, "histtype": "step", "density": True}
             ax.hist(np.clip(z, -_REACH, _REACH), ends.tolist(), label=str(estimator), **style)
     ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
-    dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
+    _named(ax, name, "error / its reported σ [-]", "density [-]")
 
 
 def plot_ecdf(table: xr.Dataset) -> Figure:
@@ -200,13 +200,19 @@ def draw_ecdf(ax: Axes, table: xr.Dataset, name: str) -> None:
         for k, edge in enumerate((low, high)):
             ax.plot(points, edge, color=TEXT, lw=0.9, ls="--", label="95 % band" if k == 0 else None)
     ax.axhline(0.0, color=TEXT, lw=0.5)
-    dress(ax, "place of the truth [-]", f"{name}\nECDF minus diagonal [-]")
+    _named(ax, name, "place of the truth [-]", "ECDF minus diagonal [-]")
     ax.set_xlim(0, 1)
 
 
 def others_of(rows: Sequence[dict]) -> list[str]:
     """Return the other settings in words; one empty text if nothing else is varied."""
     return list(dict.fromkeys(words_of(r, without=widest(rows)) for r in rows))
+
+
+def _named(ax: Axes, name: str, xlabel: str, ylabel: str) -> None:
+    """Label an axes, with the parameter above it: beside it a long name would run into the next panel."""
+    dress(ax, xlabel, ylabel)
+    ax.set_title(name, loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
 
 
 def _panels(rows: Sequence[dict]) -> tuple[list[str], list[Axes], Figure]:
