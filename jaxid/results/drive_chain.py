@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from jaxid.model.plant import Plant
     from jaxid.session import Session
 
-# Most places of an effect that are listed.
-_PLACES = 4
+# Numbers of places that are listed one by one.
+_FEW = 2
 
 
 def drive_chain(session: Session, machine: Machine) -> tuple[ChainPart, ...]:
@@ -85,15 +85,15 @@ def _load_lines(session: Session) -> list[str]:
 
 def _marks(plant: Plant, declared: int) -> dict[str, list[Mark]]:
     """Return the marks of each part: an effect of one kind at several places is one mark."""
-    grouped: dict[tuple[str, str, bool], list[str]] = {}
+    grouped: dict[tuple[str, str, str, bool], list[str]] = {}
     alone = _ports(plant) == 1
     for number, effect in enumerate(plant.effects):
         word, place = plant.place(effect.port)
-        key = (_part(effect, word), effect.kind, number >= declared)
+        key = (_part(effect, word), effect.kind, word, number >= declared)
         grouped.setdefault(key, []).append("" if alone else f"{word} {place}")
     marks: dict[str, list[Mark]] = {}
     # Found effects come first.
-    for (part, kind, found), places in sorted(grouped.items(), key=lambda item: not item[0][2]):
+    for (part, kind, _, found), places in sorted(grouped.items(), key=lambda item: not item[0][3]):
         marks.setdefault(part, []).append(Mark(_with_places(kind.replace("_", " "), places), found))
     return marks
 
@@ -108,10 +108,13 @@ def _part(effect: Effect, place: str) -> str:
 
 
 def _with_places(name: str, places: list[str]) -> str:
+    """Add places to a name, such as "joints 1 to 4"."""
     known = [place for place in places if place]
     if not known:
         return name
-    word = known[0].split()[0]
-    if len(known) > _PLACES and all(place.startswith(word) for place in known):
-        return f"{name} ({len(known)} {word}s)"
-    return f"{name} ({', '.join(known)})"
+    word, numbers = known[0].split()[0], sorted(int(place.split()[1]) for place in known)
+    if len(numbers) == 1:
+        return f"{name} ({word} {numbers[0]})"
+    run = len(numbers) > _FEW and numbers[-1] - numbers[0] == len(numbers) - 1
+    listed = f"{numbers[0]} to {numbers[-1]}" if run else ", ".join(map(str, numbers))
+    return f"{name} ({word}s {listed})"

@@ -125,7 +125,8 @@ def curve_of(kind: str) -> Curve | None:
     from jaxid.effects import EFFECTS
 
     cls = EFFECTS[kind]
-    effect = cls(**{name: np.asarray(value) for name, value in usual_values(kind).items()})
+    values: dict[str, Any] = {name: np.asarray(value) for name, value in usual_values(kind).items()}
+    effect = cls(**values)
     if cls.delays_command():
         t = np.linspace(-0.2, 1.0, _POINTS)
         late = float(np.asarray(effect.command_delay()))

@@ -30,7 +30,8 @@ def run_facts(result: Identification | Discovery, command: str) -> tuple[tuple[s
     session, estimate = result.session, result.estimate
     known = [
         ("machine", _machine(session)),
-        ("case", str(session.case.name)),
+        ("joints", _joints(session)),
+        ("case", "" if session.case.path is None else session.case.path.name),
         *[("log" if k == 0 else "", _log(run)) for k, run in enumerate(session.fits)],
         *[("validated on", _log(run)) for run in session.validations],
         ("method", estimate.method.replace("_", " ") + _reason(result.settings)),
@@ -48,6 +49,11 @@ def _machine(session: Session) -> str:
     kind = f"{plant.kind.replace('_', ' ')}{joints}"
     # A file that is called case.toml does not name its machine.
     return kind if session.case.title.startswith(UNNAMED) else f"{session.case.title} ({kind})"
+
+
+def _joints(session: Session) -> str:
+    """Return numbers and names of the joints, if a file names them."""
+    return ", ".join(f"{k} {name}" for k, name in enumerate(session.case.plant.names, start=1))
 
 
 def _log(run: OpenedLog) -> str:

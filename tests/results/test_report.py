@@ -239,7 +239,7 @@ def test_logs_are_not_mixed_in_the_answer():
     gap = {"unit": "N", "before": [4.1, 3.5], "after": [1.0, 0.02], "noise_floor": [1.0, 0.016]}
     data = _discovery(views=(), gap={**gap, "on": "validation"})
     words = _words(render(data))
-    assert "joint 1 residual on the validation log falls from 4.10 N to 1.00 N" in words
+    assert "force residual of joint 1 on the validation log falls from 4.10 N to 1.00 N" in words
     assert "3 joints" not in words
     assert "force, worst joint fit 21.0 N" in words
 

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from jaxid.results.report.axes import FONT, TEXT, bucket_count, dress, legend, span, time_axes, time_label
 from jaxid.results.report.curves import binned_mean, drawable, envelope
@@ -14,8 +17,9 @@ from jaxid.results.report.data import FrictionView, LogView
 from jaxid.results.report.numbers import scaled_unit
 from jaxid.results.report.plots import AFTER, MEASURED, draw_residual
 
-# Most panels beside each other.
-_COLUMNS = 3
+# Most panels beside each other, and widths of several and of one [inch].
+_COLUMNS = 4
+_WIDE, _NARROW = 11.5, 4.6
 
 
 def plot_forces(
@@ -67,16 +71,20 @@ def draw_forces(ax: Axes, view: LogView, units: Mapping[str, str], *, many: int)
     legend(ax)
 
 
-def plot_frictions(views: Sequence[FrictionView], units: Mapping[str, str]) -> Figure:
+def plot_frictions(
+    views: Sequence[FrictionView], units: Mapping[str, str], *, columns: int = _COLUMNS
+) -> Figure:
     """Draw the friction of each joint over its velocity, with its band and the samples of the log.
 
     Args:
         views: The joints, a panel each.
         units: Labels of "force" and "velocity".
+        columns: Most panels beside each other.
     """
-    columns = min(len(views), _COLUMNS)
+    columns = min(len(views), columns)
     rows = -(-len(views) // columns)
-    size = (5.6, 3.5) if len(views) == 1 else (3.85 * columns, 2.6 * rows)
+    width = _WIDE if columns > 1 else _NARROW
+    size = (5.6, 3.5) if len(views) == 1 else (width, 2.4 * rows + 0.4)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax, view in zip(axes, views, strict=False):
@@ -84,9 +92,11 @@ def plot_frictions(views: Sequence[FrictionView], units: Mapping[str, str]) -> F
         if len(views) > 1:
             ax.set_title(f"joint {view.joint + 1}", loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
             ax.get_legend().remove()
+            ax.xaxis.set_major_locator(MaxNLocator(4))
     if len(views) > 1:
         lines, labels = axes[0].get_legend_handles_labels()
-        figure.legend(lines, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=FONT)
+        shown = figure.legend(lines, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=FONT)
+        _darken(shown)
     for ax in axes[len(views) :]:
         ax.remove()
     return figure
@@ -119,14 +129,19 @@ def draw_friction(ax: Axes, view: FrictionView, units: Mapping[str, str]) -> Non
     cut = lambda line: np.insert(line, gap, np.nan)
     x = cut(view.velocity / speed)
     if view.low is not None and view.high is not None:
-        ends = (cut(drawable(end) / factor) for end in (view.low, view.high))
-        ax.fill_between(x, *ends, color=AFTER, alpha=0.25, lw=0, label="95 % band")
+        low, high = (cut(drawable(end) / factor) for end in (view.low, view.high))
+        ax.fill_between(x, low, high, color=AFTER, alpha=0.25, lw=0, label="95 % band")
     ax.plot(x, cut(drawable(view.force) / factor), color=AFTER, lw=1.6, label="model")
     ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
     dress(ax, f"velocity [{speed_unit}]", f"friction [{unit}]")
     place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1, "ncols": 4}
     shown = ax.legend(frameon=False, fontsize=FONT, handlelength=1.6, columnspacing=1.2, **place)
+    _darken(shown)
+
+
+def _darken(shown: Legend) -> None:
+    """Darken the dot of the samples in a legend: dots are pale where thousands of them overlap."""
     for handle in shown.legend_handles:
-        # Dots are pale where thousands of them overlap, and a single one is not.
-        if handle is not None and handle.get_label() == "samples":
+        if isinstance(handle, Line2D) and handle.get_label() == "samples":
             handle.set_alpha(1.0)
+            handle.set_markersize(6.0)

@@ -27,6 +27,7 @@ View = LogView | ExperimentView | HistoryView
 
 _NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
 _HALF = (5.6, 3.5)  # inch; half the width of a page
+_LOW = (11.5, 3.4)  # inch; its whole width
 _RASTER_DPI = 130  # Chosen: sharp on a phone, and ten clouds stay below a megabyte
 
 
@@ -106,8 +107,15 @@ def _telling(data: ReportData, main: int | None) -> dict | None:
         words = f"{view.name}: measured and simulated position over time"
         figure = image(plots.plot_fit(view, units, size=_HALF), words)
         return {"title": f"Measured and simulated position: {view.name}", "variable": None} | figure
+    size = _LOW if len(data.friction) > 1 else _HALF
     variable = telling_variable(view)
-    figure = plots.plot_residual_against(view, units, variables=(variable,), size=_HALF)
+    if not both and not view.steady and (data.model_complete or variable == "time"):
+        # A residual without a pattern says nothing; the forces show how much is explained.
+        words = f"{view.name}: measured force and model force over time"
+        title = "Measured force and model force" + (f" ({view.name})" if len(data.views) > 1 else "")
+        drawn = image(plot_forces(view, units, size=size), words)
+        return {"title": title, "variable": "forces" if size == _LOW else None} | drawn
+    figure = plots.plot_residual_against(view, units, variables=(variable,), size=size)
     title = f"{'Before and after: force' if both else 'Force'} residual over {variable}"
     title += f" ({view.name})" if len(data.views) > 1 else ""
     drawn = image(figure, f"{view.name}: force residual over {variable}")
@@ -118,8 +126,9 @@ def _beside(entry: dict, telling: dict | None) -> dict | None:
     """Return the entry of a log without the figure that the first page has; None if nothing is left."""
     shown = telling["variable"] if telling else None
     against = [figure for figure in entry["against"] if figure["variable"] != shown]
-    left = any(entry[name] for name in ("fit", "drive", "force")) or against
-    return {**entry, "against": against} if left else None
+    force = None if shown == "forces" else entry["force"]
+    left = force or entry["fit"] or entry["drive"] or against
+    return {**entry, "force": force, "against": against} if left else None
 
 
 def _friction(data: ReportData) -> dict | None:
@@ -128,9 +137,11 @@ def _friction(data: ReportData) -> dict | None:
         return None
     band = any(view.low is not None for view in data.friction)
     words = f"Friction over velocity{' with its 95 % band' if band else ''}"
-    figure = plot_frictions(data.friction, data.units)
+    drawn = image(plot_frictions(data.friction, data.units), words)
+    if len(data.friction) > 1:
+        drawn = with_narrow(drawn, plot_frictions(data.friction, data.units, columns=1))
     sampled = any(view.force_measured is not None for view in data.friction)
-    return {"title": words, "wide": len(data.friction) > 1, "sampled": sampled} | image(figure, words)
+    return {"title": words, "wide": len(data.friction) > 1, "sampled": sampled} | drawn
 
 
 def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
@@ -218,8 +229,12 @@ def _where_figure(data: ReportData) -> dict | None:
 def _picture(words: str, draw, view: View, units: Mapping, **options: object) -> dict:
     """Draw a plot over time twice: wide, and again for narrow screens."""
     wide = image(draw(view, units, **options), words)
-    wide["narrow"] = image(draw(view, units, size=_NARROW, **options), words)["source"]
-    return wide
+    return with_narrow(wide, draw(view, units, size=_NARROW, **options))
+
+
+def with_narrow(wide: dict, figure: Figure) -> dict:
+    """Return the attributes of an img element with another figure for narrow screens."""
+    return {**wide, "narrow": image(figure, wide["alt"])}
 
 
 def image(figure: Figure, words: str) -> dict:

@@ -33,15 +33,16 @@ _AXES = {
 }
 
 
-def plot_errors(rows: Sequence[dict]) -> Figure:
+def plot_errors(rows: Sequence[dict], columns: int = _COLUMNS) -> Figure:
     """Draw the RMS error of every estimator against the setting with most values, a panel a parameter.
 
     Dashes distinguish the other settings that vary.
 
     Args:
         rows: `Study.summary`.
+        columns: Most panels beside each other.
     """
-    names, panels, figure = _panels(rows)
+    names, panels, figure = _panels(rows, columns)
     for name, ax in zip(names, panels, strict=True):
         draw_errors(ax, rows, name)
     others = others_of(rows)
@@ -82,13 +83,14 @@ def draw_errors(ax: Axes, rows: Sequence[dict], name: str) -> None:
     _logarithmic(ax, at)
 
 
-def plot_coverage(rows: Sequence[dict]) -> Figure:
+def plot_coverage(rows: Sequence[dict], columns: int = _COLUMNS) -> Figure:
     """Draw the part of the 95 % intervals that hold the truth, a panel a parameter.
 
     Args:
         rows: `Study.summary`.
+        columns: Most panels beside each other.
     """
-    names, panels, figure = _panels(rows)
+    names, panels, figure = _panels(rows, columns)
     for name, ax in zip(names, panels, strict=True):
         draw_coverage(ax, rows, name)
     _legend(figure, panels[0])
@@ -127,14 +129,15 @@ def draw_coverage(ax: Axes, rows: Sequence[dict], name: str) -> None:
     ax.set_xticks(range(len(places)), [f"{x:g}" for x in places])
 
 
-def plot_scatter(table: xr.Dataset) -> Figure:
+def plot_scatter(table: xr.Dataset, columns: int = _COLUMNS) -> Figure:
     """Draw the errors of all runs under one setting in units of their reported deviation.
 
     Args:
         table: `Study.table` under that setting.
+        columns: Most panels beside each other.
     """
     names = [str(n) for n in table.parameter.values]
-    figure, panels = _grid(len(names))
+    figure, panels = _grid(len(names), columns)
     for name, ax in zip(names, panels, strict=True):
         draw_scatter(ax, table, name)
     _legend(figure, panels[0])
@@ -163,14 +166,15 @@ def draw_scatter(ax: Axes, table: xr.Dataset, name: str) -> None:
     _named(ax, name, "error / its reported σ [-]", "density [-]")
 
 
-def plot_ecdf(table: xr.Dataset) -> Figure:
+def plot_ecdf(table: xr.Dataset, columns: int = _COLUMNS) -> Figure:
     """Draw the ECDF of the truth's place in the reported distribution, a panel a parameter; see `draw_ecdf`.
 
     Args:
         table: `Study.table` under one setting.
+        columns: Most panels beside each other.
     """
     names = [str(n) for n in table.parameter.values]
-    figure, panels = _grid(len(names))
+    figure, panels = _grid(len(names), columns)
     for name, ax in zip(names, panels, strict=True):
         draw_ecdf(ax, table, name)
     _legend(figure, panels[0])
@@ -215,14 +219,14 @@ def _named(ax: Axes, name: str, xlabel: str, ylabel: str) -> None:
     ax.set_title(name, loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
 
 
-def _panels(rows: Sequence[dict]) -> tuple[list[str], list[Axes], Figure]:
+def _panels(rows: Sequence[dict], columns: int) -> tuple[list[str], list[Axes], Figure]:
     names = list(dict.fromkeys(r["parameter"] for r in rows))
-    figure, panels = _grid(len(names))
+    figure, panels = _grid(len(names), columns)
     return names, panels, figure
 
 
-def _grid(count: int) -> tuple[Figure, list[Axes]]:
-    columns = min(count, _COLUMNS)
+def _grid(count: int, columns: int) -> tuple[Figure, list[Axes]]:
+    columns = min(count, columns)
     lines = -(-count // columns)
     figure = Figure(figsize=(3.8 * columns, 2.9 * lines + 0.5), layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False).ravel()

@@ -10,7 +10,7 @@ from jaxid.results.report.data import LogView
 # Numbers of bins that are tried, and samples that each needs on average.
 _BINS, _LEAST = (30, 60, 240), 8
 # Part of the variance that a pattern must explain.
-_CLEAR = 0.1
+_CLEAR = 0.2
 
 
 def telling_variable(view: LogView) -> str:

@@ -287,7 +287,15 @@ def _gap_words(row: GapRow) -> str:
     _, log, before, after, *_ = _gap_cells(row)
     fall = _change(before, after, row.before, row.after) if row.before is not None else f"is {after}"
     floor = f", at a noise floor of {_gap_cells(row)[4]}" if is_number(row.floor) else ""
-    return f"The {row.quantity} residual on the {log} log {fall} (RMS){floor}"
+    quantity, _, joint = row.quantity.partition(", ")
+    of_joint = f" of {joint}" if joint else ""
+    return f"The {quantity} residual{of_joint} on the {_log_words(log)} {fall} (RMS){floor}"
+
+
+def _log_words(log: str) -> str:
+    """Return a log in a sentence; one of several has a name behind its kind."""
+    kind, _, name = log.partition(": ")
+    return f"{kind} log {name}".strip()
 
 
 def _change(before: str, after: str, old: float | None, new: float | None) -> str:
@@ -315,7 +323,8 @@ def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
     ]
     fall = _change(before, after, *sizes) if before else f"is {after}"
     over = f", at noise floors of {floor}" if floor else ""
-    return f"The {quantity} residual of the {len(rows)} joints on the {rows[0].log} log {fall} (RMS){over}"
+    log = _log_words(rows[0].log)
+    return f"The {quantity} residual of the {len(rows)} joints on the {log} {fall} (RMS){over}"
 
 
 def gap_rows(data: ReportData) -> list[GapRow]:
