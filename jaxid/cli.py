@@ -7,7 +7,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
@@ -400,25 +400,15 @@ class Savable(Protocol):
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path: ...
 
 
-@contextmanager
-def _progress(args: argparse.Namespace, stages: int):
-    """Show a progress bar on a terminal, and nothing when piped or quiet."""
-    from tqdm import tqdm
+def _progress(args: argparse.Namespace) -> AbstractContextManager[Callable[[str], None]]:
+    """Show progress on a terminal, and nothing when piped or quiet."""
+    from jaxid._progress import progress
 
-    with tqdm(
-        total=stages,
-        disable=args.quiet or not sys.stderr.isatty(),
-        leave=False,
-        unit="stage",
-        bar_format="{desc:42.42s} |{bar}| {elapsed}",
-    ) as bar:
-
-        def show(text: str) -> None:
-            bar.set_description_str(text)
-            if bar.n < stages - 1:
-                bar.update()
-
-        yield show
+    # Results elsewhere, and what may be overwritten, take no time.
+    told = {k: v for k, v in vars(args).items() if k not in ("run", "o", "quiet", "force")}
+    files = [str(Path(name).resolve()) for name in (told.get("case"), *(told.get("log") or ())) if name]
+    words = [f"{k}={v}" for k, v in sorted(told.items()) if k not in ("case", "log")]
+    return progress([*words, *files], shown=not args.quiet and sys.stderr.isatty())
 
 
 def _ready(args: argparse.Namespace, *files: str) -> None:
@@ -558,7 +548,7 @@ def _run_simulate(args: argparse.Namespace) -> int:
         raise InputError(f"--seed is {args.seed}", hint="give zero or more")
     path = ready_file(Path(args.o), overwrite=args.force)
     _sound(args)
-    with _progress(args, 2) as show:
+    with _progress(args) as show:
         show("simulating")
         from jaxid.commands.simulate import simulate
 
@@ -573,7 +563,7 @@ def _run_design(args: argparse.Namespace) -> int:
 
     path = ready_file(Path(args.o), overwrite=args.force)
     _sound(args)
-    with _progress(args, 4) as show:
+    with _progress(args) as show:
         from jaxid.commands.design import design
 
         found = design(args.case, progress=show)
@@ -585,7 +575,7 @@ def _run_design(args: argparse.Namespace) -> int:
 def _run_check(args: argparse.Namespace) -> int:
     _ready(args, "check.json")
     _sound(args)
-    with _progress(args, 2) as show:
+    with _progress(args) as show:
         show("checking")
         from jaxid.commands.check import check
 
@@ -602,7 +592,7 @@ def _run_identify(args: argparse.Namespace) -> int:
         raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
     _ready(args, "result.json", "report.html")
     _sound(args)
-    with _progress(args, 4) as show:
+    with _progress(args) as show:
         show("starting")
         from jaxid.commands.identify import identify
 
@@ -635,7 +625,7 @@ def _run_discover(args: argparse.Namespace) -> int:
         corrected = found_case_file(Path(args.case), folder)
         _ready(args, "discovery.json", "report.html", corrected, *experiments)
     _sound(args)
-    with _progress(args, 40) as show:
+    with _progress(args) as show:
         show("starting")
         from jaxid.commands.discover import discover
 
@@ -703,7 +693,7 @@ def _run_export(args: argparse.Namespace) -> int:
 def _run_demo(args: argparse.Namespace) -> int:
     from jaxid.demo import run_demo
 
-    with _progress(args, 40) as show:
+    with _progress(args) as show:
         show("starting")
         text, converged = run_demo(Path(args.o), overwrite=args.force, progress=show)
     print(text)

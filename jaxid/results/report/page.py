@@ -113,12 +113,16 @@ def _telling(data: ReportData, main: int | None) -> dict | None:
         # A residual without a pattern says nothing; the forces show how much is explained.
         words = f"{view.name}: measured force and model force over time"
         title = "Measured force and model force" + (f" ({view.name})" if len(data.views) > 1 else "")
-        drawn = image(plot_forces(view, units, size=size), words)
-        return {"title": title, "variable": "forces" if size == _LOW else None} | drawn
+        if size == _LOW:
+            return {"title": title, "variable": "forces"} | _picture(words, plot_forces, view, units)
+        return {"title": title, "variable": None} | image(plot_forces(view, units, size=size), words)
     figure = plots.plot_residual_against(view, units, variables=(variable,), size=size)
     title = f"{'Before and after: force' if both else 'Force'} residual over {variable}"
     title += f" ({view.name})" if len(data.views) > 1 else ""
     drawn = image(figure, f"{view.name}: force residual over {variable}")
+    if size == _LOW:
+        narrow = plots.plot_residual_against(view, units, variables=(variable,))
+        drawn = with_narrow(drawn, narrow)
     return {"title": title, "variable": variable} | drawn
 
 
