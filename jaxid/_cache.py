@@ -34,7 +34,7 @@ def configure() -> None:
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or os.environ.get("JAXID_CACHE") == "off":
         return
     try:
-        folder = _home() / _host()
+        folder = home() / _host()
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
             return
@@ -48,7 +48,8 @@ def configure() -> None:
     _heal(folder)
 
 
-def _home() -> Path:
+def home() -> Path:
+    """Return jaxid's folder among the caches of this user."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxid"
 
 

@@ -7,9 +7,9 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NoReturn, Protocol
+from typing import Any, NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
@@ -18,10 +18,57 @@ from jaxid.names import (
     METHODS,
     MINIMISERS,
     OUTPUTS,
+    PICTURES,
     SEVERAL_LOGS,
     SOLVERS,
     TARGETS,
     WHEN,
+)
+
+_GREETING = """\
+jaxid identifies machines with friction from their logs, and finds the physics that a simulation is missing.
+
+  jaxid demo                                  the whole way, on a log that ships with jaxid
+  jaxid init log.csv                          a first case, case.toml, from a log of your own
+  jaxid identify case.toml log.csv -o out     its unknowns, and a report: out/report.html
+
+jaxid --help lists all commands, and jaxid COMMAND --help the options of one, with examples."""
+# Examples below the help text of each command.
+_EXAMPLES = {
+    "demo": "jaxid demo\njaxid demo -o my-demo",
+    "methods": "jaxid methods",
+    "plants": "jaxid plants",
+    "effects": "jaxid effects\njaxid effects cogging\njaxid effects stribeck_friction -o stribeck.png",
+    "schema": "jaxid schema case > case.schema.json",
+    "init": "jaxid init log.csv\njaxid init joint_states.csv --urdf arm.urdf -o arm.toml",
+    "simulate": "jaxid simulate case.toml -o log.csv\njaxid simulate case.toml -o log.csv --seed 3",
+    "design": "jaxid design case.toml -o reference.csv",
+    "check": "jaxid check case.toml log.csv\njaxid check case.toml log.csv -o out",
+    "identify": "jaxid identify case.toml log.csv -o out\n"
+    "jaxid identify case.toml a.csv b.csv --validate c.csv\n"
+    "jaxid identify case.toml log.csv --method inverse_dynamics",
+    "discover": "jaxid discover case.toml log.csv -o out\n"
+    "jaxid discover case.toml log.csv --validate other.csv --max-effects 2",
+    "study": "jaxid study case.toml -o study --runs 50\njaxid study case.toml -o study --resume",
+    "export": "jaxid export out/result.json --to mjcf --model robot.xml -o found.xml",
+    "report": "jaxid report out\njaxid report out/result.json -o fit.html",
+    "plot": "jaxid plot out friction -o friction.png\n"
+    "jaxid plot out/result.json scatter --against position -o ripple.svg",
+}
+# Suffixes of logs, by which arguments in the wrong order are noticed.
+_LOGS = (
+    ".csv",
+    ".txt",
+    ".tsv",
+    ".mat",
+    ".npz",
+    ".h5",
+    ".hdf5",
+    ".parquet",
+    ".xlsx",
+    ".tdms",
+    ".mcap",
+    ".bag",
 )
 
 
@@ -32,7 +79,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, whatever the verdict; 2 bad input; 1 anything else, no convergence included.
     """
     try:
-        args = _parser().parse_args(argv)
+        given = sys.argv[1:] if argv is None else argv
+        if not given:
+            print(_GREETING)
+            return 0
+        args = _parser().parse_args(given)
         status = args.run(args)
         sys.stdout.flush()
         return status
@@ -62,6 +113,10 @@ def entry() -> None:
 class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, with exit status 2."""
 
+    def __init__(self, *args: Any, **options: Any):
+        """Keep the lines of the examples below a help text as they are."""
+        super().__init__(*args, formatter_class=argparse.RawDescriptionHelpFormatter, **options)
+
     def error(self, message: str) -> NoReturn:
         raise InputError(message, hint=f"see {self.prog} --help")
 
@@ -87,9 +142,9 @@ def _parser() -> argparse.ArgumentParser:
     for name, purpose, run in (
         ("methods", "list the methods of identify, and when to take which", _run_methods),
         ("plants", "list the plants with their parameters and units", _run_plants),
-        ("effects", "list the effects with their parameters and units", _run_effects),
     ):
-        commands.add_parser(name, help=purpose, description=purpose).set_defaults(run=run)
+        _plain(commands, name, purpose, run)
+    _effects(commands)
     _schema(commands)
     _init(commands)
     _simulate(commands)
@@ -99,21 +154,75 @@ def _parser() -> argparse.ArgumentParser:
     _discover(commands)
     _study(commands)
     _export(commands)
+    _report(commands)
+    _plot(commands)
     return parser
+
+
+def _plain(
+    commands: argparse._SubParsersAction, name: str, purpose: str, run: Callable, more: str = ""
+) -> argparse.ArgumentParser:
+    """Add a command, with its examples below its help text."""
+    examples = "\n".join(f"  {line}" for line in _EXAMPLES[name].splitlines())
+    end = f"{more}\n\nexamples:\n{examples}".strip()
+    parser = commands.add_parser(name, help=purpose, description=purpose, epilog=end)
+    parser.set_defaults(run=run, command=name)
+    return parser
+
+
+def _effects(commands: argparse._SubParsersAction) -> None:
+    purpose = "list the effects, or show one: formula, curve, and a snippet for a case"
+    parser = _plain(commands, "effects", purpose, _run_effects)
+    parser.add_argument("kind", metavar="KIND", nargs="?", help="the effect to show; absent: all are listed")
+    parser.add_argument("-o", metavar="FILE", help="picture of its curve: .png, .svg or .pdf")
+    parser.add_argument("--force", action="store_true", help="overwrite a file that is there")
+
+
+def _report(commands: argparse._SubParsersAction) -> None:
+    purpose = "write the report of a result again, such as after an update of jaxid"
+    parser = _plain(commands, "report", purpose, _run_report)
+    _result(parser)
+    parser.add_argument(
+        "-o", metavar="FILE.html", help="file to write; default: report.html beside the result"
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite a file that jaxid did not make")
+
+
+def _plot(commands: argparse._SubParsersAction) -> None:
+    purpose = "draw one picture of a result"
+    parser = _plain(commands, "plot", purpose, _run_plot)
+    _result(parser)
+    parser.add_argument(
+        "kind", metavar="KIND", help=f"{', '.join(PICTURES)}; forces: measured and model over each other"
+    )
+    parser.add_argument("-o", metavar="FILE", help="file to write: .png, .svg or .pdf; default: KIND.png")
+    parser.add_argument(
+        "--log", metavar="NAME", default="0", help="name or number of the log; default: 0, the first"
+    )
+    parser.add_argument("--joint", metavar="N", type=int, default=1, help="joint of several; default: 1")
+    parser.add_argument(
+        "--against",
+        metavar="QUANTITY",
+        help="abscissa of scatter: velocity, position or time; default: that which the residual follows",
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite a file that is there")
+
+
+def _result(parser: argparse.ArgumentParser) -> None:
+    what = "result.json, discovery.json, or the folder that holds one"
+    parser.add_argument("result", metavar="RESULT", help=what)
 
 
 def _schema(commands: argparse._SubParsersAction) -> None:
     what = "the JSON Schema of a file, for editors that complete and check by it"
-    parser = commands.add_parser("schema", help=what, description=what)
-    parser.set_defaults(run=_run_schema)
+    parser = _plain(commands, "schema", what, _run_schema)
     parser.add_argument("file", metavar="FILE", choices=("case",), help="case: the case file")
 
 
 def _add(
-    commands: argparse._SubParsersAction, name: str, purpose: str, run: Callable
+    commands: argparse._SubParsersAction, name: str, purpose: str, run: Callable, more: str = ""
 ) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=purpose, description=purpose)
-    parser.set_defaults(run=run)
+    parser = _plain(commands, name, purpose, run, more)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--force", action="store_true", help="overwrite files that jaxid did not make")
     return parser
@@ -129,7 +238,7 @@ def _demo(commands: argparse._SubParsersAction) -> None:
 
 def _init(commands: argparse._SubParsersAction) -> None:
     parser = _add(commands, "init", "write a first case from a raw log", _run_init)
-    parser.add_argument("log", metavar="LOG")
+    parser.add_argument("log", metavar="LOG", help="the log, as the drive or the robot wrote it")
     parser.add_argument("--urdf", metavar="FILE", help="file that describes the arm of the log")
     parser.add_argument("--tip", metavar="LINK", help="its last link; needed only where the chain branches")
     parser.add_argument("--mjcf", metavar="FILE", help="MuJoCo model of the machine; not built yet")
@@ -140,7 +249,7 @@ def _init(commands: argparse._SubParsersAction) -> None:
 
 def _simulate(commands: argparse._SubParsersAction) -> None:
     parser = _add(commands, "simulate", "simulate the log that a case describes", _run_simulate)
-    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("case", metavar="CASE.toml", help="the case, with [simulation]")
     parser.add_argument("-o", metavar="LOG.csv", required=True, help="file to write the log to")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the noise; default: 0")
 
@@ -148,12 +257,12 @@ def _simulate(commands: argparse._SubParsersAction) -> None:
 def _design(commands: argparse._SubParsersAction) -> None:
     purpose = "find the reference or input within [limits] whose log identifies the unknowns best"
     parser = _add(commands, "design", purpose, _run_design)
-    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("case", metavar="CASE.toml", help="the case, with [simulation]")
     parser.add_argument("-o", metavar="SIGNAL.csv", required=True, help="file to write the signal to")
 
 
 def _logs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("case", metavar="CASE.toml", help="the case: what is known of the machine")
     parser.add_argument(
         "log",
         metavar="LOG",
@@ -208,7 +317,10 @@ def _check(commands: argparse._SubParsersAction) -> None:
 
 
 def _identify(commands: argparse._SubParsersAction) -> None:
-    parser = _add(commands, "identify", "identify the unknowns of a case from a log", _run_identify)
+    width = max(map(len, METHODS))
+    when = "\n".join(f"  {name.ljust(width)}  {WHEN[name]}" for name in METHODS)
+    purpose = "identify the unknowns of a case from a log"
+    parser = _add(commands, "identify", purpose, _run_identify, f"which method when:\n{when}")
     _logs(parser)
     parser.add_argument(
         "--method",
@@ -260,7 +372,7 @@ def _discover(commands: argparse._SubParsersAction) -> None:
 def _study(commands: argparse._SubParsersAction) -> None:
     purpose = "simulate and identify a case many times: bias, spread and coverage of the intervals"
     parser = _add(commands, "study", purpose, _run_study)
-    parser.add_argument("case", metavar="CASE.toml")
+    parser.add_argument("case", metavar="CASE.toml", help="the case, with [simulation]")
     parser.add_argument("-o", metavar="DIR", help="folder for chunks and results; default: only print them")
     parser.add_argument(
         "--runs", metavar="N", type=int, help="runs under each setting; default: those of the case, or 100"
@@ -274,8 +386,7 @@ def _study(commands: argparse._SubParsersAction) -> None:
 
 def _export(commands: argparse._SubParsersAction) -> None:
     purpose = "put the values of a result into the robot's own file"
-    parser = commands.add_parser("export", help=purpose, description=purpose)
-    parser.set_defaults(run=_run_export)
+    parser = _plain(commands, "export", purpose, _run_export)
     parser.add_argument("result", metavar="RESULT.json", help="result.json or discovery.json of a tree")
     parser.add_argument("--to", metavar="TARGET", required=True, help=f"one of {', '.join(TARGETS)}")
     parser.add_argument("--model", metavar="ROBOT.xml", required=True, help="the file that the case names")
@@ -289,25 +400,15 @@ class Savable(Protocol):
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path: ...
 
 
-@contextmanager
-def _progress(args: argparse.Namespace, stages: int):
-    """Show a progress bar on a terminal, and nothing when piped or quiet."""
-    from tqdm import tqdm
+def _progress(args: argparse.Namespace) -> AbstractContextManager[Callable[[str], None]]:
+    """Show progress on a terminal, and nothing when piped or quiet."""
+    from jaxid._progress import progress
 
-    with tqdm(
-        total=stages,
-        disable=args.quiet or not sys.stderr.isatty(),
-        leave=False,
-        unit="stage",
-        bar_format="{desc:42.42s} |{bar}| {elapsed}",
-    ) as bar:
-
-        def show(text: str) -> None:
-            bar.set_description_str(text)
-            if bar.n < stages - 1:
-                bar.update()
-
-        yield show
+    # Results elsewhere, and what may be overwritten, take no time.
+    told = {k: v for k, v in vars(args).items() if k not in ("run", "o", "quiet", "force")}
+    files = [str(Path(name).resolve()) for name in (told.get("case"), *(told.get("log") or ())) if name]
+    words = [f"{k}={v}" for k, v in sorted(told.items()) if k not in ("case", "log")]
+    return progress([*words, *files], shown=not args.quiet and sys.stderr.isatty())
 
 
 def _ready(args: argparse.Namespace, *files: str) -> None:
@@ -320,9 +421,24 @@ def _ready(args: argparse.Namespace, *files: str) -> None:
 
 def _sound(args: argparse.Namespace) -> None:
     """Refuse an unsound case before JAX is loaded, which takes longer than all that is checked here."""
+    _in_order(args)
     from jaxid.case.case import refuse_unsound
 
     refuse_unsound(Path(args.case))
+
+
+def _in_order(args: argparse.Namespace) -> None:
+    """Refuse a log in the place of the case."""
+    if Path(args.case).suffix.lower() not in _LOGS:
+        return
+    logs = getattr(args, "log", [])
+    case = next((name for name in logs if Path(name).suffix.lower() == ".toml"), None)
+    if case is not None:
+        rest = [args.case if name == case else name for name in logs]
+        hint = f"the case comes first: jaxid {args.command} {' '.join([case, *rest])}"
+    else:
+        hint = f"the case comes first; jaxid init {args.case} writes one"
+    raise InputError("is a log, in the place of the case", where=args.case, hint=hint)
 
 
 def _run_methods(args: argparse.Namespace) -> int:
@@ -340,9 +456,69 @@ def _run_plants(args: argparse.Namespace) -> int:
 
 
 def _run_effects(args: argparse.Namespace) -> int:
-    from jaxid.results.catalogue import effects_table
+    if args.kind is None:
+        if args.o is not None:
+            raise InputError(
+                "-o draws the curve of one effect", hint="name it: jaxid effects cogging -o cogging.png"
+            )
+        from jaxid.results.catalogue import effects_table
 
-    print(effects_table())
+        print(effects_table())
+        return 0
+    from jaxid.results.effect_page import curve_of, effect_page, plot_curve
+
+    path = None if args.o is None else _picture_file(args.o, overwrite=args.force)
+    print(effect_page(args.kind))
+    if path is not None:
+        curve = curve_of(args.kind)
+        if curve is None:
+            raise InputError(f"{args.kind} has no curve of its own", hint="leave out -o")
+        plot_curve(args.kind, curve).savefig(path, dpi=160)
+        print(f"\nwrote {path}")
+    return 0
+
+
+def _picture_file(name: str, *, overwrite: bool) -> Path:
+    """Return the path of a picture after a check that it may be written."""
+    path = Path(name)
+    suffix = path.suffix.lower()
+    if suffix not in (".png", ".svg", ".pdf"):
+        raise InputError(
+            f"suffix {path.suffix!r} is no picture", where=name, hint="end it in .png, .svg or .pdf"
+        )
+    from jaxid.files import ready_file
+
+    return ready_file(path, overwrite=overwrite, suffix=suffix)
+
+
+def _run_report(args: argparse.Namespace) -> int:
+    from jaxid.commands.report import report
+    from jaxid.files import check_folder, ready_file, write_whole
+
+    result = Path(args.result)
+    if args.o is None:
+        folder = result if result.is_dir() else result.parent
+        check_folder(folder, ["report.html"], overwrite=args.force)
+        path = folder / "report.html"
+    else:
+        path = ready_file(Path(args.o), overwrite=args.force, suffix=".html")
+    write_whole(path, report(result))
+    print(f"wrote {path}")
+    return 0
+
+
+def _run_plot(args: argparse.Namespace) -> int:
+    if args.kind not in PICTURES:
+        raise InputError(f"plot {args.kind!r} is not known", hint=suggest(args.kind, PICTURES))
+    path = _picture_file(args.o or f"{args.kind}.png", overwrite=args.force)
+    from jaxid.commands.report import read_content
+    from jaxid.results.stored_plots import picture
+
+    figure = picture(
+        read_content(args.result), args.kind, log=args.log, joint=args.joint, against=args.against
+    )
+    figure.savefig(path, dpi=160)
+    print(f"wrote {path}")
     return 0
 
 
@@ -372,7 +548,7 @@ def _run_simulate(args: argparse.Namespace) -> int:
         raise InputError(f"--seed is {args.seed}", hint="give zero or more")
     path = ready_file(Path(args.o), overwrite=args.force)
     _sound(args)
-    with _progress(args, 2) as show:
+    with _progress(args) as show:
         show("simulating")
         from jaxid.commands.simulate import simulate
 
@@ -387,7 +563,7 @@ def _run_design(args: argparse.Namespace) -> int:
 
     path = ready_file(Path(args.o), overwrite=args.force)
     _sound(args)
-    with _progress(args, 4) as show:
+    with _progress(args) as show:
         from jaxid.commands.design import design
 
         found = design(args.case, progress=show)
@@ -399,7 +575,7 @@ def _run_design(args: argparse.Namespace) -> int:
 def _run_check(args: argparse.Namespace) -> int:
     _ready(args, "check.json")
     _sound(args)
-    with _progress(args, 2) as show:
+    with _progress(args) as show:
         show("checking")
         from jaxid.commands.check import check
 
@@ -416,7 +592,7 @@ def _run_identify(args: argparse.Namespace) -> int:
         raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
     _ready(args, "result.json", "report.html")
     _sound(args)
-    with _progress(args, 4) as show:
+    with _progress(args) as show:
         show("starting")
         from jaxid.commands.identify import identify
 
@@ -449,7 +625,7 @@ def _run_discover(args: argparse.Namespace) -> int:
         corrected = found_case_file(Path(args.case), folder)
         _ready(args, "discovery.json", "report.html", corrected, *experiments)
     _sound(args)
-    with _progress(args, 40) as show:
+    with _progress(args) as show:
         show("starting")
         from jaxid.commands.discover import discover
 
@@ -517,7 +693,7 @@ def _run_export(args: argparse.Namespace) -> int:
 def _run_demo(args: argparse.Namespace) -> int:
     from jaxid.demo import run_demo
 
-    with _progress(args, 40) as show:
+    with _progress(args) as show:
         show("starting")
         text, converged = run_demo(Path(args.o), overwrite=args.force, progress=show)
     print(text)

@@ -45,6 +45,19 @@ SEVERAL_LOGS = ("output_error", "prediction_error", "inverse_dynamics", "algebra
 DISCOVER, IN_LOOP = "discover", "in_loop"
 # Methods that maximise a likelihood, so that it has a Hessian and profiles.
 LIKELIHOOD_METHODS = ("output_error", "prediction_error", "within_prior")
+# Pictures that `jaxid plot` draws of a result.
+PICTURES = (
+    "forces",
+    "residual",
+    "scatter",
+    "friction",
+    "fit",
+    "parameters",
+    "history",
+    "where",
+    "candidates",
+    "profiles",
+)
 # Signals of a simulated loop that output error compares with the log.
 OUTPUTS = ("position", "force", "both")
 # Methods that output error may take its start from.

@@ -5,11 +5,14 @@ import io
 import os
 import subprocess
 import sys
+import tomllib
 
 import numpy as np
 import pytest
 
+import jaxid
 from jaxid import cli, names
+from jaxid._progress import Durations, progress, time_left
 from jaxid.effects import EFFECTS
 from jaxid.plants import PLANTS
 from tests.support.cli_setup import TRUTH, held, place, recorded, refused, run, text
@@ -52,6 +55,56 @@ def test_help_of_every_command(capsys):
         assert f"usage: jaxid {command}" in shown
         assert "-h, --help" in shown
         assert ("--quiet" in shown) == (command not in ("plants", "effects"))
+
+
+def test_alone_it_greets_with_three_examples(capsys):
+    assert cli.main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines if line.startswith("  jaxid ")] == [
+        ["jaxid", "demo"],
+        ["jaxid", "init"],
+        ["jaxid", "identify"],
+    ]
+
+
+def test_every_help_ends_with_examples_of_its_command(capsys):
+    parsers = cli._parser()._subparsers._group_actions[0].choices
+    assert {"report", "plot", "effects", *COMMANDS} <= set(parsers)
+    for name, parser in parsers.items():
+        shown = parser.format_help()
+        examples = shown.partition("\nexamples:\n")[2].splitlines()
+        assert examples, name
+        for line in examples:
+            # Each example is one that the command accepts.
+            words = line.split(">")[0].split()
+            assert words[:2] == ["jaxid", name]
+            assert cli._parser().parse_args(words[1:]).command == name
+    assert all(f"{m} " in parsers["identify"].format_help() for m in names.METHODS)
+
+
+def test_one_effect_with_formula_curve_and_snippet(tmp_path, capsys):
+    for kind in EFFECTS:
+        ran = run(capsys, "effects", kind)
+        assert (ran.status, ran.err) == (0, "")
+        assert ran.out.startswith(f"{kind}: ")
+        # The snippet is a part of a case that loads.
+        given = tomllib.loads(ran.out.partition("In a case:\n")[2])
+        assert given["effects"][0]["kind"] == kind
+        plant = "flexible_axis" if EFFECTS[kind].with_springs else "axis"
+        motion = "rotary" if EFFECTS[kind].of_rotary else "linear"
+        inertias = {
+            "axis": ["inertia"],
+            "flexible_axis": ["motor_inertia", "load_inertia", "stiffness", "damping"],
+        }
+        values = {name: 1.0 for name in inertias[plant]}
+        jaxid.load_case({"plant": {"kind": plant, "motion": motion, "parameters": values}, **given})
+    shown = run(capsys, "effects", "cogging").out
+    assert "−amplitude · cos(2π · q / period + phase)" in shown
+    assert shown.count("●") > 60
+    picture = tmp_path / "cogging.png"
+    assert run(capsys, "effects", "cogging", "-o", picture).status == 0
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert "did you mean 'cogging'?" in run(capsys, "effects", "coging").err
 
 
 def test_plants_and_effects_with_parameters_and_units(capsys):
@@ -178,6 +231,29 @@ def test_a_bar_on_a_terminal_and_none_when_quiet(files, monkeypatch):
         seen.append(sys.stderr.getvalue())
     assert "checking" in seen[0]
     assert seen[1] == ""
+
+
+def test_the_time_left_is_that_of_the_last_run(tmp_path, monkeypatch):
+    durations = Durations(tmp_path / "durations.json")
+    assert durations.expected(["identify", "a"]) is None
+    durations.remember(["identify", "a"], 20.0)
+    durations.remember(["identify", "b"], 1.0)
+    assert durations.expected(["identify", "a"]) == 20.0
+    assert durations.expected(["identify", "b"]) is None
+    assert time_left(5.0, 20.0) == "about 15 s left"
+    assert time_left(5.0, 605.0) == "about 10 min left"
+    assert time_left(25.0, 20.0) == "longer than last time"
+    (tmp_path / "durations.json").write_text("damaged")
+    assert durations.expected(["identify", "a"]) is None
+
+    # A command draws what the last one took.
+    durations.remember(["check"], 20.0)
+    monkeypatch.setattr(Durations, "of_user", lambda: durations)
+    monkeypatch.setattr(sys, "stderr", _Terminal())
+    with progress(["check"], shown=True) as show:
+        show("checking")
+    assert "checking" in sys.stderr.getvalue()
+    assert "about 20 s left" in sys.stderr.getvalue()
 
 
 ENTRY = [sys.executable, "-c", "from jaxid.cli import entry; entry()"]

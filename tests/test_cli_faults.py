@@ -24,7 +24,19 @@ def files(tmp_path, sound):
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("", "the following arguments are required: COMMAND; see jaxid --help"),
+        (
+            "check a.csv b.toml",
+            "a.csv: is a log, in the place of the case; the case comes first: jaxid check",
+        ),
+        (
+            "identify a.csv",
+            "a.csv: is a log, in the place of the case; the case comes first; jaxid init a.csv",
+        ),
+        ("report nowhere", "nowhere: is no result; name result.json or discovery.json"),
+        ("plot nowhere forces", "nowhere: is no result"),
+        ("plot nowhere force", "plot 'force' is not known; did you mean 'forces'?"),
+        ("plot nowhere forces -o a.gif", "suffix '.gif' is no picture; end it in .png, .svg or .pdf"),
+        ("effects viscous", "effect 'viscous' is not known"),
         ("identfy a b", "invalid choice: 'identfy'"),
         ("identify", "required: CASE.toml, LOG; see jaxid identify --help"),
         ("check a.toml b.csv c.csv --colour", "unrecognized arguments: --colour"),

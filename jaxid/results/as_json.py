@@ -457,14 +457,16 @@ def step_json(r: Any, plant: Plant) -> dict[str, Any]:
 
 
 def save_identification(result: Identification, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write result.json and report.html."""
-    from jaxid.results.report.build import identification_report
+    """Write result.json, report.html and the curves of the report."""
+    from jaxid.results.report.build import identification_data
+    from jaxid.results.report.kept import drop_old_page, report_files
 
     files = {
-        "report.html": identification_report(result),
+        **report_files(folder, identification_data(result)),
         "result.json": json_text(identification_json(result)),
     }
     write_results(folder, files, overwrite=overwrite)
+    drop_old_page(folder, "identify")
     return folder
 
 
@@ -477,11 +479,12 @@ def discovery_files(result: Discovery, folder: Path) -> list[str]:
 
 
 def save_discovery(result: Discovery, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write discovery.json, report.html, the corrected case, and a CSV for every proposed experiment.
+    """Write discovery.json, report.html with its curves, the corrected case, and proposed experiments.
 
     A case that was changed in Python has no file to correct, and none is written.
     """
-    from jaxid.results.report.build import discovery_report
+    from jaxid.results.report.build import discovery_data
+    from jaxid.results.report.kept import drop_old_page, report_files
 
     files: dict[str, str | bytes] = {}
     for proposal in result.proposals:
@@ -490,7 +493,8 @@ def save_discovery(result: Discovery, folder: Path, *, overwrite: bool = False) 
     corrected = found_case_file(result.session.declared.path, folder)
     if corrected in discovery_files(result, folder):
         files[corrected] = case_text(result, folder)
-    files["report.html"] = discovery_report(result)
+    files |= report_files(folder, discovery_data(result))
     files["discovery.json"] = json_text(discovery_json(result))
     write_results(folder, files, overwrite=overwrite)
+    drop_old_page(folder, "discover")
     return folder

@@ -9,7 +9,8 @@ from jaxid.model.parameter import parameters_of
 from jaxid.model.units import Units
 from jaxid.results.aligned import aligned
 
-_SIGNS = {"free": "any", "nonnegative": ">= 0", "positive": "> 0"}
+# Signs of parameters as tables show them.
+SIGNS = {"free": "any", "nonnegative": ">= 0", "positive": "> 0"}
 
 
 def effects_table() -> str:
@@ -31,6 +32,6 @@ def _table(registry: Mapping[str, type], noun: str) -> str:
         for name, info in parameters_of(cls).items():
             shown = f"{name}?" if info.optional else name
             units = [either.label(info.dimension, info.motion) for either in (linear, rotary)]
-            rows.append(["", shown, _SIGNS[info.sign], *units, info.doc])
+            rows.append(["", shown, SIGNS[info.sign], *units, info.doc])
     note = "\n? : optional, such as a parameter that replaces another"
     return aligned(rows) + (note if any(r[1].endswith("?") for r in rows) else "")

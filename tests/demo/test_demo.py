@@ -54,6 +54,8 @@ def test_the_demo_finds_what_was_hidden(tmp_path, capsys):
         assert f"\n{words}" in f"\n{out}"
     made = {p.name for p in folder.iterdir()}
     results = {"check.json", "result.json", "discovery.json", "report.html", "case_found.toml"}
+    # The report of identify keeps a name of its own beside that of discover.
+    results |= {"result.npz", "discovery.npz", "report_identify.html"}
     assert made == {".jaxid", "case.toml", "log.csv", "validation.csv"} | results
     found = json.loads((folder / "discovery.json").read_text("utf-8"))
     assert found["verdict"] == "found"
@@ -64,4 +66,8 @@ def test_the_demo_finds_what_was_hidden(tmp_path, capsys):
         assert abs(told["value"] - true) < max(3 * told["std"], 0.03 * abs(true)), name
     assert found["gap"]["on"] == "validation"
     assert found["gap"]["after"] < 0.1 * found["gap"]["before"]
+    # The fit with the effect simulates better in the loop, on the log that it has not seen.
+    assert found["method"] == "prediction_error"
+    assert found["gap"]["simulation"]["after"] < 0.1 * found["gap"]["simulation"]["before"]
+    assert "inverse dynamics" not in " ".join(found["notes"])
     assert "cogging" in (folder / "report.html").read_text("utf-8")

@@ -135,8 +135,8 @@ def test_anchors_lead_somewhere_and_images_have_words(page):
     for anchor in re.findall(r'href="#([^"]*)"', page):
         assert page.count(f'id="{anchor}"') == 1
     images = re.findall(r"<img[^>]*>", page)
-    # Each log: position, force, three clouds; then the ranking and the place.
-    assert len(images) == 2 * 5 + 1 + 1
+    # The one that tells most; each log: position, force, three clouds; then the ranking and the place.
+    assert len(images) == 1 + 2 * 5 + 1 + 1
     assert all(re.search(r'alt="[^"]{10,}"', image) for image in images)
 
 
@@ -146,9 +146,10 @@ def test_the_page_holds_the_numbers(page):
     assert "force validation 20.7 N 6.90 N 5.80 N 1.19" in words
     assert "force fit 21.0 N 6.10 N" in words
     assert "simulated position validation 11.0 mm 0 mm" in words
-    assert "inertia 95.10 0.21 0.22 % kg m²" in words
-    assert "added_mass.mass not identifiable" in words
-    assert "level 20.12 0.31 1.5 % N" in words
+    assert "inertia 95.10 kg m² 94.69 to 95.52 0.21 0.22 %" in words
+    assert "added_mass. mass – kg not identifiable" in words
+    assert "Dry friction ( coulomb_friction ): −level · sign v with level = 20.12 ± 0.31 N." in words
+    assert "Met in guides, bearings and seals under preload" in words
     assert "hysteresis (811.2)" in words
     assert "inertia by +0.71 and added_mass.mass by −0.71" in words
     assert "1 coulomb_friction added 6.10 6.90 4 812.4 12.5" in words
@@ -159,7 +160,8 @@ def test_the_page_holds_the_numbers(page):
 
 
 def test_sections_stand_in_the_promised_order(page):
-    order = ["gap", "parameters", "effects", "missing", "search", "log-0", "log-1", "where", "notes"]
+    order = ["found", "figures", "parameters", "log-0", "gap", "missing", "notes"]
+    order += ["effects", "search", "where", "log-1"]
     places = [page.index(f'id="{name}"') for name in order]
     assert places == sorted(places)
 
@@ -237,7 +239,7 @@ def test_logs_are_not_mixed_in_the_answer():
     gap = {"unit": "N", "before": [4.1, 3.5], "after": [1.0, 0.02], "noise_floor": [1.0, 0.016]}
     data = _discovery(views=(), gap={**gap, "on": "validation"})
     words = _words(render(data))
-    assert "joint 1 residual on the validation log falls from 4.10 N to 1.00 N" in words
+    assert "force residual of joint 1 on the validation log falls from 4.10 N to 1.00 N" in words
     assert "3 joints" not in words
     assert "force, worst joint fit 21.0 N" in words
 

@@ -111,7 +111,7 @@ def test_identify(folder, capsys, method):
     assert f"\n\n{method}: converged, " in ran.out
     assert [(p.stat().st_mtime_ns, p.read_bytes()) for p in inputs] == before
     written = [p.name for p in sorted(ran.folder.iterdir())]
-    assert written == [".jaxid", "report.html", "result.json"]
+    assert written == [".jaxid", "report.html", "result.json", "result.npz"]
     found = ran.json("result.json")
     assert (found["method"], found["converged"], found["unidentifiable"]) == (method, True, [])
     assert found["model_complete"] is found["explains_log"] is True
@@ -173,7 +173,7 @@ def test_discover_adds_nothing_where_nothing_is_missing(folder, capsys):
     ran = run(capsys, *argv, folder=folder / "nothing")
     assert (ran.status, ran.err) == (0, "")
     written = [p.name for p in sorted(ran.folder.iterdir())]
-    assert written == [".jaxid", "case.toml", "discovery.json", "report.html"]
+    assert written == [".jaxid", "case.toml", "discovery.json", "discovery.npz", "report.html"]
     found = ran.json("discovery.json")
     judge_discovery(found, [None])
     assert (found["verdict"], found["where"], found["effects"]) == ("nothing_missing", None, [])

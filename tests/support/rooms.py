@@ -12,6 +12,7 @@ ROOMS = {
     "_platform": "float64 and XLA's loop option",
     "_cache": "compiled code on disk",
     "files": "writing outputs whole or not at all",
+    "_progress": "progress of commands on a terminal, with the time left",
     "numerics": "smooth functions, filters, precision, batched calls; no machine",
     "model": "parameters, effects, and the balance of a plant: one statement of the physics",
     "dynamics": "readings of the balance: right-hand side, dry friction, residuals",

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxid.case.case import UNNAMED
 from jaxid.estimators.minimal.report import minimal_rows
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
+from jaxid.results.drive_chain import drive_chain
+from jaxid.results.friction_curve import friction_views
 from jaxid.results.precision import precision_content, ratio_rows
 from jaxid.results.proposals import sentence
 from jaxid.results.report.data import (
@@ -25,6 +28,7 @@ from jaxid.results.report.data import (
     WherePlot,
 )
 from jaxid.results.report.page import render
+from jaxid.results.run_facts import run_facts
 
 if TYPE_CHECKING:
     from jaxid.commands.identify import Identification
@@ -37,51 +41,61 @@ if TYPE_CHECKING:
 
 def identification_report(result: Identification) -> str:
     """Return the report of `identify` as one page of HTML."""
-    content = results.identification_json(result)
-    session = result.session
-    rows, below = minimal_rows(content["minimal"]) if "minimal" in content else ((), ())
-    return render(
-        ReportData(
-            title=f"Identification of {session.case.title}",
-            command="identify",
-            verdict=None,
-            gap=content["gap"],
-            unidentifiable=tuple(content["unidentifiable"]),
-            ratios=tuple(tuple(row) for row in ratio_rows(result.estimate)),
-            views=_views(session, None, result.gaps, drives="directions" in content),
-            converged=result.converged,
-            within_prior=content if "directions" in content else None,
-            coefficients=tuple(rows),
-            statistics=tuple(below),
-            history=history_of(result.estimate),
-            **_judged(result),
-            **_common(session, result.estimate, content["notes"], incomplete=result.model_complete is False),
-        )
-    )
+    return render(identification_data(result))
 
 
 def discovery_report(result: Discovery) -> str:
     """Return the report of `discover` as one page of HTML."""
+    return render(discovery_data(result))
+
+
+def identification_data(result: Identification) -> ReportData:
+    """Return the content of the report of `identify`."""
+    content = results.identification_json(result)
+    session = result.session
+    rows, below = minimal_rows(content["minimal"]) if "minimal" in content else ((), ())
+    return ReportData(
+        title=f"Identification of {_machine_title(session)}",
+        command="identify",
+        verdict=None,
+        gap=content["gap"],
+        unidentifiable=tuple(content["unidentifiable"]),
+        ratios=tuple(tuple(row) for row in ratio_rows(result.estimate)),
+        converged=result.converged,
+        within_prior=content if "directions" in content else None,
+        coefficients=tuple(rows),
+        statistics=tuple(below),
+        history=history_of(result.estimate),
+        **_judged(result),
+        **_common(result, content["notes"], "identify"),
+    )
+
+
+def discovery_data(result: Discovery) -> ReportData:
+    """Return the content of the report of `discover`."""
     content = results.discovery_json(result)
     session = result.session
-    return render(
-        ReportData(
-            title=f"What is missing in {session.case.title}",
-            command="discover",
-            verdict=result.verdict,
-            gap=content["gap"],
-            unidentifiable=tuple(content["unidentifiable"]),
-            effects=tuple(content["effects"]),
-            where=content["where"],
-            steps=tuple(search_step(r) for r in result.rounds),
-            where_plot=where_plot(result),
-            experiments=tuple(_experiment(p, session) for p in result.proposals),
-            views=views(result),
-            converged=result.converged,
-            **_judged(result),
-            **_common(session, result.after, content["notes"], incomplete=result.model_complete is False),
-        )
+    return ReportData(
+        title=f"What is missing in {_machine_title(session)}",
+        command="discover",
+        verdict=result.verdict,
+        gap=content["gap"],
+        unidentifiable=tuple(content["unidentifiable"]),
+        effects=tuple(_described(content["effects"], result)),
+        where=content["where"],
+        steps=tuple(search_step(r) for r in result.rounds),
+        where_plot=where_plot(result),
+        experiments=tuple(_experiment(p, session) for p in result.proposals),
+        converged=result.converged,
+        **_judged(result),
+        **_common(result, content["notes"], "discover"),
     )
+
+
+def _machine_title(session: Session) -> str:
+    """Return the name of the case's file, or of the plant if the file has none of its own."""
+    title = session.case.title
+    return f"the {session.machine.plant.kind.replace('_', ' ')}" if title.startswith(UNNAMED) else title
 
 
 def views(result: Identification | Discovery) -> tuple[LogView, ...]:
@@ -131,7 +145,12 @@ def _judged(result: Identification | Discovery) -> dict:
     }
 
 
-def _common(session: Session, estimate: Estimate, notes: Sequence[str], *, incomplete: bool) -> dict:
+def _common(result: Identification | Discovery, notes: Sequence[str], command: str) -> dict:
+    session, estimate = result.session, result.estimate
+    incomplete = result.model_complete is False
+    drives = "directions" in estimate.details
+    shown = _views(session, _gaps_before(result), result.gaps, drives=drives)
+    joints = int(np.sum(session.fit.log.measured))
     return {
         "case_name": session.case.name,
         "log_name": ", ".join(dict.fromkeys(Path(run.log.source).name for run in session.fits)),
@@ -141,7 +160,17 @@ def _common(session: Session, estimate: Estimate, notes: Sequence[str], *, incom
         "units": units_of(session),
         "notes": tuple(notes),
         "versions": results.versions(),
+        "views": shown,
+        "facts": run_facts(result, command),
+        "chain": drive_chain(session, estimate.machine),
+        "friction": friction_views(session, estimate, shown[:joints], incomplete=incomplete),
     }
+
+
+def _described(effects: Sequence[Mapping[str, Any]], result: Discovery) -> list[dict[str, Any]]:
+    """Return the found effects with the docstrings of their classes, which describe those of the user."""
+    docs = {e.kind: type(e).__doc__ or "" for e in result.after.machine.plant.effects}
+    return [{**effect, "doc": docs.get(effect["kind"], "")} for effect in effects]
 
 
 def units_of(session: Session) -> dict[str, str]:

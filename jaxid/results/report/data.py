@@ -167,6 +167,60 @@ class ExperimentView:
     speed: np.ndarray | None
 
 
+@dataclass(frozen=True, eq=False)
+class FrictionView:
+    """The friction of one joint over its velocity.
+
+    Args:
+        name: Name of the log and joint in headings.
+        joint: Number of the joint, 0-based.
+        velocity: Increasing velocities, none of them zero, (G,).
+        force: Force of the model against the motion, (G,).
+        low, high: Ends of its 95 % band, (G,); None if it is not known.
+        velocity_measured: Velocity at samples of the log, (K,); None without a force in the log.
+        force_measured: Measured force less all of the model but friction, (K,).
+        units: Labels at this joint that differ from those of the page, by quantity.
+    """
+
+    name: str
+    joint: int
+    velocity: np.ndarray
+    force: np.ndarray
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
+    velocity_measured: np.ndarray | None = None
+    force_measured: np.ndarray | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Mark:
+    """An effect in the drawing of the drive chain.
+
+    Args:
+        text: Name of the effect, with its places.
+        found: Whether a search found it; declared if not.
+    """
+
+    text: str
+    found: bool = False
+
+
+@dataclass(frozen=True)
+class ChainPart:
+    """One part of the drive chain.
+
+    Args:
+        name: "controller", "drive", "transmission" or "load".
+        lines: Facts on it, a few words each.
+        marks: Effects that act on it.
+    """
+
+    name: str
+    lines: tuple[str, ...] = ()
+    marks: tuple[Mark, ...] = ()
+
+
 def si_units() -> dict[str, str]:
     """Units of a linear axis; the default of a report."""
     return {"position": "m", "velocity": "m/s", "force": "N", "time": "s"}
@@ -209,6 +263,9 @@ class ReportData:
         explains: Whether the model explains the log at all.
         identified: Whether the log determines at least one parameter.
         drifted: Whether the simulated position measures nothing, because an open-loop run drifts.
+        facts: Pairs of a name and a text: machine, date, command, method, settings, log.
+        chain: Parts of the drive chain, from the controller to the load.
+        friction: Friction over velocity, by joint.
     """
 
     title: str
@@ -241,3 +298,6 @@ class ReportData:
     explains: bool = True
     identified: bool = True
     drifted: bool = False
+    facts: tuple[tuple[str, str], ...] = ()
+    chain: tuple[ChainPart, ...] = ()
+    friction: tuple[FrictionView, ...] = ()

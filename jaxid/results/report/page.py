@@ -13,16 +13,21 @@ from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from jaxid.results.report import plots
+from jaxid.results.report import first_page, plots
 from jaxid.results.report import words as tables
 from jaxid.results.report.data import ExperimentView, HistoryView, LogView, ReportData
+from jaxid.results.report.figure_tables import tables_of
+from jaxid.results.report.force_plots import plot_forces, plot_frictions
 from jaxid.results.report.history_plots import plot_history
 from jaxid.results.report.numbers import is_number, nats, pretty_unit, short
 from jaxid.results.report.profile_plots import plot_profiles
+from jaxid.results.report.telling import telling_variable
 
 View = LogView | ExperimentView | HistoryView
 
 _NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
+_HALF = (5.6, 3.5)  # inch; half the width of a page
+_LOW = (11.5, 3.4)  # inch; its whole width
 _RASTER_DPI = 130  # Chosen: sharp on a phone, and ten clouds stay below a megabyte
 
 
@@ -35,13 +40,24 @@ def render(data: ReportData) -> str:
     Returns:
         The whole page.
     """
+    lines, more = first_page.first_values(data)
+    main = first_page.main_view(data)
+    entries = [_view_entry(data, view, i) for i, view in enumerate(data.views)]
+    telling = _telling(data, main)
     return filled(
         "page.html",
         data=data,
         verdict=tables.verdict_words(data),
         verdict_class=tables.verdict_class(data),
+        completeness=first_page.completeness(data),
         answer=tables.answer(data),
         findings=[tables.unbroken(finding) for finding in data.findings[1:]],
+        found=first_page.found_entries(data),
+        telling=telling,
+        friction=_friction(data),
+        facts=[(name, tables.unbroken(text)) for name, text in data.facts],
+        first_values=lines,
+        more_values=more,
         gap=tables.gap_table(data),
         parameters=tables.parameter_lines((*data.parameters, *data.derived)),
         effects=tables.effect_entries(data.effects),
@@ -58,7 +74,9 @@ def render(data: ReportData) -> str:
         history=_history(data),
         precision=_precision(data),
         experiments=[_experiment(data, view) for view in data.experiments],
-        views=[_view_entry(data, view, i) for i, view in enumerate(data.views)],
+        main=None if main is None else _beside(entries[main], telling),
+        views=[entry for i, entry in enumerate(entries) if i != main],
+        steady=any(view.steady for view in data.views),
     )
 
 
@@ -76,6 +94,60 @@ def filled(template: str, **entries: object) -> str:
     return environment.get_template(template).render(style=Markup(style), **entries)
 
 
+def _telling(data: ReportData, main: int | None) -> dict | None:
+    """Return the figure that convinces: the residual over the variable that it follows most, or positions."""
+    if main is None:
+        return None
+    view = data.views[main]
+    units = {**data.units, **view.units}
+    both = view.residual_before is not None and view.residual_after is not None
+    if (view.residual_before is None and view.residual_after is None) or not len(view.band_time):
+        if view.steady or not _simulated(view):
+            return None
+        words = f"{view.name}: measured and simulated position over time"
+        figure = image(plots.plot_fit(view, units, size=_HALF), words)
+        return {"title": f"Measured and simulated position: {view.name}", "variable": None} | figure
+    size = _LOW if len(data.friction) > 1 else _HALF
+    variable = telling_variable(view)
+    if not both and not view.steady and (data.model_complete or variable == "time"):
+        # A residual without a pattern says nothing; the forces show how much is explained.
+        words = f"{view.name}: measured force and model force over time"
+        title = "Measured force and model force" + (f" ({view.name})" if len(data.views) > 1 else "")
+        if size == _LOW:
+            return {"title": title, "variable": "forces"} | _picture(words, plot_forces, view, units)
+        return {"title": title, "variable": None} | image(plot_forces(view, units, size=size), words)
+    figure = plots.plot_residual_against(view, units, variables=(variable,), size=size)
+    title = f"{'Before and after: force' if both else 'Force'} residual over {variable}"
+    title += f" ({view.name})" if len(data.views) > 1 else ""
+    drawn = image(figure, f"{view.name}: force residual over {variable}")
+    if size == _LOW:
+        narrow = plots.plot_residual_against(view, units, variables=(variable,))
+        drawn = with_narrow(drawn, narrow)
+    return {"title": title, "variable": variable} | drawn
+
+
+def _beside(entry: dict, telling: dict | None) -> dict | None:
+    """Return the entry of a log without the figure that the first page has; None if nothing is left."""
+    shown = telling["variable"] if telling else None
+    against = [figure for figure in entry["against"] if figure["variable"] != shown]
+    force = None if shown == "forces" else entry["force"]
+    left = force or entry["fit"] or entry["drive"] or against
+    return {**entry, "force": force, "against": against} if left else None
+
+
+def _friction(data: ReportData) -> dict | None:
+    """Return the figure of friction over velocity, a panel for each joint."""
+    if not data.friction:
+        return None
+    band = any(view.low is not None for view in data.friction)
+    words = f"Friction over velocity{' with its 95 % band' if band else ''}"
+    drawn = image(plot_frictions(data.friction, data.units), words)
+    if len(data.friction) > 1:
+        drawn = with_narrow(drawn, plot_frictions(data.friction, data.units, columns=1))
+    sampled = any(view.force_measured is not None for view in data.friction)
+    return {"title": words, "wide": len(data.friction) > 1, "sampled": sampled} | drawn
+
+
 def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
     units = {**data.units, **view.units}
     floor = data.gap.get("noise_floor")
@@ -89,6 +161,7 @@ def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
         "anchor": f"log-{number}",
         "simulated": simulated,
         "fit": None if view.steady else _picture(words, plots.plot_fit, view, units),
+        "drifted": data.drifted,
         "drive": None,
         "force": None,
         "against": [],
@@ -97,13 +170,13 @@ def _view_entry(data: ReportData, view: LogView, number: int) -> dict:
         words = f"{view.name}: force of the drive over time, measured and simulated"
         entry["drive"] = _picture(words, plots.plot_drive, view, units)
     if len(view.band_time) and not view.steady:
-        words = f"{view.name}: measured force and force residual over time"
-        draw = plots.plot_residual_over_time
-        entry["force"] = _picture(words, draw, view, units, noise_floor=floor)
+        words = f"{view.name}: measured force, model force and their difference over time"
+        entry["force"] = _picture(words, plot_forces, view, units, noise_floor=floor)
     if residual and len(view.band_time):
         for variable in ("velocity",) if view.steady else ("velocity", "position", "time"):
             figure = plots.plot_residual_against(view, units, variables=(variable,))
-            entry["against"].append(image(figure, f"{view.name}: force residual over {variable}"))
+            drawn = image(figure, f"{view.name}: force residual over {variable}")
+            entry["against"].append({"variable": variable} | drawn)
     return entry
 
 
@@ -160,12 +233,16 @@ def _where_figure(data: ReportData) -> dict | None:
 def _picture(words: str, draw, view: View, units: Mapping, **options: object) -> dict:
     """Draw a plot over time twice: wide, and again for narrow screens."""
     wide = image(draw(view, units, **options), words)
-    wide["narrow"] = image(draw(view, units, size=_NARROW, **options), words)["source"]
-    return wide
+    return with_narrow(wide, draw(view, units, size=_NARROW, **options))
+
+
+def with_narrow(wide: dict, figure: Figure) -> dict:
+    """Return the attributes of an img element with another figure for narrow screens."""
+    return {**wide, "narrow": image(figure, wide["alt"])}
 
 
 def image(figure: Figure, words: str) -> dict:
-    """Turn a figure into the attributes of an img element.
+    """Turn a figure into the attributes of an img element, with its numbers as tables.
 
     Args:
         figure: The figure.
@@ -181,7 +258,14 @@ def image(figure: Figure, words: str) -> dict:
     # An image rather than an inline element: identifiers of several drawings cannot clash.
     code = base64.b64encode(text.encode()).decode("ascii")
     source = f"data:image/svg+xml;base64,{code}"
-    return {"source": source, "alt": words, "width": width, "height": height, "narrow": None}
+    return {
+        "source": source,
+        "alt": words,
+        "width": width,
+        "height": height,
+        "narrow": None,
+        "tables": tables_of(figure),
+    }
 
 
 def _rounded(path: re.Match) -> str:

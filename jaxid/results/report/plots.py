@@ -251,7 +251,7 @@ def plot_residual_against(
         x, factor, x_unit = _abscissa(view, variable, units)
         for row, (label, color, residual) in enumerate(residuals):
             ax = axes[row, column]
-            _cloud(ax, x / factor, residual / small, color, _groups(variable, x))
+            _cloud(ax, x / factor, residual / small, color, _groups(variable, x), "mean")
             name = f"{variable} [{x_unit}]" if row == rows - 1 else ""
             dress(ax, name, f"residual [{unit}]" if column == 0 else "")
             ax.set_title(label, loc="left", fontsize=FONT, color=color, fontweight="bold")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from jaxid.results.report.numbers import pretty_unit, short
-from jaxid.results.report.page import filled, image
+from jaxid.results.report.page import filled, image, with_narrow
 from jaxid.results.report.study_plots import others_of, plot_coverage, plot_ecdf, plot_errors, plot_scatter
 from jaxid.studies.calibration import FEWEST
 from jaxid.studies.result import conditions
@@ -35,19 +37,20 @@ def study_report(result: Study) -> str:
             + ("" if len(others) > 1 else "Dotted: the mean σ that the estimator reports. ")
             + "Black: the lower bound of any unbiased estimate from the readings, with start and "
             "command known exactly.",
-            image(plot_errors(rows), "RMS error of every estimator, by parameter"),
+            _drawn(plot_errors, rows, "RMS error of every estimator, by parameter"),
         ),
         (
-            "Do the intervals hold the truth?",
+            "Part of the intervals that hold the truth",
             "Bars are the uncertainty (95 %) from the number of runs."
             + (f" Of each estimator from left to right: {'; '.join(others)}." if len(others) > 1 else ""),
-            image(plot_coverage(rows), "Coverage of 95 % intervals, by parameter"),
+            _drawn(plot_coverage, rows, "Coverage of 95 % intervals, by parameter"),
         ),
     ]
+    folded = []
     for setting, own in conditions(table):
         title = f"Errors in units of their reported σ: {words_of(setting)}"
         words = "Beyond 4.5 σ everything is counted in the outermost bar."
-        figures.append((title, words, image(plot_scatter(own), title)))
+        folded.append((title, words, _drawn(plot_scatter, own, title)))
         if own.sizes["run"] >= FEWEST:
             title = f"Where the truth lies in the reported distribution: {words_of(setting)}"
             words = (
@@ -56,7 +59,7 @@ def study_report(result: Study) -> str:
                 "estimator with most, at all points at once in 95 of 100 studies. An arch below on the left "
                 "and above on the right: too wide; the other way round: too narrow; all on one side: biased."
             )
-            figures.append((title, words, image(plot_ecdf(own), title)))
+            folded.append((title, words, _drawn(plot_ecdf, own, title)))
     settings = [name for name in SETTINGS if name in table.dims]
     tried = "; ".join(
         f"{name.replace('_', ' ')} {', '.join(f'{x:g}' for x in table[name].values)}" for name in settings
@@ -67,7 +70,8 @@ def study_report(result: Study) -> str:
         rows=[_line(r) for r in rows],
         settings=settings,
         failures=[f | {"where": words_of(f)} for f in result.failures],
-        verdicts=result.verdicts,
+        doubtful=[line for line in result.verdicts if "do not rely" in line],
+        verdicts=[line for line in result.verdicts if "do not rely" not in line],
         partial=[
             p | {"where": words_of(p), "without": ", ".join(p["unidentifiable"])} for p in result.partial
         ],
@@ -76,10 +80,16 @@ def study_report(result: Study) -> str:
         runs=table.sizes["run"],
         seconds=short(result.seconds, 3),
         figures=figures,
+        folded=folded,
         tried=tried,
         answer=_answer(result),
         tracking=[_followed(r) for r in result.tracking],
     )
+
+
+def _drawn(draw: Callable[..., Figure], of: Any, words: str) -> dict:
+    """Draw a figure of several panels, and again with one below the other for narrow screens."""
+    return with_narrow(image(draw(of), words), draw(of, columns=1))
 
 
 def _followed(row: dict) -> dict:

@@ -33,15 +33,16 @@ _AXES = {
 }
 
 
-def plot_errors(rows: Sequence[dict]) -> Figure:
+def plot_errors(rows: Sequence[dict], columns: int = _COLUMNS) -> Figure:
     """Draw the RMS error of every estimator against the setting with most values, a panel a parameter.
 
     Dashes distinguish the other settings that vary.
 
     Args:
         rows: `Study.summary`.
+        columns: Most panels beside each other.
     """
-    names, panels, figure = _panels(rows)
+    names, panels, figure = _panels(rows, columns)
     for name, ax in zip(names, panels, strict=True):
         draw_errors(ax, rows, name)
     others = others_of(rows)
@@ -78,17 +79,18 @@ def draw_errors(ax: Axes, rows: Sequence[dict], name: str) -> None:
             dash = "--" if len(others) == 1 else dash
             label = None if o else "Cramér–Rao bound"
             ax.plot(at, bound, color=TEXT, lw=0.8 * width, ls=dash, label=label)
-    dress(ax, _AXES[against], f"{name}\nRMS error [{pretty_unit(of_name[0]['unit'])}]")
+    _named(ax, name, _AXES[against], f"RMS error [{pretty_unit(of_name[0]['unit'])}]")
     _logarithmic(ax, at)
 
 
-def plot_coverage(rows: Sequence[dict]) -> Figure:
+def plot_coverage(rows: Sequence[dict], columns: int = _COLUMNS) -> Figure:
     """Draw the part of the 95 % intervals that hold the truth, a panel a parameter.
 
     Args:
         rows: `Study.summary`.
+        columns: Most panels beside each other.
     """
-    names, panels, figure = _panels(rows)
+    names, panels, figure = _panels(rows, columns)
     for name, ax in zip(names, panels, strict=True):
         draw_coverage(ax, rows, name)
     _legend(figure, panels[0])
@@ -121,20 +123,21 @@ def draw_coverage(ax: Axes, rows: Sequence[dict], name: str) -> None:
         ax.vlines(at, 100 * ends[:, 0], 100 * ends[:, 1], color=style["color"], lw=1.2)
         ax.plot(at, 100 * held, ls="", label=None if o else estimator, **style)
     ax.axhline(95.0, color=TEXT, lw=0.9, ls="--", zorder=0, label="nominal")
-    dress(ax, _AXES[against], f"{name}\nin the 95 % interval [%]")
+    _named(ax, name, _AXES[against], "in the 95 % interval [%]")
     ax.set_ylim(0, 103)
     ax.set_xlim(-0.5, len(places) - 0.5)
     ax.set_xticks(range(len(places)), [f"{x:g}" for x in places])
 
 
-def plot_scatter(table: xr.Dataset) -> Figure:
+def plot_scatter(table: xr.Dataset, columns: int = _COLUMNS) -> Figure:
     """Draw the errors of all runs under one setting in units of their reported deviation.
 
     Args:
         table: `Study.table` under that setting.
+        columns: Most panels beside each other.
     """
     names = [str(n) for n in table.parameter.values]
-    figure, panels = _grid(len(names))
+    figure, panels = _grid(len(names), columns)
     for name, ax in zip(names, panels, strict=True):
         draw_scatter(ax, table, name)
     _legend(figure, panels[0])
@@ -160,17 +163,18 @@ def draw_scatter(ax: Axes, table: xr.Dataset, name: str) -> None:
             style = {"color": _look(i)["color"], "lw": 1.4, "histtype": "step", "density": True}
             ax.hist(np.clip(z, -_REACH, _REACH), ends.tolist(), label=str(estimator), **style)
     ax.plot(reach, scipy.stats.norm.pdf(reach), color=TEXT, lw=0.9, ls="--", label="as reported")
-    dress(ax, "error / its reported σ [-]", f"{name}\ndensity [-]")
+    _named(ax, name, "error / its reported σ [-]", "density [-]")
 
 
-def plot_ecdf(table: xr.Dataset) -> Figure:
+def plot_ecdf(table: xr.Dataset, columns: int = _COLUMNS) -> Figure:
     """Draw the ECDF of the truth's place in the reported distribution, a panel a parameter; see `draw_ecdf`.
 
     Args:
         table: `Study.table` under one setting.
+        columns: Most panels beside each other.
     """
     names = [str(n) for n in table.parameter.values]
-    figure, panels = _grid(len(names))
+    figure, panels = _grid(len(names), columns)
     for name, ax in zip(names, panels, strict=True):
         draw_ecdf(ax, table, name)
     _legend(figure, panels[0])
@@ -200,7 +204,7 @@ def draw_ecdf(ax: Axes, table: xr.Dataset, name: str) -> None:
         for k, edge in enumerate((low, high)):
             ax.plot(points, edge, color=TEXT, lw=0.9, ls="--", label="95 % band" if k == 0 else None)
     ax.axhline(0.0, color=TEXT, lw=0.5)
-    dress(ax, "place of the truth [-]", f"{name}\nECDF minus diagonal [-]")
+    _named(ax, name, "place of the truth [-]", "ECDF minus diagonal [-]")
     ax.set_xlim(0, 1)
 
 
@@ -209,14 +213,20 @@ def others_of(rows: Sequence[dict]) -> list[str]:
     return list(dict.fromkeys(words_of(r, without=widest(rows)) for r in rows))
 
 
-def _panels(rows: Sequence[dict]) -> tuple[list[str], list[Axes], Figure]:
+def _named(ax: Axes, name: str, xlabel: str, ylabel: str) -> None:
+    """Label an axes, with the parameter above it: beside it a long name would run into the next panel."""
+    dress(ax, xlabel, ylabel)
+    ax.set_title(name, loc="left", fontsize=FONT, color=TEXT, fontweight="bold")
+
+
+def _panels(rows: Sequence[dict], columns: int) -> tuple[list[str], list[Axes], Figure]:
     names = list(dict.fromkeys(r["parameter"] for r in rows))
-    figure, panels = _grid(len(names))
+    figure, panels = _grid(len(names), columns)
     return names, panels, figure
 
 
-def _grid(count: int) -> tuple[Figure, list[Axes]]:
-    columns = min(count, _COLUMNS)
+def _grid(count: int, columns: int) -> tuple[Figure, list[Axes]]:
+    columns = min(count, columns)
     lines = -(-count // columns)
     figure = Figure(figsize=(3.8 * columns, 2.9 * lines + 0.5), layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False).ravel()

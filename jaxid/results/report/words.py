@@ -24,6 +24,8 @@ from jaxid.results.report.numbers import (
 )
 
 _MOST_INTERVALS = 12
+# Half the width of a 95 % interval, in standard deviations.
+_INTERVAL = 1.96
 # Ratio of a gap to the measured signal beyond which its number says nothing.
 _MOST_RELATIVE = 10.0
 # Name of the gap in position.
@@ -93,7 +95,7 @@ def answer(data: ReportData) -> str:
     lines = [opening, first] if opening and (data.verdict == "found" or not data.findings) else [first]
 
     # One line for each quantity, of two joints at most one each: the table below has the other logs.
-    rows = [r for r in _gap_rows(data) if is_number(r.after)]
+    rows = [r for r in gap_rows(data) if is_number(r.after)]
     rows = [r for r in rows if not (data.drifted and r.quantity.startswith(SIMULATED))]
     groups: dict[str, list[GapRow]] = {}
     for row in (r for r in rows if r.log == rows[0].log):
@@ -121,7 +123,7 @@ def place_words(entry: Mapping) -> str:
 
 def gap_table(data: ReportData) -> dict:
     """Lay out the gap as headings and lines, without the columns that hold nothing."""
-    rows = _gap_rows(data)
+    rows = gap_rows(data)
     after = "gap" if all(row.before is None for row in rows) else "after"
     heads = ["disagreement (RMS)", "log", "before", after, "noise floor"]
     heads += [f"{after} ÷ floor", "relative to the measured"]
@@ -131,6 +133,7 @@ def gap_table(data: ReportData) -> dict:
         "heads": [heads[i] for i in kept],
         "lines": [[cells[i] for i in kept] for cells in lines],
         "forces": any(row.quantity.startswith("force") for row in rows),
+        "positions": any(row.quantity.startswith(SIMULATED) for row in rows),
         "band": short(data.gap["band_hz"]) if is_number(data.gap.get("band_hz")) else None,
     }
 
@@ -284,7 +287,15 @@ def _gap_words(row: GapRow) -> str:
     _, log, before, after, *_ = _gap_cells(row)
     fall = _change(before, after, row.before, row.after) if row.before is not None else f"is {after}"
     floor = f", at a noise floor of {_gap_cells(row)[4]}" if is_number(row.floor) else ""
-    return f"The {row.quantity} residual on the {log} log {fall} (RMS){floor}"
+    quantity, _, joint = row.quantity.partition(", ")
+    of_joint = f" of {joint}" if joint else ""
+    return f"The {quantity} residual{of_joint} on the {_log_words(log)} {fall} (RMS){floor}"
+
+
+def _log_words(log: str) -> str:
+    """Return a log in a sentence; one of several has a name behind its kind."""
+    kind, _, name = log.partition(": ")
+    return f"{kind} log {name}".strip()
 
 
 def _change(before: str, after: str, old: float | None, new: float | None) -> str:
@@ -312,10 +323,12 @@ def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
     ]
     fall = _change(before, after, *sizes) if before else f"is {after}"
     over = f", at noise floors of {floor}" if floor else ""
-    return f"The {quantity} residual of the {len(rows)} joints on the {rows[0].log} log {fall} (RMS){over}"
+    log = _log_words(rows[0].log)
+    return f"The {quantity} residual of the {len(rows)} joints on the {log} {fall} (RMS){over}"
 
 
-def _gap_rows(data: ReportData) -> list[GapRow]:
+def gap_rows(data: ReportData) -> list[GapRow]:
+    """Return the gaps in force and in simulated position that are known, by log and joint."""
     gap = data.gap
     motion = gap.get("simulation") or {}
     force = {"quantity": "force", "unit": gap.get("unit"), "floor": gap.get("noise_floor")}
@@ -324,10 +337,10 @@ def _gap_rows(data: ReportData) -> list[GapRow]:
         log = gap.get("on") or "fit"
         rows = _by_joint(log=log, before=gap.get("before"), after=gap.get("after"), **force)
         rows += _other_log(data, log, force)
-        if motion:
-            both = {"before": motion.get("before"), "after": motion.get("after")}
-            rows += _by_joint(log=log, **both, **position)
-        return rows
+        both = {"before": motion.get("before"), "after": motion.get("after")}
+        rows += _by_joint(log=log, **both, **position)
+        # A table of steady speeds has no position to simulate.
+        return [r for r in rows if is_number(r.before) or is_number(r.after)]
     return _fitted_rows(gap, force) + _fitted_rows(motion, position)
 
 
@@ -408,6 +421,16 @@ def _misspecified(row: ParameterRow, scale: float) -> str | None:
     return with_std(row.value / scale, row.std_misspecified / scale)[1]
 
 
+def _interval(row: ParameterRow, scale: float) -> str:
+    """Write the 95 % interval; of an incomplete model that of the values that fit best."""
+    std = row.std_misspecified if is_number(row.std_misspecified) else row.std
+    if not is_number(row.value) or not is_number(std) or std <= 0:
+        return ABSENT
+    # Two digits of the deviation: its ends are no better known.
+    ends = (with_std((row.value + side * _INTERVAL * std) / scale, std / scale)[0] for side in (-1, 1))
+    return " to ".join(ends)
+
+
 def _relative(part: float | None, whole: float | None, most: float = 1.0) -> str:
     """Write a part as a percentage; beyond `most` the number says nothing."""
     if is_number(part) and is_number(whole) and abs(part) > most * abs(whole):
@@ -423,6 +446,7 @@ def _parameter_line(row: ParameterRow) -> dict:
         "name": row.name,
         "value": value,
         "std": std,
+        "interval": _interval(row, scale) if row.identifiable else ABSENT,
         "relative": _relative(row.std, row.value) if row.identifiable else ABSENT,
         "misspecified": _misspecified(row, scale),
         "unit": unit,
