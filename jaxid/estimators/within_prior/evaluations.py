@@ -16,7 +16,7 @@ from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Progress, descend
 from jaxid.estimators.common.minimise import minimise_on_scale
 from jaxid.estimators.common.minimisers import Minimiser
-from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.estimators.within_prior.problem import Problem, WeightedResidual
 from jaxid.logs.log import Log
 from jaxid.machine import Machine

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import choose_numerics, kept_delay, notes_of
+from jaxid.estimators.simulated_output import choose_numerics, kept_delay, notes_of
 from jaxid.estimators.within_prior.evaluations import BLOCK, DRAWS, linearise, precompile_residuals_at
 from jaxid.estimators.within_prior.multistart import (
     fit_from_many_starts,

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum
 from jaxid.estimators.common.minimisers import Minimiser
-from jaxid.estimators.output_error import measured_output, output_residual, turning_steps
+from jaxid.estimators.simulated_output import measured_output, output_residual, turning_steps
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
