@@ -23,6 +23,7 @@ from jaxid.numerics.lanes import Steps
 if TYPE_CHECKING:
     from jaxid.case.case import Case
     from jaxid.estimators.common.minimisers import Minimiser
+    from jaxid.estimators.several.parts import Part
     from jaxid.session import Session
     from jaxid.simulation.replay import Numerics
 
@@ -166,7 +167,8 @@ def _within_prior(
 
     settings, log = session.case.need_prior(), session.fit.log
     solver = solver or settings.solver
-    need_loop(session.machine, log, asked, "or take another method")
+    for run in session.fits:
+        need_loop(session.machine, run.log, asked, "or take another method")
     if solver is not None and numerics is None:
         numerics = choose_numerics(session.machine, log, solver=solver)
     others = yield from _beside_the_guesses(session)
@@ -174,7 +176,7 @@ def _within_prior(
     return (
         yield from within_prior_steps(
             session.machine,
-            log,
+            _parts(session) if session.more else log,
             prior=settings.prior,
             on=on or settings.on,
             starts=settings.starts,
@@ -271,25 +273,33 @@ def _recursive(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.recursive.memory import read_memory
 
     case, run = session.case, session.fit
-    run.log.need_every_encoder("recursive")
+    for each in session.fits:
+        each.log.need_every_encoder("recursive")
     saved = None
     if case.recursive.restart is not None:
         saved = read_memory(case.folder / case.recursive.restart, session.machine.parameters.names)
-    return recursive_steps(session.machine, run.data, case.recursive, saved)
+    logs = _parts(session) if session.more else run.data
+    return recursive_steps(session.machine, logs, case.recursive, saved)
 
 
 def _instrumental_variable(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
     from jaxid.estimators.instrumental_variable import instrumental_variable_steps
 
-    run = session.fit
-    return instrumental_variable_steps(session.machine, run.log, run.data, numerics=numerics)
+    return instrumental_variable_steps(session.machine, _parts(session), numerics=numerics)
 
 
 def _didim(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
     from jaxid.estimators.didim import didim_steps
 
+    return didim_steps(session.machine, _parts(session), numerics=numerics)
+
+
+def _parts(session: Session) -> list[Part]:
+    """Return the fitted logs of a session; of one alone the machine is that of the session."""
+    from jaxid.estimators.several.parts import Part, parts_of
+
     run = session.fit
-    return didim_steps(session.machine, run.log, run.data, numerics=numerics)
+    return parts_of(session) if session.more else [Part.alone(session.machine, run.log, run.data)]
 
 
 def _power(session: Session) -> Steps[Estimate]:

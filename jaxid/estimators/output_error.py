@@ -22,6 +22,7 @@ from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimi
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_profile import profile_steps
+from jaxid.estimators.round_the_loop import shift_steps
 from jaxid.estimators.several.descent import Descent, Model, descent_steps
 from jaxid.estimators.several.parts import Part, Scale, by_log
 from jaxid.estimators.several.sums import shares, stacked, summed
@@ -44,7 +45,7 @@ from jaxid.model.unknowns import REFERENCE
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
-from jaxid.numerics.precision import Rows, assess_together, full_hessian, hessian_notes
+from jaxid.numerics.precision import Precision, Rows, assess_together, full_hessian, hessian_notes
 from jaxid.simulation.kalman import rounded_readings
 from jaxid.simulation.replay import (
     Numerics,
@@ -560,15 +561,17 @@ def _estimate(fit: _Fit, end: _End, hessian: bool, profile: Sequence[str]) -> St
         found = (values, end.cost, count, fit.bounds, active)
         details["profiles"], more = yield from profile_steps(fit.alone_at, found, machine, precision, profile)
         remarks += more
+    theta = end.theta
     if len(moving) > 1:
-        remarks += disagreement(moving, int(active.sum()))
+        theta, precision, more = yield from _without_noise(fit, end, moving, precision)
+        remarks += [*more, *disagreement(moving, int(active.sum()))]
         details |= by_log([o.part for o in fit.outputs], shares(end.logs))
     first = fit.outputs[0]
     notes = notes_of(first.part.machine, first.numerics, first.part.log, fit.on, fit.minimiser)
     return Estimate(
         method="output_error",
-        machine=machine.with_estimate(end.theta),
-        theta=end.theta,
+        machine=machine.with_estimate(theta),
+        theta=theta,
         precision=precision,
         converged=end.converged,
         message="converged" if end.converged else end.failure,
@@ -579,6 +582,39 @@ def _estimate(fit: _Fit, end: _End, hessian: bool, profile: Sequence[str]) -> St
         details=details | kept_delay(first.part.machine, first.numerics),
         std_misspecified=std_under_misspecification(*stacked(moving))[:p],
     )
+
+
+def _without_noise(
+    fit: _Fit, end: _End, moving: Sequence[Rows], precision: Precision
+) -> Steps[tuple[np.ndarray, Precision, list[str]]]:
+    """Remove the bias by noise that goes round the loop, and return estimates, precision and notes.
+
+    It is a small part of the deviations of a log alone. Beside another log, in which something is known to
+    differ, it is several of them in the directions that the difference separates.
+
+    Args:
+        fit, end: The fit and its end.
+        moving: Residual of each log, with the columns of the unknowns that move.
+        precision: Precision of the unknowns.
+    """
+    noise = [position_noise(o.part.machine, o.part.log) for o in fit.outputs]
+    looped = all(o.looped for o in fit.outputs) and not any(o.part.log.integrated for o in fit.outputs)
+    if not looped or not end.converged or not any(np.any(std > 0) for std in noise):
+        return end.theta, precision, []
+    arguments = [o.arguments(end.theta, end.starts[p]) for o, p in zip(fit.outputs, fit.places, strict=True)]
+    shift = yield from shift_steps(list(zip(arguments, noise, moving, strict=True)), fit.on)
+    p, seen = fit.unknowns, precision.identifiable
+    if not np.all(np.isfinite(shift.step)) or not np.any(seen):
+        return end.theta, precision, []
+    step = np.where(seen, shift.step[:p], 0.0)
+    theta = np.clip(end.theta + step, *fit.machine.parameters.bounds)
+    most = float(np.max(np.abs(step[seen]) / precision.std[seen]))
+    note = (
+        "the noise of the readings goes round the loop: its effect on the estimates, at most "
+        f"{most:.2g} standard deviations, was simulated and removed"
+    )
+    precision = replace(precision, covariance=precision.covariance + shift.covariance[:p, :p])
+    return theta, precision, [note]
 
 
 def _failure(minimum: Minimum, minimiser: str | Minimiser | None) -> str:

@@ -44,17 +44,24 @@ _SEGMENTS = 40
 
 
 def output_residual(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, on: str = "position"
+    replay: Replay,
+    places: tuple,
+    plant: Plant,
+    measured: Array,
+    weight: Array,
+    on: str = "position",
+    noise: Array | None = None,
 ) -> Callable[[Array], Array]:
     """Return measured minus simulated output as a function of the unknowns, (time, k), weighted.
 
-    The unknowns may end with changes of the position and velocity at the start, (2 n,).
+    The unknowns may end with changes of the position and velocity at the start, (2 n,). `noise` is that of
+    `jaxid.simulation.replay.Replay`.
     """
 
     def residual(theta: Array) -> Array:
         extra = theta[len(places) :]
         nudge = extra if extra.size else None
-        run = replay.following(places, theta)(scatter(places, plant, theta), nudge)
+        run = replay.following(places, theta)(scatter(places, plant, theta), nudge, noise)
         outputs: dict[str, tuple[Array, ...]] = {
             "position": (run.position,),
             "velocity": (run.velocity,),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxid.estimators.several.descent import Model
@@ -36,3 +38,35 @@ def stacked(logs: list[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def shares(logs: list[Rows]) -> list[dict[str, float | int]]:
     """Return for each log its samples, and the standard deviation of white noise that informs as much."""
     return [{"samples": int(log.counts.sum()), "noise": float(log.weight**-0.5)} for log in logs]
+
+
+def counted(
+    values: Sequence[np.ndarray], masks: Sequence[np.ndarray], weights: Sequence[float] | np.ndarray
+) -> np.ndarray:
+    """Return the entries of all logs that count, one behind the other, times the root of their weights.
+
+    Args:
+        values: Residuals of each log, (time, n), or their Jacobians, (time, n, p).
+        masks: Masks of the samples that count, (time, n) each.
+        weights: Weight of each log.
+    """
+    roots = np.sqrt(np.asarray(weights))
+    return np.concatenate([r * x[mask] for r, x, mask in zip(roots, values, masks, strict=True)])
+
+
+def projected(
+    values: Sequence[np.ndarray], bases: Sequence[np.ndarray], masks: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return the Jacobian of each log projected on a span of its own, zero where nothing counts.
+
+    Args:
+        values: Jacobian of each log, (time, n, p).
+        bases: Orthonormal basis of the span over the samples that count, (rows, r) each.
+        masks: Masks of the samples that count, (time, n) each.
+    """
+    out = []
+    for x, basis, mask in zip(values, bases, masks, strict=True):
+        seen = np.zeros_like(x)
+        seen[mask] = basis @ (basis.T @ x[mask])
+        out.append(seen)
+    return out
