@@ -128,7 +128,7 @@ def joints(kind: str, count: int, samples: int, repeats: int) -> dict:
     import jax.numpy as jnp
 
     import jaxid
-    from jaxid.estimators.output_error import choose_numerics, output_residual
+    from jaxid.estimators.simulated_output import choose_numerics, output_residual
     from jaxid.session import open_session
     from jaxid.simulation.replay import make_replay
 

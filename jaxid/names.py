@@ -40,7 +40,17 @@ WHEN = {
     "minimal_model_printed": "`minimal_model` with the coefficients as published",
 }
 # Methods that fit several logs together.
-SEVERAL_LOGS = ("output_error", "prediction_error", "inverse_dynamics", "algebraic", "power")
+SEVERAL_LOGS = (
+    "output_error",
+    "prediction_error",
+    "inverse_dynamics",
+    "algebraic",
+    "power",
+    "instrumental_variable",
+    "didim",
+    "recursive",
+    "within_prior",
+)
 # Further entries of [study] estimators: the search, and the estimate of an adaptive controller.
 DISCOVER, IN_LOOP = "discover", "in_loop"
 # Methods that maximise a likelihood, so that it has a Hessian and profiles.

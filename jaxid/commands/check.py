@@ -221,10 +221,10 @@ def _precision_together(session: Session) -> Precision:
     """Return the precision that several logs allow together, each by the noise of its sensors."""
     guess, rng, logs = session.machine.parameters.guess, np.random.default_rng(0), []
     for part in parts_of(session):
-        data, machine = part.run.data, part.machine
+        data, machine = part.data, part.machine
         arrays, plant = ForceData.of(data, data.fitted), sharpened(machine.plant, data)
         jacobian = _jacobian(plant, machine.parameters.places, arrays, guess[part.index])
-        floor = noise_floor(machine, part.run.log, data)
+        floor = noise_floor(machine, part.log, data)
         wide = part.widened(np.where(data.fitted[..., None], np.asarray(jacobian), 0.0), guess.size)
         noise = rng.standard_normal(data.fitted.shape) * floor
         logs.append(Rows(wide, noise, data.fitted, float(force_size(plant, arrays))))

@@ -28,11 +28,11 @@ from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.estimators.output_error import choose_numerics, output_error
-from jaxid.estimators.prediction_error import prediction_error
+from jaxid.estimators.output_error import output_error, output_error_steps
+from jaxid.estimators.prediction_error import prediction_error, prediction_error_steps
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
-from jaxid.estimators.several.innovations import prediction_error_steps as prediction_error_of_several
-from jaxid.estimators.several.output import output_error_steps as output_error_of_several
+from jaxid.estimators.several.parts import parts_of
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.gap import Gap, force_gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -238,7 +238,7 @@ def start_search(
 def _of_force(session: Session) -> Estimate:
     """Return the estimate by inverse dynamics of one log or of several."""
     if session.more:
-        return run_alone(inverse_dynamics_of_several(session))
+        return run_alone(inverse_dynamics_of_several(session.machine, parts_of(session)))
     return inverse_dynamics(session.machine, session.fit.data)
 
 
@@ -399,11 +399,11 @@ def _refit_together(session: Session, start: Estimate) -> Estimate:
     if method == "inverse_dynamics" or (method == "output_error" and session.machine.controller is None):
         return start
     fit = {
-        "prediction_error": lambda: prediction_error_of_several(session, start=start.theta),
-        "output_error": lambda: output_error_of_several(session, start=start.theta),
+        "prediction_error": prediction_error_steps,
+        "output_error": output_error_steps,
     }[method]
     try:
-        estimate = run_alone(fit())
+        estimate = run_alone(fit(session.machine, parts_of(session), start=start.theta))
     except TooStiffError as error:
         return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
     what = method.replace("_", " ")

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from jaxid.case.case import CaseLike, load_case
 from jaxid.case.user_faults import named_faults
 from jaxid.errors import InputError
-from jaxid.estimators.output_error import choose_numerics, position_jacobian
+from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
 from jaxid.files import check_folder, mark_folder, new_folder, write_json, write_whole
 from jaxid.logs.log import Log
 from jaxid.machine import Machine

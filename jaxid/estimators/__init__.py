@@ -23,6 +23,7 @@ from jaxid.numerics.lanes import Steps
 if TYPE_CHECKING:
     from jaxid.case.case import Case
     from jaxid.estimators.common.minimisers import Minimiser
+    from jaxid.estimators.several.parts import Part
     from jaxid.session import Session
     from jaxid.simulation.replay import Numerics
 
@@ -30,8 +31,9 @@ if TYPE_CHECKING:
 def _inverse_dynamics(session: Session) -> Steps[Estimate]:
     if session.more:
         from jaxid.estimators.several.force import inverse_dynamics_steps as together
+        from jaxid.estimators.several.parts import parts_of
 
-        return (yield from together(session))
+        return (yield from together(session.machine, parts_of(session)))
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 
     if session.fit.log.steady is not None:
@@ -72,7 +74,8 @@ def _output_error(
         )
         return replace(result, method="output_error")
 
-    from jaxid.estimators.output_error import choose_numerics, output_error_steps
+    from jaxid.estimators.output_error import output_error_steps
+    from jaxid.estimators.several.parts import parts_of
 
     solver, minimiser = solver or stated.solver, minimiser or stated.minimiser
     demands = case.identification
@@ -83,26 +86,15 @@ def _output_error(
     if session.machine.unforced(log):
         return (yield from _unforced(session, on, minimiser, numerics, precision))
     start = yield from _start(session)
-    if session.more:
-        from jaxid.estimators.several.output import output_error_steps as together
-
-        need_no_profile(session, precision["profile"])
-        kinds = {"start": start, "solver": solver, "minimiser": minimiser, "on": on}
-        result = yield from together(session, **kinds, hessian=precision["hessian"])
-        return replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
-    if solver is not None and numerics is None:
-        machine = session.machine if start is None else session.machine.with_estimate(start)
-        numerics = choose_numerics(machine, log, solver=solver)
-    result = yield from output_error_steps(
-        session.machine, log, start=start, numerics=numerics, on=on, minimiser=minimiser, **precision
-    )
+    options = {"numerics": numerics, "solver": solver, "on": on, "minimiser": minimiser, **precision}
+    need_no_profile(session, precision["profile"])
+    logs = parts_of(session) if session.more else log
+    result = yield from output_error_steps(session.machine, logs, start=start, **options)
     result = replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
-    if start is None or all(log.measured):
+    if start is None or session.more or all(log.measured):
         return result
     # Without an encoder on every joint inverse dynamics may end far off, especially with coarse readings.
-    other = yield from output_error_steps(
-        session.machine, log, numerics=numerics, on=on, minimiser=minimiser, **precision
-    )
+    other = yield from output_error_steps(session.machine, log, **options)
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
 
@@ -114,7 +106,8 @@ def _unforced(
     precision: dict[str, Any],
 ) -> Steps[Estimate]:
     """Fit the position of a loop whose force was not logged, from several starts."""
-    from jaxid.estimators.output_error import choose_numerics, output_error_steps
+    from jaxid.estimators.output_error import output_error_steps
+    from jaxid.estimators.simulated_output import choose_numerics
     from jaxid.estimators.unforced import base_of, coarse_starts, scale_group, with_free_scale, without
 
     machine, log = session.machine, session.fit.log
@@ -169,12 +162,13 @@ def _within_prior(
     asked: str = "the method within_prior",
 ) -> Steps[Estimate]:
     """Fit within the prior of the guesses; `asked` names the request in messages."""
-    from jaxid.estimators.output_error import choose_numerics, need_loop
+    from jaxid.estimators.simulated_output import choose_numerics, need_loop
     from jaxid.estimators.within_prior.fit import within_prior_steps
 
     settings, log = session.case.need_prior(), session.fit.log
     solver = solver or settings.solver
-    need_loop(session.machine, log, asked, "or take another method")
+    for run in session.fits:
+        need_loop(session.machine, run.log, asked, "or take another method")
     if solver is not None and numerics is None:
         numerics = choose_numerics(session.machine, log, solver=solver)
     others = yield from _beside_the_guesses(session)
@@ -182,7 +176,7 @@ def _within_prior(
     return (
         yield from within_prior_steps(
             session.machine,
-            log,
+            _parts(session) if session.more else log,
             prior=settings.prior,
             on=on or settings.on,
             starts=settings.starts,
@@ -206,16 +200,20 @@ def _prediction_error(
 ) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.prediction_error import prediction_error_steps
+    from jaxid.estimators.several.parts import parts_of
     from jaxid.simulation.sensor_noise import force_noise
 
     machine, run, demands = session.machine, session.fit, session.case.identification
+    precision = {
+        "hessian": demands.hessian if hessian is None else hessian,
+        "profile": demands.profile if profile is None else profile,
+    }
+    need_no_profile(session, precision["profile"])
+    need_no_hessian(session, precision["hessian"])
     if session.more:
-        from jaxid.estimators.several.innovations import prediction_error_steps as together
-
-        need_no_profile(session, demands.profile if profile is None else profile)
-        need_no_hessian(session, demands.hessian if hessian is None else hessian)
         first = yield from _inverse_dynamics(session)
-        return (yield from together(session, start=first.theta if first.all_identified else None))
+        start = first.theta if first.all_identified else None
+        return (yield from prediction_error_steps(machine, parts_of(session), start=start, numerics=numerics))
     first = yield from inverse_dynamics_steps(machine, run.data)
     return (
         yield from prediction_error_steps(
@@ -225,8 +223,7 @@ def _prediction_error(
             numerics=numerics,
             rest_velocity=np.asarray(run.data.recipe.rest_velocity),
             command_noise=force_noise(machine, run.data),
-            hessian=demands.hessian if hessian is None else hessian,
-            profile=demands.profile if profile is None else profile,
+            **precision,
         )
     )
 
@@ -276,32 +273,41 @@ def _recursive(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.recursive.memory import read_memory
 
     case, run = session.case, session.fit
-    run.log.need_every_encoder("recursive")
+    for each in session.fits:
+        each.log.need_every_encoder("recursive")
     saved = None
     if case.recursive.restart is not None:
         saved = read_memory(case.folder / case.recursive.restart, session.machine.parameters.names)
-    return recursive_steps(session.machine, run.data, case.recursive, saved)
+    logs = _parts(session) if session.more else run.data
+    return recursive_steps(session.machine, logs, case.recursive, saved)
 
 
 def _instrumental_variable(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
     from jaxid.estimators.instrumental_variable import instrumental_variable_steps
 
-    run = session.fit
-    return instrumental_variable_steps(session.machine, run.log, run.data, numerics=numerics)
+    return instrumental_variable_steps(session.machine, _parts(session), numerics=numerics)
 
 
 def _didim(session: Session, *, numerics: Numerics | None = None) -> Steps[Estimate]:
     from jaxid.estimators.didim import didim_steps
 
+    return didim_steps(session.machine, _parts(session), numerics=numerics)
+
+
+def _parts(session: Session) -> list[Part]:
+    """Return the fitted logs of a session; of one alone the machine is that of the session."""
+    from jaxid.estimators.several.parts import Part, parts_of
+
     run = session.fit
-    return didim_steps(session.machine, run.log, run.data, numerics=numerics)
+    return parts_of(session) if session.more else [Part.alone(session.machine, run.log, run.data)]
 
 
 def _power(session: Session) -> Steps[Estimate]:
     if session.more:
         from jaxid.estimators.several.force import power_steps as together
+        from jaxid.estimators.several.parts import parts_of
 
-        return together(session)
+        return together(session.machine, parts_of(session))
     from jaxid.estimators.power import power_steps
 
     session.fit.log.need_every_encoder("power")
@@ -311,10 +317,11 @@ def _power(session: Session) -> Steps[Estimate]:
 def _algebraic(session: Session) -> Steps[Estimate]:
     if session.more:
         from jaxid.estimators.several.force import algebraic_steps as together
+        from jaxid.estimators.several.parts import parts_of
 
         if session.case.algebraic.window is not None:
             session.need_one_log("[algebraic] window")
-        return together(session)
+        return together(session.machine, parts_of(session))
     from jaxid.estimators.algebraic.one_window import least_squares_steps
     from jaxid.estimators.algebraic.windows import algebraic_steps
 
@@ -495,7 +502,7 @@ def need_no_profile(session: Session, asked: Sequence[str]) -> None:
     Raises:
         InputError: If any is asked for.
     """
-    if asked:
+    if asked and session.more:
         hint = "leave profile out, or name one log"
         raise InputError("profile goes with one log", where=session.case.where, hint=hint)
 
@@ -506,7 +513,7 @@ def need_no_hessian(session: Session, asked: bool) -> None:
     Raises:
         InputError: If it is asked for.
     """
-    if asked:
+    if asked and session.more:
         hint = "take output_error, or leave hessian out"
         what = "prediction_error gives no full Hessian for several logs"
         raise InputError(what, where=session.case.where, hint=hint)

@@ -18,7 +18,7 @@ from jaxid.errors import InputError, suggest
 from jaxid.estimators.common.levenberg_marquardt import Transform, eliminated
 from jaxid.estimators.common.minimise import minimise
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
-from jaxid.estimators.output_error import output_residual
+from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.by_name import Place, parameters_by_name
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import leaf, scatter

@@ -8,21 +8,28 @@ estimates are consistent.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 
 from jaxid.errors import InputError
 from jaxid.estimators.common.endogeneity import endogeneity
 from jaxid.estimators.common.rerun import Rerun, best_step, lost, settled, span
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import force_precision, inverse_dynamics_steps
+from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps as of_one
+from jaxid.estimators.several.force import inverse_dynamics_steps as of_several
+from jaxid.estimators.several.parts import Part, by_log
+from jaxid.estimators.several.sums import counted, projected, shares, stacked
+from jaxid.estimators.several.weights import disagreement, start_weights, weighted_steps
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.precision import Rows, assess_together
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics
 
@@ -55,46 +62,108 @@ def instrumental_variable(
         Janot, Vandanjon & Gautier (2014), IEEE Trans. Control Syst. Technol. 22: IDIM-IV. Nonlinear
         unknowns are linearised again at every step.
     """
-    return run_alone(instrumental_variable_steps(machine, log, data, numerics=numerics))
+    part = Part.alone(machine, log, data)
+    return run_alone(instrumental_variable_steps(machine, [part], numerics=numerics))
+
+
+@dataclass(frozen=True)
+class _Balance:
+    """Balance of forces of one log, with the simulation that gives its instruments.
+
+    Args:
+        part: The log with its machine.
+        rerun: The simulation.
+        plant: The plant with the friction of the log's speeds.
+        arrays: The prepared log.
+        size: 2-norm of the measured force.
+    """
+
+    part: Part
+    rerun: Rerun
+    plant: Plant
+    arrays: ForceData
+    size: float
+
+    @classmethod
+    def steps(cls, part: Part, theta: np.ndarray, numerics: Numerics | None) -> Steps[_Balance]:
+        """Prepare a log for values of the unknowns of all logs, (p,)."""
+        if part.log.reference is None:
+            part = replace(part, machine=replace(part.machine, controller=None))
+        rerun = Rerun.of(part.at(theta), part.log, part.data, numerics)
+        plant, arrays = sharpened(part.machine.plant, part.data), ForceData.of(part.data, part.data.fitted)
+        size = yield SolveRequest(force_size, (plant, arrays))
+        return cls(part, rerun, plant, arrays, float(size))
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Mask of the samples that count, (kept, n)."""
+        return self.part.data.fitted
+
+    def along(self, data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
+        """Compute the residual force along a motion, and its Jacobian by the unknowns of all logs."""
+        own, places = theta[self.part.index], self.part.machine.parameters.places
+        e, columns = yield SolveRequest(force_and_columns, (self.plant, places, data, own))
+        return np.asarray(e), self.part.widened(np.asarray(columns), theta.size)
 
 
 def instrumental_variable_steps(
-    machine: Machine, log: Log, data: Prepared, *, numerics: Numerics | None = None
+    machine: Machine, parts: Sequence[Part], *, numerics: Numerics | None = None
 ) -> Steps[Estimate]:
-    """Run `instrumental_variable` as a generator of solve requests."""
-    first = yield from inverse_dynamics_steps(machine, data)
+    """Run `instrumental_variable` on one log or several as a generator of solve requests.
+
+    The equations of several logs are added, each over the variance of its log's noise.
+
+    Args:
+        machine: Machine of all logs, with their unknowns.
+        parts: The logs.
+        numerics: See `instrumental_variable`.
+    """
+    several = len(parts) > 1
+    first = yield from of_several(machine, parts) if several else of_one(machine, parts[0].data)
     # Unidentifiable combinations of physically consistent links are those of a body, and have no effect.
     within = bool(machine.parameters.bodies) and first.converged
     theta = first.theta if first.all_identified or within else machine.parameters.guess
-    if log.reference is None:
+    if parts[0].log.reference is None:
         machine = replace(machine, controller=None)
-    rerun = Rerun.of(machine.with_estimate(theta), log, data, numerics)
-    plant, rows, places = sharpened(machine.plant, data), data.fitted, machine.parameters.places
-    arrays = ForceData.of(data, rows)
-    size = yield SolveRequest(force_size, (plant, arrays))
-    found = yield from _search(rerun, plant, arrays, rows, machine.parameters, theta, float(size))
-    theta, e, columns, basis = found.theta, found.e, found.columns, found.basis
-    # With the columns projected on the instruments, the formulas of least squares give the IV covariance.
-    seen = np.zeros((*rows.shape, len(places)))
-    seen[rows] = columns[rows] if basis is None else basis @ (basis.T @ columns[rows])
-    precision = force_precision(machine, size, theta, e, seen, rows)
-    how = "in its loop" if rerun.looped else "in open loop from the measured force"
-    # In open loop the instruments hold the noise of the force, which is in the residual too.
-    valid = rerun.looped and basis is not None and found.message == "converged"
-    test = endogeneity(e, columns, basis, rows) if valid and basis is not None else None
+    logs = []
+    for part in parts:
+        logs.append((yield from _Balance.steps(part, theta, numerics)))
+    weights = np.ones(1)
+    if several:
+        weights = start_weights([log.size for log in logs], [int(log.rows.sum()) for log in logs])
+
+    fit = lambda theta, weights: _search(logs, machine.parameters, theta, weights)
+    sound = lambda found: found.seen if found.message == "converged" else None
+    found, _ = yield from weighted_steps(fit, sound, lambda found: found.theta, theta, weights)
+
+    guess, seen = machine.parameters.guess, found.seen
+    precision = assess_together(machine.parameters.names, seen, np.where(guess != 0, guess, 1.0))
+    looped, converged = all(log.rerun.looped for log in logs), found.message == "converged"
+    how = "in its loop" if looped else "in open loop from the measured force"
     notes = [f"instruments: the regressor along the motion simulated {how}"]
+    details = by_log(parts, shares(seen)) if several else {}
+    # In open loop the instruments hold the noise of the force, which is in the residual too.
+    if looped and found.bases is not None and converged:
+        columns = [replace(row, jacobian=x) for row, x in zip(seen, found.columns, strict=True)]
+        jacobian, e, counts = stacked(columns)
+        test = endogeneity(e, jacobian, np.asarray(scipy.linalg.block_diag(*found.bases)), counts)
+        if test is not None:
+            names = machine.parameters.names
+            notes, details = [*notes, test.text(names)], details | {"durbin_wu_hausman": test.json(names)}
+    if several:
+        notes += disagreement(seen, int(precision.identifiable.sum()))
     return Estimate(
         method="instrumental_variable",
-        machine=machine.with_estimate(theta),
-        theta=theta,
+        machine=machine.with_estimate(found.theta),
+        theta=found.theta,
         precision=precision,
-        converged=found.message == "converged",
+        converged=converged,
         message=found.message,
-        residual=np.where(rows, e, np.nan),
-        samples=int(rows.sum()),
+        residual=np.concatenate([np.where(row.counts, row.residual, np.nan) for row in seen]),
+        samples=sum(int(row.counts.sum()) for row in seen),
         steps=found.steps,
-        notes=(*notes, *([] if test is None else [test.text(machine.parameters.names)])),
-        details={} if test is None else {"durbin_wu_hausman": test.json(machine.parameters.names)},
+        notes=tuple(notes),
+        details=details,
     )
 
 
@@ -104,62 +173,102 @@ class _Found:
 
     Args:
         theta: Estimates of the unknowns, (p,).
-        e, columns: Residual and Jacobian at the estimates, (kept, n) and (kept, n, p).
-        basis: Orthonormal basis of the instruments' span, (rows, r); None if every simulation failed.
+        seen: Residual of each log, with its Jacobian projected on the instruments. The formulas of least
+            squares then give the covariance.
+        columns: Jacobian of each log, (kept, n, p).
+        bases: Orthonormal basis of the span of each log's instruments, (rows, r); None if a run failed.
         message: "converged", or the reason why the search stopped.
         steps: Number of steps taken.
     """
 
     theta: np.ndarray
-    e: np.ndarray
-    columns: np.ndarray
-    basis: np.ndarray | None
+    seen: list[Rows]
+    columns: list[np.ndarray]
+    bases: list[np.ndarray] | None
     message: str
     steps: int
 
+    @classmethod
+    def of(
+        cls,
+        logs: Sequence[_Balance],
+        weights: np.ndarray,
+        theta: np.ndarray,
+        balance: Sequence[tuple[np.ndarray, np.ndarray]],
+        bases: list[np.ndarray] | None,
+        message: str,
+        steps: int,
+    ) -> _Found:
+        """Return the result from residual and Jacobian of each log."""
+        masks, columns = [log.rows for log in logs], [columns for _, columns in balance]
+        inside = columns if bases is None else projected(columns, bases, masks)
+        seen = [
+            Rows(x, e, log.rows, log.size, float(weight))
+            for x, (e, _), log, weight in zip(inside, balance, logs, weights, strict=True)
+        ]
+        return cls(theta, seen, columns, bases, message, steps)
+
 
 def _search(
-    rerun: Rerun,
-    plant: Plant,
-    arrays: ForceData,
-    rows: np.ndarray,
-    unknown: Parameters,
-    theta: np.ndarray,
-    size: float,
+    logs: Sequence[_Balance], unknown: Parameters, theta: np.ndarray, weights: np.ndarray
 ) -> Steps[_Found]:
     """Alternate until convergence between instruments at the estimate and an estimate with them."""
-    places = unknown.places
+    masks, roots = [log.rows for log in logs], np.sqrt(weights)
+    size = float(np.sqrt(np.sum(weights * np.square([log.size for log in logs]))))
 
-    def along(data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
-        e, columns = yield SolveRequest(force_and_columns, (plant, places, data, theta))
-        return np.asarray(e), np.asarray(columns)
+    def along(theta: np.ndarray) -> Steps[list[tuple[np.ndarray, np.ndarray]]]:
+        out = []
+        for log in logs:
+            out.append((yield from log.along(log.arrays, theta)))
+        return out
 
-    e, columns = yield from along(arrays, theta)
-    basis = None
+    def by_instruments(bases: Sequence[np.ndarray], values: Sequence[np.ndarray]) -> np.ndarray:
+        each = zip(roots, bases, values, masks, strict=True)
+        return np.concatenate([root * (basis.T @ x[mask]) for root, basis, x, mask in each])
+
+    def ended(message: str, steps: int) -> _Found:
+        return _Found.of(logs, weights, theta, balance, bases, message, steps)
+
+    balance, bases = (yield from along(theta)), None
+    simulated: list[np.ndarray | None] = [None] * len(logs)
     for step in range(1, _MOST_STEPS + 1):
-        run = yield from rerun.steps(theta, own_command=True)
-        if not rerun.looped and (run is None or lost(run, rerun.log)) and step == 1:
-            raise InputError(
-                "the simulation from the measured force loses the log, and makes no instruments",
-                where=rerun.log.source,
-                hint="name the controller in [controller] and the reference's "
-                "column in [log], or use inverse_dynamics",
-            )
-        # If the simulation diverges, the instruments of the step before remain valid.
-        if run is not None:
-            _, simulated = yield from along(ForceData.of(run, rows), theta)
-            basis = span(simulated[rows])
-        if basis is None:
-            return _Found(theta, e, columns, None, "the simulation diverged from these starting values", step)
-        change = best_step(unknown, basis.T @ columns[rows], basis.T @ e[rows], theta)
-        was = float(np.linalg.norm(basis.T @ e[rows]))
-        done = settled(basis.T @ columns[rows] @ change, e[rows], size)
+        for k, log in enumerate(logs):
+            run = yield from log.rerun.steps(theta[log.part.index], own_command=True)
+            _need_found(log, run, step)
+            # If the simulation diverges, the instruments of the step before remain valid.
+            if run is not None:
+                _, columns = yield from log.along(ForceData.of(run, log.rows), theta)
+                simulated[k] = span(columns[log.rows])
+        bases = [basis for basis in simulated if basis is not None]
+        if len(bases) < len(logs):
+            bases = None
+            return ended("the simulation diverged from these starting values", step)
+        e, jacobian = ([each[k] for each in balance] for k in (0, 1))
+        left, slope = by_instruments(bases, e), by_instruments(bases, jacobian)
+        change = best_step(unknown, slope, left, theta)
+        was = float(np.linalg.norm(left))
+        done = settled(slope @ change, counted(e, masks, weights), size)
         for _ in range(_HALVINGS):
-            tried = yield from along(arrays, theta + change)
-            if np.linalg.norm(basis.T @ tried[0][rows]) <= was:
-                theta, (e, columns) = theta + change, tried
+            tried = yield from along(theta + change)
+            if np.linalg.norm(by_instruments(bases, [e for e, _ in tried])) <= was:
+                theta, balance = theta + change, tried
                 break
             change = 0.5 * change
         if done:
-            return _Found(theta, e, columns, basis, "converged", step)
-    return _Found(theta, e, columns, basis, f"no convergence within {_MOST_STEPS} steps", _MOST_STEPS)
+            return ended("converged", step)
+    return ended(f"no convergence within {_MOST_STEPS} steps", _MOST_STEPS)
+
+
+def _need_found(log: _Balance, run: Prepared | None, step: int) -> None:
+    """Refuse a simulation from the measured force that loses the log at once.
+
+    Raises:
+        InputError: If it does.
+    """
+    if not log.rerun.looped and step == 1 and (run is None or lost(run, log.part.log)):
+        raise InputError(
+            "the simulation from the measured force loses the log, and makes no instruments",
+            where=log.part.log.source,
+            hint="name the controller in [controller] and the reference's "
+            "column in [log], or use inverse_dynamics",
+        )

@@ -1,18 +1,17 @@
-"""Gradient-based fit of the simulated to the measured position.
+"""Gradient-based fit of the simulated to the measured position, of one log or of several.
 
 The simulation runs in closed loop if the controller is known, else in open loop over the whole log. If an
-error would grow without bound, it runs in segments that restart from the log.
+error would grow without bound, it runs in segments that restart from the log. Each log has its start and its
+noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import Array
@@ -20,113 +19,53 @@ from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
 from jaxid.estimators.common.minimise import failure_text, minimise
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
-from jaxid.estimators.common.profile import BETTER, OFFSETS, falls_below, need_names, profile_entry, profiled
+from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.output_profile import profile_steps
+from jaxid.estimators.round_the_loop import shift_steps
+from jaxid.estimators.several.descent import Descent, Model, descent_steps
+from jaxid.estimators.several.parts import Part, Scale, by_log
+from jaxid.estimators.several.sums import shares, stacked, summed
+from jaxid.estimators.several.weights import descended_steps, disagreement, start_weights
+from jaxid.estimators.simulated_output import (
+    choose_numerics,
+    forgets,
+    kept_delay,
+    measured_output,
+    need_loop,
+    need_output_force,
+    notes_of,
+    output_residual,
+)
 from jaxid.gap import SHORT
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
-from jaxid.model.unknowns import REFERENCE, scatter
+from jaxid.model.unknowns import REFERENCE
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
-from jaxid.numerics.precision import Precision, assess, full_hessian, hessian_notes
+from jaxid.numerics.precision import Precision, Rows, assess_together, full_hessian, hessian_notes
 from jaxid.simulation.kalman import rounded_readings
-from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
-    LONGEST_MEMORY,
     Numerics,
     Replay,
-    exact_numerics,
     from_rest,
     make_replay,
     start_shows,
     with_fitted_start,
 )
 from jaxid.simulation.sensor_noise import position_noise
-from jaxid.simulation.solvers import RELATIVE
 
-# An open-loop run whose RMS distance from the log exceeds this part of the log's standard deviation is cut
-# into segments.
-_LOST = 0.5
 # The start of an open-loop run is fitted with the unknowns only if the residual's RMS is within this
 # factor of the position noise. Otherwise the error of the model would bias the start, which the first
 # samples determine far better.
-NOISE_LIMITED = 3.0
-CLEARLY = 10.0
-# See `turning_steps`: factor of a step's error, its allowed part of the noise, and the most steps.
-_TURNING = 0.04
-_LITTLE = 0.1
-_MOST = 4
-# Least steps a sample of a free motion.
-_FREE = 4
-# Number of segments; each is long enough to show friction and short enough not to drift away.
-_SEGMENTS = 40
-
-
-def output_residual(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, on: str = "position"
-) -> Callable[[Array], Array]:
-    """Return measured minus simulated output as a function of the unknowns, (time, k), weighted.
-
-    The unknowns may end with changes of the position and velocity at the start, (2 n,).
-    """
-
-    def residual(theta: Array) -> Array:
-        extra = theta[len(places) :]
-        nudge = extra if extra.size else None
-        run = replay.following(places, theta)(scatter(places, plant, theta), nudge)
-        outputs: dict[str, tuple[Array, ...]] = {
-            "position": (run.position,),
-            "velocity": (run.velocity,),
-            "force": (replay.drive.gain * run.command,),
-        }
-        outputs["both"] = outputs["position"] + outputs["force"]
-        return weight * (measured - jnp.concatenate(outputs[on], axis=1))
-
-    return residual
-
-
-def need_loop(machine: Machine, log: Log, what: str, other: str) -> None:
-    """Refuse an open loop, whose force is the logged one, so that the fit would compare it with itself.
-
-    Args:
-        machine: The machine that is simulated.
-        log: The log, named in the message.
-        what: Request that needs the loop, for the message.
-        other: Alternative to naming the controller, for the hint.
-
-    Raises:
-        InputError: If the machine has no controller.
-    """
-    if machine.controller is None:
-        raise InputError(
-            f"{what} needs a loop, whose simulation gives a force",
-            where=log.source,
-            hint=f"name the controller in [controller] and the reference's column in [log], {other}",
-        )
-
-
-def _need_force(machine: Machine, log: Log, on: str) -> None:
-    """Refuse a fit of a force that was not logged.
-
-    Raises:
-        InputError: If the log has no force.
-    """
-    if machine.unforced(log):
-        raise InputError(
-            f"the log has no force, which a fit on {on} compares", where=log.source, hint="fit position"
-        )
-
-
-def measured_output(machine: Machine, log: Log, on: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a log's output, (time, k), and the mask of columns that count; see `output_residual`."""
-    force = log.force * machine.gain
-    outputs = {"position": (log.filled,), "force": (force,), "both": (log.filled, force)}
-    outputs["velocity"] = (log.readings,)
-    counts = {"position": log.measured, "velocity": log.measured, "force": (True,) * force.shape[1]}
-    counts["both"] = counts["position"] + counts["force"]
-    return np.concatenate(outputs[on], axis=1), np.array(counts[on])
+_NOISE_LIMITED = 3.0
+# A freed start of a loop is kept if it lowers the cost by this many times what chance does.
+_CLEARLY = 10.0
+_DIVERGED = "the simulation diverged from these starting values"
+# Part of the cost by which a fit of several logs has converged, and its most evaluations, as of one log.
+_TOLERANCE, _MOST = 1e-12, 60
 
 
 @kept_jit
@@ -148,6 +87,21 @@ def _fit(
 
 
 @kept_jit
+def _linearised(
+    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array, on: str
+) -> tuple[Array, Array]:
+    """Return the weighted residual of the output, (time, k), and its Jacobian, (time, k, unknowns)."""
+    residual = output_residual(replay, places, plant, measured, weight, on)
+
+    def both(theta: Array) -> tuple[Array, Array]:
+        e = residual(theta)
+        return e, e
+
+    jacobian, e = jax.jacfwd(both, has_aux=True)(theta)
+    return e, jacobian
+
+
+@kept_jit
 def _hessian(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array, on: str
 ) -> Array:
@@ -159,26 +113,6 @@ def _residual(
     replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array, on: str
 ) -> Array:
     return output_residual(replay, places, plant, measured, weight, on)(theta)
-
-
-def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndarray:
-    """Return the derivative of the simulated position by the unknowns at their guesses, (time, n, p).
-
-    Args:
-        machine: The machine to simulate.
-        log: Log whose input drives the machine.
-        numerics: Settings of the integration.
-    """
-    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
-    unknown = machine.parameters
-    measured = jnp.asarray(log.filled)
-    return -np.asarray(_jacobian(replay, unknown.places, machine.plant, measured, unknown.guess))
-
-
-@kept_jit
-def _jacobian(replay: Replay, places: tuple, plant: Plant, measured: Array, theta: Array) -> Array:
-    residual = output_residual(replay, places, plant, measured, jnp.ones(measured.shape))
-    return jax.jacfwd(residual)(theta)
 
 
 def output_error(
@@ -229,189 +163,315 @@ def output_error(
     )
 
 
+@dataclass(frozen=True)
+class _Output:
+    """Output of one log that is compared with its simulation.
+
+    Args:
+        part: The log with its machine at the start of the fit.
+        numerics: Settings of the integration.
+        replay: The simulation.
+        measured: Measured output, (time, k).
+        weight: Factor of each residual, zero where it does not count, (time, k).
+        stays: Whether the start is that of the log, or rest, and never an unknown.
+        width: Number of changes of the start that are unknowns or zero.
+        start: Whether they are unknowns.
+    """
+
+    part: Part
+    numerics: Numerics
+    replay: Replay
+    measured: np.ndarray
+    weight: np.ndarray
+    stays: bool
+    width: int
+    start: bool = False
+
+    @classmethod
+    def of(cls, part: Part, numerics: Numerics, on: str, alone: bool) -> _Output:
+        """Return the output of a log, alone or among others, whose simulation starts as the log does."""
+        replay = make_replay(part.machine, part.log, numerics)
+        replay = with_fitted_start(replay, part.machine.plant, part.log)
+        looped = replay.controller is not None
+        stays = bool(numerics.segment) or (looped and part.log.samples > SHORT)
+        # Among others every start has columns: the noise by which a log counts leaves out what they explain.
+        width = 0 if stays and alone else 2 * part.log.position.shape[1]
+        return cls(part, numerics, replay, *_measured(part, on), stays, width)
+
+    @property
+    def looped(self) -> bool:
+        """Whether the simulation runs in closed loop."""
+        return self.replay.controller is not None
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Mask of the outputs that count, (time, k)."""
+        return self.weight > 0
+
+    @property
+    def signal(self) -> float:
+        """2-norm of the measured output about its mean."""
+        return float(np.linalg.norm(self.weight * (self.measured - self.measured.mean(axis=0))))
+
+    def arguments(self, theta: np.ndarray, start: np.ndarray) -> tuple:
+        """Return the arguments of compiled code at values of all unknowns, and of the start."""
+        machine, own = self.part.machine, np.concatenate([theta[self.part.index], start])
+        return self.replay, machine.parameters.places, machine.plant, self.measured, self.weight, own
+
+    def forgets(self, theta: np.ndarray) -> bool:
+        """Check that a fitted delay is longer than the past commands that are kept."""
+        return forgets(self.part.machine, self.numerics, theta[self.part.index])
+
+    def with_longer_delay(self) -> _Output:
+        """Return the output with a simulation that keeps twice as many past commands."""
+        numerics = replace(self.numerics, longest_delay=2 * self.numerics.longest_delay)
+        return replace(
+            self, numerics=numerics, replay=make_replay(self.part.machine, self.part.log, numerics)
+        )
+
+
+def _measured(part: Part, on: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the measured output of a log, and the factors of its residuals."""
+    measured, counts = measured_output(part.machine, part.log, on)
+    weight = np.tile(counts.astype(float), (len(measured), 1))
+    if part.log.passive and on == "position":
+        # A free motion ends at rest, where one rounding error stands in every reading.
+        weight = weight * rounded_readings(part.machine, part.log)
+    return measured, weight
+
+
+@dataclass(frozen=True)
+class _End:
+    """End of a fit.
+
+    Args:
+        theta: Physical values, (p,).
+        starts: Changes of all starts.
+        begun: Physical values at which the fit began, (p,).
+        cost: Half the weighted sum of squares.
+        logs: Residuals of the logs, with Jacobians by all unknowns and all changes of starts.
+        weights: Weight of each log.
+        converged: Whether the cost can fall no further.
+        failure: Reason why it has not converged.
+        steps: Number of evaluations.
+    """
+
+    theta: np.ndarray
+    starts: np.ndarray
+    begun: np.ndarray
+    cost: float
+    logs: list[Rows]
+    weights: np.ndarray
+    converged: bool
+    failure: str
+    steps: int
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A fit of one log or of several.
+
+    Args:
+        machine: Machine of all logs at the start of the fit.
+        outputs: The outputs that are compared.
+        on: Kind of the outputs, one of `jaxid.names.OUTPUTS`.
+        minimiser: A solver of optimistix for one log, or its name; None: jaxid's.
+    """
+
+    machine: Machine
+    outputs: tuple[_Output, ...]
+    on: str
+    minimiser: str | Minimiser | None = None
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns without the starts."""
+        return len(self.machine.parameters.free)
+
+    @property
+    def starts(self) -> int:
+        """Number of changes of all starts."""
+        return sum(o.width for o in self.outputs)
+
+    @property
+    def active(self) -> np.ndarray:
+        """Mask of the unknowns that move, with the changes of the starts behind the others."""
+        freed = [np.full(o.width, o.start) for o in self.outputs]
+        return np.concatenate([np.ones(self.unknowns, bool), *freed])
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds on the physical values and the changes of the starts."""
+        lower, upper = self.machine.parameters.bounds
+        free = np.full(self.starts, np.inf)
+        return np.concatenate([lower, -free]), np.concatenate([upper, free])
+
+    @property
+    def places(self) -> list[slice]:
+        """Places of each log's start among the changes of all starts."""
+        ends = np.cumsum([o.width for o in self.outputs])
+        return [slice(end - o.width, end) for end, o in zip(ends.tolist(), self.outputs, strict=True)]
+
+    def changed(self, outputs: Sequence[_Output]) -> _Fit:
+        """Return the fit with other outputs."""
+        return replace(self, outputs=tuple(outputs))
+
+    def steps(
+        self,
+        theta: np.ndarray,
+        starts: np.ndarray | None = None,
+        weights: np.ndarray | None = None,
+        active: np.ndarray | None = None,
+    ) -> Steps[_End]:
+        """Fit from some values.
+
+        Args:
+            theta: Physical values, (p,).
+            starts: Changes of all starts; None: zero.
+            weights: Weights of the logs, which then follow from their residuals; None: equal parts.
+            active: Mask of the unknowns that move; None: `active` of the fit.
+        """
+        starts = np.zeros(self.starts) if starts is None else starts
+        active = self.active if active is None else active
+        if len(self.outputs) == 1:
+            return (yield from self._alone(theta, starts, active))
+        return (yield from self._together(theta, starts, active, weights))
+
+    def alone_at(self, values: np.ndarray, active: np.ndarray) -> SolveRequest:
+        """Return the request that fits the only log from some values, by one compiled call."""
+        [output] = self.outputs
+        transform = Transform.of(self.machine.parameters)
+        transform = replace(transform, log=np.concatenate([transform.log, np.zeros(output.width, bool)]))
+        p, solver = self.unknowns, minimiser_of(self.minimiser)
+        problem = output.arguments(values[:p], values[p:])
+        return SolveRequest(_fit, (*problem, transform, self.bounds, self.on, active, solver))
+
+    def _alone(self, theta: np.ndarray, starts: np.ndarray, active: np.ndarray) -> Steps[_End]:
+        [output] = self.outputs
+        minimum = yield self.alone_at(np.concatenate([theta, starts]), active)
+        e = np.asarray(minimum.residual).reshape(output.measured.shape)
+        jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
+        p, values = self.unknowns, np.asarray(minimum.theta)
+        rows = [Rows(jacobian, e, output.counts, output.signal)]
+        failure = _failure(minimum, self.minimiser)
+        ended = (np.ones(1), bool(minimum.converged), failure, int(minimum.steps))
+        return _End(values[:p], values[p:], theta, float(minimum.cost), rows, *ended)
+
+    def _together(
+        self, theta: np.ndarray, starts: np.ndarray, active: np.ndarray, weights: np.ndarray | None
+    ) -> Steps[_End]:
+        scale, signals = Scale.of(self.machine, more=self.starts), [o.signal for o in self.outputs]
+        if weights is None:
+            weights = start_weights(signals, [int(o.counts.sum()) for o in self.outputs])
+
+        def fit(x: np.ndarray, weights: np.ndarray) -> Steps[Descent]:
+            def evaluate(x: np.ndarray) -> Steps[Model]:
+                theta, starts = scale.outward(x)
+                logs = yield from self._rows(theta, starts, signals, weights)
+                return summed(logs, scale.slope(theta))
+
+            options = {"tolerance": (_TOLERANCE, 0.0), "max_steps": _MOST, "active": active}
+            return (yield from descent_steps(evaluate, x, scale.bounds, **options))
+
+        x = scale.inward(theta, starts)
+        found, weights = yield from descended_steps(fit, x, weights)
+        model, finite = found.model, bool(np.isfinite(found.model.cost))
+        failure = _DIVERGED if not finite else f"no convergence within {found.steps} steps"
+        ended = (weights, found.converged and finite, failure, found.steps)
+        return _End(*scale.outward(found.x), theta, model.cost, model.content, *ended)
+
+    def _rows(
+        self, theta: np.ndarray, starts: np.ndarray, signals: Sequence[float], weights: np.ndarray
+    ) -> Steps[list[Rows]]:
+        logs, p, q = [], theta.size, theta.size + starts.size
+        for output, place, signal, weight in zip(self.outputs, self.places, signals, weights, strict=True):
+            request = SolveRequest(_linearised, (*output.arguments(theta, starts[place]), self.on))
+            e, jacobian = (np.asarray(x) for x in (yield request))
+            wide = np.zeros((*e.shape, q))
+            own = output.part.index.size
+            wide[..., output.part.index] = jacobian[..., :own]
+            wide[..., p + place.start : p + place.stop] = jacobian[..., own:]
+            logs.append(Rows(wide, e, output.counts, signal, float(weight)))
+        return logs
+
+    def hessian(self, end: _End) -> Steps[np.ndarray]:
+        """Compute the full Hessian of half the weighted sum of squares by the active unknowns."""
+        p, q = end.theta.size, self.active.size
+        out = np.zeros((q, q))
+        for output, place, weight in zip(self.outputs, self.places, end.weights, strict=True):
+            arguments = (*output.arguments(end.theta, end.starts[place]), self.on)
+            own = np.asarray((yield SolveRequest(_hessian, arguments)))
+            index = np.concatenate([output.part.index, p + np.arange(place.start, place.stop)])
+            out[np.ix_(index, index)] += float(weight) * own
+        return out[np.ix_(self.active, self.active)]
+
+
 def output_error_steps(
     machine: Machine,
-    log: Log,
+    log: Log | Sequence[Part],
     *,
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
+    solver: str | None = None,
     hessian: bool = False,
     profile: Sequence[str] = (),
     on: str = "position",
     minimiser: str | Minimiser | None = None,
 ) -> Steps[Estimate]:
-    """Run `output_error` as a generator of solve requests."""
-    solver = minimiser_of(minimiser)
-    need_names(profile, machine.parameters.names)
-    if on != "position":
-        need_loop(machine, log, f"output_error on {on}", "or fit position")
-        _need_force(machine, log, on)
-    elif log.integrated:
-        on = "velocity"
-    machine = machine if start is None else machine.with_estimate(start)
-    chosen = numerics is None
-    numerics = numerics or choose_numerics(machine, log)
-    replay = make_replay(machine, log, numerics)
-    replay = with_fitted_start(replay, machine.plant, log)
-    looped = replay.controller is not None
-    fixed = numerics.segment or (looped and log.samples > SHORT)
-    nuisance = 0 if fixed else 2 * log.position.shape[1]
-    p = len(machine.parameters.free)
-    active = np.arange(p + nuisance) < p
-    problem: tuple[Any, ...] = _problem(machine, replay, log, nuisance, "position" if on == "both" else on)
-    if machine.unknown_reference is not None:
-        # With a wrong reference the machine's parameters would diverge: fit the reference's unknowns first.
-        minimum = yield SolveRequest(_fit, (*problem, _of_course(machine, active), solver))
-        problem = (*problem[:5], minimum.theta, *problem[6:])
-    minimum = yield SolveRequest(_fit, (*problem, active, solver))
-    while chosen and forgets(machine, numerics, np.asarray(minimum.theta)[:p]):
-        # Beyond the past commands that are kept a longer delay has no effect: keep more, and go on.
-        numerics = replace(numerics, longest_delay=2 * numerics.longest_delay)
-        longer = make_replay(machine, log, numerics)
-        problem = (longer, *problem[1:5], minimum.theta, *problem[6:])
-        minimum = yield SolveRequest(_fit, (*problem, active, solver))
-    if on == "both":
-        problem = _problem(machine.with_estimate(np.asarray(minimum.theta)[:p]), replay, log, nuisance, on)
-        e = yield SolveRequest(_residual, (*problem[:6], on))
-        spread = np.maximum(np.std(np.asarray(e), axis=0), 1e-12 * np.std(problem[3], axis=0))
-        problem = (*problem[:4], problem[4] / spread, *problem[5:])
-        minimum = yield SolveRequest(_fit, (*problem, active, solver))
-    if looped and not nuisance and not numerics.segment:
-        left = np.asarray(minimum.residual).reshape(problem[3].shape)
-        if start_shows(left[:, np.any(problem[4] > 0, axis=0)]):
-            # The log may begin with a jerk from rest, so that its first readings give no velocity.
-            rested = (from_rest(problem[0]), *problem[1:5], minimum.theta, *problem[6:])
-            other = yield SolveRequest(_fit, (*rested, active, solver))
-            if bool(other.converged) and float(other.cost) < float(minimum.cost):
-                problem, minimum = rested, other
-    if nuisance and looped:
-        every = np.ones(p + nuisance, bool)
-        freed = yield SolveRequest(_fit, (*problem, every, solver))
-        spare = CLEARLY * nuisance / max(problem[3].size - p - nuisance, 1)
-        if bool(freed.converged) and float(freed.cost) * (1 + spare) < float(minimum.cost):
-            minimum, active = freed, every
-    elif nuisance:
-        problem, active = _with_start(machine, log, problem, minimum)
-        minimum = yield SolveRequest(_fit, (*problem, active, solver))
-    measured, weight = problem[3], problem[4]
-    e = np.asarray(minimum.residual).reshape(measured.shape)
-    counts = np.asarray(weight) > 0
-    jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
-    theta = np.asarray(minimum.theta)
-    names = [*machine.parameters.names, *[f"start {i}" for i in range(nuisance)]][: active.sum()]
-    full = np.asarray((yield SolveRequest(_hessian, (*problem[:5], minimum.theta, on)))) if hessian else None
-    precision = assess(
-        names,
-        jacobian[..., active],
-        e,
-        counts,
-        float(np.linalg.norm(weight * (measured - measured.mean(axis=0)))),
-        np.where(theta != 0, theta, 1.0)[active],
-        None if full is None else full[np.ix_(active, active)],
-        crossed=on == "both",
-    ).first(machine.parameters.names)
-    converged = bool(minimum.converged)
-    profiles, remarks = yield from _profiles(problem, active, minimum, solver, machine, precision, profile)
-    remarks = [*hessian_notes(precision, hessian), *remarks]
-    return Estimate(
-        method="output_error",
-        machine=machine.with_estimate(theta[:p]),
-        theta=theta[:p],
-        precision=precision,
-        converged=converged,
-        message="converged" if converged else _failure(minimum, minimiser),
-        residual=np.where(counts, e, np.nan),
-        samples=int(counts.sum()),
-        steps=int(minimum.steps),
-        notes=(*notes_of(machine, numerics, log, on, minimiser), *remarks),
-        details=({"profiles": profiles} if profile else {}) | kept_delay(machine, numerics),
-        std_misspecified=std_under_misspecification(jacobian[..., active], e, counts)[:p],
-    )
-
-
-def _profiles(
-    problem: tuple,
-    active: np.ndarray,
-    minimum: Minimum,
-    solver: Minimiser | None,
-    machine: Machine,
-    precision: Precision,
-    asked: Sequence[str],
-) -> Steps[tuple[dict[str, Any], list[str]]]:
-    """Compute the profile likelihood of some unknowns, and notes about those that have none.
-
-    The cost takes the residual for white. Its rise is divided by the variance of the white residual that
-    would give the unknown the same standard deviation as the coloured one.
+    """Run `output_error` as a generator of solve requests.
 
     Args:
-        problem: Arguments of `_fit`, up to the mask.
-        active: Mask of the unknowns of the fit, (p + nuisance,).
-        minimum: The fit.
-        solver: Its minimiser.
-        machine: The machine, with its unknowns.
-        precision: Precision of the unknowns.
-        asked: Names of the unknowns.
+        machine: Machine of all logs, with their unknowns.
+        log: The log, or the parts of several.
+        start, numerics, hessian, profile, on, minimiser: See `output_error`.
+        solver: One of `jaxid.names.SOLVERS` for the chosen settings of the integration; None: fixed steps.
 
-    Source:
-        Chandler and Bate (2007), Biometrika 94, 167-183: an independence likelihood, scaled vertically.
+    Raises:
+        InputError: Those of `output_error`; or a profile or a minimiser is asked for with several logs.
     """
-    profiles, notes = {}, []
-    theta, (lower, upper) = np.asarray(minimum.theta), problem[7]
-    white = 2 * float(minimum.cost) / max(np.sum(problem[4] > 0) - active.sum(), 1)
-    bound = np.isin(np.arange(theta.size), [k for b in machine.parameters.bodies for k in b.places])
-    for name in asked:
-        k = machine.parameters.names.index(name)
-        if not precision.identifiable[k] or precision.equivalent_variance is None:
-            notes.append(f"no profile of {name}: it is not identifiable from this log")
-            continue
-        if bound[k]:
-            notes.append(f"no profile of {name}: it belongs to a link that is kept physically consistent")
-            continue
-        std, variance = float(precision.std[k]), float(precision.equivalent_variance[k])
-        others = active & (np.arange(theta.size) != k)
+    parts = [Part.alone(machine, log)] if isinstance(log, Log) else list(log)
+    need_names(profile, machine.parameters.names)
+    if len(parts) > 1 and (minimiser_of(minimiser) is not None or profile):
+        what = "minimiser" if minimiser_of(minimiser) is not None else "profile"
+        raise InputError(f"{what} goes with one log", hint=f"leave {what} out, or name one log")
+    if on != "position":
+        for part in parts:
+            need_loop(part.machine, part.log, f"output_error on {on}", "or fit position")
+            need_output_force(part.machine, part.log, on)
+    elif parts[0].log.integrated:
+        on = "velocity"
+    if start is not None:
+        machine = machine.with_estimate(start)
+        parts = [replace(part, machine=part.at(start)) for part in parts]
 
-        def refit(
-            at: np.ndarray,
-            offset: float,
-            k: int = k,
-            others: np.ndarray = others,
-            of: tuple = (std, variance),
-        ) -> Steps[tuple[np.ndarray, float]]:
-            held = theta[k] + offset * of[0]
-            if not lower[k] < held < upper[k]:
-                return at, np.nan
-            start = np.where(np.arange(theta.size) == k, held, at)
-            there = yield SolveRequest(_fit, (*problem[:5], start, *problem[6:], others, solver))
-            rise = 2 * (float(there.cost) - float(minimum.cost)) / of[1]
-            return np.asarray(there.theta), rise if bool(there.converged) else np.nan
-
-        rise = yield from profiled(refit, theta)
-        notes += [BETTER.format(name)] if falls_below(rise) else []
-        unit = machine.parameters.free[k].unit
-        profiles[name] = profile_entry(
-            float(theta[k]), std, theta[k] + OFFSETS * std, rise, variance / white, unit
-        )
-    if profiles:
-        notes.append(
-            "profiles: the residual counts as Gaussian, and its colour as a constant factor of the variance"
-        )
-    return profiles, notes
+    first = "position" if on == "both" else on
+    fit = _Fit(machine, _outputs(parts, numerics, solver, first), first, minimiser)
+    theta = machine.parameters.guess
+    if machine.unknown_reference is not None:
+        # With a wrong reference the machine's parameters would diverge: fit the reference's unknowns first.
+        end = yield from fit.steps(theta, active=_of_course(machine, fit.active))
+        theta = end.theta
+    end = yield from fit.steps(theta)
+    while numerics is None and any(o.forgets(end.theta) for o in fit.outputs):
+        # Beyond the past commands that are kept a longer delay has no effect: keep more, and go on.
+        fit = fit.changed([o.with_longer_delay() for o in fit.outputs])
+        end = yield from fit.steps(end.theta, end.starts, end.weights)
+    if on == "both":
+        fit = yield from _on_both(fit, end)
+        end = yield from fit.steps(end.theta, end.starts)
+    fit, end = yield from _with_starts(fit, end)
+    return (yield from _estimate(fit, end, hessian, profile))
 
 
-def forgets(machine: Machine, numerics: Numerics, theta: np.ndarray) -> bool:
-    """Check that a fitted delay reaches the end of the past commands, and that a loop can keep more."""
-    if machine.controller is None or not 0 < numerics.longest_delay <= LONGEST_MEMORY // 2:
-        return False
-    fitted = machine.with_estimate(theta).plant
-    delay = float(np.max(np.asarray(fitted.command_delays(machine.gain.size))))
-    return bool(delay >= (numerics.longest_delay - 1) * machine.controller.period)
-
-
-def kept_delay(machine: Machine, numerics: Numerics) -> dict[str, float]:
-    """Return the longest delay that a simulated loop has, `longest_delay` [s]; empty without any delay."""
-    if machine.controller is None or not numerics.longest_delay:
-        return {}
-    return {"longest_delay": numerics.longest_delay * machine.controller.period}
+def _outputs(
+    parts: Sequence[Part], numerics: Numerics | None, solver: str | None, on: str
+) -> tuple[_Output, ...]:
+    """Return the outputs of all logs; one number of steps serves them, so that they share compiled code."""
+    chosen = [numerics or choose_numerics(part.machine, part.log, solver=solver) for part in parts]
+    most, alone = max(n.substeps for n in chosen), len(parts) == 1
+    return tuple(
+        _Output.of(part, replace(n, substeps=most), on, alone) for part, n in zip(parts, chosen, strict=True)
+    )
 
 
 def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
@@ -421,148 +481,145 @@ def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
     return own
 
 
-def _with_start(machine: Machine, log: Log, problem: tuple, minimum: Minimum) -> tuple[tuple, np.ndarray]:
-    """Return the problem with the start refitted to the fitted plant, and the mask of its active unknowns.
+def _on_both(fit: _Fit, end: _End) -> Steps[_Fit]:
+    """Return the fit of position and force, each over the spread of its residual."""
+    outputs = []
+    for output, place in zip(fit.outputs, fit.places, strict=True):
+        measured, weight = _measured(output.part, "both")
+        output = replace(output, measured=measured, weight=weight)
+        arguments = (*output.arguments(end.theta, end.starts[place]), "both")
+        e = np.asarray((yield SolveRequest(_residual, arguments)))
+        spread = np.maximum(np.std(e, axis=0), 1e-12 * np.std(measured, axis=0))
+        outputs.append(replace(output, weight=weight / spread))
+    return replace(fit, outputs=tuple(outputs), on="both")
 
-    The start is active if the residual is no larger than noise.
+
+def _with_starts(fit: _Fit, end: _End) -> Steps[tuple[_Fit, _End]]:
+    """Free the starts of the logs for which that is right, and fit again.
+
+    In open loop the start of a log is refitted to the fitted plant, and free if the residual is no larger
+    than noise. In a loop it is free on a short log if that explains clearly more than chance; a longer one
+    may begin with a jerk from rest, so that its first readings give no velocity.
     """
-    p = len(machine.parameters.free)
-    fitted = machine.with_estimate(np.asarray(minimum.theta)[:p])
-    replay = with_fitted_start(problem[0], fitted.plant, log)
-    problem = (replay, *problem[1:5], minimum.theta, *problem[6:])
-    rms = np.sqrt(np.mean(np.square(minimum.residual)))
-    noise = position_noise(machine, log)
-    free = bool(rms <= NOISE_LIMITED * np.max(noise))
-    active = (np.arange(len(minimum.theta)) < p) | free
-    return problem, active
+    outputs = []
+    for output, log in zip(fit.outputs, end.logs, strict=True):
+        part = output.part
+        if output.numerics.segment:
+            outputs.append(output)
+        elif not output.looped:
+            replay = with_fitted_start(output.replay, part.at(end.theta).plant, part.log)
+            rms = np.sqrt(np.mean(np.square(log.residual)))
+            noise = np.max(position_noise(part.machine, part.log))
+            outputs.append(replace(output, replay=replay, start=bool(rms <= _NOISE_LIMITED * noise)))
+        elif not output.stays:
+            outputs.append(replace(output, start=True))
+        else:
+            shows = start_shows(log.residual[:, np.any(output.weight > 0, axis=0)])
+            outputs.append(replace(output, replay=from_rest(output.replay)) if shows else output)
+    if all(new is old for new, old in zip(outputs, fit.outputs, strict=True)):
+        return fit, end
+
+    freed, looped = fit.changed(outputs), any(o.looped for o in outputs)
+    # A start that is free opens other valleys of a loop's cost: begin where the fit before did.
+    again = looped and any(o.start for o in outputs)
+    other = yield from freed.steps(end.begun if again else end.theta, end.starts, end.weights)
+    if not looped:
+        return freed, other
+
+    # In a loop each log keeps what clearly explains it better.
+    kept = []
+    for old, new, before, after in zip(fit.outputs, outputs, end.logs, other.logs, strict=True):
+        unknown = new.part.index.size + new.width
+        spare = _CLEARLY * new.width / max(new.measured.size - unknown, 1) if new.start else 0.0
+        better = np.sum(after.residual**2) * (1 + spare) < np.sum(before.residual**2)
+        kept.append(new if better and other.converged else old)
+    if all(a is b for a, b in zip(kept, outputs, strict=True)):
+        return freed, other
+    if all(a is b for a, b in zip(kept, fit.outputs, strict=True)):
+        return fit, end
+    fit = fit.changed(kept)
+    starts = other.starts.copy()
+    for output, place in zip(kept, fit.places, strict=True):
+        starts[place] = starts[place] if output.start else 0.0
+    return fit, (yield from fit.steps(other.theta, starts, other.weights))
 
 
-def _problem(machine: Machine, replay: Replay, log: Log, nuisance: int, on: str) -> tuple:
-    parameters, (measured, counts) = machine.parameters, measured_output(machine, log, on)
-    lower, upper = parameters.bounds
-    free = np.full(nuisance, np.inf)
-    transform = Transform.of(parameters)
-    transform = replace(transform, log=np.concatenate([transform.log, np.zeros(nuisance, bool)]))
-    weight = np.tile(counts.astype(float), (len(measured), 1))
-    if log.passive and on == "position":
-        # A free motion ends at rest, where one rounding error stands in every reading.
-        weight = weight * rounded_readings(machine, log)
-    return (
-        replay,
-        parameters.places,
-        machine.plant,
-        measured,
-        weight,
-        np.concatenate([parameters.guess, np.zeros(nuisance)]),
-        transform,
-        (np.concatenate([lower, -free]), np.concatenate([upper, free])),
-        on,
+def _estimate(fit: _Fit, end: _End, hessian: bool, profile: Sequence[str]) -> Steps[Estimate]:
+    machine, active, p = fit.machine, fit.active, fit.unknowns
+    names = [*machine.parameters.names, *[f"start {i}" for i in range(active.size - p)]]
+    names = [name for name, moves in zip(names, active, strict=True) if moves]
+    moving = [replace(log, jacobian=log.jacobian[..., active]) for log in end.logs]
+    values = np.concatenate([end.theta, end.starts])
+    x, full = values[active], (yield from fit.hessian(end)) if hessian else None
+    precision = assess_together(names, moving, np.where(x != 0, x, 1.0), full, crossed=fit.on == "both")
+    precision = precision.first(machine.parameters.names)
+
+    details: dict[str, Any] = {}
+    remarks = list(hessian_notes(precision, hessian))
+    if profile:
+        count = int(np.sum(fit.outputs[0].weight > 0))
+        found = (values, end.cost, count, fit.bounds, active)
+        details["profiles"], more = yield from profile_steps(fit.alone_at, found, machine, precision, profile)
+        remarks += more
+    theta = end.theta
+    if len(moving) > 1:
+        theta, precision, more = yield from _without_noise(fit, end, moving, precision)
+        remarks += [*more, *disagreement(moving, int(active.sum()))]
+        details |= by_log([o.part for o in fit.outputs], shares(end.logs))
+    first = fit.outputs[0]
+    notes = notes_of(first.part.machine, first.numerics, first.part.log, fit.on, fit.minimiser)
+    return Estimate(
+        method="output_error",
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        converged=end.converged,
+        message="converged" if end.converged else end.failure,
+        residual=np.concatenate([np.where(log.counts, log.residual, np.nan) for log in end.logs]),
+        samples=sum(int(log.counts.sum()) for log in end.logs),
+        steps=end.steps,
+        notes=(*notes, *remarks),
+        details=details | kept_delay(first.part.machine, first.numerics),
+        std_misspecified=std_under_misspecification(*stacked(moving))[:p],
     )
 
 
-def choose_numerics(
-    machine: Machine, log: Log, *, segments: bool = True, solver: str | None = None
-) -> Numerics:
-    """Choose the integration that suits a machine and its log.
+def _without_noise(
+    fit: _Fit, end: _End, moving: Sequence[Rows], precision: Precision
+) -> Steps[tuple[np.ndarray, Precision, list[str]]]:
+    """Remove the bias by noise that goes round the loop, and return estimates, precision and notes.
 
-    Dry friction sticks exactly. Its gradient is exact too, because the force is continuous at the onset of
-    sliding. With break-away friction it is not, so that friction is smoothed; likewise with a solver of
-    diffrax.
+    It is a small part of the deviations of a log alone. Beside another log, in which something is known to
+    differ, it is several of them in the directions that the difference separates.
 
     Args:
-        machine: The machine to simulate.
-        log: The log that drives it.
-        segments: Whether an open-loop run may be cut into segments.
-        solver: One of `jaxid.names.SOLVERS`; None: fixed steps.
+        fit, end: The fit and its end.
+        moving: Residual of each log, with the columns of the unknowns that move.
+        precision: Precision of the unknowns.
     """
-    breaks_away = any(e.break_away_level is not None for e in machine.plant.effects)
-    exact = exact_numerics(machine, log, 1 if solver else None)
-    numerics = replace(
-        exact,
-        substeps=1 if solver else max(exact.substeps, turning_steps(machine, log)),
-        set_valued=not breaks_away and solver is None,
-        solver=solver,
+    noise = [position_noise(o.part.machine, o.part.log) for o in fit.outputs]
+    looped = all(o.looped for o in fit.outputs) and not any(o.part.log.integrated for o in fit.outputs)
+    if not looped or not end.converged or not any(np.any(std > 0) for std in noise):
+        return end.theta, precision, []
+    arguments = [o.arguments(end.theta, end.starts[p]) for o, p in zip(fit.outputs, fit.places, strict=True)]
+    shift = yield from shift_steps(list(zip(arguments, noise, moving, strict=True)), fit.on)
+    p, seen = fit.unknowns, precision.identifiable
+    if not np.all(np.isfinite(shift.step)) or not np.any(seen):
+        return end.theta, precision, []
+    step = np.where(seen, shift.step[:p], 0.0)
+    theta = np.clip(end.theta + step, *fit.machine.parameters.bounds)
+    most = float(np.max(np.abs(step[seen]) / precision.std[seen]))
+    note = (
+        "the noise of the readings goes round the loop: its effect on the estimates, at most "
+        f"{most:.2g} standard deviations, was simulated and removed"
     )
-    if log.passive and solver is None:
-        # Without noise of a force the phase of a swing is so precise that it shows the error of a step.
-        numerics = replace(numerics, substeps=max(numerics.substeps, _FREE))
-    if not numerics.set_valued and solver is None:
-        numerics = replace(numerics, substeps=max(numerics.substeps, _sharp_steps(machine, log)))
-    if machine.controller is not None or not segments:
-        return numerics
-    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
-    run = eqx.filter_jit(lambda r, p: r(p).position)(replay, machine.plant)
-    off = np.sqrt(np.nanmean((np.asarray(run) - log.position) ** 2))
-    if np.isfinite(off) and off < _LOST * np.nanstd(log.position):
-        return numerics
-    length = max(20, log.samples // _SEGMENTS)
-    return replace(numerics, segment=length)
-
-
-def turning_steps(machine: Machine, log: Log) -> int:
-    """Return the steps per sample that keep the error at reversals of dry friction below the noise.
-
-    A joint that comes to rest within a step h is afterwards off by about 0.04 F / m h^2 with F its dry
-    friction; a tenth of a reading's noise is small enough for thousands of samples.
-    """
-    plant, inertia = machine.plant, machine.plant.own_inertia()
-    noise = position_noise(machine, log)
-    if inertia is None or not np.any(noise > 0):
-        return 1
-    period = machine.controller.period if machine.controller is not None else log.period
-    # Noise of a velocity moves an integrated position by as much in one sample.
-    noise = noise * log.period if log.integrated else noise
-    n = log.position.shape[1]
-    zero, u = jnp.zeros(n), jnp.zeros(log.force.shape[1])
-    q = jnp.asarray(log.filled[0])
-    dry = np.asarray(_levels(plant, q, zero, u))[:n]
-    off = _TURNING * np.max(np.abs(dry) / np.broadcast_to(np.asarray(inertia), n)) * period**2
-    return int(np.clip(np.ceil(np.sqrt(off / (_LITTLE * np.min(noise[noise > 0])))), 1, _MOST))
-
-
-@kept_jit
-def _levels(plant: Plant, q: Array, v: Array, u: Array) -> Array:
-    """Return the level of dry friction at rest by port, including break-away [N or N m]."""
-    levels = plant.balance(q, v, v, u, jnp.zeros(()), plant.initial_states(u))
-    return levels.dry + levels.stick
-
-
-def _sharp_steps(machine: Machine, log: Log) -> int:
-    """Return the steps per sample that the smoothed sign needs; with fewer steps the gradient is wrong."""
-    period = machine.controller.period if machine.controller is not None else log.period
-    picks = np.linspace(0, log.samples - 1, 50).astype(int)
-    q, u = jnp.asarray(log.filled[picks]), jnp.asarray(log.force[picks] * machine.gain)
-    drive = Drive(jnp.asarray(machine.gain), period)
-    return needed_substeps(machine.plant, drive, q, jnp.zeros_like(q), u)
+    precision = replace(precision, covariance=precision.covariance + shift.covariance[:p, :p])
+    return theta, precision, [note]
 
 
 def _failure(minimum: Minimum, minimiser: str | Minimiser | None) -> str:
     if not np.isfinite(float(minimum.cost)):
-        return "the simulation diverged from these starting values"
+        return _DIVERGED
     if minimum.failure is not None:
         return failure_text(minimum, minimiser_name(minimiser))
     return f"no convergence within {int(minimum.steps)} steps"
-
-
-def notes_of(
-    machine: Machine,
-    numerics: Numerics,
-    log: Log,
-    on: str,
-    minimiser: str | Minimiser | None = None,
-) -> tuple[str, ...]:
-    """Return remarks for the user about simulation and minimisation."""
-    where = "in the loop" if machine.controller is not None else "open loop"
-    how = "sticks exactly" if numerics.sticks else "is smoothed"
-    steps = f"{numerics.substeps} step(s) a sample"
-    if numerics.solver is not None:
-        steps = f"by diffrax's {numerics.solver}, each step within {RELATIVE:g}"
-    notes = [f"simulated {where}, {steps}; dry friction {how}"]
-    if on != "position":
-        notes.append(f"fitted on {'position and force' if on == 'both' else on}")
-    if numerics.segment:
-        seconds = numerics.segment * log.period
-        notes.append(f"restarted from the log every {seconds:.3g} s, because it would drift off otherwise")
-    if minimiser_of(minimiser) is not None:
-        notes.append(f"minimised by {minimiser_name(minimiser)}")
-    return tuple(notes)

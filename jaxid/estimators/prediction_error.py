@@ -1,57 +1,45 @@
-"""Prediction error: maximum likelihood of the innovations of a Kalman filter on the plant's step."""
+"""Prediction error: maximum likelihood of the innovations of a Kalman filter on the plant's step.
+
+Several logs have one likelihood, to which each adds its own with the noise of its force and readings.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from jaxid.arrays import Array
-from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
-from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.common.profile import need_names
-from jaxid.estimators.common.scoring import Scored
 from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.innovations import STEPS, Innovations, fit_steps, hessian_steps, profile_steps
+from jaxid.estimators.innovations import STEPS, hessian_steps, profile_steps
+from jaxid.estimators.joint_likelihood import JointLikelihood, Maximum, Member, scored_at
+from jaxid.estimators.likelihood import likelihood_of, needed_numerics
+from jaxid.estimators.several.parts import Part, by_log
+from jaxid.estimators.several.sums import stacked
+from jaxid.estimators.several.weights import disagreement
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.model.balance import Balance
 from jaxid.numerics.lanes import Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
-from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, assess, hessian_notes
-from jaxid.simulation.kalman import make_filter, slow_samples, smooth_steps
-from jaxid.simulation.replay import Numerics, exact_numerics
-from jaxid.simulation.sensor_noise import position_noise
-from jaxid.simulation.step_size import needed_steps
+from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, Rows, assess_together, hessian_notes
+from jaxid.simulation.replay import Numerics
+from jaxid.simulation.sensor_noise import force_noise
 
 # Evaluations that show which start is the best one.
-SCREENING = 12
-# Noise of the force at the start, as a part of the force; a large one makes a wrong model possible.
-_FORCE_NOISE = 0.1
-# Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow
-# curved valley: a fit at a higher noise leads close to its floor. The last one is below any drive's noise,
-# and above the error of the steps at reversals.
-_FLOORS = (1e-2, 1e-3, 1e-4)
-# Largest noise of the force, as a part of it; noise of a reading, as a multiple of its first estimate.
-_MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
-# Noise of the force, as a part of it, below which sticking is certain.
-_QUIET = 1e-3
-# Steps of the last fit of such a log for each one before.
-_FINER = 4
+_SCREENING = 12
 # Pairs of simulated noise for the correction of the bias by noise of the command's reading.
-PAIRS = 4
+_PAIRS = 4
 # Eigenvalue of the scaled information, relative to the largest, below which a direction is not corrected.
-BLIND = 1e-10
+_BLIND = 1e-10
 # Lags of the test of whiteness, and the probability at which it rejects.
-LAGS, REJECTS = 20, 1e-3
+_LAGS, _REJECTS = 20, 1e-3
 
 
 def prediction_error(
@@ -113,107 +101,9 @@ def prediction_error(
     )
 
 
-@dataclass(frozen=True)
-class Likelihood:
-    """The likelihood of a log with what a fit of it starts from.
-
-    Args:
-        problem: The likelihood, at the highest floor of the noise.
-        machine: The machine at its guesses.
-        log: The log, whose force is the command that drives the filter.
-        numerics: Settings of the integration.
-        applied: Command of the declared law, if it explains the logged one; None: the logged one drives.
-        slow: Mask of the samples at rest, which do not count; None: all count.
-        force: Size of the logged force, (m,).
-        noise: Logarithms of the noise at the start, of the force and then of the readings, (m + k,).
-        floors: Lower bounds on them, in turn.
-    """
-
-    problem: Innovations
-    machine: Machine
-    log: Log
-    numerics: Numerics
-    applied: np.ndarray | None
-    slow: np.ndarray | None
-    force: np.ndarray
-    noise: np.ndarray
-    floors: Sequence[np.ndarray]
-
-    def sticks_surely(self, noise: np.ndarray) -> bool:
-        """Check that there is so little noise of the force that it is known when a joint sticks."""
-        if self.slow is None or self.applied is None:
-            return False
-        return bool(np.all(np.exp(noise[: len(self.force)]) < _QUIET * self.force))
-
-    def at_rest_too(self, problem: Innovations) -> Innovations:
-        """Return the likelihood with the samples at rest."""
-        # So precise a fit shows the error of a step in which a joint comes to rest.
-        finer = replace(self.numerics, substeps=_FINER * self.numerics.substeps)
-        kalman = make_filter(self.machine, self.log, finer)
-        counts = np.asarray(kalman.used)[:: kalman.every][:, list(self.log.measured)]
-        return problem._replace(kalman=kalman, counts=counts)
-
-
-def likelihood_of(
-    machine: Machine,
-    log: Log,
-    *,
-    start: np.ndarray | None = None,
-    numerics: Numerics | None = None,
-    rest_velocity: np.ndarray | None = None,
-) -> Likelihood:
-    """Return the likelihood of a log; see `prediction_error` for the arguments.
-
-    Raises:
-        InputError: If too few readings count.
-    """
-    if numerics is None:
-        numerics = needed_numerics(machine, log, start)
-    parameters, measured = machine.parameters, list(log.measured)
-    applied = noise_free_command(machine, log)
-    driven = log if applied is None else replace(log, force=applied)
-    slow = None
-    if rest_velocity is not None and slides(machine, log):
-        slow = slow_samples(log, rest_velocity)
-    kalman = make_filter(machine, driven, numerics, slow)
-    counts = np.asarray(kalman.used)[:: kalman.every]
-    counts = (counts if slow is None else counts & ~slow)[:, measured]
-    if counts.sum() < 5 * len(parameters.free):
-        slowest = 0.0 if rest_velocity is None else np.min(rest_velocity)
-        raise InputError(
-            f"only {int(counts.sum())} readings are of a motion faster than {slowest:.3g}",
-            where=log.source,
-            hint="take a log with more motion, lower [preprocess] rest_velocity, or use another method",
-        )
-
-    force = _force_scale(machine, log)
-    stroke = np.maximum(np.ptp(log.readings, axis=0), 1e-300)
-    reading = np.maximum(position_noise(machine, log), 1e-9 * stroke)[measured]
-    noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
-    floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
-    problem = Innovations(
-        kalman=kalman,
-        places=parameters.places,
-        plant=machine.plant,
-        counts=counts,
-        transform=Transform.of(parameters),
-        bounds=parameters.bounds,
-        low=floors[0],
-        high=np.log(np.concatenate([_MOST * force, _READING_RANGE[1] * reading])),
-    )
-    return Likelihood(problem, machine, driven, numerics, applied, slow, force, noise, floors)
-
-
-def needed_numerics(machine: Machine, log: Log, start: np.ndarray | None) -> Numerics:
-    """Return the settings of the integration that a machine needs at its start."""
-    # Guesses that are far off, such as inertias of no possible body, may need many more steps.
-    near = machine if start is None else machine.with_estimate(np.clip(start, *machine.parameters.bounds))
-    return exact_numerics(machine, log, needed_steps(near, log))
-
-
 def prediction_error_steps(
     machine: Machine,
-    log: Log,
+    log: Log | Sequence[Part],
     *,
     start: np.ndarray | None = None,
     numerics: Numerics | None = None,
@@ -223,69 +113,111 @@ def prediction_error_steps(
     hessian: bool = False,
     profile: Sequence[str] = (),
 ) -> Steps[Estimate]:
-    """Run `prediction_error` as a generator of solve requests."""
+    """Run `prediction_error` as a generator of solve requests.
+
+    Args:
+        machine: Machine of all logs, with their unknowns.
+        log: The log, or the parts of several, whose `rest_velocity` and `command_noise` are those of each.
+        start, numerics, rest_velocity, command_noise, alone, hessian, profile: See `prediction_error`.
+
+    Raises:
+        InputError: Those of `prediction_error`; or `hessian` or `profile` is asked for with several logs.
+    """
     need_names(profile, machine.parameters.names)
-    begun = likelihood_of(machine, log, start=start, numerics=numerics, rest_velocity=rest_velocity)
-    parameters, problem, noise, force = machine.parameters, begun.problem, begun.noise, begun.force
-    transform, bounds, applied = problem.transform, problem.bounds, begun.applied
+    if isinstance(log, Log):
+        settings = [(Part.alone(machine, log), rest_velocity, command_noise)]
+    else:
+        settings = [(p, np.asarray(p.data.recipe.rest_velocity), force_noise(p.machine, p.data)) for p in log]
+    if len(settings) > 1 and (hessian or profile):
+        what = "hessian" if hessian else "profile"
+        raise InputError(f"{what} of innovations goes with one log", hint="leave it out, or name one log")
+    fit = _joined(machine, settings, start, numerics)
 
     # Beside another method's start the guesses matter for shapes only, whose likelihood has several maxima.
-    p, m, steps = len(parameters.free), len(force), 0
+    parameters, noises, steps = machine.parameters, [m.at.noise for m in fit.members], 0
     shapes = [] if alone else shape_starts(machine, parameters.guess)
     starts = [parameters.guess, *shapes] if shapes or start is None else []
     if start is not None:
-        starts.insert(0, np.clip(start, *bounds))
+        starts.insert(0, np.clip(start, *parameters.bounds))
     theta, trials = starts[0], []
     for at in starts if len(starts) > 1 else ():
-        trials.append((yield from fit_steps(problem, at, noise, SCREENING)))
+        trials.append((yield from fit.fit(at, noises, _SCREENING)))
     if trials:
-        best = min(trials, key=lambda trial: np.nan_to_num(float(trial.cost), nan=np.inf))
-        theta, noise = np.asarray(transform.outward(best.x[:p])), best.x[p:]
-        steps = sum(int(trial.steps) for trial in trials)
+        best = min(trials, key=lambda trial: np.nan_to_num(trial.cost, nan=np.inf))
+        theta, noises = best.theta, best.noises
+        steps = sum(trial.steps for trial in trials)
 
-    scored = None
-    for floor in begun.floors:
-        problem = problem._replace(low=floor)
-        scored = yield from fit_steps(problem, theta, noise, STEPS)
-        theta, noise = np.asarray(transform.outward(scored.x[:p])), np.asarray(scored.x[p:])
-        steps += int(scored.steps)
-        if np.all(noise[:m] > floor[:m] + 1e-3) or not np.isfinite(float(scored.cost)):
+    end = None
+    for floor in range(len(fit.members[0].at.floors)):
+        fit = fit.at_floor(floor)
+        end = yield from fit.fit(theta, noises, STEPS)
+        theta, noises, steps = end.theta, end.noises, steps + end.steps
+        if fit.above(floor, end) or not np.isfinite(end.cost):
             break
-    assert scored is not None, "there is at least one floor"
+    assert end is not None, "there is at least one floor"
 
     # Without noise of the force it is known when a joint sticks, and samples at rest count too.
-    if begun.sticks_surely(noise):
-        problem = begun.at_rest_too(problem)
-        scored = yield from fit_steps(problem, theta, noise, STEPS)
-        theta, steps = np.asarray(transform.outward(scored.x[:p])), steps + int(scored.steps)
+    sure = [m.at.sticks_surely(noise) for m, noise in zip(fit.members, noises, strict=True)]
+    if any(sure):
+        finer = [
+            replace(m, problem=m.at.at_rest_too(m.problem)) if s else m
+            for m, s in zip(fit.members, sure, strict=True)
+        ]
+        fit = replace(fit, members=tuple(finer))
+        end = yield from fit.fit(theta, noises, STEPS)
+        theta, steps = end.theta, steps + end.steps
 
-    read = np.zeros(m)
-    if bool(scored.converged) and applied is None and command_noise is not None and np.any(command_noise > 0):
-        x, read = yield from _corrected_steps(problem, scored, theta, command_noise)
-        theta = np.clip(transform.outward(x), *bounds)
-    estimate = _estimate(machine, problem, theta, scored, by_law=applied is not None, read=read, steps=steps)
+    reads = [np.zeros(m.drives) for m in fit.members]
+    if end.converged:
+        theta, reads = yield from _corrected_steps(fit, end)
+    end = replace(end, steps=steps)
+    estimate = _estimate(fit, end, theta, reads)
 
     true = [free.true for free in parameters.free]
     if true and None not in true and estimate.converged:
         truth = np.array(true, dtype=np.float64)
-        there = yield from fit_steps(problem, truth, noise, 1)
-        bound = _precision(parameters.names, problem, truth, there).std
+        there = yield from fit.fit(truth, noises, 1)
+        bound = _precision(fit, _rows(fit, there, truth), truth).std
         values = dict(zip(parameters.names, bound.tolist(), strict=True))
         estimate = replace(estimate, details={**estimate.details, "least_std": values})
     if hessian:
-        estimate = yield from _by_hessian(estimate, problem, scored)
+        estimate = yield from _by_hessian(estimate, fit, end)
     if not profile:
         return estimate
-    profiles, notes = yield from profile_steps(problem, machine, theta, scored, estimate.precision, profile)
+    [member], [scored] = fit.members, end.scored
+    profiles, notes = yield from profile_steps(
+        member.problem, machine, theta, scored, estimate.precision, profile
+    )
     return replace(
         estimate, notes=(*estimate.notes, *notes), details={**estimate.details, "profiles": profiles}
     )
 
 
-def _corrected_steps(
-    problem: Innovations, scored: Scored, theta: np.ndarray, command_noise: np.ndarray
-) -> Steps[tuple[np.ndarray, np.ndarray]]:
-    """Remove the bias by noise with which the command was read; return the estimates and the noise.
+def _joined(
+    machine: Machine,
+    settings: Sequence[tuple[Part, np.ndarray | None, np.ndarray | None]],
+    start: np.ndarray | None,
+    numerics: Numerics | None,
+) -> JointLikelihood:
+    """Return the likelihood of logs, each with its rest velocity and the noise of its command's reading.
+
+    One number of steps serves all logs, so that they share compiled code.
+    """
+    own = [None if start is None else start[part.index] for part, *_ in settings]
+    chosen = [
+        needed_numerics(part.machine, part.log, at) if numerics is None else numerics
+        for (part, *_), at in zip(settings, own, strict=True)
+    ]
+    most = max(n.substeps for n in chosen)
+    members = []
+    for (part, rest, noise), n in zip(settings, chosen, strict=True):
+        made = likelihood_of(part.machine, part.log, numerics=replace(n, substeps=most), rest_velocity=rest)
+        members.append(Member(part, made, made.problem, noise))
+    return JointLikelihood(machine, tuple(members))
+
+
+def _corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarray, list[np.ndarray]]]:
+    """Remove the bias by noise with which the commands were read; return the estimates and the noise.
 
     The filter takes the logged command for the applied one plus an error that is independent of the log.
     Noise of the reading is not independent: like noise of a regressor it makes the force count too little. As
@@ -293,194 +225,159 @@ def _corrected_steps(
     scoring, is subtracted. Pairs of opposite noise cancel in first order.
 
     Args:
-        problem: The likelihood.
-        scored: The fit.
-        theta: Its estimates, (p,).
-        command_noise: Noise with which the command was read, (m,).
+        fit: The likelihood.
+        end: Its maximum.
 
     Returns:
-        The estimates on the scale of the solver, (p,), and the noise for which they were corrected, (m,).
+        The estimates, (p,), and the noise of each log for which they were corrected, (m,).
 
     Source:
         Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
     """
-    kalman, p, drives = problem.kalman, len(theta), problem.kalman.command.shape[1]
-    x = np.asarray(scored.x)
-    read = np.minimum(command_noise, np.exp(x[p : p + drives]))
-    noise = x[p:].copy()
-    noise[:drives] += 0.5 * np.log1p((read / np.exp(noise[:drives])) ** 2)
-
-    def at(command: np.ndarray) -> Steps[Scored]:
-        shifted = problem._replace(kalman=eqx.tree_at(lambda k: k.command, kalman, command))
-        return fit_steps(shifted, theta, noise, 1)
-
-    command, every = np.asarray(kalman.command), kalman.every
-    information = (yield from at(command)).information
-    rng, gradients = np.random.default_rng(0), []
-    for _ in range(PAIRS):
-        more = read * rng.standard_normal((len(command[::every]), drives))
-        more = np.repeat(more, every, axis=0)[: len(command)]
-        for sign in (1.0, -1.0):
-            gradients.append((yield from at(command + sign * more)).gradient)
-    if not np.all(np.isfinite(information)) or not np.all(np.isfinite(gradients)):
-        return x[:p], np.zeros(drives)
-
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information / np.outer(size, size), rcond=BLIND, hermitian=True)
-    shift = -inverse @ (np.mean(gradients, axis=0) / size) / size
-    return x[:p] - shift[:p], read
-
-
-def _force_scale(machine: Machine, log: Log) -> Float[np.ndarray, " m"]:
-    """Return the typical size of each command, in its unit, (m,).
-
-    That of a constant force is its level. Of a machine that nothing drives it is the command that would
-    accelerate the masses as they were, at the guesses.
-    """
-    if log.passive:
-        speed = smooth_steps(log) / log.period
-        inertia = machine.plant.own_inertia()
-        mass = 1.0 if inertia is None else np.asarray(inertia)
-        own = np.sqrt(np.mean((mass * np.gradient(speed, log.period, axis=0)) ** 2, axis=0))
-        driven = machine.plant.driven(machine.plant.joints)[: log.force.shape[1]]
-        return np.maximum(np.max(own[list(driven)]) / np.abs(machine.gain), 1e-300)
-    spread, size = np.std(log.force, axis=0), np.sqrt(np.mean(log.force**2, axis=0))
-    return np.maximum(np.where(spread > 1e-9 * size, spread, size), 1e-300)
+    size, x = end.x.size, end.x
+    gradient, information = np.zeros(size), np.zeros((size, size))
+    reads, rng = [], np.random.default_rng(0)
+    for member, place in zip(fit.members, fit.places, strict=True):
+        p, drives, own = member.unknowns, member.drives, x[place].copy()
+        known = member.command_noise is None or member.at.applied is not None
+        stated = np.zeros(drives) if known or member.command_noise is None else member.command_noise
+        read = np.minimum(stated, np.exp(own[p : p + drives]))
+        reads.append(read)
+        own[p : p + drives] += 0.5 * np.log1p((read / np.exp(own[p : p + drives])) ** 2)
+        if not np.any(read > 0) and len(fit.members) == 1:
+            return end.theta, reads
+        information[np.ix_(place, place)] += (yield from scored_at(member.problem, own, p)).information
+        if not np.any(read > 0):
+            continue
+        kalman, gradients = member.problem.kalman, []
+        command, every = np.asarray(kalman.command), kalman.every
+        for _ in range(_PAIRS):
+            more = read * rng.standard_normal((len(command[::every]), drives))
+            more = np.repeat(more, every, axis=0)[: len(command)]
+            for sign in (1.0, -1.0):
+                shifted = eqx.tree_at(lambda k: k.command, kalman, command + sign * more)
+                at = yield from scored_at(member.problem._replace(kalman=shifted), own, p)
+                gradients.append(at.gradient)
+        gradient[place] += np.mean(gradients, axis=0)
+    if not any(np.any(read > 0) for read in reads):
+        return end.theta, reads
+    moved = x.copy()
+    if np.all(np.isfinite(information)) and np.all(np.isfinite(gradient)):
+        norm = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        inverse = np.linalg.pinv(information / np.outer(norm, norm), rcond=_BLIND, hermitian=True)
+        shift = -inverse @ (gradient / norm) / norm
+        moved[: fit.unknowns] -= shift[: fit.unknowns]
+    else:
+        reads = [np.zeros_like(read) for read in reads]
+    return np.clip(fit.theta(moved), *fit.machine.parameters.bounds), reads
 
 
-def slides(machine: Machine, log: Log) -> bool:
-    """Check that dry friction acts somewhere."""
-    plant = machine.plant
-
-    def balance(q: Array, u: Array) -> Balance:
-        zero = jnp.zeros_like(q)
-        return plant.balance(q, zero, zero, u, jnp.zeros(()), plant.initial_states(u))
-
-    # Shapes tell: no operation is compiled.
-    return bool(jax.eval_shape(balance, log.filled[0], log.force[0]).slides)
-
-
-def _estimate(
-    machine: Machine,
-    problem: Innovations,
-    theta: np.ndarray,
-    scored: Scored,
-    *,
-    by_law: bool,
-    read: np.ndarray,
-    steps: int,
-) -> Estimate:
+def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequence[np.ndarray]) -> Estimate:
     """Return the estimate of a fit, with its precision, its noise and a test of its innovations.
 
     Args:
-        machine: The machine at its guesses.
-        problem: The likelihood.
+        fit: The likelihood.
+        end: Its maximum.
         theta: Estimates, (p,).
-        scored: The fit.
-        by_law: Whether the command was computed by the declared law.
-        read: Noise with which the command was read, (m,).
-        steps: Evaluations of all fits.
+        reads: Noise with which the command of each log was read, (m,).
     """
-    names, counts, drives = machine.parameters.names, np.asarray(problem.counts), len(read)
-    z, jacobian = np.asarray(scored.z), _slopes(problem, scored)
-    plain = _precision(names, problem, theta, scored)
+    machine, several = fit.machine, len(fit.members) > 1
+    rows = _rows(fit, end, theta)
+    plain = _precision(fit, rows, theta)
+    jacobian, z, counts = stacked(rows)
 
-    noise = np.exp(np.asarray(scored.x)[len(theta) :])
-    p_values = [whiteness(e[c]) for e, c in zip(z.T, counts.T, strict=True)]
-    notes = ["noise of the force and of the readings was estimated with the unknowns"]
+    entries: list[dict[str, Any]] = []
+    for member, row, noise, read in zip(fit.members, rows, end.noises, reads, strict=True):
+        shown, drives = np.exp(noise), member.drives
+        of_readings = "velocity" if member.problem.kalman.of_velocity else "position"
+        sizes = {"force": shown[:drives], "force_reading": read, of_readings: shown[drives:]}
+        p = [whiteness(e[c]) for e, c in zip(row.residual.T, row.counts.T, strict=True)]
+        entries.append({"noise": sizes, "whiteness": {"lags": _LAGS, "p": p}})
+
+    each = " for each log," if several else ""
+    notes = [f"noise of the force and of the readings was estimated{each} with the unknowns"]
+    by_law = [m.part.name for m in fit.members if m.at.applied is not None]
     if by_law:
+        where = f" (in {', '.join(by_law)})" if several else ""
         notes.append(
-            "the command was computed by the declared law from the logged readings: the logged one is the "
-            "same but for white noise of its reading"
+            f"the command was computed by the declared law from the logged readings{where}: the logged one "
+            "is the same but for white noise of its reading"
         )
-    if min(p_values) < REJECTS:
+    if min(min(entry["whiteness"]["p"]) for entry in entries) < _REJECTS:
         notes.append(
             "the innovations are not white (rounding, coloured noise or an incomplete model): the standard "
             "deviations are widened accordingly"
         )
-    converged = bool(scored.converged) and bool(np.all(np.isfinite(theta)))
+    details = dict(entries[0])
+    if several:
+        notes += disagreement(rows, int(plain.identifiable.sum()))
+        samples = [{"samples": int(row.counts.sum())} for row in rows]
+        parts = [m.part for m in fit.members]
+        details = by_log(parts, [s | entry for s, entry in zip(samples, entries, strict=True)])
+    converged = end.converged and bool(np.all(np.isfinite(theta)))
     return Estimate(
         method="prediction_error",
         machine=machine.with_estimate(theta),
         theta=theta,
-        precision=plain.widened(widening(plain, jacobian, z, counts)),
+        precision=plain.widened(widening(plain, jacobian, z, counts, [len(row.residual) for row in rows])),
         converged=converged,
-        message="converged" if converged else f"no convergence within {steps} steps",
+        message="converged" if converged else f"no convergence within {end.steps} steps",
         residual=np.where(counts, z, np.nan),
         std_misspecified=std_under_misspecification(jacobian, z, counts),
         samples=int(counts.sum()),
-        steps=steps,
+        steps=end.steps,
         notes=tuple(notes),
-        details={
-            "noise": {
-                "force": noise[:drives],
-                "force_reading": read,
-                "velocity" if problem.kalman.of_velocity else "position": noise[drives:],
-            },
-            "log_likelihood": -float(scored.cost),
-            "whiteness": {"lags": LAGS, "p": p_values},
-        },
+        details={**details, "log_likelihood": -end.cost},
     )
 
 
-def _by_hessian(estimate: Estimate, problem: Innovations, scored: Scored) -> Steps[Estimate]:
+def _by_hessian(estimate: Estimate, fit: JointLikelihood, end: Maximum) -> Steps[Estimate]:
     """Replace Fisher's information in the covariance by the full Hessian, if that is positive definite.
 
     Args:
         estimate: Estimate with its precision by Fisher's information.
-        problem: The likelihood.
-        scored: The fit.
+        fit: The likelihood of one log.
+        end: Its maximum.
     """
-    full = yield from hessian_steps(problem, scored)
+    [member], [scored] = fit.members, end.scored
+    full = yield from hessian_steps(member.problem, scored)
     if full is None:
         precision = replace(estimate.precision, curvature=np.full(2, np.nan))
     else:
-        names, theta = estimate.names, estimate.theta
+        rows = _rows(fit, end, estimate.theta)
         # Errors that outlast their colour's model widen both by the same factors.
-        plain, curved = (_precision(names, problem, theta, scored, h) for h in (None, full))
-        jacobian, z, counts = _slopes(problem, scored), np.asarray(scored.z), np.asarray(problem.counts)
-        precision = curved.widened(widening(plain, jacobian, z, counts))
+        plain, curved = (_precision(fit, rows, estimate.theta, h) for h in (None, full))
+        precision = curved.widened(widening(plain, *stacked(rows)))
     notes = hessian_notes(precision, True, FISHER)
     return replace(estimate, precision=precision, notes=(*estimate.notes, *notes))
 
 
-def _slopes(problem: Innovations, scored: Scored) -> Float[np.ndarray, "time k p"]:
-    """Return the derivatives of the innovations, over their standard deviations, by the unknowns in SI."""
-    p = problem.bounds[0].size
-    # The slopes are those at the optimum, before the correction.
-    fitted = problem.transform.outward(scored.x[:p])
-    rows = problem.transform.physical(scored.mean[..., :p].reshape(scored.z.size, p), fitted)
-    return np.asarray(rows).reshape(*scored.z.shape, p)
+def _rows(fit: JointLikelihood, end: Maximum, theta: np.ndarray) -> list[Rows]:
+    """Return the innovations of all logs as residuals, with natural sizes by the estimates."""
+    scale = np.where(theta != 0, theta, 1.0)
+    return [member.rows(scored, scale) for member, scored in zip(fit.members, end.scored, strict=True)]
 
 
 def _precision(
-    names: list[str],
-    problem: Innovations,
+    fit: JointLikelihood,
+    rows: Sequence[Rows],
     theta: np.ndarray,
-    scored: Scored,
     hessian: Float[np.ndarray, "p p"] | None = None,
 ) -> Precision:
     """Return the precision by Fisher's information of the innovations, or by the observed one.
 
     Args:
-        names: Names of the unknowns.
-        problem: The likelihood.
+        fit: The likelihood.
+        rows: Its innovations.
         theta: Estimates, (p,).
-        scored: The fit.
         hessian: Observed information, which is used if it is positive definite, (p, p); None: not known.
     """
-    counts, jacobian = np.asarray(problem.counts), _slopes(problem, scored)
-
-    # An unknown is identifiable if its standard deviation changes the innovations less than the largest
-    # effect of any unknown does.
     scale = np.where(theta != 0, theta, 1.0)
-    effect = np.linalg.norm((jacobian * scale).reshape(scored.z.size, len(theta)), axis=0)
-    largest = float(np.max(effect, initial=0.0))
-    precision = assess(names, jacobian, np.asarray(scored.z), counts, largest, scale, hessian)
+    precision = assess_together(fit.machine.parameters.names, rows, scale, hessian)
     return replace(precision, kind=FULL_HESSIAN if precision.kind == FULL_HESSIAN else FISHER)
 
 
-def whiteness(z: Float[np.ndarray, " time"], lags: int = LAGS) -> float:
+def whiteness(z: Float[np.ndarray, " time"], lags: int = _LAGS) -> float:
     """Return the probability that white noise has autocorrelations as large as these.
 
     Source:

@@ -20,7 +20,7 @@ from jaxid.arrays import Array
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import choose_numerics, output_residual, position_jacobian
+from jaxid.estimators.simulated_output import choose_numerics, output_residual, position_jacobian
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant

@@ -296,8 +296,18 @@ def assess(
     if not names:
         return Precision(np.zeros((0, 0)), np.zeros(0, bool), [], np.zeros(0))
     rows = jacobian if counts.all() else np.where(counts[..., None], jacobian, 0.0)
-    flat = rows.reshape(-1, len(names))
-    meat = np.zeros((len(names), len(names)))
+    flat, meat = rows.reshape(-1, len(names)), _of_gradient(rows, residual, counts, crossed)
+    return assess_from_sums(names, flat.T @ flat, meat, signal, scale, hessian, solved)
+
+
+def _of_gradient(
+    rows: Float[np.ndarray, "time n p"],
+    residual: Float[np.ndarray, "time n"],
+    counts: Bool[np.ndarray, "time n"],
+    crossed: bool,
+) -> Float[np.ndarray, "p p"]:
+    """Return J'RJ, the covariance of the gradient, for a Jacobian that is zero where nothing counts."""
+    meat = np.zeros((rows.shape[-1], rows.shape[-1]))
     noises = [NoiseModel.fit(e, c) for e, c in zip(residual.T, counts.T, strict=True)]
     for i, noise in enumerate(noises):
         # In a chain of many masses each balance contains few of the unknowns.
@@ -308,7 +318,7 @@ def assess(
             pair = [(rows[:, k], noises[k], residual[:, k]) for k in (i, j)]
             both = cross_sandwich(*zip(*pair, strict=True))
             meat += both + both.T
-    return assess_from_sums(names, flat.T @ flat, meat, signal, scale, hessian, solved)
+    return meat
 
 
 def assess_from_sums(
@@ -356,14 +366,11 @@ class Rows:
     signal: float
     weight: float = 1.0
 
-    def matrices(self, norm: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
+    def matrices(self, norm: Float[np.ndarray, " p"], crossed: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return J'J and J'RJ by the unknowns over `norm`, (p, p) each, R being the residual's covariance."""
-        rows = np.where(self.counts[..., None], self.jacobian, 0.0)
-        flat, meat = (rows / norm).reshape(-1, len(norm)), np.zeros((len(norm), len(norm)))
-        for i, (e, c) in enumerate(zip(self.residual.T, self.counts.T, strict=True)):
-            own = np.flatnonzero(np.any(rows[:, i] != 0, axis=0))
-            meat[np.ix_(own, own)] += sandwich(rows[:, i, own] / norm[own], NoiseModel.fit(e, c))
-        return flat.T @ flat, meat
+        rows = np.where(self.counts[..., None], self.jacobian, 0.0) / norm
+        flat = rows.reshape(-1, len(norm))
+        return flat.T @ flat, _of_gradient(rows, self.residual, self.counts, crossed)
 
     @property
     def size(self) -> Float[np.ndarray, " p"]:
@@ -414,15 +421,21 @@ def assess_together(
     logs: Sequence[Rows],
     scale: Float[np.ndarray, " p"],
     hessian: Float[np.ndarray, "p p"] | None = None,
+    crossed: bool = False,
 ) -> Precision:
-    """Return the precision of one least-squares fit to several logs, each with its noise and weight.
+    """Return the precision of one least-squares fit to one log or several, each with its noise and weight.
 
     Args:
         names: Names of the p parameters.
-        logs: Residuals of the logs.
+        logs: Residuals of the logs; of one alone the weight does not matter.
         scale: Natural size of each parameter, (p,).
         hessian: Full Hessian of half the weighted sum of squares, (p, p), see `assess`.
+        crossed: Whether the columns of a residual have common noise, see `assess`.
     """
+    if len(logs) == 1:
+        [log] = logs
+        shape = (log.jacobian, log.residual, log.counts, log.signal)
+        return assess(names, *shape, scale, None if hessian is None else hessian / log.weight, crossed)
     if not names:
         return Precision(np.zeros((0, 0)), np.zeros(0, bool), [], np.zeros(0))
     signal = float(np.sqrt(np.sum([log.weight * log.signal**2 for log in logs])))
@@ -431,7 +444,7 @@ def assess_together(
     norm = np.where(dead, 1.0, norm)
     normal, meat = np.zeros((len(names),) * 2), np.zeros((len(names),) * 2)
     for log in logs:
-        own, coloured = log.matrices(norm)
+        own, coloured = log.matrices(norm, crossed)
         normal += log.weight * own
         meat += log.weight**2 * coloured
     for matrix in (normal, meat):

@@ -96,12 +96,15 @@ class Replay(eqx.Module):
     every: int = eqx.field(static=True)
     follow: Float[Array, "n k"]
 
-    def __call__(self, plant: Plant, nudge: Array | None = None) -> Trajectory:
+    def __call__(
+        self, plant: Plant, nudge: Array | None = None, noise: Float[Array, "ticks n"] | None = None
+    ) -> Trajectory:
         """Return the trajectory at the samples of the log.
 
         Args:
             plant: The plant to simulate.
             nudge: Change of position and velocity at the start, (2 n,).
+            noise: Standard normal numbers for the noise of the readings of a loop; None: no noise.
         """
         q, v = self.position, self.velocity
         if nudge is not None:
@@ -119,6 +122,7 @@ class Replay(eqx.Module):
                 q,
                 v,
                 self.sensor,
+                noise,
             )
         else:
             assert self.command is not None, "make_replay gives an open loop its command"

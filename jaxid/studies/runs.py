@@ -12,7 +12,7 @@ from jaxid.errors import InputError
 from jaxid.estimators import SIMULATING, steps_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.prepare import Recipe
 from jaxid.names import DISCOVER, IN_LOOP
 from jaxid.numerics.lanes import Steps, run_alone, run_batched

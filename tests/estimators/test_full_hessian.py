@@ -11,7 +11,8 @@ import scipy.signal
 
 import jaxid
 from jaxid.build import build_machine
-from jaxid.estimators.output_error import output_error, output_error_steps, output_residual
+from jaxid.estimators.output_error import output_error, output_error_steps
+from jaxid.estimators.simulated_output import output_residual
 from jaxid.logs.log import Log
 from jaxid.numerics.lanes import run_batched
 from jaxid.numerics.precision import assess, full_hessian, hessian_covariance, hessian_notes

@@ -85,7 +85,7 @@ def test_steps_are_counted_where_the_fit_starts(tmp_path, monkeypatch):
         counted.append(float(machine.plant.inertia))
         raise InputError("enough")
 
-    monkeypatch.setattr("jaxid.estimators.prediction_error.needed_steps", steps)
+    monkeypatch.setattr("jaxid.estimators.likelihood.needed_steps", steps)
     session = open_session(*opened(tmp_path, 1, closed=False))
     for start in (TRUE, None):
         with pytest.raises(InputError, match="enough"):

@@ -11,7 +11,8 @@ import jaxid
 from jaxid.build import build_machine
 from jaxid.cli import main
 from jaxid.estimators.common.profile import OFFSETS, likelihood_interval, profile_entry
-from jaxid.estimators.output_error import output_error, output_error_steps, output_residual
+from jaxid.estimators.output_error import output_error, output_error_steps
+from jaxid.estimators.simulated_output import output_residual
 from jaxid.numerics.lanes import run_batched
 from jaxid.simulation.replay import make_replay, with_fitted_start
 from tests.estimators.test_full_hessian import BENT, CASE, NUMERICS, PERIOD, SAMPLES, STIFFNESS, logs

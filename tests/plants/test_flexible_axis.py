@@ -15,7 +15,7 @@ from jaxid.cli import main
 from jaxid.dynamics.hidden_joints import complete_motion
 from jaxid.errors import InputError
 from jaxid.estimators import METHODS
-from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.log import Log
 from jaxid.numerics.lanes import run_alone
 from jaxid.results.as_json import derived_json

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxid.errors import InputError
-from jaxid.estimators.output_error import choose_numerics, output_error
+from jaxid.estimators.output_error import output_error
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.gap import simulated
 from jaxid.results.verdict.absurd import remarks_on
 from jaxid.session import Session, open_session

@@ -13,7 +13,8 @@ import jaxid
 from jaxid.controllers.linear import CascadePD
 from jaxid.dynamics.rhs import State
 from jaxid.effects import EFFECTS
-from jaxid.estimators.output_error import choose_numerics, output_error
+from jaxid.estimators.output_error import output_error
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.smoothing import Smoothing

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.simulation.replay import make_replay
 
 CASE = (Path(jaxid.__file__).parent / "demo" / "case.toml").read_text(encoding="utf-8")

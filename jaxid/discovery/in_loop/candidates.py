@@ -16,7 +16,7 @@ from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where
 from jaxid.estimators.common.levenberg_marquardt import Minimum
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import choose_numerics, output_residual
+from jaxid.estimators.simulated_output import choose_numerics, output_residual
 from jaxid.estimators.within_prior.evaluations import linearise
 from jaxid.estimators.within_prior.posterior import maximum_a_posteriori
 from jaxid.estimators.within_prior.problem import Problem

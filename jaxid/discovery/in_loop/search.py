@@ -20,7 +20,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.estimators import steps_of
-from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.estimators.within_prior.fit import within_prior_steps
 from jaxid.gap import gaps, noise_floor
 from jaxid.machine import Machine

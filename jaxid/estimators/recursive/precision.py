@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, RecursiveMemory
 from jaxid.estimators.recursive.rows import Rows
@@ -21,6 +22,15 @@ def weights(rows: Rows, forgetting: float) -> Float[np.ndarray, " kept"]:
     return forgetting ** (np.cumsum(moved[::-1])[::-1] - moved)
 
 
+def weights_together(logs: Sequence[Rows], forgetting: Sequence[float]) -> Float[np.ndarray, " kept"]:
+    """Return the weight of each sample of logs that were run one after the other, at the end of the last."""
+    out, later = [], 1.0
+    for rows, factor in zip(reversed(logs), reversed(forgetting), strict=True):
+        out.append(later * weights(rows, factor))
+        later *= factor ** rows.moved.sum()
+    return np.concatenate(out[::-1])
+
+
 def precision_of(
     machine: Machine,
     rows: Rows,
@@ -29,6 +39,8 @@ def precision_of(
     history: RecursiveEstimate,
     every: int,
     whole: bool,
+    weight: Float[np.ndarray, " kept"] | None = None,
+    block: Int[np.ndarray, " kept"] | None = None,
 ) -> tuple[Precision, Float[np.ndarray, " p"]]:
     """Compute the precision at the end, and the factors by which coloured noise widens white deviations.
 
@@ -41,15 +53,19 @@ def precision_of(
         every: Number of samples between them.
         whole: Whether the estimate is from these rows alone; else the earlier rows in the memory are taken to
             have the noise of this log.
+        weight: Weight of each sample at the end; None: that of one log.
+        block: Number of the estimate after each sample in the history; None: that of one log.
 
     Returns:
         The precision: that of weighted least squares, with the colour of the residual and the square of the
         remaining pull of the start; and the factors, (p,).
     """
     names = machine.parameters.names
-    w, counts = weights(rows, float(recursion.forgetting))[:, None], rows.counts
+    weight = weights(rows, float(recursion.forgetting)) if weight is None else weight
+    block = np.arange(len(rows.rows)) // every if block is None else block
+    w, counts = weight[:, None], rows.counts
     root = np.where(counts, np.sqrt(w), 0.0)
-    e = _residual(rows, root, recursion, history, every)
+    e = _residual(rows, root, recursion, history, block)
 
     # Least squares on the weighted rows, or on their projection on the instruments.
     weighted = root[..., None] * (rows.rows if not recursion.instrument else _projected(rows.rows, z, root))
@@ -78,7 +94,7 @@ def precision_of(
 
 
 def _residual(
-    rows: Rows, root: np.ndarray, recursion: Recursion, history: RecursiveEstimate, every: int
+    rows: Rows, root: np.ndarray, recursion: Recursion, history: RecursiveEstimate, block: np.ndarray
 ) -> Float[np.ndarray, "kept m"]:
     """Return a residual with the colour and size of the noise that acts on the estimate.
 
@@ -89,7 +105,6 @@ def _residual(
     last = np.where(rows.counts, rows.rows @ history.theta[-1] - rows.target, 0.0)
     if recursion.forgetting == 1.0:
         return last
-    block = np.arange(len(last)) // every
     known = np.asarray(history.identifiable.all(axis=1))
     then = np.where(known[block, None], history.theta[block], history.theta[-1])
     e = np.where(rows.counts, np.einsum("tmp,tp->tm", rows.rows, then) - rows.target, 0.0)

@@ -7,13 +7,14 @@ unknowns together is checked on the log itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxid.arrays import Array
 from jaxid.dynamics.residuals import balance_along
@@ -54,6 +55,27 @@ class Rows:
             np.sum(np.where(self.counts, x, 0.0), axis=1, keepdims=True) for x in (self.target, self.force)
         )
         return Rows(rows, target, np.asarray(self.moved)[:, None], force)
+
+    def widened(self, index: Int[np.ndarray, " own"], width: int) -> Rows:
+        """Return the rows by `width` unknowns of all logs, of which these are the ones with some numbers."""
+        rows = np.zeros((*self.rows.shape[:-1], width))
+        rows[..., index] = self.rows
+        return replace(self, rows=rows)
+
+    def scaled(self, factor: float) -> Rows:
+        """Return the regression times a factor."""
+        return Rows(factor * self.rows, factor * self.target, self.counts, factor * self.force)
+
+    @classmethod
+    def joined(cls, logs: Sequence[Rows]) -> Rows:
+        """Return the regressions of logs, one behind the other."""
+        fields = ("rows", "target", "counts", "force")
+        return cls(*(np.concatenate([getattr(rows, name) for rows in logs]) for name in fields))
+
+    @property
+    def size(self) -> float:
+        """2-norm of the force in the rows that count."""
+        return float(np.linalg.norm(np.where(self.counts, self.force, 0.0)))
 
     @property
     def moved(self) -> Bool[np.ndarray, " kept"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +13,13 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import linear_scale
 from jaxid.estimators.power import power_and_columns, windows_of
 from jaxid.estimators.several.descent import Descent, Model, descent_steps
-from jaxid.estimators.several.parts import Part, Scale, by_log, parts_of
-from jaxid.estimators.several.weights import disagreement, start_weights, weighted_steps
+from jaxid.estimators.several.parts import Part, Scale, by_log
+from jaxid.estimators.several.sums import shares, stacked, summed
+from jaxid.estimators.several.weights import descended_steps, disagreement, start_weights
+from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Rows, assess_together
-from jaxid.session import Session
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 
 # Part of the cost by which a fit has converged, and most evaluations, as of the fit to one log.
@@ -43,59 +44,58 @@ class Equations:
     signal: float
 
 
-def inverse_dynamics_steps(session: Session) -> Steps[Estimate]:
+def inverse_dynamics_steps(machine: Machine, parts: Sequence[Part]) -> Steps[Estimate]:
     """Fit the unknowns to several logs by least squares on the balance of forces, as `inverse_dynamics`."""
-    parts, equations = parts_of(session), []
-    whole = all(all(part.run.data.measured) for part in parts)
+    equations = []
+    whole = all(all(part.data.measured) for part in parts)
     for part in parts:
-        data = part.run.data
+        data = part.data
         arrays, plant = ForceData.of(data, data.fitted), sharpened(part.machine.plant, data)
         size = float((yield SolveRequest(force_size, (plant, arrays))))
         arguments = (plant, part.machine.parameters.places, arrays)
         equations.append(Equations(force_and_columns, arguments, data.fitted, size))
-    return (yield from least_squares_steps(session, "inverse_dynamics", parts, equations, whole=whole))
+    return (yield from least_squares_steps(machine, "inverse_dynamics", parts, equations, whole=whole))
 
 
-def power_steps(session: Session) -> Steps[Estimate]:
+def power_steps(machine: Machine, parts: Sequence[Part]) -> Steps[Estimate]:
     """Fit the unknowns to balances of energy over windows of several logs, as `power`."""
-    parts, equations = parts_of(session), []
+    equations = []
     for part in parts:
-        part.run.log.need_every_encoder("power")
-        plant = sharpened(part.machine.plant, part.run.data)
-        windows, unit = windows_of(part.machine, part.run.data)
+        part.log.need_every_encoder("power")
+        plant = sharpened(part.machine.plant, part.data)
+        windows, unit = windows_of(part.machine, part.data)
         counts = np.asarray(windows.weight > 0)
         arguments = (plant, part.machine.parameters.places, windows)
         signal = float(unit * np.sqrt(counts.sum()))
         equations.append(Equations(power_and_columns, arguments, counts, signal))
-    return (yield from least_squares_steps(session, "power", parts, equations))
+    return (yield from least_squares_steps(machine, "power", parts, equations))
 
 
-def algebraic_steps(session: Session) -> Steps[Estimate]:
+def algebraic_steps(machine: Machine, parts: Sequence[Part]) -> Steps[Estimate]:
     """Fit the unknowns to windows of iterated integrals of several logs, as `algebraic`."""
-    parts, equations = parts_of(session), []
+    equations = []
     for part in parts:
-        part.run.log.need_every_encoder("algebraic")
-        length, counts = windows_without_rest(part.machine, part.run.log, part.run.data)
-        plant, data = sharpened(part.machine.plant, part.run.data), part.run.data
-        arguments = (plant, part.machine.parameters.places, ForceData.of(data), part.run.log.position, length)
+        part.log.need_every_encoder("algebraic")
+        length, counts = windows_without_rest(part.machine, part.log, part.data)
+        plant, data = sharpened(part.machine.plant, part.data), part.data
+        arguments = (plant, part.machine.parameters.places, ForceData.of(data), part.log.position, length)
         force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
         equations.append(Equations(windows_and_columns, arguments, counts, force * np.sqrt(counts.sum())))
-    return (yield from least_squares_steps(session, "algebraic", parts, equations))
+    return (yield from least_squares_steps(machine, "algebraic", parts, equations))
 
 
 def least_squares_steps(
-    session: Session, method: str, parts: list[Part], equations: list[Equations], *, whole: bool = True
+    machine: Machine, method: str, parts: Sequence[Part], equations: list[Equations], *, whole: bool = True
 ) -> Steps[Estimate]:
     """Solve the equations of several logs by least squares, each log weighed by its noise.
 
     Args:
-        session: Case and logs.
+        machine: Machine of all logs, with their unknowns.
         method: Name of the method, for the estimate.
         parts: The logs.
         equations: The equations of each.
         whole: Whether every joint has an encoder.
     """
-    machine = session.machine
     transform, damping = linear_scale(machine, whole)
     scale, p = Scale.of(machine, transform), len(machine.parameters.free)
 
@@ -120,37 +120,12 @@ def least_squares_steps(
     for at in [theta, *phase_starts(machine, theta), *shape_starts(machine, theta)]:
         ends.append((yield from fit(scale.inward(at), first)))
     best = min(ends, key=lambda end: np.nan_to_num(end.model.cost, nan=np.inf))
-    found, _ = yield from weighted_steps(fit, lambda end: end.model.content, best.x, first)
-    return _estimate(session, method, parts, scale, found)
+    found, _ = yield from descended_steps(fit, best.x, first)
+    return _estimate(machine, method, parts, scale, found)
 
 
-def summed(logs: list[Rows], slope: np.ndarray) -> Model:
-    """Return half the weighted sum of squares of some logs, and its model on the scale of the solver.
-
-    Args:
-        logs: Residuals and Jacobians by the physical values; both are zero at samples that do not count.
-        slope: Derivative of the physical values by those of the solver.
-    """
-    cost, q = 0.0, slope.size
-    gradient, normal = np.zeros(q), np.zeros((q, q))
-    for log in logs:
-        e, columns = log.residual.ravel(), log.jacobian.reshape(-1, q) * slope
-        cost += 0.5 * log.weight * float(e @ e)
-        gradient += log.weight * (columns.T @ e)
-        normal += log.weight * (columns.T @ columns)
-    return Model(cost, gradient, normal, logs)
-
-
-def stacked(logs: list[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Jacobian, residual and mask of all logs, one behind the other, over the root of their noise."""
-    roots = [np.sqrt(log.weight) for log in logs]
-    jacobian = np.concatenate([r * log.jacobian for r, log in zip(roots, logs, strict=True)])
-    residual = np.concatenate([r * log.residual for r, log in zip(roots, logs, strict=True)])
-    return jacobian, residual, np.concatenate([log.counts for log in logs])
-
-
-def _estimate(session: Session, method: str, parts: list[Part], scale: Scale, found: Descent) -> Estimate:
-    machine, logs = session.machine, found.model.content
+def _estimate(machine: Machine, method: str, parts: Sequence[Part], scale: Scale, found: Descent) -> Estimate:
+    logs = found.model.content
     theta, guess = scale.outward(found.x)[0], machine.parameters.guess
     natural = np.where(guess != 0, guess, 1.0)
     precision = assess_together(machine.parameters.names, logs, natural)
@@ -170,8 +145,3 @@ def _estimate(session: Session, method: str, parts: list[Part], scale: Scale, fo
         details=by_log(parts, shares(logs)),
         std_misspecified=std_under_misspecification(*stacked(logs)),
     )
-
-
-def shares(logs: list[Rows]) -> list[dict[str, float | int]]:
-    """Return for each log its samples, and the standard deviation of white noise that informs as much."""
-    return [{"samples": int(log.counts.sum()), "noise": float(log.weight**-0.5)} for log in logs]

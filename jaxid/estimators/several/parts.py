@@ -4,29 +4,48 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.estimators.common.levenberg_marquardt import Transform
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.session import OpenedLog, Session
+
+if TYPE_CHECKING:
+    from jaxid.session import Session
 
 
 @dataclass(frozen=True)
 class Part:
-    """One of several logs that are fitted together.
+    """One of the logs that are fitted together; a fit of one log has one part.
 
     Args:
-        run: The log.
+        name: Name of the log in results.
+        log: The log.
         machine: Its machine, with the values and the unknowns that hold in it.
         index: Number of each of its unknowns among those of all logs, (own,).
+        prepared: The prepared log; None for a method that takes the log as it is.
     """
 
-    run: OpenedLog
+    name: str
+    log: Log
     machine: Machine
     index: np.ndarray
+    prepared: Prepared | None = None
+
+    @classmethod
+    def alone(cls, machine: Machine, log: Log, prepared: Prepared | None = None) -> Part:
+        """Return the part of a fit of one log, which has all unknowns."""
+        return cls("fit", log, machine, np.arange(len(machine.parameters.free)), prepared)
+
+    @property
+    def data(self) -> Prepared:
+        """The prepared log."""
+        assert self.prepared is not None, "the log of this fit was not prepared"
+        return self.prepared
 
     def at(self, theta: Float[np.ndarray, " p"]) -> Machine:
         """Return the machine of this log with its unknowns at values of those of all logs, (p,)."""
@@ -46,7 +65,7 @@ def parts_of(session: Session) -> list[Part]:
     for run in session.fits:
         machine = run.machine(session.machine)
         index = np.array([names.index(name) for name in machine.parameters.names], dtype=int)
-        parts.append(Part(run, machine, index))
+        parts.append(Part(run.name, run.log, machine, index, run.data))
     return parts
 
 
@@ -96,4 +115,4 @@ class Scale:
 
 def by_log(parts: Sequence[Part], entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return results of each log by its name, as details of an estimate."""
-    return {"fits": {part.run.name: entry for part, entry in zip(parts, entries, strict=True)}}
+    return {"fits": {part.name: entry for part, entry in zip(parts, entries, strict=True)}}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import scipy.stats
@@ -12,6 +13,7 @@ from jaxid.estimators.several.descent import Descent
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Rows
 
+T = TypeVar("T")
 # Rounds of fit and weights, and the relative change of all weights at which they end.
 _ROUNDS, _SETTLED = 8, 0.02
 # Probability with which chance alone makes logs contradict each other.
@@ -40,34 +42,47 @@ def noise_weights(logs: Sequence[Rows]) -> Float[np.ndarray, " logs"]:
 
 
 def weighted_steps(
-    fit: Callable[[np.ndarray, np.ndarray], Steps[Descent]],
-    rows: Callable[[Descent], list[Rows]],
+    fit: Callable[[np.ndarray, np.ndarray], Steps[T]],
+    rows: Callable[[T], list[Rows] | None],
+    values: Callable[[T], np.ndarray],
     x: Float[np.ndarray, " q"],
     weights: Float[np.ndarray, " logs"],
-) -> Steps[tuple[Descent, Float[np.ndarray, " logs"]]]:
+) -> Steps[tuple[T, Float[np.ndarray, " logs"]]]:
     """Fit in turn the unknowns with given weights, and the weights from the residuals.
 
     Args:
         fit: Function that fits from a start with weights.
-        rows: Function that returns the residuals of all logs at the end of a fit.
+        rows: Function that returns the residuals of all logs at the end of a fit; None if it failed.
+        values: Function that returns the values at which a fit ended, where the next one starts.
         x: Start.
-        weights: First weights.
+        weights: First weights; that of a single log stays.
 
     Source:
         Aitken (1936), Proc. Roy. Soc. Edinburgh 55, for the weights; Oberhofer and Kmenta (1974),
         Econometrica 42, 579-590, for their iteration, which maximises the likelihood.
     """
     found = yield from fit(x, weights)
-    for _ in range(_ROUNDS):
-        if not found.model.finite:
+    for _ in range(_ROUNDS if len(weights) > 1 else 0):
+        logs = rows(found)
+        if logs is None:
             break
-        new = noise_weights(rows(found))
+        new = noise_weights(logs)
         settled = np.all(np.abs(np.log(new / weights)) < _SETTLED)
         weights = new
-        found = yield from fit(found.x, weights)
+        found = yield from fit(values(found), weights)
         if settled:
             break
     return found, weights
+
+
+def descended_steps(
+    fit: Callable[[np.ndarray, np.ndarray], Steps[Descent]],
+    x: Float[np.ndarray, " q"],
+    weights: Float[np.ndarray, " logs"],
+) -> Steps[tuple[Descent, Float[np.ndarray, " logs"]]]:
+    """Run `weighted_steps` on descents, whose models hold the residuals of the logs."""
+    rows = lambda end: end.model.content if end.model.finite else None
+    return (yield from weighted_steps(fit, rows, lambda end: end.x, x, weights))
 
 
 def disagreement(logs: Sequence[Rows], unknowns: int) -> list[str]:

@@ -16,8 +16,8 @@ from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Progress, descend
 from jaxid.estimators.common.minimise import minimise_on_scale
 from jaxid.estimators.common.minimisers import Minimiser
-from jaxid.estimators.output_error import choose_numerics
-from jaxid.estimators.within_prior.problem import Problem, WeightedResidual
+from jaxid.estimators.simulated_output import choose_numerics
+from jaxid.estimators.within_prior.problem import Compared, Problem
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import ParallelCalls, Precompile, SolveRequest, Steps, side_by_side
@@ -44,7 +44,7 @@ _ONCE = np.asarray(_EVALUATIONS_PER_CALL)
 
 
 @side_by_side
-def _residuals_at(compared: WeightedResidual, sharpness: Array, w: Array, starts: Array) -> Array:
+def _residuals_at(compared: Compared, sharpness: Array, w: Array, starts: Array) -> Array:
     """Return the residuals at many whitened points, each from its initial positions, (draws, rows)."""
     compared = compared.at_sharpness(sharpness)
 
@@ -86,7 +86,7 @@ def _zero_starts(problem: Problem, draws: int) -> np.ndarray:
 
 
 def _with_prior(
-    compared: WeightedResidual, sharpness: Array, prior_weight: Array, origin: Array, vectors: Array
+    compared: Compared, sharpness: Array, prior_weight: Array, origin: Array, vectors: Array
 ) -> Callable[[Array], Array]:
     """Return the residual as a function of the coordinates, followed by the rows of the prior."""
     along = compared.at_sharpness(sharpness).along(vectors, origin)
@@ -94,7 +94,7 @@ def _with_prior(
 
 
 def _advance(
-    compared: WeightedResidual,
+    compared: Compared,
     sharpness: Array,
     prior_weight: Array,
     origin: Array,
@@ -129,7 +129,7 @@ _advance_compiled = eqx.filter_jit(_advance)
 @eqx.filter_jit
 def _by_minimiser(
     minimiser: Minimiser,
-    compared: WeightedResidual,
+    compared: Compared,
     sharpness: Array,
     prior_weight: Array,
     origin: Array,
@@ -236,7 +236,7 @@ def _begun(width: int, size: int) -> Progress:
 
 @eqx.filter_jit
 def fit_each(
-    compared: WeightedResidual,
+    compared: Compared,
     sharpness: Array,
     prior_weight: Array,
     origin: Array,

@@ -15,10 +15,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.errors import InputError
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_error import choose_numerics, kept_delay, notes_of
+from jaxid.estimators.several.parts import Part, by_log
+from jaxid.estimators.several.weights import disagreement
+from jaxid.estimators.simulated_output import choose_numerics, kept_delay, notes_of
 from jaxid.estimators.within_prior.evaluations import BLOCK, DRAWS, linearise, precompile_residuals_at
 from jaxid.estimators.within_prior.multistart import (
     fit_from_many_starts,
@@ -39,6 +42,7 @@ from jaxid.estimators.within_prior.precision import (
     parameter_precision,
     precision_of_directions,
     profiles_of,
+    rows_of,
     with_prior,
 )
 from jaxid.estimators.within_prior.problem import Problem
@@ -76,7 +80,7 @@ _REPRESENTED = 0.1
 
 def within_prior_steps(
     machine: Machine,
-    log: Log,
+    log: Log | Sequence[Part],
     *,
     prior: float,
     on: str = "position",
@@ -95,7 +99,7 @@ def within_prior_steps(
 
     Args:
         machine: The machine; its controller closes the loop, which begins at rest.
-        log: The log to fit.
+        log: The log to fit, or the parts of several. Each column of each of them counts over its spread.
         prior: Relative standard deviation of the guesses.
         on: Output that is compared: "position", "force" or "both". For the latter two the loop is simulated
             without quantisation of the readings: the count of a simulated reading is random for a coarse
@@ -118,16 +122,25 @@ def within_prior_steps(
         effect on the fitted ones; `details["directions"]` has the combinations and their standard deviations.
 
     Raises:
-        InputError: If the loop cannot be simulated, or a guess is zero.
+        InputError: If the loop cannot be simulated, or a guess is zero; if quantisation would be drawn for
+            several logs.
 
     Source:
         Precision: Bogdan and Abba, (12)-(27), with the residual's colour in place of white noise.
         (27) lacks the inverse of B: 100 (sigma^2 diag B^-1)^(1/2) / theta.
     """
     need_names(profile_of, machine.parameters.names)
-    numerics = numerics or choose_numerics(machine, log)
-    problem = Problem.of(machine, log, prior, on, numerics, widths)
+    parts = [Part.alone(machine, log)] if isinstance(log, Log) else list(log)
+    chosen = [numerics or choose_numerics(part.machine, part.log) for part in parts]
+    numerics = replace(chosen[0], substeps=max(each.substeps for each in chosen))
+    problem = _problem(machine, parts, prior, on, numerics, widths)
     problem = replace(problem, minimiser=minimiser_of(minimiser))
+    if problem.logs and drawn and omits_quantisation(machine, problem):
+        raise InputError(
+            "the quantisation of the readings is drawn for one log, and there are several",
+            where="within_prior",
+            hint='set drawn = false, or on = "position"',
+        )
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     first = None if begin is None else problem.prior.inward(problem.padded(begin))
     fit, precision, multistart = yield from _search(machine, problem, first, starts, given, drawn)
@@ -155,8 +168,36 @@ def within_prior_steps(
         ]
         notes += _quantisation_notes(drawn, precision is not None, more)
 
-    notes = (*notes_of(machine, numerics, log, on, minimiser), *notes)
+    if problem.logs and precision is not None:
+        logs = rows_of(fit)
+        notes += disagreement(logs, fit.count)
+        noise = [
+            float(log.equivalent_variance() ** 0.5) / float(np.max(fit.problem.weight[rows]))
+            for log, rows in zip(logs, fit.problem.slices, strict=True)
+        ]
+        samples = [int(log.counts.sum()) for log in logs]
+        entries = [{"samples": n, "noise": s} for n, s in zip(samples, noise, strict=True)]
+        details |= by_log(parts, entries)
+    notes = (*notes_of(parts[0].machine, numerics, parts[0].log, on, minimiser), *notes)
     return _estimate(machine, fit, whole, notes, details | multistart | kept_delay(machine, numerics))
+
+
+def _problem(
+    machine: Machine,
+    parts: Sequence[Part],
+    prior: float,
+    on: str,
+    numerics: Numerics,
+    widths: Mapping[str, float] | None,
+) -> Problem:
+    """Set up the fit of one log or of several; see `within_prior_steps`."""
+    if len(parts) == 1:
+        return Problem.of(machine, parts[0].log, prior, on, numerics, widths)
+    logs = [
+        (part.name, Problem.of(part.machine, part.log, prior, on, numerics, widths), part.index)
+        for part in parts
+    ]
+    return Problem.joint(machine, prior, logs, widths)
 
 
 def _quantisation_notes(drawn: bool, identifiable: bool, more: Sequence[str]) -> list[str]:

@@ -16,11 +16,11 @@ from jaxid.estimators.within_prior.posterior import (
     maximum_a_posteriori,
     negative_log_posterior,
 )
-from jaxid.estimators.within_prior.problem import WeightedResidual
+from jaxid.estimators.within_prior.problem import Compared
 from jaxid.estimators.within_prior.subspace import SubspaceFit
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
-from jaxid.numerics.precision import GAUSS_NEWTON, LAPLACE, Precision, assess, full_hessian
+from jaxid.numerics.precision import GAUSS_NEWTON, LAPLACE, Precision, Rows, assess_together, full_hessian
 
 # An unknown is identifiable if its posterior standard deviation is below this, in those of its prior.
 _IDENTIFIABLE_STD = 0.5
@@ -29,7 +29,7 @@ _NEGLIGIBLE = 0.1
 
 
 @eqx.filter_jit
-def cost_hessian(compared: WeightedResidual, sharpness: Array, vectors: Array, z: Array) -> Array:
+def cost_hessian(compared: Compared, sharpness: Array, vectors: Array, z: Array) -> Array:
     """Return the full Hessian of the cost in the coordinates of some directions, (k, k).
 
     Args:
@@ -75,31 +75,35 @@ def precision_of_directions(fit: SubspaceFit) -> SubspacePrecision:
     Args:
         fit: The fit, of at least one direction.
     """
-    problem, r = fit.problem, fit.count
-    shape, counts = problem.measured.shape, problem.weight > 0
-    jacobian = np.asarray(fit.minimum.jacobian).reshape(*shape, -1)[..., :r]
-    e = np.asarray(fit.minimum.residual).reshape(shape)
-    deviation = problem.weight * (problem.measured - problem.measured.mean(axis=0))
-    signal = float(np.linalg.norm(deviation))
-    coloured = assess(
+    r = fit.count
+    coloured = assess_together(
         [f"direction {k + 1}" for k in range(r)],
-        jacobian,
-        e,
-        counts,
-        signal,
+        rows_of(fit),
         np.ones(r),
-        crossed=problem.on == "both",
+        crossed=fit.problem.on == "both",
     )
 
     # The triangular factor keeps digits that the normal matrix loses: the precision of directions differs by
     # factors of a million.
-    triangle = np.linalg.qr(jacobian.reshape(-1, r), mode="r")
-    white = problem.noise(fit.minimum, r) * np.linalg.norm(np.linalg.inv(triangle), axis=1)
+    triangle = np.linalg.qr(np.asarray(fit.minimum.jacobian)[:, :r], mode="r")
+    white = fit.problem.noise(fit.minimum, r) * np.linalg.norm(np.linalg.inv(triangle), axis=1)
 
     # A colour that is estimated from a hundred samples is itself uncertain: the standard deviation is never
     # less than with white noise.
     larger = np.maximum(1.0, white / coloured.std)
     return SubspacePrecision(coloured.covariance * np.outer(larger, larger), white, coloured.information)
+
+
+def rows_of(fit: SubspaceFit) -> list[Rows]:
+    """Return the weighted residual of each log, with its Jacobian in the fitted directions."""
+    problem, r = fit.problem, fit.count
+    shape, counts, deviation = problem.measured.shape, problem.weight > 0, problem.deviation
+    jacobian = np.asarray(fit.minimum.jacobian).reshape(*shape, -1)[..., :r]
+    e = np.asarray(fit.minimum.residual).reshape(shape)
+    return [
+        Rows(jacobian[rows], e[rows], counts[rows], float(np.linalg.norm(deviation[rows])))
+        for rows in problem.slices
+    ]
 
 
 def with_prior(

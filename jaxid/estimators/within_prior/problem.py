@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Minimum
 from jaxid.estimators.common.minimisers import Minimiser
-from jaxid.estimators.output_error import measured_output, output_residual, turning_steps
+from jaxid.estimators.simulated_output import measured_output, output_residual, turning_steps
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
@@ -58,19 +58,75 @@ class WeightedResidual(eqx.Module):
         """Return the residual from shifted initial positions of the joints with an encoder."""
         return replace(self, replay=self.replay.started(start))
 
-    def along(self, vectors: Array, origin: Array | float = 0.0) -> Callable[[Array], Array]:
-        """Return the residual as a function of coordinates z, at the whitened point origin + vectors z."""
+    @property
+    def nuisances(self) -> int:
+        """Number of nuisance parameters behind the unknowns."""
+        return self.prior.base.size - len(self.places)
+
+    def of_values(self) -> Callable[[Array, Array], Array]:
+        """Return the residual as a function of physical unknowns and nuisance parameters."""
         physical = output_residual(self.replay, self.places, self.plant, self.measured, self.weight, self.on)
 
-        def residual(z: Array) -> Array:
-            # The nuisance parameters behind the unknowns are initial positions; initial velocities are
-            # known to be those of the log.
-            theta, start = jnp.split(self.prior.outward(origin + vectors @ z), [len(self.places)])
+        def residual(theta: Array, start: Array) -> Array:
+            # The nuisance parameters are initial positions; initial velocities are known to be those of the
+            # log.
             if start.size:
                 start = self.replay.follow @ start
             return physical(jnp.concatenate([theta, start, jnp.zeros_like(start)]))
 
         return residual
+
+    def along(self, vectors: Array, origin: Array | float = 0.0) -> Callable[[Array], Array]:
+        """Return the residual as a function of coordinates z, at the whitened point origin + vectors z."""
+        physical = self.of_values()
+
+        def residual(z: Array) -> Array:
+            return physical(*jnp.split(self.prior.outward(origin + vectors @ z), [len(self.places)]))
+
+        return residual
+
+
+class JointResidual(eqx.Module):
+    """The residuals of several logs, one behind the other, by the unknowns of all.
+
+    Args:
+        members: The residual of each log.
+        index: Number of each log's unknowns among those of all logs.
+        prior: Prior of the unknowns of all logs, followed by the nuisance parameters of each log.
+    """
+
+    members: tuple[WeightedResidual, ...]
+    index: tuple[Array, ...]
+    prior: Prior
+
+    @property
+    def measured(self) -> Array:
+        """Measured output of all logs, (time, k)."""
+        return jnp.concatenate([member.measured for member in self.members])
+
+    def at_sharpness(self, sharpness: Array) -> JointResidual:
+        """Return the residual with the smoothed sign of the friction at another sharpness."""
+        return replace(self, members=tuple(member.at_sharpness(sharpness) for member in self.members))
+
+    def from_start(self, start: Array) -> JointResidual:
+        """Return the residual with every log from shifted initial positions of the joints with an encoder."""
+        return replace(self, members=tuple(member.from_start(start) for member in self.members))
+
+    def along(self, vectors: Array, origin: Array | float = 0.0) -> Callable[[Array], Array]:
+        """Return the residual as a function of coordinates z, at the whitened point origin + vectors z."""
+        physical, nuisances = [m.of_values() for m in self.members], [m.nuisances for m in self.members]
+        ends = np.cumsum([self.prior.base.size - sum(nuisances), *nuisances])[:-1].tolist()
+
+        def residual(z: Array) -> Array:
+            theta, *starts = jnp.split(self.prior.outward(origin + vectors @ z), ends)
+            each = zip(physical, self.index, starts, strict=True)
+            return jnp.concatenate([of_log(theta[index], start) for of_log, index, start in each])
+
+        return residual
+
+
+# What compiled functions of a fit compare.
+Compared = WeightedResidual | JointResidual
 
 
 @dataclass(frozen=True)
@@ -88,6 +144,8 @@ class Problem:
         sharpnesses: Sharpness of the smoothed sign at each step of the continuation.
         encoders: Indices of the joints that have an encoder.
         minimiser: A solver of optimistix for the descents; None: jaxid's Levenberg-Marquardt.
+        logs: Name, problem and numbers of the unknowns of each of several logs, which stand one behind the
+            other in `measured` and `weight`; empty: there is one log.
     """
 
     replay: Replay
@@ -100,10 +158,18 @@ class Problem:
     sharpnesses: tuple[np.ndarray, ...]
     encoders: tuple[int, ...]
     minimiser: Minimiser | None = None
+    logs: tuple[tuple[str, Problem, np.ndarray], ...] = ()
 
     @functools.cached_property
-    def residual(self) -> WeightedResidual:
+    def residual(self) -> Compared:
         """The residual, as an argument of compiled functions."""
+        if self.logs:
+            members = []
+            for (_, problem, _), rows in zip(self.logs, self.slices, strict=True):
+                own = replace(problem, measured=self.measured[rows], weight=self.weight[rows]).residual
+                assert isinstance(own, WeightedResidual), "a log among others is one log"
+                members.append(own)
+            return JointResidual(tuple(members), tuple(index for *_, index in self.logs), self.prior)
         return WeightedResidual(
             replay=self.replay,
             places=self.places,
@@ -161,9 +227,53 @@ class Problem:
             encoders=encoders,
         )
 
+    @classmethod
+    def joint(
+        cls,
+        machine: Machine,
+        prior: float,
+        logs: Sequence[tuple[str, Problem, np.ndarray]],
+        widths: Mapping[str, float] | None = None,
+    ) -> Problem:
+        """Set up the fit of a machine to several logs.
+
+        Args:
+            machine: Machine of all logs, with their unknowns.
+            prior: Relative standard deviation of the guesses.
+            logs: Name of each log, its problem, and the numbers of its unknowns among those of all.
+            widths: Standard deviations of single guesses, see `of`.
+        """
+        problems = [problem for _, problem, _ in logs]
+        starts = [problem.prior.scale[len(problem.places) :] for problem in problems]
+        first = max(problems, key=lambda problem: len(problem.sharpnesses))
+        return replace(
+            first,
+            places=machine.parameters.places,
+            plant=machine.plant,
+            measured=np.concatenate([problem.measured for problem in problems]),
+            weight=np.concatenate([problem.weight for problem in problems]),
+            prior=Prior.of(machine, prior, np.concatenate(starts), widths),
+            logs=tuple(logs),
+        )
+
+    @property
+    def slices(self) -> list[slice]:
+        """Rows of each log in `measured` and `weight`."""
+        lengths = [len(problem.measured) for _, problem, _ in self.logs] or [len(self.measured)]
+        ends = np.cumsum(lengths).tolist()
+        return [slice(end - length, end) for end, length in zip(ends, lengths, strict=True)]
+
+    @property
+    def deviation(self) -> Float[np.ndarray, "time k"]:
+        """Weighted deviation of the measured output from the mean of its log."""
+        parts = [(self.measured[rows], self.weight[rows]) for rows in self.slices]
+        return np.concatenate([weight * (measured - measured.mean(axis=0)) for measured, weight in parts])
+
     @property
     def nuisances(self) -> list[str]:
         """Names of the nuisance parameters, which follow the machine's unknowns."""
+        if self.logs:
+            return [f"{start} @ {name}" for name, problem, _ in self.logs for start in problem.nuisances]
         count = self.prior.base.size - len(self.places)
         return [f"start position {k + 1}" for k in self.encoders[:count]]
 
@@ -172,7 +282,7 @@ class Problem:
         return np.concatenate([theta, np.zeros(self.prior.base.size - len(theta))])
 
     def reweighted(self, minimum: Minimum) -> tuple[Problem, Minimum]:
-        """Weight each column of the residual by its standard deviation, if there are several.
+        """Weight each column of the residual of each log by its standard deviation, if there are several.
 
         Args:
             minimum: A minimum of this problem.
@@ -181,19 +291,23 @@ class Problem:
             The problem with the new weights, and the minimum rescaled to them.
         """
         counts = self.weight[0] > 0
-        if counts.sum() == 1:
+        if counts.sum() == 1 and not self.logs:
             return self, minimum
 
-        e = np.asarray(minimum.residual).reshape(self.measured.shape)[:, counts] / self.weight[0, counts]
-        least = 1e-12 * np.std(self.measured[:, counts], axis=0)
-        row, factor = np.zeros(len(counts)), np.zeros(len(counts))
-        row[counts] = 1.0 / np.maximum(np.std(e, axis=0), least)
-        factor[counts] = row[counts] / self.weight[0, counts]
+        whole, weights, factors = np.asarray(minimum.residual).reshape(self.measured.shape), [], []
+        for rows in self.slices:
+            e, measured = whole[rows][:, counts] / self.weight[rows][0, counts], self.measured[rows]
+            least = 1e-12 * np.std(measured[:, counts], axis=0)
+            row, factor = np.zeros(len(counts)), np.zeros(len(counts))
+            row[counts] = 1.0 / np.maximum(np.std(e, axis=0), least)
+            factor[counts] = row[counts] / self.weight[rows][0, counts]
+            weights.append(np.tile(row, (len(measured), 1)))
+            factors.append(np.tile(factor, len(measured)))
 
-        by = np.tile(factor, len(self.measured))
+        by = np.concatenate(factors)
         e, jacobian = by * np.asarray(minimum.residual), by[:, None] * np.asarray(minimum.jacobian)
         rescaled = replace(minimum, residual=e, jacobian=jacobian, cost=np.asarray(0.5 * e @ e))
-        return replace(self, weight=np.tile(row, (len(self.measured), 1))), rescaled
+        return replace(self, weight=np.concatenate(weights)), rescaled
 
     def noise(self, minimum: Minimum, count: float) -> float:
         """Return the standard deviation of the weighted residual, with `count` fitted parameters."""
@@ -202,7 +316,7 @@ class Problem:
 
     def criterion(self, minimum: Minimum) -> float:
         """Return (11) of Bogdan and Abba: squared residual over squared deviation from the mean [%]."""
-        spread = np.sum((self.weight * (self.measured - self.measured.mean(axis=0))) ** 2)
+        spread = np.sum(self.deviation**2)
         return float(100 * 2 * float(minimum.cost) / spread)
 
 

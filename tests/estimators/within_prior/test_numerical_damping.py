@@ -8,7 +8,7 @@ import pytest
 
 import jaxid
 from jaxid.build import build_machine
-from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.estimators.within_prior.problem import Problem
 from jaxid.logs.log import Log
 from jaxid.session import open_session

@@ -16,7 +16,7 @@ from jaxid.cli import main
 from jaxid.commands.identify import identify_many
 from jaxid.estimators import _beside_the_guesses, steps_of
 from jaxid.estimators.common.levenberg_marquardt import Minimum
-from jaxid.estimators.output_error import choose_numerics
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.estimators.within_prior import subspace
 from jaxid.estimators.within_prior.evaluations import criterion_steps
 from jaxid.estimators.within_prior.prior import Prior

@@ -1,0 +1,164 @@
+"""The likelihood of the innovations of one log, and the noise at which its fit starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.arrays import Array
+from jaxid.consistency.law import noise_free_command
+from jaxid.errors import InputError
+from jaxid.estimators.common.levenberg_marquardt import Transform
+from jaxid.estimators.innovations import Innovations
+from jaxid.logs.log import Log
+from jaxid.machine import Machine
+from jaxid.model.balance import Balance
+from jaxid.simulation.kalman import make_filter, slow_samples, smooth_steps
+from jaxid.simulation.replay import Numerics, exact_numerics
+from jaxid.simulation.sensor_noise import position_noise
+from jaxid.simulation.step_size import needed_steps
+
+# Noise of the force at the start, as a part of the force; a large one makes a wrong model possible.
+_FORCE_NOISE = 0.1
+# Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow
+# curved valley: a fit at a higher noise leads close to its floor. The last one is below any drive's noise,
+# and above the error of the steps at reversals.
+_FLOORS = (1e-2, 1e-3, 1e-4)
+# Largest noise of the force, as a part of it; noise of a reading, as a multiple of its first estimate.
+_MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
+# Noise of the force, as a part of it, below which sticking is certain.
+_QUIET = 1e-3
+# Steps of the last fit of such a log for each one before.
+_FINER = 4
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """The likelihood of a log with what a fit of it starts from.
+
+    Args:
+        problem: The likelihood, at the highest floor of the noise.
+        machine: The machine at its guesses.
+        log: The log, whose force is the command that drives the filter.
+        numerics: Settings of the integration.
+        applied: Command of the declared law, if it explains the logged one; None: the logged one drives.
+        slow: Mask of the samples at rest, which do not count; None: all count.
+        force: Size of the logged force, (m,).
+        noise: Logarithms of the noise at the start, of the force and then of the readings, (m + k,).
+        floors: Lower bounds on them, in turn.
+    """
+
+    problem: Innovations
+    machine: Machine
+    log: Log
+    numerics: Numerics
+    applied: np.ndarray | None
+    slow: np.ndarray | None
+    force: np.ndarray
+    noise: np.ndarray
+    floors: Sequence[np.ndarray]
+
+    def sticks_surely(self, noise: np.ndarray) -> bool:
+        """Check that there is so little noise of the force that it is known when a joint sticks."""
+        if self.slow is None or self.applied is None:
+            return False
+        return bool(np.all(np.exp(noise[: len(self.force)]) < _QUIET * self.force))
+
+    def at_rest_too(self, problem: Innovations) -> Innovations:
+        """Return the likelihood with the samples at rest."""
+        # So precise a fit shows the error of a step in which a joint comes to rest.
+        finer = replace(self.numerics, substeps=_FINER * self.numerics.substeps)
+        kalman = make_filter(self.machine, self.log, finer)
+        counts = np.asarray(kalman.used)[:: kalman.every][:, list(self.log.measured)]
+        return problem._replace(kalman=kalman, counts=counts)
+
+
+def likelihood_of(
+    machine: Machine,
+    log: Log,
+    *,
+    start: np.ndarray | None = None,
+    numerics: Numerics | None = None,
+    rest_velocity: np.ndarray | None = None,
+) -> Likelihood:
+    """Return the likelihood of a log; see `prediction_error` for the arguments.
+
+    Raises:
+        InputError: If too few readings count.
+    """
+    if numerics is None:
+        numerics = needed_numerics(machine, log, start)
+    parameters, measured = machine.parameters, list(log.measured)
+    applied = noise_free_command(machine, log)
+    driven = log if applied is None else replace(log, force=applied)
+    slow = None
+    if rest_velocity is not None and slides(machine, log):
+        slow = slow_samples(log, rest_velocity)
+    kalman = make_filter(machine, driven, numerics, slow)
+    counts = np.asarray(kalman.used)[:: kalman.every]
+    counts = (counts if slow is None else counts & ~slow)[:, measured]
+    if counts.sum() < 5 * len(parameters.free):
+        slowest = 0.0 if rest_velocity is None else np.min(rest_velocity)
+        raise InputError(
+            f"only {int(counts.sum())} readings are of a motion faster than {slowest:.3g}",
+            where=log.source,
+            hint="take a log with more motion, lower [preprocess] rest_velocity, or use another method",
+        )
+
+    force = _force_scale(machine, log)
+    stroke = np.maximum(np.ptp(log.readings, axis=0), 1e-300)
+    reading = np.maximum(position_noise(machine, log), 1e-9 * stroke)[measured]
+    noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
+    floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
+    problem = Innovations(
+        kalman=kalman,
+        places=parameters.places,
+        plant=machine.plant,
+        counts=counts,
+        transform=Transform.of(parameters),
+        bounds=parameters.bounds,
+        low=floors[0],
+        high=np.log(np.concatenate([_MOST * force, _READING_RANGE[1] * reading])),
+    )
+    return Likelihood(problem, machine, driven, numerics, applied, slow, force, noise, floors)
+
+
+def needed_numerics(machine: Machine, log: Log, start: np.ndarray | None) -> Numerics:
+    """Return the settings of the integration that a machine needs at its start."""
+    # Guesses that are far off, such as inertias of no possible body, may need many more steps.
+    near = machine if start is None else machine.with_estimate(np.clip(start, *machine.parameters.bounds))
+    return exact_numerics(machine, log, needed_steps(near, log))
+
+
+def _force_scale(machine: Machine, log: Log) -> Float[np.ndarray, " m"]:
+    """Return the typical size of each command, in its unit, (m,).
+
+    That of a constant force is its level. Of a machine that nothing drives it is the command that would
+    accelerate the masses as they were, at the guesses.
+    """
+    if log.passive:
+        speed = smooth_steps(log) / log.period
+        inertia = machine.plant.own_inertia()
+        mass = 1.0 if inertia is None else np.asarray(inertia)
+        own = np.sqrt(np.mean((mass * np.gradient(speed, log.period, axis=0)) ** 2, axis=0))
+        driven = machine.plant.driven(machine.plant.joints)[: log.force.shape[1]]
+        return np.maximum(np.max(own[list(driven)]) / np.abs(machine.gain), 1e-300)
+    spread, size = np.std(log.force, axis=0), np.sqrt(np.mean(log.force**2, axis=0))
+    return np.maximum(np.where(spread > 1e-9 * size, spread, size), 1e-300)
+
+
+def slides(machine: Machine, log: Log) -> bool:
+    """Check that dry friction acts somewhere."""
+    plant = machine.plant
+
+    def balance(q: Array, u: Array) -> Balance:
+        zero = jnp.zeros_like(q)
+        return plant.balance(q, zero, zero, u, jnp.zeros(()), plant.initial_states(u))
+
+    # Shapes tell: no operation is compiled.
+    return bool(jax.eval_shape(balance, log.filled[0], log.force[0]).slides)
