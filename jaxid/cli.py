@@ -20,6 +20,7 @@ from jaxid.names import (
     OUTPUTS,
     PICTURES,
     SEVERAL_LOGS,
+    SIGNALS,
     SOLVERS,
     TARGETS,
     WHEN,
@@ -53,7 +54,8 @@ _EXAMPLES = {
     "export": "jaxid export out/result.json --to mjcf --model robot.xml -o found.xml",
     "report": "jaxid report out\njaxid report out/result.json -o fit.html",
     "plot": "jaxid plot out friction -o friction.png\n"
-    "jaxid plot out/result.json scatter --against position -o ripple.svg",
+    "jaxid plot out/result.json scatter --against position -o ripple.svg\n"
+    "jaxid plot out signals -o signals.csv",
 }
 # Suffixes of logs, by which arguments in the wrong order are noticed.
 _LOGS = (
@@ -193,9 +195,12 @@ def _plot(commands: argparse._SubParsersAction) -> None:
     parser = _plain(commands, "plot", purpose, _run_plot)
     _result(parser)
     parser.add_argument(
-        "kind", metavar="KIND", help=f"{', '.join(PICTURES)}; forces: measured and model over each other"
+        "kind",
+        metavar="KIND",
+        help=f"{', '.join(PICTURES)}; forces: measured and model over each other; or {SIGNALS}: measured and "
+        "simulated signals as a table for PlotJuggler (.csv)",
     )
-    parser.add_argument("-o", metavar="FILE", help="file to write: .png, .svg or .pdf; default: KIND.png")
+    parser.add_argument("-o", metavar="FILE", help="file to write: .png, .svg, .pdf; default: KIND.png")
     parser.add_argument(
         "--log", metavar="NAME", default="0", help="name or number of the log; default: 0, the first"
     )
@@ -508,8 +513,10 @@ def _run_report(args: argparse.Namespace) -> int:
 
 
 def _run_plot(args: argparse.Namespace) -> int:
+    if args.kind == SIGNALS:
+        return _write_signals(args)
     if args.kind not in PICTURES:
-        raise InputError(f"plot {args.kind!r} is not known", hint=suggest(args.kind, PICTURES))
+        raise InputError(f"plot {args.kind!r} is not known", hint=suggest(args.kind, (*PICTURES, SIGNALS)))
     path = _picture_file(args.o or f"{args.kind}.png", overwrite=args.force)
     from jaxid.commands.report import read_content
     from jaxid.results.stored_plots import picture
@@ -528,6 +535,17 @@ def _run_schema(args: argparse.Namespace) -> int:
     from jaxid.case.json_schema import case_schema
 
     print(json.dumps(case_schema(), indent=2, ensure_ascii=False))
+    return 0
+
+
+def _write_signals(args: argparse.Namespace) -> int:
+    from jaxid.commands.report import read_content
+    from jaxid.files import ready_file, write_whole
+    from jaxid.results.stored_plots import signals_csv
+
+    path = ready_file(Path(args.o or f"{SIGNALS}.csv"), overwrite=args.force)
+    write_whole(path, signals_csv(read_content(args.result)))
+    print(f"wrote {path}")
     return 0
 
 

@@ -55,7 +55,8 @@ SEVERAL_LOGS = (
 DISCOVER, IN_LOOP = "discover", "in_loop"
 # Methods that maximise a likelihood, so that it has a Hessian and profiles.
 LIKELIHOOD_METHODS = ("output_error", "prediction_error", "within_prior")
-# Pictures that `jaxid plot` draws of a result.
+# Pictures that `jaxid plot` draws of a result, and the name of its table of signals.
+SIGNALS = "signals"
 PICTURES = (
     "forces",
     "residual",

@@ -175,3 +175,44 @@ _DRAW: dict[str, Callable[[Chosen], Figure | None]] = {
     "candidates": _candidates,
     "profiles": _profiles,
 }
+
+
+def signals_csv(data: ReportData) -> str:
+    """Return measured and simulated signals of all logs as text, as PlotJuggler reads it.
+
+    A row is a sample. Forces stand in the rows of the samples that the balance uses; other cells are empty.
+    Names of columns have the form "log/joint 1/position/measured"; the unit stands behind each name.
+
+    Args:
+        data: Content of the report.
+
+    Raises:
+        InputError: If the rows of the logs have no time.
+    """
+    views = [view for view in data.views if not view.steady]
+    if not views:
+        raise InputError("rows of steady speeds have no time", hint="choose another plot")
+    time = np.unique(np.concatenate([view.time for view in views]))
+    columns: dict[str, np.ndarray] = {}
+    for view in views:
+        name = view.name.split(", joint ")[0]
+        units = {**data.units, **view.units}
+        before, after = view.residual_before, view.residual_after
+        signals = {
+            "position/measured": (view.time, view.position_measured, "position"),
+            "position/simulated before": (view.time, view.position_simulated_before, "position"),
+            "position/simulated": (view.time, view.position_simulated_after, "position"),
+            "force/measured": (view.band_time, view.force_measured, "force"),
+            "force/model": (view.band_time, None if after is None else view.force_measured - after, "force"),
+            "force/residual before": (view.band_time, before, "force"),
+            "force/residual": (view.band_time, after, "force"),
+        }
+        for what, (at, values, quantity) in signals.items():
+            if values is not None and len(values):
+                column = np.full(time.size, np.nan)
+                column[np.searchsorted(time, at)] = values
+                columns[f"{name}/joint {view.joint + 1}/{what} [{units[quantity]}]"] = column
+    heads = ",".join(["time", *[name.replace(",", ";") for name in columns]])
+    table = np.column_stack([time, *columns.values()])
+    rows = [",".join("" if np.isnan(x) else f"{x:.12g}" for x in row) for row in table]
+    return "\n".join([heads, *rows]) + "\n"

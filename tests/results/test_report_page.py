@@ -1,4 +1,4 @@
-"""The report of a fit and of a search: its first page, its curves on disk, and the page made again from them."""
+"""The report of a fit and of a search: first page, curves on disk, and the page made from them again."""
 
 import re
 from dataclasses import replace
@@ -167,6 +167,19 @@ def test_each_picture_of_a_result(fitted, found, tmp_path, capsys):
     assert set(PICTURES) - drawn == {"history", "profiles"}
     ran = run(capsys, "plot", tmp_path / "fit.npz", "forces", "-o", tmp_path / "a.png", "--joint", 2)
     assert "joint 2 has no measured position; choose one of 1" in ran.err
+
+
+def test_signals_as_a_table(fitted, tmp_path, capsys):
+    (tmp_path / "fit.npz").write_bytes(packed(identification_data(fitted)))
+    ran = run(capsys, "plot", tmp_path / "fit.npz", "signals", "-o", tmp_path / "signals.csv")
+    assert (ran.status, ran.err) == (0, "")
+    table = np.genfromtxt(tmp_path / "signals.csv", delimiter=",", names=True, deletechars="")
+    log, gap = fitted.session.fit.log, fitted.gaps[0]
+    np.testing.assert_allclose(table["time"], log.time)
+    np.testing.assert_allclose(table["fit/joint_1/position/measured_[m]"], log.position[:, 0], rtol=1e-10)
+    residual = table["fit/joint_1/force/residual_[N]"]
+    known = gap.force.residual[np.isfinite(gap.force.residual)]
+    np.testing.assert_allclose(residual[np.isfinite(residual)], known, rtol=1e-10)
 
 
 def test_long_logs_are_thinned_on_disk(tmp_path, fitted):
