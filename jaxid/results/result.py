@@ -10,6 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     import pandas
+    import xarray
     from matplotlib.axes import Axes
 
     from jaxid.case.case import Case
@@ -143,6 +144,23 @@ class FitResult:
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table with a row for each parameter; needs pandas."""
         return self.parameters.to_pandas()
+
+    def to_xarray(self, log: str | int = 0) -> xarray.Dataset:
+        """Return the signals of a log, measured and simulated, and the parameters with their covariance.
+
+        `position` and `position_simulated` are over `time` and `joint`; `force` and `force_residual`, low-passed,
+        over `force_time` and `joint`, NaN at rest; `estimate`, `std` and `unit` over `parameter`; `covariance`
+        over `parameter` and `parameter_`. Attributes hold the units.
+
+        Args:
+            log: Name or number of the log, the fitted one being "fit" or 0.
+
+        Raises:
+            InputError: If there is no such log.
+        """
+        from jaxid.results.as_xarray import dataset_of
+
+        return dataset_of(self, log)
 
     def case(self) -> Case:
         """Return the case with the results: estimates as guesses, and the effects that a search added.

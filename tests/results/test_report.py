@@ -154,7 +154,10 @@ def test_the_page_holds_the_numbers(page):
     assert "inertia by +0.71 and added_mass.mass by −0.71" in words
     assert "1 coulomb_friction added 6.10 6.90 4 812.4 12.5" in words
     assert "−0.02 to 0.02 m/s" in words
-    assert "1.2–1.31 s" in words
+    # A pattern over velocity is shown over velocity, and its instants are not listed.
+    assert "1.2–1.31 s" not in words
+    over_time = {**_discovery().where, "variable": "time"}
+    assert "1.2–1.31 s" in _words(render(_discovery(where=over_time, where_plot=None, views=())))
     assert "Reverse more often." in words
     assert "jaxid 0.1.0" in words
 

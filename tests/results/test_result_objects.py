@@ -85,6 +85,23 @@ def test_residuals(fitted, folder):
         fitted.residuals("fitt")
 
 
+def test_a_result_as_a_dataset(fitted, folder):
+    data = fitted.to_xarray()
+    log, gap = fitted.session.fit.log, fitted.gaps[0]
+    np.testing.assert_array_equal(data.position.values, log.position)
+    np.testing.assert_array_equal(data.position_simulated.values, gap.simulation.position)
+    np.testing.assert_array_equal(data.force_residual.values, gap.force.residual)
+    assert data.position.units == "m"
+    assert data.force.units == "N"
+    assert float(data.estimate.sel(parameter="inertia")) == fitted.value("inertia")
+    assert float(data["std"].sel(parameter="inertia")) == fitted.parameters["inertia"].std
+    data.to_netcdf(folder / "fit.nc", engine="scipy")
+    assert xarray.load_dataset(folder / "fit.nc", engine="scipy").attrs["method"] == "inverse_dynamics"
+    assert fitted.to_xarray("log").attrs["log"] == "log"
+    with pytest.raises(jaxid.InputError, match="did you mean 'fit'"):
+        fitted.to_xarray("fitt")
+
+
 FITTED = ("fit", "difference", "force", "residual", "scatter", "parameters", "correlation", "gaps")
 
 

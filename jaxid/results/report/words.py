@@ -23,7 +23,7 @@ from jaxid.results.report.numbers import (
     with_std,
 )
 
-_MOST_INTERVALS = 12
+_MOST_INTERVALS = 6
 # Half the width of a 95 % interval, in standard deviations.
 _INTERVAL = 1.96
 # Ratio of a gap to the measured signal beyond which its number says nothing.
@@ -228,8 +228,9 @@ def where_lines(data: ReportData) -> dict | None:
     if region and len(region) == 2 and all(is_number(r) for r in region):
         text = f"{short(region[0], 3)} to {short(region[1], 3)} {unit}"
         facts.append(("region", text.strip()))
+    # Of a pattern over velocity or position the instants say nothing.
     spans = where.get("intervals") or []
-    if spans:
+    if spans and variable not in ("velocity", "position"):
         listed = [f"{short(a)}–{short(b)}" for a, b in spans[:_MOST_INTERVALS]]
         more = f" and {len(spans) - len(listed)} more" if len(spans) > len(listed) else ""
         facts.append(("when", f"{', '.join(listed)} {data.units.get('time', 's')}{more}"))
