@@ -148,9 +148,9 @@ class FitResult:
     def to_xarray(self, log: str | int = 0) -> xarray.Dataset:
         """Return the signals of a log, measured and simulated, and the parameters with their covariance.
 
-        `position` and `position_simulated` are over `time` and `joint`; `force` and `force_residual`, low-passed,
-        over `force_time` and `joint`, NaN at rest; `estimate`, `std` and `unit` over `parameter`; `covariance`
-        over `parameter` and `parameter_`. Attributes hold the units.
+        `position` and `position_simulated` are over `time` and `joint`; `force` and `force_residual` are
+        low-passed, NaN at rest, and over `force_time` and `joint`. `estimate`, `std` and `unit` are over `parameter`, and
+        `covariance` is over `parameter` and `parameter_`. Attributes hold the units.
 
         Args:
             log: Name or number of the log, the fitted one being "fit" or 0.
