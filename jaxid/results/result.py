@@ -149,8 +149,8 @@ class FitResult:
         """Return the signals of a log, measured and simulated, and the parameters with their covariance.
 
         `position` and `position_simulated` are over `time` and `joint`; `force` and `force_residual` are
-        low-passed, NaN at rest, and over `force_time` and `joint`. `estimate`, `std` and `unit` are over `parameter`, and
-        `covariance` is over `parameter` and `parameter_`. Attributes hold the units.
+        low-passed, NaN at rest, and over `force_time` and `joint`. `estimate`, `std` and `unit` are over
+        `parameter`, and `covariance` is over `parameter` and `parameter_`. Attributes hold the units.
 
         Args:
             log: Name or number of the log, the fitted one being "fit" or 0.
