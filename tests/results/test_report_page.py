@@ -13,6 +13,7 @@ from jaxid.results.effect_words import CONTROLLER, DRIVE, GEAR, LOAD, WORDS, wor
 from jaxid.results.report.build import discovery_data, identification_data
 from jaxid.results.report.data import LogView
 from jaxid.results.report.figure_tables import tables_of
+from jaxid.results.report.first_page import first_values
 from jaxid.results.report.force_plots import plot_frictions
 from jaxid.results.report.page import render
 from jaxid.results.report.store import packed, unpacked
@@ -84,6 +85,21 @@ def test_what_was_found_stands_in_the_chain_and_in_words(found):
     assert "Before and after: force residual over velocity" in page
     assert "1.96 σ" in page
     assert page.index("What was found") < page.index("The drive chain") < page.index("This run")
+
+
+def test_a_long_list_of_values_begins_with_what_is_known(fitted):
+    data = identification_data(fitted)
+    rows = [replace(data.parameters[0], name=f"mass[{k}]", identifiable=k > 20) for k in range(40)]
+    shown, more = first_values(replace(data, parameters=tuple(rows), derived=()))
+    assert [line["name"] for line in shown] == [f"mass[{k}]" for k in range(21, 29)]
+    assert more == 32
+    page = render(replace(data, parameters=tuple(rows), derived=()))
+    assert "32 more stand" in words(page)
+    # All stand in the folded table, and what is not identifiable is folded too.
+    assert page.count("mass[39]") == 1
+    assert '<details class="sheet" id="missing">' in page
+    assert page.count("<details") == page.count("</details>")
+    assert page.count("<section") == page.count("</section>")
 
 
 def test_every_effect_has_words():

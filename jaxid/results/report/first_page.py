@@ -11,8 +11,10 @@ from jaxid.results.report.data import LogView, ReportData
 from jaxid.results.report.numbers import ABSENT, is_number, nats, usual_unit, with_std
 from jaxid.results.report.words import parameter_lines, place_words
 
-# Most rows of the table of values on the first page; all of them stand below.
-MOST_VALUES = 14
+# Rows of values that the first page shows whole, and those that it shows of more; all of them stand below.
+MOST_VALUES, FIRST_VALUES = 14, 8
+# Combinations, and names without a value, beyond which the section on them is folded.
+_MANY_COMBINATIONS, _MANY_NAMES = 3, 12
 _MODEL = {
     True: ("model complete", "good"),
     False: ("model incomplete", "open"),
@@ -84,7 +86,12 @@ def first_values(data: ReportData) -> tuple[list[dict], int]:
         range(len(lines)),
         key=lambda k: (not lines[k]["identifiable"], not lines[k]["name"].startswith(found or ("\0",)), k),
     )
-    return [lines[k] for k in sorted(order[:MOST_VALUES])], len(lines) - MOST_VALUES
+    return [lines[k] for k in sorted(order[:FIRST_VALUES])], len(lines) - FIRST_VALUES
+
+
+def many_unidentifiable(combinations: int, names: int) -> bool:
+    """Check that what a log does not determine is a long list."""
+    return combinations > _MANY_COMBINATIONS or names > _MANY_NAMES
 
 
 def main_view(data: ReportData) -> int | None:

@@ -44,6 +44,7 @@ def render(data: ReportData) -> str:
     main = first_page.main_view(data)
     entries = [_view_entry(data, view, i) for i, view in enumerate(data.views)]
     telling = _telling(data, main)
+    missing = [row.name for row in data.parameters if not row.identifiable]
     return filled(
         "page.html",
         data=data,
@@ -64,7 +65,8 @@ def render(data: ReportData) -> str:
         unidentifiable=tables.unidentifiable_lines(data.unidentifiable),
         directions=tables.direction_lines(data.within_prior["directions"]) if data.within_prior else [],
         within_prior_words=tables.within_prior_words(data.within_prior or {}),
-        missing=[row.name for row in data.parameters if not row.identifiable],
+        missing=missing,
+        many_missing=first_page.many_unidentifiable(len(data.unidentifiable), len(missing)),
         steps=tables.step_lines(data),
         force_unit=pretty_unit(str(data.units["force"])),
         rankings=_rankings(data),
