@@ -200,7 +200,7 @@ class _Output:
 
     @property
     def looped(self) -> bool:
-        """Whether the simulation runs in closed loop."""
+        """True if the simulation runs in closed loop."""
         return self.replay.controller is not None
 
     @property

@@ -1,7 +1,9 @@
 """Levenberg-Marquardt of many fits side by side, with the Jacobian of each fit's end only.
 
 A batch by `jax.vmap` selects residual and Jacobian of every fit after every evaluation. Here only sums over
-the samples are selected, and the lanes of a processor are the fits.
+the samples are selected, and the lanes of a processor are the fits. The step is that of
+`levenberg_marquardt`, by `advanced_by_model`. One loop cannot serve both: a single fit ends with residual and
+Jacobian in its state, and in a batch that is the copy which this loop avoids.
 """
 
 from __future__ import annotations
