@@ -385,11 +385,15 @@ def _study(commands: argparse._SubParsersAction) -> None:
 
 
 def _export(commands: argparse._SubParsersAction) -> None:
-    purpose = "put the values of a result into the robot's own file"
+    purpose = "put the values of a result into the robot's own file, or into one of another program"
     parser = _plain(commands, "export", purpose, _run_export)
     parser.add_argument("result", metavar="RESULT.json", help="result.json or discovery.json of a tree")
     parser.add_argument("--to", metavar="TARGET", required=True, help=f"one of {', '.join(TARGETS)}")
-    parser.add_argument("--model", metavar="ROBOT.xml", required=True, help="the file that the case names")
+    parser.add_argument(
+        "--model",
+        metavar="ROBOT.xml",
+        help="for mjcf and urdf, the file that the case names; default: the path in the case",
+    )
     parser.add_argument("-o", metavar="FILE", required=True, help="file to write")
     parser.add_argument("--force", action="store_true", help="overwrite a file that jaxid did not make")
 
@@ -678,15 +682,19 @@ def _run_study(args: argparse.Namespace) -> int:
 
 
 def _run_export(args: argparse.Namespace) -> int:
+    if args.to not in TARGETS:
+        raise InputError(f"target {args.to!r} is not known", hint=suggest(args.to, TARGETS))
     from jaxid.commands.export import export
     from jaxid.files import ready_file, write_whole
 
-    path = ready_file(Path(args.o), overwrite=args.force, suffix=".xml")
-    exported = export(args.result, args.to, args.model)
+    suffix, *also = TARGETS[args.to]
+    path = ready_file(Path(args.o), overwrite=args.force, suffix=suffix, also=also)
+    exported = export(args.result, args.to, args.model, name=path.stem)
     write_whole(path, exported.content)
     lines = [f"not exported: {note}" for note in exported.notes]
     changed = ", ".join(exported.changed) or "nothing"
-    print("\n".join([*lines, f"changed {changed} in {path}"]))
+    lines.append(f"{'changed' if args.to in ('mjcf', 'urdf') else 'wrote'} {changed} in {path}")
+    print("\n".join(lines))
     return 0
 
 

@@ -143,8 +143,14 @@ SIGN_OF = UNIT_OF[1:]
 SIDES = ("load", "motor")
 # Ways to resample: lines between readings, or cubic splines.
 RESAMPLINGS = ("linear", "band_limited")
-# Files of other programs that `export` writes.
-TARGETS = ("mjcf",)
+# Files of other programs that `export` writes, with the ends of their names.
+TARGETS = {
+    "mjcf": (".xml",),
+    "urdf": (".urdf", ".xml"),
+    "isaaclab": (".py",),
+    "c": (".h",),
+    "python": (".py",),
+}
 # Names of ports in case files and results; ports of each kind count from 1.
 PLACES = ("joint", "spring", "shaft", "passive", "tool")
 # Kinds of the joints of an arm.

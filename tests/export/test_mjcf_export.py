@@ -16,7 +16,7 @@ from jaxid.case.case import read_case
 from jaxid.commands.export import export
 from jaxid.errors import InputError
 from jaxid.export.bodies import are_bodies, bodies_of, links_of
-from jaxid.results.as_json import robot_json
+from jaxid.results.model_json import robot_json
 from tests.case.test_mjcf import FREE, forces_of_mujoco
 from tests.support.mjcf_robots import BRANCHED, CART_JOINTS, cart, cart_log
 from tests.support.written_logs import write_csv
