@@ -395,6 +395,19 @@ def _export(commands: argparse._SubParsersAction) -> None:
         help="for mjcf and urdf, the file that the case names; default: the path in the case",
     )
     parser.add_argument("-o", metavar="FILE", required=True, help="file to write")
+    parser.add_argument(
+        "--check",
+        metavar="LOG",
+        help="replay a log by the file in MuJoCo: how far it is from jaxid's own simulation, by joint, and "
+        "what each thing that the file lacks is worth",
+    )
+    parser.add_argument(
+        "--samples",
+        metavar="N",
+        type=int,
+        help="also write N models drawn from the posterior, FILE_1 to FILE_N",
+    )
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of these draws; default: 0")
     parser.add_argument("--force", action="store_true", help="overwrite a file that jaxid did not make")
 
 
@@ -684,17 +697,34 @@ def _run_study(args: argparse.Namespace) -> int:
 def _run_export(args: argparse.Namespace) -> int:
     if args.to not in TARGETS:
         raise InputError(f"target {args.to!r} is not known", hint=suggest(args.to, TARGETS))
-    from jaxid.commands.export import export
-    from jaxid.files import ready_file, write_whole
+    if args.samples is not None and not 1 <= args.samples <= 10_000:
+        raise InputError(f"--samples is {args.samples}", hint="give 1 to 10000")
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}", hint="give zero or more")
+    from jaxid.commands.export import check_export, draw_exports, export
+    from jaxid.files import ready_file, write_together
 
     suffix, *also = TARGETS[args.to]
-    path = ready_file(Path(args.o), overwrite=args.force, suffix=suffix, also=also)
+    path, count = Path(args.o), args.samples or 0
+    drawn_paths = [path.with_stem(f"{path.stem}_{k:0{len(str(count))}}") for k in range(1, count + 1)]
+    for one in (path, *drawn_paths):
+        ready_file(one, overwrite=args.force, suffix=suffix, also=also)
     exported = export(args.result, args.to, args.model, name=path.stem)
-    write_whole(path, exported.content)
     lines = [f"not exported: {note}" for note in exported.notes]
+    files = {path: exported.content}
+    drawn = None
+    if count:
+        drawn = draw_exports(args.result, args.to, count, args.model, seed=args.seed)
+        files |= {one: file.content for one, file in zip(drawn_paths, drawn.files, strict=True)}
+    checked = None
+    if args.check is not None:
+        checked = check_export(args.result, args.to, exported, args.check, args.model)
+    write_together(files)
     changed = ", ".join(exported.changed) or "nothing"
     lines.append(f"{'changed' if args.to in ('mjcf', 'urdf') else 'wrote'} {changed} in {path}")
-    print("\n".join(lines))
+    if drawn is not None:
+        lines.append(f"drew {count} models, {drawn_paths[0].name} to {drawn_paths[-1].name}; {drawn}")
+    print("\n".join([*lines, *([] if checked is None else ["", str(checked)])]))
     return 0
 
 

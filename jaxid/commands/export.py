@@ -6,11 +6,16 @@ import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxid.errors import InputError, suggest
 from jaxid.export.exported import ExportedFile
+from jaxid.logs.in_memory import LogLike
 from jaxid.names import TARGETS
+
+if TYPE_CHECKING:
+    from jaxid.export.replayed import Replayed
+    from jaxid.export.samples import Drawn
 
 # Targets that change the text of the robot's own file, with the key of the case that names it.
 _OWN_FILES = {"mjcf": "mjcf", "urdf": "urdf"}
@@ -54,6 +59,70 @@ def export(
     else:
         from jaxid.export.isaaclab import export_isaaclab as written
     return written(machine, name, version("jaxid"), where)
+
+
+def check_export(
+    result: Mapping[str, Any] | str | Path,
+    to: str,
+    exported: ExportedFile,
+    log: LogLike,
+    model: str | Path | None = None,
+) -> Replayed:
+    """Replay a log by an exported file in MuJoCo, and say how far that is from jaxid's own simulation.
+
+    Args:
+        result: result.json or discovery.json, or its content.
+        to: Target of the file: "mjcf" or "urdf".
+        exported: The file, as `export` returns it.
+        log: The log, with the columns of the case.
+        model: The user's own file; None: the path that the case states.
+
+    Raises:
+        InputError: If MuJoCo does not read this target or is not installed, or the log or the result is
+            unsound.
+    """
+    _need_own_file("--check", to)
+    from jaxid.export.replayed import replay_export
+
+    machine, where = machine_of(result)
+    path = Path(model) if model is not None else _named_file(machine, to, where)
+    return replay_export(machine, exported, path, log, where)
+
+
+def draw_exports(
+    result: Mapping[str, Any] | str | Path,
+    to: str,
+    count: int,
+    model: str | Path | None = None,
+    *,
+    seed: int = 0,
+) -> Drawn:
+    """Draw models from the posterior of a result, each in the robot's own file.
+
+    Args:
+        result: result.json or discovery.json, or its content.
+        to: "mjcf" or "urdf".
+        count: Number of models.
+        model: The user's own file; None: the path that the case states.
+        seed: Seed of the draws.
+
+    Raises:
+        InputError: If the target is another one, or the result has no covariance.
+    """
+    _need_own_file("--samples", to)
+    if count < 1:
+        raise InputError(f"--samples is {count}", hint="give one or more")
+    from jaxid.export.samples import draw
+
+    _, where = machine_of(result)
+    content = content_of(result)
+    return draw(content, count, seed, lambda one: export({"model": one}, to, model), where)
+
+
+def _need_own_file(option: str, to: str) -> None:
+    if to not in _OWN_FILES:
+        hint = f"leave it out, or export to {' or '.join(_OWN_FILES)} too"
+        raise InputError(f"{option} goes with {' and '.join(_OWN_FILES)}", hint=hint)
 
 
 def machine_of(result: Mapping[str, Any] | str | Path) -> tuple[Mapping[str, Any], str]:

@@ -23,12 +23,14 @@ class ExportedFile:
         changed: Names of the joints and bodies that were changed, or of the joints that it describes.
         notes: Parts of the result that it cannot hold, a sentence each.
         lost: Effects among them, by their numbers in `model.effects` of the result, from 0.
+        real: Whether every body that was found can exist, and was written.
     """
 
     content: bytes
     changed: tuple[str, ...]
     notes: tuple[str, ...]
     lost: tuple[int, ...] = ()
+    real: bool = True
 
 
 def shown(effect: Mapping[str, Any]) -> str:

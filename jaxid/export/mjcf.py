@@ -16,6 +16,7 @@ from jaxid.case.robot import Robot, RobotJoint, body_in, kept, moved_by, project
 from jaxid.errors import InputError
 from jaxid.export.bodies import Bodies, are_bodies, bodies_of
 from jaxid.export.exported import ExportedFile, JointLaws, need_joints, plant_of, shown
+from jaxid.export.mjcf_drives import DRIVE_EFFECTS, DriveText
 from jaxid.export.xml_text import Element, XmlText
 
 # Relative change below which a value of the file stays as it is written.
@@ -34,8 +35,6 @@ _LAWS = {
     "cubic_stiffness": "coefficient",
     "added_mass": "mass",
 }
-# Effects of the file's actuators, which stay as they are.
-_OF_DRIVES = ("back_emf_damping", "saturation", "actuator_lag", "input_delay")
 _DAMPING = ("viscous_friction", "quadratic_drag", "cubic_friction")
 _SPRING = ("constant_force", "linear_stiffness", "quadratic_stiffness", "cubic_stiffness")
 
@@ -54,7 +53,7 @@ def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
     try:
         content = path.read_bytes()
         spec = mujoco.MjSpec.from_file(str(path))
-        degrees = bool(spec.compiler.degree)
+        degrees, autolimits = bool(spec.compiler.degree), bool(spec.compiler.autolimits)
         whole, compiled = robot_of_spec(spec, where)
         text = XmlText(content)
     except (OSError, ValueError, expat.ExpatError) as error:
@@ -63,13 +62,16 @@ def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
     robot = kept(whole, model["joints"], model.get("held", {}))
     need_joints(robot, model, where)
     elements = _elements(text, compiled, mujoco, where)
-    work = _Work(mujoco, compiled, text, elements, robot, model, degrees)
+    drives = DriveText(text, compiled, robot, model, elements.joints, autolimits)
+    drives.write()
+    work = _Work(mujoco, compiled, text, elements, robot, model, degrees, drives.damping)
     file = projected(robot)
     rotors = np.array([file[joint.name].armature for joint in robot.free])
     found = bodies_of(plant_of(robot, model), robot.bodies, rotors)
     work.joints(file, found.rotors)
     work.bodies(found)
-    return ExportedFile(text.text(), tuple(work.changed), tuple(work.notes), tuple(work.lost))
+    changed, notes = (*work.changed, *drives.changed), (*work.notes, *drives.notes)
+    return ExportedFile(text.text(), changed, notes, (*work.lost, *drives.lost), work.real)
 
 
 @dataclass
@@ -131,9 +133,11 @@ class _Work:
     robot: Robot
     model: Mapping[str, Any]
     degrees: bool
+    drag: Mapping[str, float]
     notes: list[str] = field(default_factory=list)
     changed: list[str] = field(default_factory=list)
     lost: list[int] = field(default_factory=list)
+    real: bool = True
 
     @property
     def names(self) -> list[str]:
@@ -159,7 +163,7 @@ class _Work:
 
     def _laws(self) -> tuple[dict[str, float], ...]:
         """Return the effects that a joint of an MJCF has, by joint; name the others."""
-        laws = JointLaws.of(self.model, _LAWS, _OF_DRIVES)
+        laws = JointLaws.of(self.model, _LAWS, DRIVE_EFFECTS)
         self._lose(laws.lost, "has no place in an MJCF")
         return laws.values
 
@@ -188,6 +192,7 @@ class _Work:
         self, values: dict[str, str | None], joint: RobotJoint, stated: RobotJoint, law: dict, index: int
     ) -> None:
         more = [law.get(kind, 0.0) - old for kind, old in zip(_DAMPING, stated.damping, strict=True)]
+        more[0] += self.drag.get(joint.name, 0.0)
         if all(abs(m) <= _SAME * max(abs(s), 1e-9) for m, s in zip(more, stated.damping, strict=True)):
             return
         dof = self._dof(index)
@@ -231,6 +236,7 @@ class _Work:
         if found.error > _CLOSE:
             what = f"no bodies have the inertias that were found: sums differ by {found.error:.2g}"
             self.notes.append(what)
+            self.real = False
         frames = self._frames()
         for k, joint in enumerate(self.robot.joints):
             more = links[k] - start[k]
@@ -288,6 +294,7 @@ class _Work:
         if not new[0] > 0 or not are_bodies(new[None]):
             what = f"less was found than the bodies weigh that are fixed to '{name}': not written"
             self.notes.append(f"joint '{joint.name}': {what}")
+            self.real = False
             return
         mass, centre = new[0], new[1:4] / new[0]
         xx, xy, xz, yy, yz, zz = new[4:]

@@ -51,7 +51,7 @@ def export_urdf(model: Mapping[str, Any], path: Path) -> ExportedFile:
     work = _Work(text, robot, model)
     work.joints(found.rotors)
     work.bodies(found)
-    return ExportedFile(text.text(), tuple(work.changed), tuple(work.notes), tuple(work.lost))
+    return ExportedFile(text.text(), tuple(work.changed), tuple(work.notes), tuple(work.lost), work.real)
 
 
 @dataclass
@@ -64,6 +64,7 @@ class _Work:
     notes: list[str] = field(default_factory=list)
     changed: list[str] = field(default_factory=list)
     lost: list[int] = field(default_factory=list)
+    real: bool = True
 
     def _elements(self, tag: str) -> dict[str, Element]:
         return {e.attributes.get("name", ""): e for e in self.text.root.children if e.tag == tag}
@@ -117,9 +118,9 @@ class _Work:
         start, links = self.robot.bodies, self._elements("link")
         joints = self._elements("joint")
         if found.error > _CLOSE:
-            self.notes.append(
-                f"no bodies have the inertias that were found: sums differ by {found.error:.2g}"
-            )
+            what = f"no bodies have the inertias that were found: sums differ by {found.error:.2g}"
+            self.notes.append(what)
+            self.real = False
         for k, joint in enumerate(self.robot.joints):
             more = found.links[k] - start[k]
             if np.all(np.abs(more) <= _SAME * np.abs(start[k]).max()):
@@ -136,6 +137,7 @@ class _Work:
         if not new[0] > 0 or not are_bodies(new[None]):
             what = f"less was found than the links weigh that are fixed to '{name}': not written"
             self.notes.append(f"joint '{joint.name}': {what}")
+            self.real = False
             return
         mass, centre = new[0], new[1:4] / new[0]
         xx, xy, xz, yy, yz, zz = new[4:]
