@@ -9,21 +9,26 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
 from jaxid.names import (
+    FIRST_CASE,
     LIKELIHOOD_METHODS,
     METHODS,
     MINIMISERS,
     OUTPUTS,
     PICTURES,
+    ROBOT_FILES,
     SEVERAL_LOGS,
     SOLVERS,
     TARGETS,
     WHEN,
 )
+
+if TYPE_CHECKING:
+    from jaxid.commands.robot_case import RobotCase
 
 _GREETING = """\
 jaxid identifies machines with friction from their logs, and finds the physics that a simulation is missing.
@@ -241,7 +246,7 @@ def _init(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("log", metavar="LOG", help="the log, as the drive or the robot wrote it")
     parser.add_argument("--urdf", metavar="FILE", help="file that describes the arm of the log")
     parser.add_argument("--tip", metavar="LINK", help="its last link; needed only where the chain branches")
-    parser.add_argument("--mjcf", metavar="FILE", help="MuJoCo model of the machine; not built yet")
+    parser.add_argument("--mjcf", metavar="FILE", help="MuJoCo model of the robot of the log")
     parser.add_argument(
         "-o", metavar="CASE.toml", default="case.toml", help="file to write the case to; default: case.toml"
     )
@@ -249,7 +254,9 @@ def _init(commands: argparse._SubParsersAction) -> None:
 
 def _simulate(commands: argparse._SubParsersAction) -> None:
     parser = _add(commands, "simulate", "simulate the log that a case describes", _run_simulate)
-    parser.add_argument("case", metavar="CASE.toml", help="the case, with [simulation]")
+    parser.add_argument(
+        "case", metavar="CASE.toml", help="the case; or a robot's MJCF or URDF, which is let go at zero"
+    )
     parser.add_argument("-o", metavar="LOG.csv", required=True, help="file to write the log to")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the noise; default: 0")
 
@@ -262,7 +269,11 @@ def _design(commands: argparse._SubParsersAction) -> None:
 
 
 def _logs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("case", metavar="CASE.toml", help="the case: what is known of the machine")
+    parser.add_argument(
+        "case",
+        metavar="CASE.toml",
+        help="the case; or a robot's MJCF or URDF, with the columns of the log named after its joints",
+    )
     parser.add_argument(
         "log",
         metavar="LOG",
@@ -275,6 +286,17 @@ def _logs(parser: argparse.ArgumentParser) -> None:
 def _given(args: argparse.Namespace) -> str | list[str] | None:
     """Return the logs of a command: one, several, or none."""
     return args.log[0] if len(args.log) == 1 else args.log or None
+
+
+def _case(args: argparse.Namespace, *, search: bool = False) -> tuple[Any, RobotCase | None]:
+    """Return the case of a command; if it is given a robot's file, the one that this and the log imply."""
+    if Path(args.case).suffix.lower() not in ROBOT_FILES:
+        _sound(args)
+        return args.case, None
+    from jaxid.commands.robot_case import RobotCase
+
+    made = RobotCase.of(args.case, args.log, search=search)
+    return made.tables, made
 
 
 def _validate(parser: argparse.ArgumentParser) -> None:
@@ -563,13 +585,18 @@ def _run_simulate(args: argparse.Namespace) -> int:
 
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}", hint="give zero or more")
-    path = ready_file(Path(args.o), overwrite=args.force)
-    _sound(args)
+    path, case = ready_file(Path(args.o), overwrite=args.force), args.case
+    if Path(case).suffix.lower() in ROBOT_FILES:
+        from jaxid.commands.robot_case import let_go
+
+        case = let_go(case)
+    else:
+        _sound(args)
     with _progress(args) as show:
         show("simulating")
         from jaxid.commands.simulate import simulate
 
-        simulated_log = simulate(args.case, seed=args.seed)
+        simulated_log = simulate(case, seed=args.seed)
     simulated_log.save(path)
     print(f"{simulated_log.log.samples} samples at {simulated_log.log.rate_hz:g} Hz in {path}")
     return 0
@@ -590,15 +617,15 @@ def _run_design(args: argparse.Namespace) -> int:
 
 
 def _run_check(args: argparse.Namespace) -> int:
-    _ready(args, "check.json")
-    _sound(args)
+    _ready(args, "check.json", *_first_of(args))
+    case, made = _case(args)
     with _progress(args) as show:
         show("checking")
         from jaxid.commands.check import check
 
-        result = check(args.case, _given(args))
+        result = check(case, _given(args))
     print(result)
-    return _finish(args, result, "check.json")
+    return _finish(args, result, "check.json", made=made)
 
 
 def _run_identify(args: argparse.Namespace) -> int:
@@ -607,14 +634,14 @@ def _run_identify(args: argparse.Namespace) -> int:
     _need_numerics(args)
     if args.on is not None and args.on not in OUTPUTS:
         raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
-    _ready(args, "result.json", "report.html")
-    _sound(args)
+    _ready(args, "result.json", "report.html", *_first_of(args))
+    case, made = _case(args)
     with _progress(args) as show:
         show("starting")
         from jaxid.commands.identify import identify
 
         result = identify(
-            args.case,
+            case,
             _given(args),
             method=args.method,
             solver=args.solver,
@@ -626,7 +653,7 @@ def _run_identify(args: argparse.Namespace) -> int:
             progress=show,
         )
     print(result)
-    return _finish(args, result, "result.json", "report.html")
+    return _finish(args, result, "result.json", "report.html", made=made)
 
 
 def _run_discover(args: argparse.Namespace) -> int:
@@ -640,14 +667,14 @@ def _run_discover(args: argparse.Namespace) -> int:
         folder = Path(args.o)
         experiments = [p.name for p in folder.glob("separate_*.csv")]
         corrected = found_case_file(Path(args.case), folder)
-        _ready(args, "discovery.json", "report.html", corrected, *experiments)
-    _sound(args)
+        _ready(args, "discovery.json", "report.html", corrected, *experiments, *_first_of(args))
+    case, made = _case(args, search=True)
     with _progress(args) as show:
         show("starting")
         from jaxid.commands.discover import discover
 
         result = discover(
-            args.case,
+            case,
             _given(args),
             validate=args.validate,
             max_effects=args.max_effects,
@@ -659,7 +686,7 @@ def _run_discover(args: argparse.Namespace) -> int:
     print(result)
     from jaxid.results.as_json import discovery_files
 
-    return _finish(args, result, *discovery_files(result, Path(args.o or ".")))
+    return _finish(args, result, *discovery_files(result, Path(args.o or ".")), made=made)
 
 
 def _run_study(args: argparse.Namespace) -> int:
@@ -738,11 +765,19 @@ def _run_demo(args: argparse.Namespace) -> int:
     return 0 if converged else 1
 
 
-def _finish(args: argparse.Namespace, result: Savable, *files: str) -> int:
+def _first_of(args: argparse.Namespace) -> list[str]:
+    """Return the name of the case that is written beside the results, if a robot's file is given for one."""
+    return [FIRST_CASE] if Path(args.case).suffix.lower() in ROBOT_FILES else []
+
+
+def _finish(args: argparse.Namespace, result: Savable, *files: str, made: RobotCase | None = None) -> int:
     """Save a result where the user wants it, and return the exit status."""
     if args.o is not None:
         result.save(args.o, overwrite=args.force)
-        print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in files)}")
+        written = [str(Path(args.o) / f) for f in files]
+        if made is not None:
+            written.append(str(made.save(Path(args.o))))
+        print(f"\nwrote {', '.join(written)}")
     return 0 if getattr(result, "converged", True) else 1
 
 

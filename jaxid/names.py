@@ -151,6 +151,10 @@ TARGETS = {
     "c": (".h",),
     "python": (".py",),
 }
+# Ends of the names of robot files, which commands take in place of a case, and the name of the case that they
+# then write beside their results.
+ROBOT_FILES = (".xml", ".mjcf", ".urdf")
+FIRST_CASE = "first_case.toml"
 # Names of ports in case files and results; ports of each kind count from 1.
 PLACES = ("joint", "spring", "shaft", "passive", "tool")
 # Kinds of the joints of an arm.
