@@ -132,11 +132,12 @@ def init(
         hint = "give the file, or a table with the columns by name"
         raise InputError("a Log has its columns already", where=log.source, hint=hint)
     raw = raw_log(log)
-    chosen = choose(columns_of(raw.data, raw.units, raw.contents.time), raw.source)
     robot = _robot(mjcf, urdf if tree else None)
+    names = () if robot is None else tuple(joint.name for joint in robot.free)
+    chosen = choose(columns_of(raw.data, raw.units, raw.contents.time, names), raw.source)
     arm = None if urdf is None or robot is not None else read_urdf(urdf, tip)
     if robot is not None:
-        chosen = of_tree(chosen, tuple(joint.name for joint in robot.free), robot.file, raw.source)
+        chosen = of_tree(chosen, names, robot.file, raw.source)
     elif arm is not None:
         chosen = of_arm(chosen, arm, str(urdf), raw.source)
     elif len(chosen.joints) > 1:

@@ -27,7 +27,8 @@ def of_tree(chosen: Chosen, names: tuple[str, ...], file: str, where: str) -> Ch
     Raises:
         InputError: If the joints of the log are not those of the robot.
     """
-    keys = [" ".join(meaning_of(name).joint) for name in names]
+    # Columns may hold the names as they are, or their words.
+    keys = [n if n in chosen.joints else " ".join(meaning_of(n).joint) for n in names]
     found = [k for k, key in enumerate(keys) if key and key in chosen.joints and keys.count(key) == 1]
     if not found or len(found) == len(names) or len(chosen.joints) == len(names):
         return _of_joints(chosen, names, keys, file, where, "")
