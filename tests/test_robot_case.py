@@ -15,7 +15,7 @@ from tests.export.test_replayed import SERVOS, TRUE, logged, text
 from tests.support.cli_setup import run
 from tests.support.written_logs import write_csv
 
-NAMES = {"qa": "q_a", "qb": "q_b", "ra": "torque_a", "rb": "torque_b"}
+NAMES = {"qa": "q_a", "qb": "q_b", "ra": "u_a", "rb": "u_b"}
 
 
 @pytest.fixture
@@ -32,7 +32,9 @@ def test_a_robot_and_its_log_imply_a_case(folder):
     assert plant["kind"] == "tree"
     assert plant["unknown"] == ["base", "armature", "damping", "frictionloss"]
     assert log["position"] == {"a": "q_a", "b": "q_b"}
-    assert log["force"] == {"a": "torque_a", "b": "torque_b"}
+    assert "units" not in plant
+    assert "actuators" not in plant
+    assert log["force"] == {"a": "u_a", "b": "u_b"}
     # A search begins with what the file states: it has armature and damping, and no dry friction.
     search = RobotCase.of(str(folder / "robot.xml"), [str(folder / "log.csv")], search=True)
     assert search.tables["plant"]["unknown"] == ["base", "armature", "damping"]
@@ -48,7 +50,11 @@ def test_joints_that_the_log_lacks_are_held(folder):
     first = init(write_csv(folder / "one.csv", columns), mjcf=folder / "robot.xml", folder=folder)
     assert first.tables["plant"]["joints"] == ["b"]
     assert first.tables["log"]["position"] == {"b": "q_b"}
-    assert first.case().plant.names == ("b",)
+    case = first.case()
+    assert case.plant.names == ("b",)
+    # A torque is that of the joint, whatever gear the file's motors have.
+    assert case.tables["plant"]["actuators"] is False
+    assert case.actuator.gain == 1.0
     assert any("the others are held at zero" in line for line in first.assumed)
 
 

@@ -143,7 +143,8 @@ def init(
     elif len(chosen.joints) > 1:
         need_forces(chosen, raw.source)
         chosen = most_moved(chosen)
-    draft = Draft(log, raw, chosen, measures_of(chosen), Path(folder))
+    motion = "" if robot is None else _motion_of(robot, next(iter(chosen.joints)))
+    draft = Draft(log, raw, chosen, measures_of(chosen, motion), Path(folder))
     if robot is not None:
         key = "urdf" if mjcf is None else "mjcf"
         words = (UNKNOWN_OF_FORCES if chosen.force else UNKNOWN_OF_SERVOS) if unknown is None else unknown
@@ -172,6 +173,12 @@ def _robot(mjcf: str | Path | None, urdf: str | Path | None) -> Robot | None:
     if mjcf is not None:
         return read_mjcf(mjcf)
     return None if urdf is None else read_urdf_tree(urdf)
+
+
+def _motion_of(robot: Robot, name: str) -> str:
+    """Return "linear" or "rotary" for a joint of a robot."""
+    joint = next(joint for joint in robot.joints if joint.name == name)
+    return "rotary" if joint.motion == "revolute" else "linear"
 
 
 def _need_loadable(first: FirstCase, chosen: Chosen) -> None:

@@ -133,6 +133,10 @@ class Draft:
         )
         if not chosen.force:
             plant.assumed.append("no force is logged: the file's position servos follow the reference")
+        elif robot.drives and chosen.force[0].meaning.quantity in ("torque", "force"):
+            if any(drive.gain != 1.0 or drive.drag or drive.limit for drive in robot.drives):
+                plant.keys["actuators"] = False
+                plant.assumed.append("the forces are those of the joints, behind the file's actuators")
         if key == "urdf":
             plant.questions.append(
                 "does gravity act along -z of the first link? Else gravity_vector = [x, y, z] in m/s^2"

@@ -48,7 +48,7 @@ def true_file() -> str:
 def arm_log(
     seconds: float = 12.0, rate: int = 250, noise: float = 1e-5, seed: int = 0
 ) -> dict[str, np.ndarray]:
-    """Columns of a log by MuJoCo: the arm under PD control along sums of sines, torques held between samples."""
+    """Columns of a log by MuJoCo: the arm under PD control along sums of sines; torques are held."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(true_file())
