@@ -105,6 +105,8 @@ def read_tree(given: Mapping[str, Any], table: Mapping[str, Any], spot: Spot) ->
         effects=_effects(tree),
         defaults=_limits(tree) | _gains(tree) | servo,
         notes=(*robot.notes, *notes),
+        bodies=robot.bodies,
+        rotors=np.array([joint.armature for joint in projected(robot).values()]),
     )
 
 

@@ -11,10 +11,10 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arms.bodies import Bodies, are_bodies, bodies_of
 from jaxid.case.mjcf import is_one_of, need_mujoco, robot_of_spec
 from jaxid.case.robot import Robot, RobotJoint, body_in, kept, moved_by, projected
 from jaxid.errors import InputError
-from jaxid.export.bodies import Bodies, are_bodies, bodies_of
 from jaxid.export.exported import ExportedFile, JointLaws, need_joints, plant_of, shown
 from jaxid.export.mjcf_drives import DRIVE_EFFECTS, DriveText
 from jaxid.export.xml_text import Element, XmlText

@@ -12,10 +12,10 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arms.bodies import Bodies, are_bodies, bodies_of
 from jaxid.case.robot import Robot, RobotJoint, body_in, kept, projected, towards
 from jaxid.case.urdf import read_inertial, read_urdf_tree
 from jaxid.errors import InputError
-from jaxid.export.bodies import Bodies, are_bodies, bodies_of
 from jaxid.export.exported import ExportedFile, JointLaws, need_joints, plant_of, shown
 from jaxid.export.xml_text import Element, XmlText
 

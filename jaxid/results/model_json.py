@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from jaxid.arms.bodies import bodies_of
 from jaxid.controllers import CONTROLLERS
 from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import effect_name
+from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 from jaxid.results.found_case import changed_in_python
 
@@ -32,6 +34,7 @@ def model_json(session: Session, estimate: Estimate) -> dict[str, Any]:
     return {
         "model": {
             **robot_json(machine.plant, entry, held),
+            "bodies": bodies_json(machine.plant, entry),
             "drives": drives_json(machine),
             **_case_json(session.declared),
         }
@@ -73,6 +76,23 @@ def robot_json(plant: LinkTree, entry: PlantEntry, held: Mapping[str, float]) ->
         "parameters": {n: None if v is None else np.asarray(v).tolist() for n, v in values.items()},
         "effects": effects,
     }
+
+
+def bodies_json(plant: LinkTree, entry: PlantEntry) -> dict[str, Any] | None:
+    """Return links and rotors that can exist and move as those of a result, near those of its file.
+
+    Parameters behind sums are no bodies, and a fit may end at links that none can be. `error` is the largest
+    difference of a sum from that of the result, relative to its size; above 1e-6 no bodies have these sums.
+    """
+    if entry.bodies is None or entry.rotors is None:
+        return None
+    rotors = plant.rotor_inertia
+    if rotors is not None and plant.gear_ratio is not None:
+        rotors = rotors * plant.gear_ratio**2
+    bare = replace(plant, effects=(), rotor_inertia=rotors, gear_ratio=None)
+    found = bodies_of(bare, entry.bodies, entry.rotors)
+    links = dict(zip(TEN, found.links.T.tolist(), strict=True))
+    return {**links, "rotor_inertia": found.rotors.tolist(), "error": found.error}
 
 
 def drives_json(machine: Machine) -> dict[str, Any]:
