@@ -69,6 +69,7 @@ def test_servos_that_follow_a_reference_need_no_force(folder):
     assert set(case.controller.unknown) == {"kp", "kd"}
 
 
+@pytest.mark.slow
 def test_check_takes_a_robot_and_writes_its_case(folder, capsys):
     ran = run(capsys, "check", folder / "robot.xml", folder / "log.csv", folder=folder / "out")
     assert ran.status == 0

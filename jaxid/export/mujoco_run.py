@@ -96,7 +96,7 @@ def load(
     Raises:
         InputError: If MuJoCo cannot read it.
     """
-    mujoco = need_mujoco(str(path))
+    mujoco = need_mujoco(str(path), "a replay")
     try:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".jaxid-", suffix=path.suffix) as file:
             file.write(content)

@@ -12,6 +12,7 @@ from jaxid.case.case import read_case
 from jaxid.commands.export import check_export, draw_exports, export
 from jaxid.errors import InputError
 from jaxid.results.model_json import drives_json, robot_json
+from tests.support.urdf_arms import arm
 from tests.support.written_logs import write_csv
 
 # Two links in a vertical plane; the log's are heavier, and rub.
@@ -53,14 +54,14 @@ def logged(content, seconds=2.0):
     return columns | {"ua": u[:, 0], "ub": u[:, 1]}
 
 
-def result_of(folder, start, true, log):
+def result_of(folder, start, true, log, file="robot.xml"):
     """A result that is right: the machine of the file behind the log, stated for the user's own file."""
-    (folder / "robot.xml").write_text(true)
-    plant = {"kind": "tree", "mjcf": "robot.xml"}
+    (folder / file).write_text(true)
+    plant = {"kind": "tree", "urdf" if file.endswith(".urdf") else "mjcf": file}
     tables = {"plant": plant, "log": log, "sensor": {"position_noise": 1e-6}}
     case = read_case(tables, None, folder)
     machine = build_machine(case, period=1 / RATE)
-    (folder / "robot.xml").write_text(start)
+    (folder / file).write_text(start)
     model = robot_json(machine.plant, case.plant, {}) | {"drives": drives_json(machine)}
     return {"model": model | {"case": {"folder": str(folder), "tables": tables}}}
 
@@ -131,6 +132,33 @@ def test_servos_of_the_file_close_the_loop(tmp_path):
     by_law = check_export(own, "mjcf", export(own, "mjcf"), tmp_path / "log.csv")
     # A law differences readings where a servo has the velocity.
     assert np.all(by_law.after < 0.1 * by_law.before)
+
+
+@pytest.mark.slow
+def test_a_urdf_is_replayed_too(tmp_path):
+    """The log is MuJoCo's, of a URDF whose second link is heavier, forces on its joints."""
+    true = arm(["revolute", "fixed", "revolute"], seed=4).replace(
+        "</joint>", '<dynamics damping="0.4"/></joint>'
+    )
+    start = true.replace('damping="0.4"', 'damping="0.1"')
+    model = mujoco.MjModel.from_xml_string(true)
+    model.opt.timestep = 0.001
+    data, t = mujoco.MjData(model), np.arange(500) / RATE
+    force = 0.6 * np.stack([np.sin(5 * t), np.sin(9 * t)], axis=1)
+    q = np.zeros_like(force)
+    for k, now in enumerate(force):
+        q[k], data.qfrc_applied[:] = data.qpos, now
+        mujoco.mj_step(model, data, 4)
+    names = [model.joint(k).name for k in range(2)]
+    columns = {"t": t} | {f"q_{n}": q[:, k] for k, n in enumerate(names)}
+    write_csv(tmp_path / "log.csv", columns | {f"u_{n}": force[:, k] for k, n in enumerate(names)})
+    position, forces = ({n: f"{x}_{n}" for n in names} for x in "qu")
+    log = {"time": "t", "position": position, "force": forces, "hold": "zero_order"}
+    result = result_of(tmp_path, start, true, log, "robot.urdf")
+    file = export(result, "urdf")
+    assert len(file.changed) == 2
+    found = check_export(result, "urdf", file, tmp_path / "log.csv")
+    assert np.all(found.after < 0.02 * found.before)
 
 
 def with_covariance(result, std):
