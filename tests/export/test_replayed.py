@@ -16,7 +16,7 @@ from tests.support.urdf_arms import arm
 from tests.support.written_logs import write_csv
 
 # Two links in a vertical plane; the log's are heavier, and rub.
-ARM = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody>
+ARM = """<mujoco><option timestep="0.00025" integrator="implicitfast"/><worldbody>
   <body><joint name="a" axis="0 1 0" damping="0.5" {rub}/>
     <inertial pos="0.1 0 0" mass="{mass}" diaginertia="0.02 0.02 0.02"/>
     <body pos="0.2 0 0"><joint name="b" axis="0 1 0" damping="0.3" armature="0.01"/>
@@ -47,17 +47,18 @@ def logged(content, seconds=2.0):
     q, u = np.zeros((count, 2)), np.zeros((count, 2))
     for k in range(count):
         q[k], data.ctrl[:] = data.qpos, ctrl[k]
-        mujoco.mj_step(model, data, inner)
+        mujoco.mj_forward(model, data)
         u[k] = data.qfrc_actuator
+        mujoco.mj_step(model, data, inner)
     q += 1e-6 * rng.normal(size=q.shape)
     columns = {"t": t, "qa": q[:, 0], "qb": q[:, 1], "ra": ctrl[:, 0], "rb": ctrl[:, 1]}
     return columns | {"ua": u[:, 0], "ub": u[:, 1]}
 
 
-def result_of(folder, start, true, log, file="robot.xml"):
+def result_of(folder, start, true, log, file="robot.xml", **plant):
     """A result that is right: the machine of the file behind the log, stated for the user's own file."""
     (folder / file).write_text(true)
-    plant = {"kind": "tree", "urdf" if file.endswith(".urdf") else "mjcf": file}
+    plant |= {"kind": "tree", "urdf" if file.endswith(".urdf") else "mjcf": file}
     tables = {"plant": plant, "log": log, "sensor": {"position_noise": 1e-6}}
     case = read_case(tables, None, folder)
     machine = build_machine(case, period=1 / RATE)
@@ -94,7 +95,7 @@ def test_a_replay_says_how_near_the_file_is_and_what_it_lacks(tmp_path, capsys):
     assert lost[1] > 1e-3
     assert found.difference[1] == pytest.approx(lost[1], rel=0.2)
     assert [what for what, _ in found.costs][1:] == [
-        "time step of 0.001 s, against a 10th",
+        "time step of 0.00025 s, against a 10th",
         "soft dry friction (solreffriction), against stiff",
     ]
     (tmp_path / "result.json").write_text(json.dumps(result))
@@ -118,20 +119,23 @@ def test_a_replay_says_how_near_the_file_is_and_what_it_lacks(tmp_path, capsys):
 def test_servos_of_the_file_close_the_loop(tmp_path):
     true = text(SERVOS, kp=60, **TRUE)
     write_csv(tmp_path / "log.csv", logged(true))
-    result = result_of(tmp_path, text(SERVOS, kp=40), true, FOLLOWED)
+    result = result_of(tmp_path, text(SERVOS, kp=40), true, FOLLOWED, unknown=["kp", "kv"])
     file = export(result, "mjcf")
     assert "actuator '1'" in file.changed
     found = check_export(result, "mjcf", file, tmp_path / "log.csv")
     assert found.closed
     assert np.all(found.before > 20 * found.after)
-    assert np.all(found.share < 0.01)
+    # jaxid holds the servo's force over each step of the file, MuJoCo's Euler runs half a step ahead of that:
+    # 3 mrad at steps of 1 ms, 0.9 mrad at these.
+    assert np.all(found.difference < 1e-3)
     # The same law stated by the case runs at its own ticks in place of the servos.
     own = copy.deepcopy(result)
-    law = {"kind": "pd", "derivative": "velocity", "kp": [60.0, 20.0], "kd": [2.0, 0.5], "period": 0.001}
+    law = {"kind": "pd", "derivative": "velocity", "kp": [60.0, 20.0], "kd": [2.0, 0.5], "period": 0.00025}
     own["model"]["case"]["tables"]["controller"] = law
     by_law = check_export(own, "mjcf", export(own, "mjcf"), tmp_path / "log.csv")
     # A law differences readings where a servo has the velocity.
-    assert np.all(by_law.after < 0.1 * by_law.before)
+    assert np.all(by_law.difference < 1e-3)
+    assert np.all(by_law.before > 2e-3)
 
 
 @pytest.mark.slow
