@@ -45,17 +45,21 @@ _EXAMPLES = {
     "plants": "jaxid plants",
     "effects": "jaxid effects\njaxid effects cogging\njaxid effects stribeck_friction -o stribeck.png",
     "schema": "jaxid schema case > case.schema.json",
-    "init": "jaxid init log.csv\njaxid init joint_states.csv --urdf arm.urdf -o arm.toml",
+    "init": "jaxid init log.csv\njaxid init joint_states.csv --urdf arm.urdf -o arm.toml\n"
+    "jaxid init log.csv --mjcf robot.xml -o arm.toml",
     "simulate": "jaxid simulate case.toml -o log.csv\njaxid simulate case.toml -o log.csv --seed 3",
     "design": "jaxid design case.toml -o reference.csv",
     "check": "jaxid check case.toml log.csv\njaxid check case.toml log.csv -o out",
     "identify": "jaxid identify case.toml log.csv -o out\n"
+    "jaxid identify robot.xml log.csv -o out\n"
     "jaxid identify case.toml a.csv b.csv --validate c.csv\n"
     "jaxid identify case.toml log.csv --method inverse_dynamics",
     "discover": "jaxid discover case.toml log.csv -o out\n"
     "jaxid discover case.toml log.csv --validate other.csv --max-effects 2",
     "study": "jaxid study case.toml -o study --runs 50\njaxid study case.toml -o study --resume",
-    "export": "jaxid export out/result.json --to mjcf --model robot.xml -o found.xml",
+    "export": "jaxid export out/result.json --to mjcf -o found.xml --check log.csv\n"
+    "jaxid export out/result.json --to urdf --model robot.urdf -o found.urdf\n"
+    "jaxid export out/discovery.json --to c -o feed_forward.h",
     "report": "jaxid report out\njaxid report out/result.json -o fit.html",
     "plot": "jaxid plot out friction -o friction.png\n"
     "jaxid plot out/result.json scatter --against position -o ripple.svg",
