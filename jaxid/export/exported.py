@@ -13,6 +13,9 @@ from jaxid.errors import InputError
 from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 
+# Parameter below which an effect counts as none [its SI unit].
+_ROUNDING = 1e-14
+
 
 @dataclass(frozen=True)
 class ExportedFile:
@@ -38,6 +41,12 @@ def shown(effect: Mapping[str, Any]) -> str:
     values = ", ".join(f"{n} = {v:.6g}" for n, v in effect["parameters"].items() if v is not None)
     place = f"[{effect['joint_name']}]" if "joint_name" in effect else ""
     return f"{effect['kind']}{place} ({values})"
+
+
+def is_nothing(effect: Mapping[str, Any]) -> bool:
+    """Check that an effect with one parameter is zero but for rounding, as of a spring's expansion."""
+    values = [v for v in effect["parameters"].values() if v is not None]
+    return len(values) == 1 and abs(values[0]) < _ROUNDING
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,7 @@ class JointLaws:
             value = effect["parameters"].get(placed.get(kind, ""))
             if value is not None and joint >= 0:
                 values[joint][kind] = values[joint].get(kind, 0.0) + float(value)
-            elif kind not in stay:
+            elif kind not in stay and not is_nothing(effect):
                 lost.append(number)
         return cls(tuple(values), tuple(lost))
 

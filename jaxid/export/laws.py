@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jaxid.export.exported import shown
+from jaxid.export.exported import is_nothing, shown
 
 # Force that a drive needs to overcome an effect: position q, velocity v, acceleration a, gravity g.
 _FORMULAS = {
@@ -101,6 +101,8 @@ def written(model: Mapping[str, Any], language: Language, field: float) -> Writt
     commands: list[list[str]] = [[] for _ in range(count)]
     notes, lost = [], []
     for number, effect in enumerate(model["effects"]):
+        if is_nothing(effect):
+            continue
         kind, joint = effect["kind"], effect.get("joint", 0) - 1
         values = {"g": field, **{n: v for n, v in effect["parameters"].items() if v is not None}}
         if "period" in values:
