@@ -13,6 +13,7 @@ from jaxid.commands.robot_case import RobotCase, let_go
 from jaxid.errors import InputError
 from tests.export.test_replayed import SERVOS, TRUE, logged, text
 from tests.support.cli_setup import run
+from tests.support.urdf_arms import arm
 from tests.support.written_logs import write_csv
 
 NAMES = {"qa": "q_a", "qb": "q_b", "ra": "u_a", "rb": "u_b"}
@@ -56,6 +57,21 @@ def test_joints_that_the_log_lacks_are_held(folder):
     assert case.tables["plant"]["actuators"] is False
     assert case.actuator.gain == 1.0
     assert any("the others are held at zero" in line for line in first.assumed)
+
+
+def test_a_urdf_is_a_tree_too(folder):
+    (folder / "robot.urdf").write_text(arm(["revolute", "fixed", "prismatic"]))
+    t = np.arange(100) / 100
+    columns = {"t": t}
+    for k, name in enumerate(("joint1", "joint3"), start=2):
+        columns |= {f"{name}_pos": np.sin(k * t), f"{name} effort": np.cos(k * t)}
+    log = write_csv(folder / "two.csv", columns)
+    made = RobotCase.of(str(folder / "robot.urdf"), [str(log)], search=True)
+    assert made.tables["plant"]["unknown"] == ["base"]
+    assert made.tables["log"]["force"] == {"joint1": "joint1 effort", "joint3": "joint3 effort"}
+    case = load_case(made.tables)
+    assert case.plant.names == ("joint1", "joint3")
+    assert case.tables["plant"]["kind"] == "tree"
 
 
 def test_servos_that_follow_a_reference_need_no_force(folder):
