@@ -9,22 +9,27 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from jaxid import _cache
 from jaxid.errors import InputError, suggest
 from jaxid.names import (
+    FIRST_CASE,
     LIKELIHOOD_METHODS,
     METHODS,
     MINIMISERS,
     OUTPUTS,
     PICTURES,
+    ROBOT_FILES,
     SEVERAL_LOGS,
     SIGNALS,
     SOLVERS,
     TARGETS,
     WHEN,
 )
+
+if TYPE_CHECKING:
+    from jaxid.commands.robot_case import RobotCase
 
 _GREETING = """\
 jaxid identifies machines with friction from their logs, and finds the physics that a simulation is missing.
@@ -41,17 +46,21 @@ _EXAMPLES = {
     "plants": "jaxid plants",
     "effects": "jaxid effects\njaxid effects cogging\njaxid effects stribeck_friction -o stribeck.png",
     "schema": "jaxid schema case > case.schema.json",
-    "init": "jaxid init log.csv\njaxid init joint_states.csv --urdf arm.urdf -o arm.toml",
+    "init": "jaxid init log.csv\njaxid init joint_states.csv --urdf arm.urdf -o arm.toml\n"
+    "jaxid init log.csv --mjcf robot.xml -o arm.toml",
     "simulate": "jaxid simulate case.toml -o log.csv\njaxid simulate case.toml -o log.csv --seed 3",
     "design": "jaxid design case.toml -o reference.csv",
     "check": "jaxid check case.toml log.csv\njaxid check case.toml log.csv -o out",
     "identify": "jaxid identify case.toml log.csv -o out\n"
+    "jaxid identify robot.xml log.csv -o out\n"
     "jaxid identify case.toml a.csv b.csv --validate c.csv\n"
     "jaxid identify case.toml log.csv --method inverse_dynamics",
     "discover": "jaxid discover case.toml log.csv -o out\n"
     "jaxid discover case.toml log.csv --validate other.csv --max-effects 2",
     "study": "jaxid study case.toml -o study --runs 50\njaxid study case.toml -o study --resume",
-    "export": "jaxid export out/result.json --to mjcf --model robot.xml -o found.xml",
+    "export": "jaxid export out/result.json --to mjcf -o found.xml --check log.csv\n"
+    "jaxid export out/result.json --to urdf --model robot.urdf -o found.urdf\n"
+    "jaxid export out/discovery.json --to c -o feed_forward.h",
     "report": "jaxid report out\njaxid report out/result.json -o fit.html",
     "plot": "jaxid plot out friction -o friction.png\n"
     "jaxid plot out/result.json scatter --against position -o ripple.svg\n"
@@ -246,7 +255,7 @@ def _init(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("log", metavar="LOG", help="the log, as the drive or the robot wrote it")
     parser.add_argument("--urdf", metavar="FILE", help="file that describes the arm of the log")
     parser.add_argument("--tip", metavar="LINK", help="its last link; needed only where the chain branches")
-    parser.add_argument("--mjcf", metavar="FILE", help="MuJoCo model of the machine; not built yet")
+    parser.add_argument("--mjcf", metavar="FILE", help="MuJoCo model of the robot of the log")
     parser.add_argument(
         "-o", metavar="CASE.toml", default="case.toml", help="file to write the case to; default: case.toml"
     )
@@ -254,7 +263,9 @@ def _init(commands: argparse._SubParsersAction) -> None:
 
 def _simulate(commands: argparse._SubParsersAction) -> None:
     parser = _add(commands, "simulate", "simulate the log that a case describes", _run_simulate)
-    parser.add_argument("case", metavar="CASE.toml", help="the case, with [simulation]")
+    parser.add_argument(
+        "case", metavar="CASE.toml", help="the case; or a robot's MJCF or URDF, which is let go at zero"
+    )
     parser.add_argument("-o", metavar="LOG.csv", required=True, help="file to write the log to")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the noise; default: 0")
 
@@ -267,7 +278,11 @@ def _design(commands: argparse._SubParsersAction) -> None:
 
 
 def _logs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("case", metavar="CASE.toml", help="the case: what is known of the machine")
+    parser.add_argument(
+        "case",
+        metavar="CASE.toml",
+        help="the case; or a robot's MJCF or URDF, with the columns of the log named after its joints",
+    )
     parser.add_argument(
         "log",
         metavar="LOG",
@@ -280,6 +295,17 @@ def _logs(parser: argparse.ArgumentParser) -> None:
 def _given(args: argparse.Namespace) -> str | list[str] | None:
     """Return the logs of a command: one, several, or none."""
     return args.log[0] if len(args.log) == 1 else args.log or None
+
+
+def _case(args: argparse.Namespace, *, search: bool = False) -> tuple[Any, RobotCase | None]:
+    """Return the case of a command; if it is given a robot's file, the one that this and the log imply."""
+    if Path(args.case).suffix.lower() not in ROBOT_FILES:
+        _sound(args)
+        return args.case, None
+    from jaxid.commands.robot_case import RobotCase
+
+    made = RobotCase.of(args.case, args.log, search=search)
+    return made.tables, made
 
 
 def _validate(parser: argparse.ArgumentParser) -> None:
@@ -390,12 +416,29 @@ def _study(commands: argparse._SubParsersAction) -> None:
 
 
 def _export(commands: argparse._SubParsersAction) -> None:
-    purpose = "put the values of a result into the robot's own file"
+    purpose = "put the values of a result into the robot's own file, or into one of another program"
     parser = _plain(commands, "export", purpose, _run_export)
     parser.add_argument("result", metavar="RESULT.json", help="result.json or discovery.json of a tree")
     parser.add_argument("--to", metavar="TARGET", required=True, help=f"one of {', '.join(TARGETS)}")
-    parser.add_argument("--model", metavar="ROBOT.xml", required=True, help="the file that the case names")
+    parser.add_argument(
+        "--model",
+        metavar="ROBOT.xml",
+        help="for mjcf and urdf, the file that the case names; default: the path in the case",
+    )
     parser.add_argument("-o", metavar="FILE", required=True, help="file to write")
+    parser.add_argument(
+        "--check",
+        metavar="LOG",
+        help="replay a log by the file in MuJoCo: how far it is from jaxid's own simulation, by joint, and "
+        "what each thing that the file lacks is worth",
+    )
+    parser.add_argument(
+        "--samples",
+        metavar="N",
+        type=int,
+        help="also write N models drawn from the posterior, FILE_1 to FILE_N",
+    )
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of these draws; default: 0")
     parser.add_argument("--force", action="store_true", help="overwrite a file that jaxid did not make")
 
 
@@ -564,13 +607,18 @@ def _run_simulate(args: argparse.Namespace) -> int:
 
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}", hint="give zero or more")
-    path = ready_file(Path(args.o), overwrite=args.force)
-    _sound(args)
+    path, case = ready_file(Path(args.o), overwrite=args.force), args.case
+    if Path(case).suffix.lower() in ROBOT_FILES:
+        from jaxid.commands.robot_case import let_go
+
+        case = let_go(case)
+    else:
+        _sound(args)
     with _progress(args) as show:
         show("simulating")
         from jaxid.commands.simulate import simulate
 
-        simulated_log = simulate(args.case, seed=args.seed)
+        simulated_log = simulate(case, seed=args.seed)
     simulated_log.save(path)
     print(f"{simulated_log.log.samples} samples at {simulated_log.log.rate_hz:g} Hz in {path}")
     return 0
@@ -591,15 +639,15 @@ def _run_design(args: argparse.Namespace) -> int:
 
 
 def _run_check(args: argparse.Namespace) -> int:
-    _ready(args, "check.json")
-    _sound(args)
+    _ready(args, "check.json", *_first_of(args))
+    case, made = _case(args)
     with _progress(args) as show:
         show("checking")
         from jaxid.commands.check import check
 
-        result = check(args.case, _given(args))
+        result = check(case, _given(args))
     print(result)
-    return _finish(args, result, "check.json")
+    return _finish(args, result, "check.json", made=made)
 
 
 def _run_identify(args: argparse.Namespace) -> int:
@@ -608,14 +656,14 @@ def _run_identify(args: argparse.Namespace) -> int:
     _need_numerics(args)
     if args.on is not None and args.on not in OUTPUTS:
         raise InputError(f"on {args.on!r} is not known", hint=suggest(args.on, OUTPUTS))
-    _ready(args, "result.json", "report.html")
-    _sound(args)
+    _ready(args, "result.json", "report.html", *_first_of(args))
+    case, made = _case(args)
     with _progress(args) as show:
         show("starting")
         from jaxid.commands.identify import identify
 
         result = identify(
-            args.case,
+            case,
             _given(args),
             method=args.method,
             solver=args.solver,
@@ -627,7 +675,7 @@ def _run_identify(args: argparse.Namespace) -> int:
             progress=show,
         )
     print(result)
-    return _finish(args, result, "result.json", "report.html")
+    return _finish(args, result, "result.json", "report.html", made=made)
 
 
 def _run_discover(args: argparse.Namespace) -> int:
@@ -641,14 +689,14 @@ def _run_discover(args: argparse.Namespace) -> int:
         folder = Path(args.o)
         experiments = [p.name for p in folder.glob("separate_*.csv")]
         corrected = found_case_file(Path(args.case), folder)
-        _ready(args, "discovery.json", "report.html", corrected, *experiments)
-    _sound(args)
+        _ready(args, "discovery.json", "report.html", corrected, *experiments, *_first_of(args))
+    case, made = _case(args, search=True)
     with _progress(args) as show:
         show("starting")
         from jaxid.commands.discover import discover
 
         result = discover(
-            args.case,
+            case,
             _given(args),
             validate=args.validate,
             max_effects=args.max_effects,
@@ -660,7 +708,7 @@ def _run_discover(args: argparse.Namespace) -> int:
     print(result)
     from jaxid.results.as_json import discovery_files
 
-    return _finish(args, result, *discovery_files(result, Path(args.o or ".")))
+    return _finish(args, result, *discovery_files(result, Path(args.o or ".")), made=made)
 
 
 def _run_study(args: argparse.Namespace) -> int:
@@ -696,15 +744,36 @@ def _run_study(args: argparse.Namespace) -> int:
 
 
 def _run_export(args: argparse.Namespace) -> int:
-    from jaxid.commands.export import export
-    from jaxid.files import ready_file, write_whole
+    if args.to not in TARGETS:
+        raise InputError(f"target {args.to!r} is not known", hint=suggest(args.to, TARGETS))
+    if args.samples is not None and not 1 <= args.samples <= 10_000:
+        raise InputError(f"--samples is {args.samples}", hint="give 1 to 10000")
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}", hint="give zero or more")
+    from jaxid.commands.export import check_export, draw_exports, export
+    from jaxid.files import ready_file, write_together
 
-    path = ready_file(Path(args.o), overwrite=args.force, suffix=".xml")
-    exported = export(args.result, args.to, args.model)
-    write_whole(path, exported.content)
+    suffix, *also = TARGETS[args.to]
+    path, count = Path(args.o), args.samples or 0
+    drawn_paths = [path.with_stem(f"{path.stem}_{k:0{len(str(count))}}") for k in range(1, count + 1)]
+    for one in (path, *drawn_paths):
+        ready_file(one, overwrite=args.force, suffix=suffix, also=also)
+    exported = export(args.result, args.to, args.model, name=path.stem)
     lines = [f"not exported: {note}" for note in exported.notes]
+    files = {path: exported.content}
+    drawn = None
+    if count:
+        drawn = draw_exports(args.result, args.to, count, args.model, seed=args.seed)
+        files |= {one: file.content for one, file in zip(drawn_paths, drawn.files, strict=True)}
+    checked = None
+    if args.check is not None:
+        checked = check_export(args.result, args.to, exported, args.check, args.model)
+    write_together(files)
     changed = ", ".join(exported.changed) or "nothing"
-    print("\n".join([*lines, f"changed {changed} in {path}"]))
+    lines.append(f"{'changed' if args.to in ('mjcf', 'urdf') else 'wrote'} {changed} in {path}")
+    if drawn is not None:
+        lines.append(f"drew {count} models, {drawn_paths[0].name} to {drawn_paths[-1].name}; {drawn}")
+    print("\n".join([*lines, *([] if checked is None else ["", str(checked)])]))
     return 0
 
 
@@ -718,11 +787,19 @@ def _run_demo(args: argparse.Namespace) -> int:
     return 0 if converged else 1
 
 
-def _finish(args: argparse.Namespace, result: Savable, *files: str) -> int:
+def _first_of(args: argparse.Namespace) -> list[str]:
+    """Return the name of the case that is written beside the results, if a robot's file is given for one."""
+    return [FIRST_CASE] if Path(args.case).suffix.lower() in ROBOT_FILES else []
+
+
+def _finish(args: argparse.Namespace, result: Savable, *files: str, made: RobotCase | None = None) -> int:
     """Save a result where the user wants it, and return the exit status."""
     if args.o is not None:
         result.save(args.o, overwrite=args.force)
-        print(f"\nwrote {', '.join(str(Path(args.o) / f) for f in files)}")
+        written = [str(Path(args.o) / f) for f in files]
+        if made is not None:
+            written.append(str(made.save(Path(args.o))))
+        print(f"\nwrote {', '.join(written)}")
     return 0 if getattr(result, "converged", True) else 1
 
 

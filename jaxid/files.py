@@ -216,8 +216,16 @@ def mark_folder(folder: Path) -> None:
         ) from error
 
 
-def ready_file(path: Path, *, overwrite: bool = False, suffix: str = ".csv") -> Path:
+def ready_file(
+    path: Path, *, overwrite: bool = False, suffix: str = ".csv", also: Sequence[str] = ()
+) -> Path:
     """Check that a log, or another file, may be written, before the work that makes it.
+
+    Args:
+        path: The file.
+        overwrite: Whether it may exist.
+        suffix: End of its name.
+        also: Further ends that are as good.
 
     Raises:
         InputError: If the file exists and `overwrite` is false, its folder does not exist, it is a folder, or
@@ -225,7 +233,7 @@ def ready_file(path: Path, *, overwrite: bool = False, suffix: str = ".csv") -> 
     """
     if path.is_dir():
         raise InputError("is a folder", where=str(path), hint=f"name a file: -o LOG{suffix}")
-    if path.suffix.lower() != suffix:
+    if path.suffix.lower() not in (suffix, *also):
         raise InputError(
             f"suffix {path.suffix!r}: the {'log' if suffix == '.csv' else 'file'} is written as "
             f"{suffix[1:].upper()}",

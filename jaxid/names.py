@@ -144,8 +144,18 @@ SIGN_OF = UNIT_OF[1:]
 SIDES = ("load", "motor")
 # Ways to resample: lines between readings, or cubic splines.
 RESAMPLINGS = ("linear", "band_limited")
-# Files of other programs that `export` writes.
-TARGETS = ("mjcf",)
+# Files of other programs that `export` writes, with the ends of their names.
+TARGETS = {
+    "mjcf": (".xml",),
+    "urdf": (".urdf", ".xml"),
+    "isaaclab": (".py",),
+    "c": (".h",),
+    "python": (".py",),
+}
+# Ends of the names of robot files, which commands take in place of a case, and the name of the case that they
+# then write beside their results.
+ROBOT_FILES = (".xml", ".mjcf", ".urdf")
+FIRST_CASE = "first_case.toml"
 # Names of ports in case files and results; ports of each kind count from 1.
 PLACES = ("joint", "spring", "shaft", "passive", "tool")
 # Kinds of the joints of an arm.

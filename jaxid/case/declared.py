@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jaxid.case.values import Value
 from jaxid.model.units import Units
 
@@ -32,6 +34,8 @@ class PlantEntry:
         effects: Effects that such a file states.
         defaults: Tables of the case that such a file states, by name.
         notes: Parts of such a file that the plant does not hold, a sentence each.
+        bodies: Ten inertial parameters of each link by such a file; None: there is none.
+        rotors: Inertia of each rotor by such a file, as seen at its joint.
     """
 
     cls: type[Plant]
@@ -47,6 +51,8 @@ class PlantEntry:
     effects: tuple[EffectEntry, ...] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    bodies: np.ndarray | None = field(default=None, compare=False, repr=False)
+    rotors: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def drives(self) -> int:

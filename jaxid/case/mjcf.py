@@ -64,8 +64,12 @@ def robot_of_spec(spec: Any, file: str = "model") -> tuple[Robot, Any]:
     return robot, model
 
 
-def need_mujoco(file: str) -> Any:
+def need_mujoco(file: str, purpose: str = "reading an MJCF file") -> Any:
     """Import MuJoCo.
+
+    Args:
+        file: The file, for messages.
+        purpose: What needs it, for messages.
 
     Raises:
         InputError: If it is not installed.
@@ -73,8 +77,10 @@ def need_mujoco(file: str) -> Any:
     try:
         import mujoco
     except ImportError as error:
-        hint = "pip install 'jaxid[mujoco]', or name the robot's URDF by urdf"
-        raise InputError("reading an MJCF file needs MuJoCo", where=file, hint=hint) from error
+        hint = "pip install 'jaxid[mujoco]'"
+        if purpose.startswith("reading"):
+            hint += ", or name the robot's URDF by urdf"
+        raise InputError(f"{purpose} needs MuJoCo", where=file, hint=hint) from error
     return mujoco
 
 

@@ -24,6 +24,9 @@ from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 from jaxid.schema import Spot, is_list
 
+# Guess of an unknown delay of which a file says nothing [s].
+_DELAY = 0.005
+
 
 @dataclass(frozen=True)
 class Tree:
@@ -102,6 +105,8 @@ def read_tree(given: Mapping[str, Any], table: Mapping[str, Any], spot: Spot) ->
         effects=_effects(tree),
         defaults=_limits(tree) | _gains(tree) | servo,
         notes=(*robot.notes, *notes),
+        bodies=robot.bodies,
+        rotors=np.array([joint.armature for joint in projected(robot).values()]),
     )
 
 
@@ -238,7 +243,8 @@ def _effects(tree: Tree) -> tuple[EffectEntry, ...]:
     def put(kind: str, parameter: str, port: int, value: float, word: str = "") -> None:
         unknown = bool(word) and tree.unknown(word)
         if value or unknown:
-            values.setdefault((kind, parameter), {})[port] = Value(value, unknown)
+            guess = value or (_DELAY if word == "delay" else 0.0)
+            values.setdefault((kind, parameter), {})[port] = Value(guess, unknown)
 
     for port, name in enumerate(names):
         joint = joints[name]
@@ -258,10 +264,12 @@ def _effects(tree: Tree) -> tuple[EffectEntry, ...]:
             continue
         port = names.index(drive.joint)
         put("back_emf_damping", "coefficient", port, drive.drag)
-        put("input_delay", "delay", port, drive.delay)
         put("actuator_lag", "time_constant", port, drive.lag)
-        if drive.kp is None and drive.limit is not None:
-            put("saturation", "limit", port, drive.limit)
+        # Of a servo both are part of [controller].
+        if drive.kp is None:
+            put("input_delay", "delay", port, drive.delay, "delay")
+            if drive.limit is not None:
+                put("saturation", "limit", port, drive.limit, "forcerange")
     return tuple(
         EffectEntry(EFFECTS[kind], {parameter: tuple(of_ports.values())}, tuple(of_ports))
         for (kind, parameter), of_ports in values.items()
@@ -290,16 +298,24 @@ def _servo(tree: Tree) -> tuple[dict[str, Any], list[str]]:
         return {}, []
     if len(servos) < len(_driven(tree)):
         return {}, ["not every drive is a position servo: state [controller]"]
+
+    def values(word: str, of_file: list[float | None]) -> list[Any]:
+        return [{"guess": value} for value in of_file] if tree.unknown(word) else of_file
+
     law: dict[str, Any] = {
         "kind": "pd",
         "derivative": "velocity",
-        "kp": [drive.kp for drive in servos],
-        "kd": [drive.kd for drive in servos],
+        "kp": values("kp", [drive.kp for drive in servos]),
+        "kd": values("kv", [drive.kd for drive in servos]),
         "period": tree.robot.period,
     }
     limits, notes = [drive.limit for drive in servos], []
     if None not in limits:
-        law["limit"] = limits
+        law["limit"] = values("forcerange", limits)
     elif any(limits):
         notes.append("some servos have a force range, others none: state limit in [controller]")
+    if tree.unknown("delay"):
+        law["delay"] = [{"guess": drive.delay or _DELAY} for drive in servos]
+    elif any(drive.delay for drive in servos):
+        law["delay"] = [drive.delay for drive in servos]
     return {"controller": law}, notes

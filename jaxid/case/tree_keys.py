@@ -27,7 +27,9 @@ TREE_KIND = "tree"
 # Parameters of links that may be unknown, and further words for values that a file states of its joints.
 LINKS_UNKNOWN = ("base", "all")
 JOINTS_UNKNOWN = ("armature", "damping", "frictionloss", "stiffness")
-UNKNOWN = ("none", *LINKS_UNKNOWN, *JOINTS_UNKNOWN)
+# The same for values of its actuators.
+DRIVES_UNKNOWN = ("kp", "kv", "forcerange", "delay")
+UNKNOWN = ("none", *LINKS_UNKNOWN, *JOINTS_UNKNOWN, *DRIVES_UNKNOWN)
 
 
 def _unknown_reader() -> Reader:
@@ -71,7 +73,7 @@ TREE: Keys = {
     "held": Key(_by_name(number()), "positions of joints that are held", unit="position", note="zero"),
     "unknown": Key(
         _unknown_reader(),
-        "values of the file that are unknown: parameters of its links (base, all), and those of its joints",
+        "values of the file that are unknown: of its links (base, all), its joints, and its actuators",
         default=(),
         note="none",
     ),

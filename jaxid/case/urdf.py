@@ -86,7 +86,7 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
         link, body, frame = ahead.pop()
         inertial = links[link].find("inertial")
         if inertial is not None:
-            bodies[body] += _inertial(inertial, frame, f"{file}, link '{link}'")
+            bodies[body] += read_inertial(inertial, frame, f"{file}, link '{link}'")
             weighed[body] = True
         for joint in (j for j in joints if j.parent == link):
             if joint.name not in moving:
@@ -147,7 +147,7 @@ def read_urdf_tree(path: str | Path) -> Robot:
     def visit(link: str, body: int, frame: np.ndarray) -> None:
         inertial = links[link].find("inertial")
         if inertial is not None and body >= 0:
-            bodies[body] += _inertial(inertial, frame, f"{file}, link '{link}'")
+            bodies[body] += read_inertial(inertial, frame, f"{file}, link '{link}'")
         for joint in (j for j in joints if j.parent == link):
             if joint.motion is None:
                 visit(joint.child, body, frame @ joint.place)
@@ -415,7 +415,7 @@ def _place(origin: Element | None, where: str) -> Float[np.ndarray, "4 4"]:
     return out
 
 
-def _inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndarray, " 10"]:
+def read_inertial(inertial: Element, frame: np.ndarray, where: str) -> Float[np.ndarray, " 10"]:
     """Return the ten parameters of a link about the origin of its body's frame.
 
     Raises:

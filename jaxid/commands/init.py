@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from jaxid.case.case import Case, load_case
-from jaxid.case.urdf import read_urdf
+from jaxid.case.mjcf import read_mjcf
+from jaxid.case.robot import Robot
+from jaxid.case.urdf import read_urdf, read_urdf_tree
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.first_case.columns import Chosen, choose, columns_of
 from jaxid.first_case.drafting import Draft
-from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_arm
+from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_arm, of_tree
 from jaxid.first_case.raw import raw_log
 from jaxid.first_case.section import case_text
 from jaxid.first_case.units import measures_of
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 
+# Values of a robot's file that forces show, and those that a servo's motion along a known reference shows.
+UNKNOWN_OF_FORCES = ("base", "armature", "damping", "frictionloss")
+UNKNOWN_OF_SERVOS = ("damping", "frictionloss", "kp", "kv")
 _TITLE = (
     "Lines that begin with `assumed` say what the log seemed to show.",
     "Lines that begin with `question` ask what only you know. Neither stops a command.",
@@ -52,8 +58,9 @@ class FirstCase:
     def case(self) -> Case:
         """Return the case, as `identify` and the other commands take it."""
         tables = self.tables
-        if "urdf" in tables["plant"]:
-            tables["plant"]["urdf"] = str(self.folder / tables["plant"]["urdf"])
+        for file in ("urdf", "mjcf"):
+            if file in tables["plant"]:
+                tables["plant"][file] = str(self.folder / tables["plant"][file])
         return load_case(tables)
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -99,6 +106,8 @@ def init(
     tip: str | None = None,
     mjcf: str | Path | None = None,
     folder: str | Path = ".",
+    tree: bool = False,
+    unknown: Sequence[str] | None = None,
 ) -> FirstCase:
     """Write a first case from a raw log: columns, units, sensors, and rough guesses of the unknowns.
 
@@ -106,31 +115,41 @@ def init(
         log: The file, or a table in memory (DataFrame, Dataset, dict).
         urdf: File that describes the arm of the log; None: an axis.
         tip: Name of its last link; None: there is only one way to go.
-        mjcf: MuJoCo model of the machine; not built yet.
-        folder: Folder in which the case will stand, for the path of the URDF file in it.
+        mjcf: MuJoCo model of the robot of the log.
+        folder: Folder in which the case will stand, for the path of the robot's file in it.
+        tree: Whether a URDF file is taken for a tree, with its friction, in place of an arm.
+        unknown: Words of `[plant] unknown` for a robot's file; None: all that a log of its kind shows.
 
     Raises:
         InputError: If no column is the position or velocity of a joint, there is no force, or nothing else
             from which one could be concluded.
     """
-    if mjcf is not None:
-        hint = "give --urdf FILE --tip LINK, or no model for the case of one axis"
-        raise InputError("--mjcf is not built yet", where=str(mjcf), hint=hint)
+    if mjcf is not None and urdf is not None:
+        raise InputError("--mjcf and --urdf are both given", hint="name one file")
     if tip is not None and urdf is None:
         raise InputError("--tip goes with --urdf", hint="add --urdf FILE, or leave --tip out")
     if isinstance(log, Log):
         hint = "give the file, or a table with the columns by name"
         raise InputError("a Log has its columns already", where=log.source, hint=hint)
     raw = raw_log(log)
-    chosen = choose(columns_of(raw.data, raw.units, raw.contents.time), raw.source)
-    arm = None if urdf is None else read_urdf(urdf, tip)
-    if arm is not None:
+    robot = _robot(mjcf, urdf if tree else None)
+    names = () if robot is None else tuple(joint.name for joint in robot.free)
+    chosen = choose(columns_of(raw.data, raw.units, raw.contents.time, names), raw.source)
+    arm = None if urdf is None or robot is not None else read_urdf(urdf, tip)
+    if robot is not None:
+        chosen = of_tree(chosen, names, robot.file, raw.source)
+    elif arm is not None:
         chosen = of_arm(chosen, arm, str(urdf), raw.source)
     elif len(chosen.joints) > 1:
         need_forces(chosen, raw.source)
         chosen = most_moved(chosen)
-    draft = Draft(log, raw, chosen, measures_of(chosen), Path(folder))
-    if not chosen.force:
+    motion = "" if robot is None else _motion_of(robot, next(iter(chosen.joints)))
+    draft = Draft(log, raw, chosen, measures_of(chosen, motion), Path(folder))
+    if robot is not None:
+        key = "urdf" if mjcf is None else "mjcf"
+        words = (UNKNOWN_OF_FORCES if chosen.force else UNKNOWN_OF_SERVOS) if unknown is None else unknown
+        sections = draft.tree(robot, Path(robot.file), key, chosen.joints, words)
+    elif not chosen.force:
         sections = draft.without_force()
     elif arm is not None:
         assert urdf is not None, "an arm is read from it"
@@ -147,6 +166,19 @@ def init(
     )
     _need_loadable(first, chosen)
     return first
+
+
+def _robot(mjcf: str | Path | None, urdf: str | Path | None) -> Robot | None:
+    """Read the robot's file, if there is one."""
+    if mjcf is not None:
+        return read_mjcf(mjcf)
+    return None if urdf is None else read_urdf_tree(urdf)
+
+
+def _motion_of(robot: Robot, name: str) -> str:
+    """Return "linear" or "rotary" for a joint of a robot."""
+    joint = next(joint for joint in robot.joints if joint.name == name)
+    return "rotary" if joint.motion == "revolute" else "linear"
 
 
 def _need_loadable(first: FirstCase, chosen: Chosen) -> None:

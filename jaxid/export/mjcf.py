@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,13 +11,13 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arms.bodies import Bodies, are_bodies, bodies_of
 from jaxid.case.mjcf import is_one_of, need_mujoco, robot_of_spec
 from jaxid.case.robot import Robot, RobotJoint, body_in, kept, moved_by, projected
 from jaxid.errors import InputError
-from jaxid.export.bodies import Bodies, are_bodies, bodies_of
+from jaxid.export.exported import ExportedFile, JointLaws, need_joints, plant_of, shown
+from jaxid.export.mjcf_drives import DRIVE_EFFECTS, DriveText
 from jaxid.export.xml_text import Element, XmlText
-from jaxid.names import TEN
-from jaxid.plants.link_tree import LinkTree
 
 # Relative change below which a value of the file stays as it is written.
 _SAME = 1e-12
@@ -35,25 +35,8 @@ _LAWS = {
     "cubic_stiffness": "coefficient",
     "added_mass": "mass",
 }
-# Effects of the file's actuators, which stay as they are.
-_OF_DRIVES = ("back_emf_damping", "saturation", "actuator_lag", "input_delay")
 _DAMPING = ("viscous_friction", "quadratic_drag", "cubic_friction")
 _SPRING = ("constant_force", "linear_stiffness", "quadratic_stiffness", "cubic_stiffness")
-
-
-@dataclass(frozen=True)
-class ExportedFile:
-    """A file with a result in it.
-
-    Args:
-        content: Its bytes.
-        changed: Names of the joints and bodies that were changed.
-        notes: Parts of the result that it cannot hold, a sentence each.
-    """
-
-    content: bytes
-    changed: tuple[str, ...]
-    notes: tuple[str, ...]
 
 
 def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
@@ -70,24 +53,25 @@ def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
     try:
         content = path.read_bytes()
         spec = mujoco.MjSpec.from_file(str(path))
-        degrees = bool(spec.compiler.degree)
+        degrees, autolimits = bool(spec.compiler.degree), bool(spec.compiler.autolimits)
         whole, compiled = robot_of_spec(spec, where)
         text = XmlText(content)
     except (OSError, ValueError, expat.ExpatError) as error:
         what = " ".join(str(error).split())
         raise InputError(what, where=where, hint="name the MJCF of the case by --model") from error
     robot = kept(whole, model["joints"], model.get("held", {}))
-    if robot.names != tuple(model["links"]):
-        what = f"its joints are {', '.join(robot.names)}, and those of the result {', '.join(model['links'])}"
-        raise InputError(what, where=where, hint="name the MJCF of the case by --model")
+    need_joints(robot, model, where)
     elements = _elements(text, compiled, mujoco, where)
-    work = _Work(mujoco, compiled, text, elements, robot, model, degrees)
+    drives = DriveText(text, compiled, robot, model, elements.joints, autolimits)
+    drives.write()
+    work = _Work(mujoco, compiled, text, elements, robot, model, degrees, drives.damping)
     file = projected(robot)
     rotors = np.array([file[joint.name].armature for joint in robot.free])
-    found = bodies_of(work.plant(), robot.bodies, rotors)
+    found = bodies_of(plant_of(robot, model), robot.bodies, rotors)
     work.joints(file, found.rotors)
     work.bodies(found)
-    return ExportedFile(text.text(), tuple(work.changed), tuple(work.notes))
+    changed, notes = (*work.changed, *drives.changed), (*work.notes, *drives.notes)
+    return ExportedFile(text.text(), changed, notes, (*work.lost, *drives.lost), work.real)
 
 
 @dataclass
@@ -149,8 +133,11 @@ class _Work:
     robot: Robot
     model: Mapping[str, Any]
     degrees: bool
+    drag: Mapping[str, float]
     notes: list[str] = field(default_factory=list)
     changed: list[str] = field(default_factory=list)
+    lost: list[int] = field(default_factory=list)
+    real: bool = True
 
     @property
     def names(self) -> list[str]:
@@ -174,20 +161,17 @@ class _Work:
                 self.text.set(self.elements.joints[index], values)
                 self.changed.append(f"joint '{joint.name}'")
 
-    def _laws(self) -> list[dict[str, float]]:
+    def _laws(self) -> tuple[dict[str, float], ...]:
         """Return the effects that a joint of an MJCF has, by joint; name the others."""
-        out: list[dict[str, float]] = [{} for _ in self.robot.free]
-        for effect in self.model["effects"]:
-            kind, port = effect["kind"], effect.get("joint", 0) - 1
-            parameter = _LAWS.get(kind)
-            values = effect["parameters"]
-            if parameter is not None and port >= 0 and values.get(parameter) is not None:
-                out[port][kind] = out[port].get(kind, 0.0) + float(values[parameter])
-            elif kind not in _OF_DRIVES:
-                shown = ", ".join(f"{n} = {v:.6g}" for n, v in values.items() if v is not None)
-                place = f"[{effect['joint_name']}]" if "joint_name" in effect else ""
-                self.notes.append(f"{kind}{place} ({shown}) has no place in an MJCF")
-        return out
+        laws = JointLaws.of(self.model, _LAWS, DRIVE_EFFECTS)
+        self._lose(laws.lost, "has no place in an MJCF")
+        return laws.values
+
+    def _lose(self, numbers: Iterable[int], why: str) -> None:
+        """Name effects that the file cannot hold."""
+        for number in numbers:
+            self.notes.append(f"{shown(self.model['effects'][number])} {why}")
+            self.lost.append(number)
 
     def _dof(self, joint: int) -> int:
         return int(self.compiled.jnt_dofadr[joint])
@@ -208,6 +192,7 @@ class _Work:
         self, values: dict[str, str | None], joint: RobotJoint, stated: RobotJoint, law: dict, index: int
     ) -> None:
         more = [law.get(kind, 0.0) - old for kind, old in zip(_DAMPING, stated.damping, strict=True)]
+        more[0] += self.drag.get(joint.name, 0.0)
         if all(abs(m) <= _SAME * max(abs(s), 1e-9) for m, s in zip(more, stated.damping, strict=True)):
             return
         dof = self._dof(index)
@@ -229,10 +214,15 @@ class _Work:
         roots: Any = own.trim().roots() if own.trim().degree() > 0 else np.array([])
         real = roots[np.abs(roots.imag) < 1e-9].real
         if not real.size or own.deriv()(real[np.argmin(np.abs(real))]) < 0:
-            shown = ", ".join(f"{kind} = {law[kind]:.6g}" for kind in _SPRING if kind in law)
+            listed = ", ".join(f"{kind} = {law[kind]:.6g}" for kind in _SPRING if kind in law)
             self.notes.append(
-                f"{shown} at joint '{joint.name}': a spring of an MJCF has a rest, and pulls towards it"
+                f"{listed} at joint '{joint.name}': a spring of an MJCF has a rest, and pulls towards it"
             )
+            self.lost += [
+                number
+                for number, effect in enumerate(self.model["effects"])
+                if effect["kind"] in _SPRING and effect.get("joint_name") == joint.name
+            ]
             return
         rest = float(real[np.argmin(np.abs(real))])
         _, *slopes = [float(c) for c in own(np.polynomial.Polynomial([rest, 1.0])).coef]
@@ -246,6 +236,7 @@ class _Work:
         if found.error > _CLOSE:
             what = f"no bodies have the inertias that were found: sums differ by {found.error:.2g}"
             self.notes.append(what)
+            self.real = False
         frames = self._frames()
         for k, joint in enumerate(self.robot.joints):
             more = links[k] - start[k]
@@ -256,22 +247,6 @@ class _Work:
                 self.notes.append(f"joint '{joint.name}' has no body of its own: its inertia is not written")
                 continue
             self._write(body, place, joint, more)
-
-    def plant(self) -> LinkTree:
-        """Return the plant of the result, its rotors as seen at the joints."""
-        robot, parameters = self.robot, self.model["parameters"]
-        rotors, ratios = parameters.get("rotor_inertia"), self.model.get("gear_ratio")
-        if rotors is not None:
-            rotors = np.asarray(rotors) * (1.0 if ratios is None else np.asarray(ratios) ** 2)
-        copies = {"copies": robot.copies, "leading": robot.leading} if robot.copies else {}
-        return LinkTree(
-            **{name: np.asarray(parameters[name]) for name in TEN},
-            rotor_inertia=rotors,
-            geometry=robot.geometry,
-            parents=robot.parents,
-            gravity_vector=np.asarray(self.model["gravity_vector"]),
-            **copies,
-        )
 
     def _frames(self) -> dict[str, tuple[int | None, Float[np.ndarray, "4 4"]]]:
         """Return the body of each kept joint, and the joint's frame in that of the body.
@@ -319,6 +294,7 @@ class _Work:
         if not new[0] > 0 or not are_bodies(new[None]):
             what = f"less was found than the bodies weigh that are fixed to '{name}': not written"
             self.notes.append(f"joint '{joint.name}': {what}")
+            self.real = False
             return
         mass, centre = new[0], new[1:4] / new[0]
         xx, xy, xz, yy, yz, zz = new[4:]
@@ -333,8 +309,8 @@ class _Work:
         element = self.elements.bodies[body]
         found = element.find("inertial")
         if found is None:
-            shown = " ".join(f'{n}="{v}"' for n, v in values.items())
-            self.text.insert_into(element, f"<inertial {shown}/>")
+            listed = " ".join(f'{n}="{v}"' for n, v in values.items())
+            self.text.insert_into(element, f"<inertial {listed}/>")
         else:
             gone = dict.fromkeys(("diaginertia", "quat", "axisangle", "xyaxes", "zaxis", "euler"))
             self.text.set(found, {**values, **gone})

@@ -49,6 +49,9 @@ class XmlText:
     def __init__(self, content: bytes) -> None:
         self.content = content
         self._edits: dict[tuple[int, int], bytes] = {}
+        # Insertions behind a start tag, and end tags of elements that had none, by the end of the start tag.
+        self._inside: dict[int, list[bytes]] = {}
+        self._closing: dict[int, bytes] = {}
         # An element around the first one, so that there is always a last one open.
         whole = Element("", {}, 0, 0)
         stack = [whole]
@@ -80,16 +83,29 @@ class XmlText:
         self._edits[place] = text.encode()
 
     def insert_into(self, element: Element, text: str) -> None:
-        """Insert text as the first child of an element, which has an end tag, indented as its others."""
+        """Insert text as the first child of an element, behind other insertions, indented as its others.
+
+        An element that is written as one tag gets an end tag.
+        """
         line = self.content.rfind(b"\n", 0, element.start) + 1
         indent = self.content[line : element.start]
         indent = indent if not indent.strip() else b""
-        self._edits[(element.end, element.end)] = b"\n" + indent + b"  " + text.encode()
+        if element.end not in self._inside:
+            self._inside[element.end] = []
+            place = (element.start, element.end)
+            tag = self._edits.get(place, self.content[element.start : element.end])
+            if tag.endswith(b"/>"):
+                self._edits[place] = tag[:-2].rstrip() + b">"
+                self._closing[element.end] = b"\n" + indent + f"</{element.tag}>".encode()
+        self._inside[element.end].append(b"\n" + indent + b"  " + text.encode())
 
     def text(self) -> bytes:
         """Return the file with all changes."""
+        edits = dict(self._edits)
+        for end, texts in self._inside.items():
+            edits[(end, end)] = b"".join(texts) + self._closing.get(end, b"")
         out = self.content
-        for (start, end), new in sorted(self._edits.items(), reverse=True):
+        for (start, end), new in sorted(edits.items(), reverse=True):
             out = out[:start] + new + out[end:]
         return out
 

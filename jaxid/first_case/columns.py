@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
-from jaxid.first_case.words import FORCES, Meaning, meaning_of
+from jaxid.first_case.words import FORCES, Meaning, meaning_of_joint
 from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
 
@@ -80,7 +80,10 @@ class Chosen:
 
 
 def columns_of(
-    data: Mapping[str, Float[np.ndarray, "rows 1"]], units: Mapping[str, str], time: str
+    data: Mapping[str, Float[np.ndarray, "rows 1"]],
+    units: Mapping[str, str],
+    time: str,
+    joints: Sequence[str] = (),
 ) -> list[Column]:
     """Return the columns of a table with the meaning of their names.
 
@@ -88,10 +91,11 @@ def columns_of(
         data: Columns by name.
         units: Units that the file states, by name.
         time: Name of the time if the format has one of its own; empty otherwise.
+        joints: Names of a robot's joints, which names of columns may hold.
     """
     out = []
     for name, values in data.items():
-        meaning = meaning_of(name)
+        meaning = meaning_of_joint(name, joints)
         if time:
             quantity = (
                 "time" if name == time else "passed over" if meaning.quantity == "time" else meaning.quantity

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.case.robot import Robot
 from jaxid.case.urdf import Urdf
 from jaxid.errors import InputError
 from jaxid.first_case.balance import FreeSwing, RoughBalance, free_swing, rough_balance
@@ -43,6 +44,7 @@ class Draft:
         self._log, self._raw, self._chosen, self._measures = log, raw, chosen, measures
         self._folder = folder
         self._joints = len(chosen.position or chosen.velocity)
+        self._motions = (measures.motion,) * self._joints
 
     # what stands in the case
 
@@ -98,6 +100,51 @@ class Draft:
             )
         ]
         return [plant, *frictions, table, *self._sensor(log)]
+
+    def tree(
+        self, robot: Robot, path: Path, key: str, names: Sequence[str], unknown: Sequence[str]
+    ) -> list[Section]:
+        """Return the case of a robot's file: its joints that the log has, their friction and its servos.
+
+        Args:
+            robot: The robot.
+            path: Its file.
+            key: "mjcf" or "urdf".
+            names: Names of the joints that the log has.
+            unknown: Words for the values that are unknown.
+
+        Raises:
+            InputError: If the log has no force, and no reference that position servos of the file follow.
+        """
+        measures, chosen = self._measures, self._chosen
+        plant = Section("[plant]", {"kind": "tree", key: _relative(path, self._folder)})
+        if len(names) < len(robot.free):
+            plant.keys["joints"] = list(names)
+        servos = {drive.joint for drive in robot.drives if drive.kp is not None}
+        if not chosen.force and not (chosen.reference and set(names) <= servos):
+            raise InputError(no_force(chosen), where=self._raw.source, hint=NO_FORCE_HINT)
+        plant.keys["unknown"] = [*unknown]
+        plant.notes["unknown"] = "the values of the file that are unknown, from the file's on"
+        if measures.labels:
+            plant.keys["units"] = measures.labels
+            plant.questions += [measures.questions[q] for q in ("force",) if q in measures.questions]
+        plant.questions.append(
+            'which values of the file are right? Take them out of unknown; "none": all are'
+        )
+        if not chosen.force:
+            plant.assumed.append("no force is logged: the file's position servos follow the reference")
+        elif robot.drives and chosen.force[0].meaning.quantity in ("torque", "force"):
+            if any(drive.gain != 1.0 or drive.drag or drive.limit for drive in robot.drives):
+                plant.keys["actuators"] = False
+                plant.assumed.append("the forces are those of the joints, behind the file's actuators")
+        if key == "urdf":
+            plant.questions.append(
+                "does gravity act along -z of the first link? Else gravity_vector = [x, y, z] in m/s^2"
+            )
+        table = self._log_table(names)
+        motions = {joint.name: "rotary" if joint.motion == "revolute" else "linear" for joint in robot.joints}
+        self._motions = tuple(motions[name] for name in names)
+        return [plant, table, *self._sensor(self._read(table))]
 
     def without_force(self) -> list[Section]:
         """Return the case of a servo that follows its reference, or of a free swing under its weight."""
@@ -321,7 +368,7 @@ class Draft:
             for key, value in table.keys.items()
         }
         frame = Frame(
-            motions=(self._measures.motion,) * self._joints,
+            motions=self._motions,
             driven=tuple(range(self._joints)),
             labels=self._measures.labels,
         )

@@ -15,22 +15,63 @@ from jaxid.first_case.words import meaning_of
 NO_FORCE_HINT = "log the torque or the current of the drives with its sign, and name it so"
 
 
+def of_tree(chosen: Chosen, names: tuple[str, ...], file: str, where: str) -> Chosen:
+    """Return the columns of a robot's joints, in their order: of all, or of those that the log names.
+
+    Args:
+        chosen: Columns of the log.
+        names: Names of the robot's free joints.
+        file: The robot's file, for messages.
+        where: The log, for messages.
+
+    Raises:
+        InputError: If the joints of the log are not those of the robot.
+    """
+    # Columns may hold the names as they are, or their words.
+    keys = [n if n in chosen.joints else " ".join(meaning_of(n).joint) for n in names]
+    found = [k for k, key in enumerate(keys) if key and key in chosen.joints and keys.count(key) == 1]
+    if not found or len(found) == len(names) or len(chosen.joints) == len(names):
+        return _of_joints(chosen, names, keys, file, where, "")
+    some = tuple(names[k] for k in found)
+    return _of_joints(chosen, some, [keys[k] for k in found], file, where, "; the others are held at zero")
+
+
 def of_arm(chosen: Chosen, arm: Urdf, urdf: str, where: str) -> Chosen:
     """Return the columns of an arm's joints, in their order."""
     keys = [" ".join(meaning_of(name).joint) for name in arm.names]
+    return _of_joints(chosen, arm.names, keys, urdf, where, " up to that tip")
+
+
+def _of_joints(
+    chosen: Chosen, names: tuple[str, ...], keys: list[str], file: str, where: str, which: str
+) -> Chosen:
+    """Return the columns of some joints: by the words of their names, or in their order.
+
+    Args:
+        chosen: Columns of the log.
+        names: Names of the joints.
+        keys: The same by the words that columns have.
+        file: The file of the robot.
+        where: The log, for messages.
+        which: Words on the joints, for messages.
+    """
     if all(keys) and len(set(keys)) == len(keys) and set(keys) <= set(chosen.joints):
         at = [chosen.joints.index(key) for key in keys]
-        said = f"columns belong to the joints of {Path(urdf).name} by their names"
+        said = f"columns belong to the joints of {Path(file).name} by their names"
+        said += which if which.startswith(";") else ""
         left = [f"'{joint}'" for joint in chosen.joints if joint not in keys]
-        said += f"; those of {', '.join(left)} are no joints up to that tip" if left else ""
-    elif len(chosen.joints) == len(arm.names):
-        at = list(range(len(arm.names)))
-        said = f"columns belong to the joints {', '.join(arm.names)} of {Path(urdf).name} in this order"
+        of_which = "" if which.startswith(";") else which
+        said += f"; those of {', '.join(left)} are no joints{of_which}" if left else ""
+    elif len(chosen.joints) == len(names):
+        at = list(range(len(names)))
+        said = f"columns belong to the joints {', '.join(names)} of {Path(file).name} in this order"
     else:
         listed = ", ".join(f"'{j}'" for j in chosen.joints)
-        hint = "name the tip whose joints the log has by --tip, or rename the columns"
+        hint = "rename the columns by the joints, or the joints by joints = [...] in a case"
+        if which.startswith(" "):
+            hint = "name the tip whose joints the log has by --tip, or rename the columns"
         raise InputError(
-            f"columns of {listed}, and {Path(urdf).name} moves {', '.join(arm.names)}", where=where, hint=hint
+            f"columns of {listed}, and {Path(file).name} moves {', '.join(names)}", where=where, hint=hint
         )
 
     def picked(columns: tuple[Column, ...]) -> tuple[Column, ...]:
@@ -42,7 +83,7 @@ def of_arm(chosen: Chosen, arm: Urdf, urdf: str, where: str) -> Chosen:
         velocity=picked(chosen.velocity),
         force=picked(chosen.force),
         reference=picked(chosen.reference),
-        joints=arm.names,
+        joints=names,
         said=(*chosen.said, said),
     )
 

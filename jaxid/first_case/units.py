@@ -62,8 +62,14 @@ class Measures:
     questions: dict[str, str]
 
 
-def measures_of(chosen: Chosen) -> Measures:
-    """Return units and motion of the chosen columns, of joints of one kind."""
+def measures_of(chosen: Chosen, robot: str = "") -> Measures:
+    """Return units and motion of the chosen columns, of joints of one kind.
+
+    Args:
+        chosen: The columns.
+        robot: "linear" or "rotary", the motion of the first joint by a robot's file, whose other joints have
+            theirs, and whose drives take commands; empty: there is no such file.
+    """
     said: list[str] = []
     questions: dict[str, str] = {}
     units: dict[str, str] = {}
@@ -84,7 +90,9 @@ def measures_of(chosen: Chosen) -> Measures:
     if chosen.position and chosen.velocity and not counts and wrap is None:
         position, velocity = _by_slope(chosen, period, position, velocity, said)
     motion = "rotary"
-    if not counts:
+    if robot:
+        motion = robot
+    elif not counts:
         motion = _motion(chosen, place, position or velocity, wrap is not None, said, questions)
 
     if counts:
@@ -97,10 +105,14 @@ def measures_of(chosen: Chosen) -> Measures:
     elif position:
         _state("position", position, units, said, place if chosen.position else None)
     elif chosen.position:
-        said.append(f"the position is taken to be in {_SI[motion]}: nothing states its unit")
+        unit = "rad, or m where a joint slides" if robot else _SI[motion]
+        said.append(f"the position is taken to be in {unit}: nothing states its unit")
     if chosen.velocity and velocity not in ("", _unknown()):
         units["velocity"] = velocity
-    _force(chosen, motion, units, labels, said, questions)
+    if robot and chosen.force and _of_robot(chosen.force[0]):
+        said.append(_of_robot(chosen.force[0]))
+    else:
+        _force(chosen, motion, units, labels, said, questions)
     if chosen.reference:
         own = _stated(chosen.reference[0], "position")
         own = own or (units.get("position", "") if not counts else "")
@@ -257,6 +269,20 @@ def _force(
     force = "N" if motion == "linear" else "N m"
     said.append(f"results are per {label}: the {force} for one {label}{of} are not known")
     questions["force"] = questions_of_drive(kind, motion, label)
+
+
+def _of_robot(column: Column) -> str:
+    """Return how a force without a unit goes with a robot's file; empty if the file does not say."""
+    if _stated(column, "force"):
+        return ""
+    kind = column.meaning.quantity
+    if kind in ("torque", "force"):
+        return f"'{column.name}' is taken to be in N m, or N where a joint slides: nothing states its unit"
+    if kind in ("command", ""):
+        return (
+            f"'{column.name}' is taken for a command of the robot file's actuators, or a force without these"
+        )
+    return ""
 
 
 def questions_of_drive(kind: str, motion: str, label: str) -> str:

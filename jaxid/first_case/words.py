@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from jaxid.logs.readers.dialect import split_unit
 
@@ -139,6 +140,30 @@ def meaning_of(name: str) -> Meaning:
     quantity = _one(quantities)
     reference = "reference" in roles and "actual" not in roles
     return Meaning(name, quantity, reference, tuple(joint), unit, frozenset(words))
+
+
+def meaning_of_joint(name: str, joints: Sequence[str]) -> Meaning:
+    """Return the meaning of a column's name that may hold the name of a robot's joint.
+
+    The longest one counts that stands in it between signs, with or without the word joint. A column that is
+    called as the joint is its position.
+
+    Args:
+        name: The name.
+        joints: Names of the joints.
+    """
+    for joint in sorted(joints, key=len, reverse=True):
+        bare = re.sub(r"(?i)^joint_|_joint$", "", joint)
+        for called in dict.fromkeys((joint, bare)):
+            found = re.search(rf"(?<![A-Za-z0-9]){re.escape(called)}(?![A-Za-z0-9])", name)
+            if found is None:
+                continue
+            rest = f"{name[: found.start()]} {name[found.end() :]}"
+            meaning = meaning_of(rest)
+            alone = not re.search(r"[A-Za-z0-9]", split_unit(rest)[0])
+            quantity = "position" if alone else meaning.quantity
+            return replace(meaning, name=name, quantity=quantity, joint=(joint,))
+    return meaning_of(name)
 
 
 def _one(found: list[str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.files import found_case_file, json_text, signal_csv, write_results
-from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import leaf, several_places
-from jaxid.plants.link_tree import LinkTree
 from jaxid.results.found_case import case_text, changed_in_python
+from jaxid.results.model_json import joint_name, model_json
 from jaxid.results.parameters import Covariance
 from jaxid.results.proposals import proposal_json
 
 if TYPE_CHECKING:
-    from jaxid.case.declared import PlantEntry
     from jaxid.commands.identify import Identification
     from jaxid.discovery.candidates import Candidate
     from jaxid.discovery.result import Discovery, NamedEffect
@@ -236,40 +234,6 @@ def identification_json(result: Identification) -> dict[str, Any]:
     }
 
 
-def model_json(session: Session, estimate: Estimate) -> dict[str, Any]:
-    """Return the object `model` of results: a whole robot from a file, for `export`; else nothing."""
-    entry, plant = session.case.plant, estimate.machine.plant
-    if not isinstance(plant, LinkTree) or plant.kind != LinkTree.kind:
-        return {}
-    return {"model": robot_json(plant, entry, session.case.tables["plant"].get("held", {}))}
-
-
-def robot_json(plant: LinkTree, entry: PlantEntry, held: Mapping[str, float]) -> dict[str, Any]:
-    """Return all values of a robot: its joints and links by name, its parameters, and its effects."""
-    values = {name: getattr(plant, name) for name in parameters_of(LinkTree)}
-    effects = []
-    for effect in plant.effects:
-        place = plant.place(effect.port)
-        numbers = {name: getattr(effect, name) for name in parameters_of(type(effect))}
-        effects.append(
-            {
-                "kind": effect.kind,
-                place[0]: place[1],
-                **joint_name(place, entry.names),
-                "parameters": {n: None if v is None else float(v) for n, v in numbers.items()},
-            }
-        )
-    return {
-        "joints": list(entry.names),
-        "links": list(entry.links),
-        "held": dict(held),
-        "gravity_vector": np.asarray(plant.gravity_vector).tolist(),
-        "gear_ratio": None if plant.gear_ratio is None else np.asarray(plant.gear_ratio).tolist(),
-        "parameters": {n: None if v is None else np.asarray(v).tolist() for n, v in values.items()},
-        "effects": effects,
-    }
-
-
 def readings_json(session: Session) -> dict[str, Any]:
     """Return how each log was read, under `logs`; empty if nothing was assumed."""
     logs = {run.name: [a.json() for a in run.log.assumed] for run in session.runs if run.log.assumed}
@@ -322,11 +286,6 @@ def effect_json(effect: NamedEffect, estimate: Estimate, names: Sequence[str] = 
         "evidence": effect.score.evidence,
         "alternatives": [_alternative(s, estimate.machine.plant) for s in effect.alternatives],
     }
-
-
-def joint_name(place: tuple[str, int], names: Sequence[str]) -> dict[str, str]:
-    """Return the name of the joint on which an effect acts; nothing without names, or in another place."""
-    return {"joint_name": names[place[1] - 1]} if names and place[0] == "joint" else {}
 
 
 def _alternative(score: Score, plant: Plant) -> dict[str, Any]:

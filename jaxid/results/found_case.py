@@ -269,6 +269,9 @@ def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
             _put(tables["effects"][number], name, guesses, places, case.effects[number].parameters[name])
     for key, guess in findings.reference.items():
         tables["reference"][key]["guess"] = guess
+    if findings.controller and "controller" not in tables:
+        # The servos of a robot's file stand in no table of the case.
+        tables["controller"] = copy.deepcopy(case.plant.defaults["controller"])
     for key, guesses in findings.controller.items():
         assert case.controller is not None, "its unknowns are estimated"
         values = case.controller.unknown[key]

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.arms.bodies import are_bodies, bodies_of, links_of
 from jaxid.build import build_machine
 from jaxid.case.case import read_case
 from jaxid.commands.export import export
 from jaxid.errors import InputError
-from jaxid.export.bodies import are_bodies, bodies_of, links_of
-from jaxid.results.as_json import robot_json
+from jaxid.names import TEN
+from jaxid.results.model_json import bodies_json, robot_json
 from tests.case.test_mjcf import FREE, forces_of_mujoco
 from tests.support.mjcf_robots import BRANCHED, CART_JOINTS, cart, cart_log
 from tests.support.written_logs import write_csv
@@ -143,6 +144,21 @@ def test_bodies_behind_base_parameters_are_real_and_move_alike(tmp_path):
     force = jax.jit(jax.vmap(lambda p, s: p.inertial(*s), (None, 0)))
     wanted = np.asarray(force(whole, states))
     np.testing.assert_allclose(force(real, states), wanted, atol=1e-8 * np.abs(wanted).max())
+
+
+def test_results_hold_bodies_that_can_exist(tmp_path):
+    entry, base, _ = machine_of(tmp_path, cart(), unknown=["base", "armature"])
+    assert not are_bodies(links_of(base))
+    held = bodies_json(base, entry)
+    links = np.stack([held[name] for name in TEN], axis=-1)
+    assert are_bodies(links)
+    assert held["error"] < 1e-6
+    # The sums are those of the file itself, so its bodies are found again.
+    whole = links_of(machine_of(tmp_path, cart())[1])
+    np.testing.assert_allclose(links, whole, atol=1e-8)
+    # Links that no body can be are said to be none.
+    less = replace(base, **{"inertia_zz": base.inertia_zz - 10.0})
+    assert bodies_json(less, entry)["error"] > 1e-3
 
 
 def forward(text: str, u: np.ndarray, start: np.ndarray, rate: int) -> np.ndarray:

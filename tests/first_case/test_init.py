@@ -280,7 +280,7 @@ def test_what_is_refused(tmp_path, capsys):
     log = write_csv(tmp_path / "log.csv", signals())
     out = tmp_path / "case.toml"
     refused(capsys, tmp_path, "init", tmp_path / "none.csv", "-o", out, told="no such file; check the path")
-    refused(capsys, tmp_path, "init", log, "--mjcf", "arm.xml", "-o", out, told="--mjcf is not built yet")
+    refused(capsys, tmp_path, "init", log, "--mjcf", "arm.xml", "-o", out, told="no such file")
     refused(capsys, tmp_path, "init", log, "--tip", "tool", "-o", out, told="--tip goes with --urdf")
     refused(capsys, tmp_path, "init", log, "-o", tmp_path / "case.json", told="a case is a .toml file")
     refused(capsys, tmp_path, "init", log, "-o", tmp_path / "no" / "case.toml", told="has no such folder")

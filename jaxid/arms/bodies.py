@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.base_parameters import BaseParameters, base_parameters
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
+from jaxid.arrays import Array
 from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 
@@ -84,28 +86,54 @@ def bodies_of(
     size = np.abs(mapping) @ np.abs(start[links, kinds]) + np.abs(wanted)
     size = np.where(size > 1e-9 * size.max(), size, 1e-9 * size.max())
     heavy = np.flatnonzero(start[:, 0] > 0)
-
-    @jax.jit
-    def rest(x: jax.Array) -> jax.Array:
-        whole = jnp.asarray(start).at[heavy].set(jax.vmap(of_log_cholesky)(x.reshape(-1, 10)))
-        return (jnp.asarray(mapping) @ whole[links, kinds] - wanted) / size
-
-    slope = jax.jit(jax.jacfwd(rest))
+    asked = _Asked(*map(jnp.asarray, (start, heavy, mapping, links, kinds, wanted, size)))
     x = np.asarray(jax.vmap(log_cholesky)(jnp.asarray(_fuller(start[heavy])))).ravel()
-    error = np.asarray(rest(jnp.asarray(x)))
+    error = np.asarray(_rest(x, asked))
     for _ in range(_STEPS):
         if np.abs(error).max() < _CLOSE:
             break
-        step = np.linalg.lstsq(np.asarray(slope(jnp.asarray(x))), -error, rcond=1e-10)[0]
+        step = np.linalg.lstsq(np.asarray(_slope(x, asked)), -error, rcond=1e-10)[0]
         step *= min(1.0, 1.0 / np.abs(step).max())
-        shorter = ((step * 0.5**k, np.asarray(rest(jnp.asarray(x + step * 0.5**k)))) for k in range(20))
+        shorter = ((step * 0.5**k, np.asarray(_rest(x + step * 0.5**k, asked))) for k in range(20))
         better = next((s for s in shorter if np.linalg.norm(s[1]) < np.linalg.norm(error)), None)
         if better is None:
             break
         x, error = x + better[0], better[1]
-    out = start.copy()
-    out[heavy] = np.asarray(jax.vmap(of_log_cholesky)(jnp.asarray(x.reshape(-1, 10))))
+    out = np.asarray(_links(jnp.asarray(x), asked)).copy()
     return Bodies(out, final, float(np.abs(error).max()))
+
+
+class _Asked(NamedTuple):
+    """The sums that bodies are to have, as arrays of a compiled function.
+
+    Args:
+        start: Links of the file; heavy: indices of those that have mass.
+        mapping, links, kinds: Factors of the parameters in each sum, and the link and kind of each.
+        wanted, size: The sums, and the size by which each counts.
+    """
+
+    start: Array
+    heavy: Array
+    mapping: Array
+    links: Array
+    kinds: Array
+    wanted: Array
+    size: Array
+
+
+def _links(x: Array, asked: _Asked) -> Array:
+    """Return all links from the coordinates of those that have mass."""
+    heavy = jax.vmap(of_log_cholesky)(x.reshape(-1, 10))
+    return jnp.asarray(asked.start).at[asked.heavy].set(heavy)
+
+
+@jax.jit
+def _rest(x: Array, asked: _Asked) -> Array:
+    """Return the sums of bodies less those that are asked for, relative to their sizes."""
+    return (asked.mapping @ _links(x, asked)[asked.links, asked.kinds] - asked.wanted) / asked.size
+
+
+_slope = jax.jit(jax.jacfwd(_rest))
 
 
 def _alone(sums: BaseParameters, column: int) -> bool:

@@ -1,0 +1,107 @@
+"""Commands that are given a robot's file in place of a case: the case that the file and a log imply."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxid.case.mjcf import read_mjcf
+from jaxid.case.robot import Robot
+from jaxid.case.urdf import read_urdf_tree
+from jaxid.commands.init import FirstCase, init
+from jaxid.errors import InputError
+from jaxid.files import write_whole
+from jaxid.names import FIRST_CASE
+
+# Simulation of a robot that is let go: its length [s], and the most samples a second.
+_SECONDS, _RATE = 5.0, 500.0
+
+
+@dataclass(frozen=True)
+class RobotCase:
+    """A case that follows from a robot's file and a log.
+
+    Args:
+        robot: The file.
+        log: The log.
+        unknown: Words of `[plant] unknown`; None: all that such a log shows.
+        first: The case, its file names from the current folder on.
+    """
+
+    robot: Path
+    log: str
+    unknown: tuple[str, ...] | None
+    first: FirstCase
+
+    @classmethod
+    def of(cls, robot: str, logs: Sequence[str], *, search: bool = False) -> RobotCase:
+        """Make the case of a robot's file and its log.
+
+        Args:
+            robot: The file.
+            logs: The logs of the command; the first one shows the columns.
+            search: Whether effects are to be searched for: then only what the file states may be wrong.
+
+        Raises:
+            InputError: If there is no log, or the file or the log is unsound.
+        """
+        if not logs:
+            hint = "name the log behind the robot's file, or give a case"
+            raise InputError("a robot's file alone has no log", where=robot, hint=hint)
+        path = Path(robot)
+        unknown = _of_file(_read(path)) if search else None
+        return cls(path, logs[0], unknown, _first(path, logs[0], unknown, Path()))
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """Tables of the case, as every command takes them."""
+        return self.first.tables
+
+    def save(self, folder: Path) -> Path:
+        """Write the case beside a result, file names from there on."""
+        path = folder / FIRST_CASE
+        write_whole(path, _first(self.robot, self.log, self.unknown, folder).text)
+        return path
+
+
+def let_go(robot: str) -> dict[str, Any]:
+    """Return the tables of a simulation in which a robot is let go at its zero position, drives off.
+
+    Raises:
+        InputError: If the file is unsound.
+    """
+    path = Path(robot)
+    found = _read(path)
+    period = found.period or 1.0 / _RATE
+    every = max(1, round(1.0 / _RATE / period))
+    key = "urdf" if path.suffix.lower() == ".urdf" else "mjcf"
+    still = {"kind": "multisine", "amplitude": 1e-12, "band_hz": [0.5, 5.0]}
+    return {
+        "plant": {"kind": "tree", key: robot, "actuators": False},
+        "input": still,
+        "simulation": {"duration": _SECONDS, "sample_rate": 1.0 / (every * period)},
+    }
+
+
+def _read(path: Path) -> Robot:
+    return read_urdf_tree(path) if path.suffix.lower() == ".urdf" else read_mjcf(path)
+
+
+def _first(path: Path, log: str, unknown: tuple[str, ...] | None, folder: Path) -> FirstCase:
+    if path.suffix.lower() == ".urdf":
+        return init(log, urdf=path, tree=True, unknown=unknown, folder=folder)
+    return init(log, mjcf=path, unknown=unknown, folder=folder)
+
+
+def _of_file(robot: Robot) -> tuple[str, ...]:
+    """Return the words for values that a file states: what it lacks is for the search to find."""
+    joints = robot.joints
+    stated = {
+        "armature": any(joint.armature for joint in joints),
+        "damping": any(any(joint.damping) for joint in joints),
+        "frictionloss": any(joint.friction for joint in joints),
+        "stiffness": any(any(joint.spring) for joint in joints),
+    }
+    return ("base", *(word for word, is_there in stated.items() if is_there))

@@ -1,0 +1,136 @@
+"""A robot's file in place of a case: columns by joint name, and the case beside the result."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from jaxid.case.case import load_case
+from jaxid.cli import main
+from jaxid.commands.init import init
+from jaxid.commands.robot_case import RobotCase, let_go
+from jaxid.errors import InputError
+from tests.export.test_replayed import SERVOS, TRUE, logged, text
+from tests.support.cli_setup import run
+from tests.support.urdf_arms import arm
+from tests.support.written_logs import write_csv
+
+NAMES = {"qa": "q_a", "qb": "q_b", "ra": "u_a", "rb": "u_b"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    columns = {NAMES.get(n, n): x for n, x in logged(text(**TRUE)).items() if n not in ("ua", "ub")}
+    write_csv(tmp_path / "log.csv", columns)
+    (tmp_path / "robot.xml").write_text(text())
+    return tmp_path
+
+
+def test_a_robot_and_its_log_imply_a_case(folder):
+    made = RobotCase.of(str(folder / "robot.xml"), [str(folder / "log.csv")])
+    plant, log = made.tables["plant"], made.tables["log"]
+    assert plant["kind"] == "tree"
+    assert plant["unknown"] == ["base", "armature", "damping", "frictionloss"]
+    assert log["position"] == {"a": "q_a", "b": "q_b"}
+    assert "units" not in plant
+    assert "actuators" not in plant
+    assert log["force"] == {"a": "u_a", "b": "u_b"}
+    # A search begins with what the file states: it has armature and damping, and no dry friction.
+    search = RobotCase.of(str(folder / "robot.xml"), [str(folder / "log.csv")], search=True)
+    assert search.tables["plant"]["unknown"] == ["base", "armature", "damping"]
+    (folder / "out").mkdir()
+    case = load_case(made.save(folder / "out"))
+    assert case.plant.names == ("a", "b")
+    assert case.tables["plant"]["mjcf"] == "../robot.xml"
+
+
+def test_joints_that_the_log_lacks_are_held(folder):
+    t = np.arange(100) / 100
+    columns = {"t": t, "q_b": np.sin(3 * t), "torque_b": np.cos(7 * t)}
+    first = init(write_csv(folder / "one.csv", columns), mjcf=folder / "robot.xml", folder=folder)
+    assert first.tables["plant"]["joints"] == ["b"]
+    assert first.tables["log"]["position"] == {"b": "q_b"}
+    case = first.case()
+    assert case.plant.names == ("b",)
+    # A torque is that of the joint, whatever gear the file's motors have.
+    assert case.tables["plant"]["actuators"] is False
+    assert case.actuator.gain == 1.0
+    assert any("the others are held at zero" in line for line in first.assumed)
+
+
+def test_a_urdf_is_a_tree_too(folder):
+    (folder / "robot.urdf").write_text(arm(["revolute", "fixed", "prismatic"]))
+    t = np.arange(100) / 100
+    columns = {"t": t}
+    for k, name in enumerate(("joint1", "joint3"), start=2):
+        columns |= {f"{name}_pos": np.sin(k * t), f"{name} effort": np.cos(k * t)}
+    log = write_csv(folder / "two.csv", columns)
+    made = RobotCase.of(str(folder / "robot.urdf"), [str(log)], search=True)
+    assert made.tables["plant"]["unknown"] == ["base"]
+    assert made.tables["log"]["force"] == {"joint1": "joint1 effort", "joint3": "joint3 effort"}
+    case = load_case(made.tables)
+    assert case.plant.names == ("joint1", "joint3")
+    assert case.tables["plant"]["kind"] == "tree"
+
+
+def test_servos_that_follow_a_reference_need_no_force(folder):
+    (folder / "robot.xml").write_text(text(SERVOS, kp=40))
+    columns = {n: x for n, x in logged(text(SERVOS, kp=60, **TRUE)).items() if n not in ("ua", "ub")}
+    called = {"qa": "q_a", "qb": "q_b", "ra": "q_ref_a", "rb": "q_ref_b"}
+    renamed = {called.get(n, n): x for n, x in columns.items()}
+    first = init(write_csv(folder / "moves.csv", renamed), mjcf=folder / "robot.xml", folder=folder)
+    assert first.tables["log"]["reference"] == {"a": "q_ref_a", "b": "q_ref_b"}
+    case = first.case()
+    assert set(case.controller.unknown) == {"kp", "kd"}
+
+
+@pytest.mark.slow
+def test_check_takes_a_robot_and_writes_its_case(folder, capsys):
+    ran = run(capsys, "check", folder / "robot.xml", folder / "log.csv", folder=folder / "out")
+    assert ran.status == 0
+    assert f"{folder / 'out' / 'first_case.toml'}" in ran.out
+    assert tomllib.loads((folder / "out" / "first_case.toml").read_text())["plant"]["kind"] == "tree"
+    assert ran.json("check.json")
+
+
+def test_faults_are_one_line_and_leave_nothing(folder, capsys):
+    (folder / "broken.xml").write_text("<mujoco><worldbody>")
+    (folder / "broken.urdf").write_text("<robot>")
+    three = {"t": [0.0, 0.1, 0.2], "q_1": [0.0, 1, 2], "q_2": [0, 2, 1], "q_3": [1, 0, 1]}
+    other = write_csv(folder / "other.csv", three)
+    for argv, words in (
+        (["identify", "robot.xml"], "a robot's file alone has no log"),
+        (["identify", "none.xml", "log.csv"], "no such file"),
+        (["check", "broken.xml", "log.csv"], "MuJoCo cannot read it"),
+        (["check", "broken.urdf", "log.csv"], "is not XML"),
+        (["discover", "robot.xml", "none.csv"], "no such file"),
+        (["check", "robot.xml", other.name], "moves a, b"),
+    ):
+        given = [argv[0], *(str(folder / name) for name in argv[1:])]
+        assert main([*given, "-o", str(folder / "out")]) == 2
+        told = capsys.readouterr().err
+        assert words in told, told
+        assert told.count("\n") == 1
+    assert not (folder / "out").exists()
+    with pytest.raises(InputError, match="both given"):
+        init(folder / "log.csv", mjcf=folder / "robot.xml", urdf=folder / "broken.urdf")
+
+
+def test_a_robot_is_let_go(folder, capsys):
+    assert let_go(str(folder / "robot.xml"))["simulation"]["sample_rate"] == pytest.approx(500.0)
+    ran = run(capsys, "simulate", folder / "robot.xml", "-o", folder / "free.csv")
+    assert ran.status == 0
+    assert "2500 samples at 500 Hz" in ran.out
+
+
+@pytest.mark.slow
+def test_identify_takes_a_robot_and_its_result_exports_without_a_model(folder, capsys):
+    ran = run(capsys, "identify", folder / "robot.xml", folder / "log.csv", folder=folder / "out")
+    assert ran.status == 0
+    result = ran.json("result.json")
+    assert result["parameters"]["coulomb_friction[1].level"]["value"] == pytest.approx(0.3, rel=0.02)
+    assert json.dumps(result["model"]["case"]["tables"]["plant"]["kind"]) == '"tree"'
+    export = run(capsys, "export", folder / "out" / "result.json", "--to", "mjcf", "-o", folder / "found.xml")
+    assert export.status == 0
+    assert "changed joint 'a'" in export.out
