@@ -71,7 +71,7 @@ def test_identify_gives_the_numbers_of_the_file(tmp_path):
     result = jaxid.identify(tables, DEMO / "log.csv", method="inverse_dynamics")
     np.testing.assert_array_equal(result.estimate.theta, of_file.estimate.theta)
     result.save(tmp_path)
-    assert "Identification of case" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Identification of the axis" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_simulate_and_study_take_it(tmp_path):

@@ -147,7 +147,7 @@ def test_the_page_holds_the_numbers(page):
     assert "force fit 21.0 N 6.10 N" in words
     assert "simulated position validation 11.0 mm 0 mm" in words
     assert "inertia 95.10 kg m² 94.69 to 95.52 0.21 0.22 %" in words
-    assert "added_mass. mass – kg not identifiable" in words
+    assert "added_mass.mass – kg not identifiable" in words
     assert "Dry friction ( coulomb_friction ): −level · sign v with level = 20.12 ± 0.31 N." in words
     assert "Met in guides, bearings and seals under preload" in words
     assert "hysteresis (811.2)" in words
