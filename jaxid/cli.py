@@ -456,7 +456,8 @@ def _progress(args: argparse.Namespace) -> AbstractContextManager[Callable[[str]
     told = {k: v for k, v in vars(args).items() if k not in ("run", "o", "quiet", "force")}
     files = [str(Path(name).resolve()) for name in (told.get("case"), *(told.get("log") or ())) if name]
     words = [f"{k}={v}" for k, v in sorted(told.items()) if k not in ("case", "log")]
-    return progress([*words, *files], shown=not args.quiet and sys.stderr.isatty())
+    quiet = getattr(args, "quiet", False)
+    return progress([*words, *files], shown=not quiet and sys.stderr.isatty())
 
 
 def _ready(args: argparse.Namespace, *files: str) -> None:
@@ -550,7 +551,10 @@ def _run_report(args: argparse.Namespace) -> int:
         path = folder / "report.html"
     else:
         path = ready_file(Path(args.o), overwrite=args.force, suffix=".html")
-    write_whole(path, report(result))
+    with _progress(args) as show:
+        show("drawing")
+        page = report(result)
+    write_whole(path, page)
     print(f"wrote {path}")
     return 0
 
