@@ -160,7 +160,7 @@ WORDS = {
     "cogging": EffectWords(
         "a ripple over the position",
         "−amplitude · cos(2π · q / period + phase)",
-        "cogging of motors with iron cores, teeth of belts and gears, ball screws (once a turn or a ball)",
+        "motors with iron cores (cogging), teeth of belts and gears, ball screws (once a turn or a ball)",
         DRIVE,
     ),
 }

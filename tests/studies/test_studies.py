@@ -13,6 +13,7 @@ import scipy.stats
 import xarray as xr
 
 import jaxid
+from jaxid.commands.report import report
 from jaxid.errors import InputError
 from jaxid.numerics.lanes import SolveRequest, run_alone, run_batched
 from jaxid.studies import plan as planned
@@ -120,6 +121,10 @@ def test_sampling_and_resolution_are_varied_with_each_other(tmp_path):
     assert float(bound[0] / bound[1]) == pytest.approx(np.sqrt(2), rel=0.02)
     page = (study.save(tmp_path / "out") / "report.html").read_text()
     assert "400 Hz, resolution 0.001, noise 1" in page
+    # The page is made again from the files.
+    again = report(tmp_path / "out")
+    assert "400 Hz, resolution 0.001, noise 1" in again
+    assert again.count("<tr>") == page.count("<tr>")
     with xr.open_dataset(tmp_path / "out" / "study.nc", engine="scipy") as saved:
         np.testing.assert_array_equal(saved["estimate"], table["estimate"])
 
