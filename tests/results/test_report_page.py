@@ -133,7 +133,8 @@ def test_the_figure_that_tells_most_is_chosen_by_the_residual():
     assert telling_variable(_view(stribeck + noise, position, velocity)) == "velocity"
     assert telling_variable(_view(noise, position, velocity)) == "time"
     assert share_explained(position, ripple + noise) == pytest.approx(0.5 / (0.5 + 0.09), abs=0.05)
-    assert abs(share_explained(position, noise)) < 0.05
+    # Bins alone explain 0.03 of noise; that is taken off.
+    assert abs(share_explained(position, noise)) < 0.015
 
 
 def test_every_figure_has_its_numbers(fitted):
