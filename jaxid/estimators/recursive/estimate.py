@@ -173,6 +173,7 @@ def recursive_steps(
         saved is None,
         weight,
         _blocks(samples, every),
+        samples,
     )
 
     converged = bool(np.all(np.isfinite(theta)))
