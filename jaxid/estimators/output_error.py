@@ -42,6 +42,7 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE
+from jaxid.numerics import filters as signals
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification
@@ -597,7 +598,11 @@ def _without_noise(
         moving: Residual of each log, with the columns of the unknowns that move.
         precision: Precision of the unknowns.
     """
-    noise = [position_noise(o.part.machine, o.part.log) for o in fit.outputs]
+    # No more than the readings show, whatever the case states.
+    noise = [
+        np.minimum(position_noise(o.part.machine, o.part.log), signals.high_band_std(o.part.log.readings))
+        for o in fit.outputs
+    ]
     looped = all(o.looped for o in fit.outputs) and not any(o.part.log.integrated for o in fit.outputs)
     if not looped or not end.converged or not any(np.any(std > 0) for std in noise):
         return end.theta, precision, []

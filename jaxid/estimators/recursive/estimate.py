@@ -125,6 +125,7 @@ def recursive_steps(
             instrument has no gain, or rows of different units are to be summed.
     """
     noisy = settings.instrument == "model"
+    _check(machine, settings, gains_of(machine), saved)
     parts, logs = [] if isinstance(log, Prepared) else list(log), []
     if isinstance(log, Prepared):
         members = [("fit", machine, log, np.arange(len(machine.parameters.free)))]
@@ -132,7 +133,6 @@ def recursive_steps(
         members = [(part.name, part.machine, part.data, part.index) for part in parts]
     for name, own, data, index in members:
         gains = tuple(None if g is None else int(index[g]) for g in gains_of(own))
-        _check(own, settings, gains, saved)
         rows = yield from rows_steps(own, data, _gates(data, settings))
         rows = rows.widened(index, len(machine.parameters.free))
         logs.append(_Run(name, data, rows, rows.summed if settings.rows == "summed" else rows, gains))
@@ -173,6 +173,7 @@ def recursive_steps(
         saved is None,
         weight,
         _blocks(samples, every),
+        samples,
     )
 
     converged = bool(np.all(np.isfinite(theta)))

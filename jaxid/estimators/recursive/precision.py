@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, RecursiveMemory
 from jaxid.estimators.recursive.rows import Rows
 from jaxid.machine import Machine
-from jaxid.numerics.precision import NoiseModel, Precision, assess, sandwich
+from jaxid.numerics.precision import NoiseModel, Precision, assess_from_sums, sandwich
+from jaxid.numerics.precision import Rows as Residual
 from jaxid.settings import Recursive
 
 
@@ -41,6 +42,7 @@ def precision_of(
     whole: bool,
     weight: Float[np.ndarray, " kept"] | None = None,
     block: Int[np.ndarray, " kept"] | None = None,
+    logs: Sequence[int] = (),
 ) -> tuple[Precision, Float[np.ndarray, " p"]]:
     """Compute the precision at the end, and the factors by which coloured noise widens white deviations.
 
@@ -55,6 +57,7 @@ def precision_of(
             have the noise of this log.
         weight: Weight of each sample at the end; None: that of one log.
         block: Number of the estimate after each sample in the history; None: that of one log.
+        logs: Samples of each log, if several stand one behind the other.
 
     Returns:
         The precision: that of weighted least squares, with the colour of the residual and the square of the
@@ -73,7 +76,12 @@ def precision_of(
     jacobian = root[..., None] * weighted
     signal = float(np.linalg.norm(root**2 * rows.force))
     natural = np.where(machine.parameters.guess == 0, 1.0, machine.parameters.guess)
-    precision = assess(names, jacobian, e, counts, signal, natural, solved=flat.T @ flat)
+    # Each log has a colour of its own.
+    edges, gram, meat = np.cumsum(logs)[:-1], np.zeros((len(names),) * 2), np.zeros((len(names),) * 2)
+    for j, x, c in zip(*(np.split(y, edges) for y in (jacobian, e, counts)), strict=True):
+        own, coloured = Residual(j, x, c, signal).matrices(np.ones(len(names)))
+        gram, meat = gram + own, meat + coloured
+    precision = assess_from_sums(names, gram, meat, signal, natural, solved=flat.T @ flat)
 
     inflation = _inflation(jacobian, e, counts)
     covariance = history.covariance[-1] * np.outer(inflation, inflation)

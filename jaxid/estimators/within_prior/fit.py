@@ -171,12 +171,13 @@ def within_prior_steps(
     if problem.logs and precision is not None:
         logs = rows_of(fit)
         notes += disagreement(logs, fit.count)
-        noise = [
-            float(log.equivalent_variance() ** 0.5) / float(np.max(fit.problem.weight[rows]))
-            for log, rows in zip(logs, fit.problem.slices, strict=True)
-        ]
-        samples = [int(log.counts.sum()) for log in logs]
-        entries = [{"samples": n, "noise": s} for n, s in zip(samples, noise, strict=True)]
+        entries = []
+        for log, rows in zip(logs, fit.problem.slices, strict=True):
+            entry: dict[str, Any] = {"samples": int(log.counts.sum())}
+            weights = fit.problem.weight[rows][0]
+            if np.sum(weights > 0) == 1:
+                entry["noise"] = float(log.equivalent_variance() ** 0.5 / weights.max())
+            entries.append(entry)
         details |= by_log(parts, entries)
     notes = (*notes_of(parts[0].machine, numerics, parts[0].log, on, minimiser), *notes)
     return _estimate(machine, fit, whole, notes, details | multistart | kept_delay(machine, numerics))
