@@ -13,12 +13,12 @@
 # %% [markdown]
 # # Your own log
 #
-# You have a trace of a drive, a CSV, and no model. This notebook goes from the raw file to a case, to
-# parameters, and to the effect that the first model misses. Put your own file in place of `trace`, and
-# the rest stays as it is.
+# You have a trace of a drive, a CSV, and no model. This notebook goes from the raw file to a
+# case, to parameters, and to the effect that the first model misses. Put your own file in place
+# of `trace`, and the rest stays as it is.
 #
-# The trace here comes from a simulator that shares no code with jaxid: a slide of 180 kg on a ball screw.
-# It is in `truth/` of the checkout, so run this notebook there.
+# The trace here comes from a simulator that shares no code with jaxid: a slide of 180 kg on a
+# ball screw. It is in `truth/` of the checkout, so run this notebook there.
 
 # %%
 # %matplotlib inline
@@ -39,16 +39,16 @@ trace.head()
 # %% [markdown]
 # ## A first case
 #
-# `init` reads the columns by their names, the units by the header, and makes rough guesses. It prints
-# what it assumed, and asks what only you know.
+# `init` reads the columns by their names, the units by the header, and makes rough guesses. It
+# prints what it assumed, and asks what only you know.
 
 # %%
 first = jaxid.init(trace)
 print(first)
 
 # %% [markdown]
-# It asks for the drive. The data sheet says 0.72 N m/A, and the screw moves 20 mm in a turn. With these two
-# numbers results are in kg and N.
+# It asks for the drive. The data sheet says 0.72 N m/A, and the screw moves 20 mm in a turn. With
+# these two numbers results are in kg and N.
 
 # %%
 case = {
@@ -70,8 +70,8 @@ print(jaxid.check(case, trace))
 # %% [markdown]
 # ## Fit what was declared
 #
-# Read the first sentence: it says whether the model is complete. If it is not, the standard deviations
-# count noise only, and the values are those of the wrong model.
+# Read the first sentence: it says whether the model is complete. If it is not, the standard
+# deviations count noise only, and the values are those of the wrong model.
 
 # %%
 declared = jaxid.identify(case, trace, method="inverse_dynamics")
@@ -88,8 +88,7 @@ plt.show()
 # %% [markdown]
 # ## Find what is missing
 #
-# The search uses the first trace, and the second one confirms. Studies of alternatives are left out here
-# to keep it short.
+# The search uses the first trace, and the second one confirms.
 
 # %%
 found = jaxid.discover(case, trace, validate=[again], experiments=False)
@@ -101,14 +100,16 @@ plt.show()
 
 # %% [markdown]
 # ## The corrected model
+#
+# `found.case()` is the case with the effect in it, `found.save_case("found.toml")` writes it. The values
+# are those of the last refit.
 
 # %%
-corrected = jaxid.identify(found.case(), trace, method="inverse_dynamics")
-corrected
+found.parameters
 
 # %% [markdown]
-# The machine was made with 180 kg, 400 N s/m, 60 N, and a Stribeck friction of 35 N below 12 mm/s. Here is
-# how far each value is off, in its standard deviations.
+# The machine was made with 180 kg, 400 N s/m, 60 N, and a Stribeck friction of 35 N below 12 mm/s.
+# Here is how far each value is off, in its standard deviations.
 
 # %%
 truth = {
@@ -118,10 +119,8 @@ truth = {
     "stribeck_friction.level": 35.0,
     "stribeck_friction.velocity": 0.012,
 }
-off = {
-    name: (corrected.parameters[name].value - true) / corrected.parameters[name].std
-    for name, true in truth.items()
-}
-for name, sigmas in off.items():
-    p = corrected.parameters[name]
-    print(f"{name:30s} {p.value:9.4g} ± {p.std:.2g} {p.unit}, true {truth[name]:g}: {sigmas:+.1f} std")
+off = {}
+for name, true in truth.items():
+    p = found.parameters[name]
+    off[name] = (p.value - true) / p.std
+    print(f"{name:30s} {p.value:9.4g} ± {p.std:.2g} {p.unit}, true {true:g}: {off[name]:+.1f} std")

@@ -13,9 +13,10 @@
 # %% [markdown]
 # # A plant of your own, in JAX
 #
-# A plant is one class: its parameters and its inertial forces. From it jaxid makes a right-hand side for
-# ODE solvers, exact simulations with sticking friction, regressors and fits. Everything can be jitted, mapped
-# and differentiated. This notebook writes a pendulum on a motor, and checks jaxid against SciPy.
+# A plant is one class: its parameters and its inertial forces. From it jaxid makes a right-hand
+# side for ODE solvers, exact simulations with sticking friction, regressors and fits. Everything
+# can be jitted, mapped and differentiated. This notebook writes a pendulum on a motor, and checks
+# jaxid against SciPy.
 
 # %%
 # %matplotlib inline
@@ -126,8 +127,8 @@ print(fan.shape)
 # %% [markdown]
 # ## Hessian
 #
-# The cost of a fit is a sum of squares. Its exact second derivative, forward over forward, gives the
-# curvature at the optimum. A finite difference of the gradient agrees.
+# The cost of a fit is a sum of squares. Its exact second derivative, forward over forward, gives
+# the curvature at the optimum. A finite difference of the gradient agrees.
 
 
 # %%
@@ -150,7 +151,8 @@ print(f"finite differences of the gradient: {hessian_apart:.0e} apart")
 # %% [markdown]
 # ## A fit
 #
-# `jaxid.fit` is a pure function of arrays. The log is SciPy's motion with noise; guesses are 30 % off.
+# `jaxid.fit` is a pure function of arrays. The log is SciPy's motion with noise; guesses are 30 %
+# off.
 
 # %%
 command = np.asarray(torque(times)[0])[:, None]

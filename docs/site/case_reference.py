@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from jaxid.case.tables import TOP
 _INTRODUCTION = """# Every key of the case file
 
 This page is made from the code that reads a case. [The case file](../case_file.md) explains the keys with
-examples. `jaxid schema case` prints the same as a JSON Schema ([file](case.schema.json)), by which editors
+examples. `jaxid schema case` prints the same as a [JSON Schema](schemas.md), by which editors
 complete and check.
 
 A value is a number (known) or `{ guess = …, min = …, max = …, true = … }` (unknown). All numbers are in SI
@@ -28,10 +27,8 @@ _ELSEWHERE = {
 
 
 def page(folder: Path) -> str:
-    """Return the page; the schema is written to the folder as a file."""
+    """Return the page."""
     schema = case_schema()
-    text = json.dumps(schema, indent=2, ensure_ascii=False)
-    (folder / "case.schema.json").write_text(text + "\n", "utf-8")
     parts = [_INTRODUCTION]
     for name, several in TOP.items():
         parts.append(f"## `{'[[' if several else '['}{name}{']]' if several else ']'}` {{ #{name} }}")

@@ -23,7 +23,9 @@ def page(folder: Path) -> str:
     parts = [_INTRODUCTION]
     for name, parser in subparsers.choices.items():
         usage = parser.format_usage().removeprefix("usage: ")
-        parts += [f"## `jaxid {name}`", f"{prose((parser.description or '').strip())}", code(usage)]
+        purpose = (parser.description or "").strip()
+        purpose = prose(purpose[:1].upper() + purpose[1:].rstrip(".") + ".")
+        parts += [f"## `jaxid {name}`", purpose, code(usage)]
         rows = [_row(a) for a in parser._actions if a.dest != "help" and a.help != argparse.SUPPRESS]
         if rows:
             parts.append(table(["argument", "meaning"], rows))

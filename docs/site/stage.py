@@ -15,6 +15,7 @@ from docs.site import (
     notebook_pages,
     plant_reference,
     python_reference,
+    schema_reference,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -33,6 +34,7 @@ GENERATED: dict[str, Callable[[Path], str]] = {
     "reference/plants.md": plant_reference.page,
     "reference/commands.md": command_reference.page,
     "reference/python.md": python_reference.page,
+    "reference/schemas.md": schema_reference.page,
 }
 LINK = re.compile(r"(?<!!)\[([^\]\[]*(?:\[[^\]]*\][^\]\[]*)*)\]\(([^)\s]+)\)")
 IMAGE = re.compile(r"!\[[^\]]*\]\(([^)\s]+)\)")

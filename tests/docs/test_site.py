@@ -78,6 +78,15 @@ def test_every_plant_command_and_public_name_is_in_the_reference(pages):
                 assert f"`{option}" in section, (name, option)
 
 
+def test_every_schema_is_a_file_that_parses(pages):
+    page = text(pages, "reference/schemas.md")
+    found = {p.name for p in (pages / "reference").glob("*.schema.json")}
+    assert "case.schema.json" in found
+    for name in found:
+        assert json.loads(text(pages, f"reference/{name}"))["type"] == "object"
+        assert f"]({name})" in page
+
+
 def test_a_table_of_keys_says_type_bounds_and_default():
     properties = {
         "runs": {"type": "integer", "minimum": 1, "default": 100, "description": "of a | study [1]"},
