@@ -151,8 +151,8 @@ print(f"finite differences of the gradient: {hessian_apart:.0e} apart")
 # %% [markdown]
 # ## A fit
 #
-# `jaxid.fit` is a pure function of arrays. The log is SciPy's motion with noise; guesses are 30 %
-# off.
+# `jaxid.fit` is a pure function of arrays. The log is SciPy's motion with noise; guesses are 10 % off.
+# This pendulum turns over, so that guesses much farther off may end in another minimum.
 
 # %%
 command = np.asarray(torque(times)[0])[:, None]
@@ -161,7 +161,7 @@ free = ("inertia", "weight", "viscous_friction.coefficient")
 period = float(times[1] - times[0])
 # Between two samples the torque goes on: a line between them, in four steps each.
 fitted = jax.jit(
-    lambda y: jaxid.fit(plant, free, period, y, command, start=theta * 1.3, hold="linear", substeps=4)
+    lambda y: jaxid.fit(plant, free, period, y, command, start=theta * 1.1, hold="linear", substeps=4)
 )(jnp.asarray(noisy))
 sigmas = np.asarray((fitted.theta - theta) / fitted.std)
 for name, value, std, true in zip(free, fitted.theta, fitted.std, theta, strict=True):
