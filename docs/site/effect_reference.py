@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from docs.site.curves import draw, drawing_of, values_of
-from docs.site.markdown import code
+from docs.site.curves import draw
+from docs.site.markdown import code, prose
 from docs.site.plant_reference import documented, parameter_table
 from jaxid.effects import EFFECTS
 from jaxid.model.effect import Effect
-from jaxid.model.parameter import parameters_of
+from jaxid.results.effect_page import snippet
+from jaxid.results.effect_words import words_of
 
 _INTRODUCTION = """# Effects
 
-This page is made from the classes of `jaxid.EFFECTS`; `jaxid effects` prints the same in a terminal. q is the
-position of the joint (or the elongation e of a spring), v its velocity, a its acceleration, u the declared
+This page is made from the classes of `jaxid.EFFECTS`; `jaxid effects KIND` prints the same in a terminal. q is
+the position of the joint (or the elongation e of a spring), v its velocity, a its acceleration, u the declared
 force. A positive force pushes towards positive q. [An effect of your own](../adding_an_effect.md) is one
 class.
 
@@ -31,9 +32,10 @@ def page(folder: Path) -> str:
         parts += [
             f"## `{kind}`",
             documented(cls),
-            f"![Curve of {kind} over {drawing_of(kind).over}](curves/{kind}.svg){{ .curve }}",
+            *_met(kind, cls),
+            f"![Curve of {kind}](curves/{kind}.svg){{ .curve }}",
             parameter_table(cls),
-            code(snippet(kind, cls), "toml"),
+            code(snippet(kind), "toml"),
             *_notes(cls),
         ]
     return "\n\n".join(parts) + "\n"
@@ -55,12 +57,9 @@ def _overview() -> str:
     )
 
 
-def snippet(kind: str, cls: type[Effect]) -> str:
-    """Return an [[effects]] table with every parameter that an effect needs as an unknown."""
-    needed = [n for n in parameters_of(cls) if n in values_of(kind)]
-    place = ["spring = 1"] if cls.with_springs else []
-    lines = [f"{name} = {{ guess = {values_of(kind)[name]:.3g} }}" for name in needed]
-    return "\n".join(["[[effects]]", f'kind = "{kind}"', *place, *lines])
+def _met(kind: str, cls: type[Effect]) -> list[str]:
+    words = words_of(kind, cls.__doc__ or "", in_drive=cls.in_drive, of_spring=cls.of_spring)
+    return [f"Met in {prose(words.met)}."] if words.met else []
 
 
 def _notes(cls: type[Effect]) -> list[str]:
