@@ -151,12 +151,13 @@ print(f"finite differences of the gradient: {hessian_apart:.0e} apart")
 # %% [markdown]
 # ## A fit
 #
-# `jaxid.fit` is a pure function of arrays. The log is SciPy's motion with noise; guesses are 10 % off.
+# `jaxid.fit` is a pure function of arrays. The log is SciPy's motion with noise of 5 mrad; guesses are
+# 10 % off.
 # This pendulum turns over, so that guesses much farther off may end in another minimum.
 
 # %%
 command = np.asarray(torque(times)[0])[:, None]
-noisy = reference[:, None] + 1e-3 * np.random.default_rng(0).standard_normal((times.size, 1))
+noisy = reference[:, None] + 5e-3 * np.random.default_rng(0).standard_normal((times.size, 1))
 free = ("inertia", "weight", "viscous_friction.coefficient")
 period = float(times[1] - times[0])
 # Between two samples the torque goes on: a line between them, in four steps each.

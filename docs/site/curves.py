@@ -1,4 +1,4 @@
-"""The curve of each effect as a picture: that of `jaxid effects KIND`, or one of its own where it has none."""
+"""The curve of each effect as a picture: that of `jaxid effects KIND`, or one of its own."""
 
 from __future__ import annotations
 
