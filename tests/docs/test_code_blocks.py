@@ -28,6 +28,14 @@ COMMAND = re.compile(r"^(?:\$ )?(?:\S*/bin/)?jaxid [a-z]")
 MODULE = re.compile(r"python -m ((?:experiments|benchmarks|truth)[\w.]*)")
 SCRIPT = re.compile(r"python (?:experiments|benchmarks|tests)/\S+")
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
+# Pages whose blocks take over 5 s of a processor: they fit several times, or an arm.
+LONG = {
+    "docs/accelerator.md",
+    "docs/in_a_loop.md",
+    "docs/robots.md",
+    "docs/short_logs.md",
+    "docs/without_a_controller.md",
+}
 # A block that begins so is a part of a file of docs/examples, which other tests run.
 EXCERPT = re.compile(r"^# (\w+\.py)\n")
 
@@ -69,7 +77,12 @@ def having(*languages: str) -> list:
     return [pytest.param(p, id=name(p)) for p in chosen]
 
 
-@pytest.mark.parametrize("page", having("python"))
+def with_long_ones_slow(pages: list) -> list:
+    """Return the pages as parameters, those of `LONG` marked slow."""
+    return [pytest.param(*p.values, id=p.id, marks=pytest.mark.slow) if p.id in LONG else p for p in pages]
+
+
+@pytest.mark.parametrize("page", with_long_ones_slow(having("python")))
 def test_python_blocks_run(page, tmp_path):
     for source in (Path(jaxid.__file__).parent / "demo").glob("*.*"):
         if source.suffix != ".py":
