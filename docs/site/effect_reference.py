@@ -15,8 +15,8 @@ from jaxid.results.effect_words import words_of
 _INTRODUCTION = """# Effects
 
 This page is made from the classes of `jaxid.EFFECTS`; `jaxid effects KIND` prints the same in a terminal. q
-is the position of the joint (or the elongation e of a spring), v its velocity, a its acceleration, u the force
-that is declared. A positive force pushes towards positive q. [An effect of your own](../adding_an_effect.md) is
+is the position of the joint (or the elongation e of a spring), v its velocity, a its acceleration, u the
+declared force. A positive force pushes towards positive q. [An effect of your own](../adding_an_effect.md) is
 one class.
 
 Curves are drawn by the classes themselves, at round values of their parameters."""
