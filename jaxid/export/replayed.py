@@ -24,8 +24,8 @@ from jaxid.session import open_session
 from jaxid.simulation.replay import Replay, exact_numerics, make_replay, with_fitted_start
 from jaxid.simulation.step_size import TooStiffError
 
-# Length of the stretches after which an open loop starts anew from the log [s]: an arm held upright falls with
-# a time constant of about 0.15 s, and errors of its start grow as fast.
+# Length of the stretches after which an open loop starts anew from the log [s]: errors of the start of an arm
+# that stands upright grow with a time constant of about 0.15 s.
 _STRETCH = 0.25
 # Factor by which the time step of the file is shortened to see what it costs.
 _FINER = 10
