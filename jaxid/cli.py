@@ -416,7 +416,7 @@ def _study(commands: argparse._SubParsersAction) -> None:
 
 
 def _export(commands: argparse._SubParsersAction) -> None:
-    purpose = "put the values of a result into the robot's own file, or into one of another program"
+    purpose = "put the values of a result into the robot's file, or into one of another program"
     parser = _plain(commands, "export", purpose, _run_export)
     parser.add_argument("result", metavar="RESULT.json", help="result.json or discovery.json of a tree")
     parser.add_argument("--to", metavar="TARGET", required=True, help=f"one of {', '.join(TARGETS)}")
@@ -429,7 +429,7 @@ def _export(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--check",
         metavar="LOG",
-        help="replay a log by the file in MuJoCo: how far it is from jaxid's own simulation, by joint, and "
+        help="replay a log by the file in MuJoCo: how far it is from jaxid's simulation, by joint, and "
         "what each thing that the file lacks is worth",
     )
     parser.add_argument(

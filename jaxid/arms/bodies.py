@@ -21,6 +21,8 @@ from jaxid.plants.link_tree import LinkTree
 _ZERO = 1e-4
 # Chosen: steps of a Newton method that ends within ten from a nearby start.
 _STEPS = 100
+# Size of a sum, over the largest of its kind, from which it counts by itself.
+_SMALL = 1e-3
 # Relative change of the sums at which the bodies count as found.
 _CLOSE = 1e-10
 
@@ -82,9 +84,12 @@ def bodies_of(
     kinds = np.array([TEN.index(sums.standard[c][0]) for c in columns])
     links = np.array([sums.standard[c][1] for c in columns])
     wanted = mapping @ found[links, kinds] + sums.mapping[:, turning] @ (own - final)[: len(turning)]
-    # A row counts by the size of its sum over the magnitudes of the file's bodies.
+    # A row counts by the size of its sum over the magnitudes of the file's bodies; one that is next to
+    # nothing, such as the product of inertia of a symmetric link, by a part of the largest of its kind.
     size = np.abs(mapping) @ np.abs(start[links, kinds]) + np.abs(wanted)
-    size = np.where(size > 1e-9 * size.max(), size, 1e-9 * size.max())
+    dimension = np.digitize(kinds[np.argmax(mapping != 0, axis=1)], [1, 4])
+    largest = np.array([size[dimension == d].max() for d in dimension])
+    size = np.maximum(size, _SMALL * largest)
     heavy = np.flatnonzero(start[:, 0] > 0)
     asked = _Asked(*map(jnp.asarray, (start, heavy, mapping, links, kinds, wanted, size)))
     x = np.asarray(jax.vmap(log_cholesky)(jnp.asarray(_fuller(start[heavy])))).ravel()

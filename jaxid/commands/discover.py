@@ -381,6 +381,10 @@ def _refit(session: Session, start: Estimate) -> Estimate:
         estimate = output_error(session.machine, log, numerics=numerics, minimiser=stated.minimiser)
     except TooStiffError as error:
         return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
+    except np.linalg.LinAlgError:
+        # An arm that stands upright falls without its loop: the baseline of a search may run off the log.
+        note = "not refitted in simulation: the simulated motion runs away from the log"
+        return replace(start, notes=(*start.notes, note))
     if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
         note = f"output error: {estimate.message}; the parameters are those of inverse dynamics"
         return replace(start, notes=(*start.notes, note))

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from jaxid.export.replayed import Replayed
     from jaxid.export.samples import Drawn
 
-# Targets that change the text of the robot's own file, with the key of the case that names it.
+# Targets that change the text of the robot's file, with the key of the case that names it.
 _OWN_FILES = {"mjcf": "mjcf", "urdf": "urdf"}
 
 
 def export(
     result: Mapping[str, Any] | str | Path, to: str, model: str | Path | None = None, *, name: str = "robot"
 ) -> ExportedFile:
-    """Put the values of a result into the user's own model, or into a file of another program.
+    """Put the values of a result into the user's model, or into a file of another program.
 
     Args:
         result: result.json or discovery.json, or its content.
@@ -68,14 +68,14 @@ def check_export(
     log: LogLike,
     model: str | Path | None = None,
 ) -> Replayed:
-    """Replay a log by an exported file in MuJoCo, and say how far that is from jaxid's own simulation.
+    """Replay a log by an exported file in MuJoCo, and say how far that is from jaxid's simulation.
 
     Args:
         result: result.json or discovery.json, or its content.
         to: Target of the file: "mjcf" or "urdf".
         exported: The file, as `export` returns it.
         log: The log, with the columns of the case.
-        model: The user's own file; None: the path that the case states.
+        model: The user's file; None: the path that the case states.
 
     Raises:
         InputError: If MuJoCo does not read this target or is not installed, or the log or the result is
@@ -97,13 +97,13 @@ def draw_exports(
     *,
     seed: int = 0,
 ) -> Drawn:
-    """Draw models from the posterior of a result, each in the robot's own file.
+    """Draw models from the posterior of a result, each in the robot's file.
 
     Args:
         result: result.json or discovery.json, or its content.
         to: "mjcf" or "urdf".
         count: Number of models.
-        model: The user's own file; None: the path that the case states.
+        model: The user's file; None: the path that the case states.
         seed: Seed of the draws.
 
     Raises:

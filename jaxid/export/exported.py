@@ -1,4 +1,4 @@
-"""Files with a result in them, and the part of a result that a robot's own file can hold."""
+"""Files with a result in them, and the part of a result that a robot's file can hold."""
 
 from __future__ import annotations
 

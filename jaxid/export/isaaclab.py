@@ -26,7 +26,7 @@ _FILE = '''\
 """Actuators of {title} for Isaac Lab: ArticulationCfg(..., actuators=ACTUATORS).
 
 Written by jaxid {version} from a result. Units: rad, m, s, N m, N. Frictions are efforts, as Isaac Sim has
-them from 5.0 on. Masses and inertias are those of the robot's own file.
+them from 5.0 on. Masses and inertias are those of the robot's file.
 {remarks}"""
 
 from isaaclab.actuators import {cls}

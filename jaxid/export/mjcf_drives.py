@@ -31,7 +31,7 @@ class DriveText:
         joints: Elements of all joints, by their index in the compiled model.
         autolimits: Whether a range by itself limits.
         notes: Sentences on what it cannot hold; lost: numbers of such effects; changed: names of actuators.
-        damping: What belongs to the damping of each joint besides its own, by name.
+        damping: What belongs to the damping of each joint besides, by name.
     """
 
     text: XmlText

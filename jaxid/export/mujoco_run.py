@@ -47,7 +47,7 @@ class MujocoRobot:
         model: The compiled model, contacts off and held joints made immovable.
         robot: Its kept joints.
         held: Positions of the other joints, by name.
-        servo: Whether its own position actuators close the loop.
+        servo: Whether its position actuators close the loop.
         driven: Whether its actuators take the commands; otherwise forces act on its joints.
         gains: Force at each driven joint per unit of its command.
         drives: Driven joints, 0-based among the free ones.
@@ -88,7 +88,7 @@ def load(
 
     Args:
         content: Its text.
-        path: The user's own file.
+        path: The user's file.
         names: Names of the free joints that a result keeps.
         held: Positions of held joints.
         gravity: Acceleration of gravity in the base's frame [m/s^2].

@@ -24,8 +24,9 @@ from jaxid.session import open_session
 from jaxid.simulation.replay import Replay, exact_numerics, make_replay, with_fitted_start
 from jaxid.simulation.step_size import TooStiffError
 
-# Length of the stretches after which an open loop starts anew from the log [s]: errors of its model grow.
-_STRETCH = 1.0
+# Length of the stretches after which an open loop starts anew from the log [s]: errors of the start of an arm
+# that stands upright grow with a time constant of about 0.15 s.
+_STRETCH = 0.25
 # Factor by which the time step of the file is shortened to see what it costs.
 _FINER = 10
 
@@ -39,8 +40,8 @@ class Replayed:
         units: Unit of each joint's position.
         before: Measured less simulated position, of the user's file in MuJoCo.
         after: The same of the exported file.
-        own: The same of the result in jaxid's own simulation.
-        difference: Exported file in MuJoCo less jaxid's own simulation.
+        own: The same of the result in jaxid's simulation.
+        difference: Exported file in MuJoCo less jaxid's simulation.
         costs: Changes by single differences between both on this log: a sentence, and the RMS by joint.
         closed: Whether the loop was closed; if not, both start anew from the log after each `stretch` [s].
         stretch: Length of such a stretch [s].
@@ -91,7 +92,7 @@ def replay_export(
     Args:
         model: `model` of result.json.
         exported: The file with the result in it.
-        path: The user's own file.
+        path: The user's file.
         log: The log, with the columns of the case.
         where: The result, for messages.
 

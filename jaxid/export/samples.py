@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arms.bodies import are_bodies
 from jaxid.case.tables import unknown_info
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.export.exported import ExportedFile
 from jaxid.model.parameter import parameters_of
+from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 
 # Most draws for each model that is kept: of those that are written, and of those refused by their signs.
@@ -75,7 +77,8 @@ def draw(
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     mean = np.array([place.get(model) for place in chosen])
     rng, files, refused = np.random.default_rng(seed), list[ExportedFile](), 0
-    written = 0
+    # Sums of parameters are no bodies themselves: the export finds some that have these sums.
+    written, whole = 0, _are_bodies(model)
     for theta in _draws(mean, root, rng):
         if len(files) == count:
             break
@@ -89,12 +92,19 @@ def draw(
         one = copy.deepcopy(model)
         for place, value in zip(chosen, theta, strict=True):
             place.put(one, float(value))
+        if whole and not _are_bodies(one):
+            refused += 1
+            continue
         exported, written = export(one), written + 1
         if exported.real:
             files.append(exported)
         else:
             refused += 1
     return Drawn(tuple(files), refused, fixed)
+
+
+def _are_bodies(model: Mapping[str, Any]) -> bool:
+    return are_bodies(np.stack([np.array(model["parameters"][name]) for name in TEN], axis=-1))
 
 
 def _covariance(content: Mapping[str, Any], where: str) -> tuple[list[str], list[list[float]]]:

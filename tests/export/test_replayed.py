@@ -106,7 +106,7 @@ def test_a_replay_says_how_near_the_file_is_and_what_it_lacks(tmp_path, capsys):
 
     assert status("new.xml", "log.csv") == 0
     shown = capsys.readouterr().out
-    assert "replay by MuJoCo, open loop, anew from the log every 1 s" in shown
+    assert "replay by MuJoCo, open loop, anew from the log every 0.25 s" in shown
     assert (tmp_path / "new.xml").read_bytes() == file.content
     # A log without the columns of the case leaves nothing behind.
     write_csv(tmp_path / "bad.csv", {"t": [0.0, 0.1], "x": [0.0, 0.0]})
