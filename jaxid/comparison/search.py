@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +14,7 @@ from jaxtyping import Float
 
 from jaxid.comparison.model import Change, Model
 from jaxid.comparison.rows import STRETCHES, ComparedLog, Whitened
-from jaxid.comparison.screen import Screen, Scored, screen_changes
+from jaxid.comparison.screen import Scored, Screen, screen_changes
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import RELEVANT, absorbed_noise
@@ -27,8 +28,8 @@ _REFITTED = 6
 _SUPERFLUOUS = 0.05
 # A residual counts as noise if its RMS exceeds that of the noise by less than this many deviations.
 _SCATTER = 3.0
-# Sets of parameters for each log, none of which differs clearly alone, count as a difference if they close
-# this part of the gap.
+# Differences must close this part of the gap, unless noise alone is left: an incomplete model leaves more to
+# chance than to any difference. So must sets of parameters for each log, none of which differs clearly alone.
 _MOST_OF_IT = 0.5
 # A log is disturbed if its residual exceeds the noise by this factor, while that of another is noise.
 _ABOVE_FLOOR = 1.3
@@ -160,7 +161,15 @@ class Search:
             model, found = self.explained(model, change)
             named += [found] if found is not None else []
         # A change of all logs alike may have stood in for a difference that was found later.
-        return self.without_superfluous(model, [c for c in model.changes if c.alike]), named
+        model = self.without_superfluous(model, [c for c in model.changes if c.alike])
+        if named and not self.at_floor(model):
+            shared = model
+            for change in model.differences:
+                shared = shared.without(change)
+            shared = self.fit(shared)
+            if self.closed(shared, model) < _MOST_OF_IT:
+                return shared, []
+        return model, named
 
     def round(self, model: Model) -> Round:
         """Screen the changes of a model, and refit the most promising."""
@@ -347,8 +356,8 @@ class Search:
             closed = self.closed(model, self.fit(apart))
             if closed > _MOST_OF_IT:
                 return (
-                    f"parameters of their own for each log close {100 * closed:.0f} % of the gap, in squares, "
-                    "and no one of them does"
+                    f"parameters of their own for each log close {100 * closed:.0f} % of the gap, in "
+                    "squares, and no one of them does"
                 )
         return self._disturbed(model)
 
@@ -385,21 +394,17 @@ class Search:
         """Describe a log whose residual is no noise, while that of another is, over the same motion."""
         residuals = self.residuals(model)
         quiet = [k for k, log in enumerate(self.logs) if self._is_noise(log, residuals[k])]
-        for k, log in enumerate(self.logs):
-            if k in quiet:
-                continue
-            for other in quiet:
-                within = _within(log, self.logs[other])
-                counts = log.counts & within
-                if not counts.any():
-                    continue
-                total = np.sum(np.where(counts, residuals[k] / log.smallest, 0.0) ** 2)
-                ratio = float(np.sqrt(total / counts.sum()))
-                if ratio > _ABOVE_FLOOR:
-                    return (
-                        f"{log.name} leaves a residual of {ratio:.2g} times the noise where {self.logs[other].name} "
-                        "moves too and leaves noise"
-                    )
+        loud = [k for k in range(len(self.logs)) if k not in quiet]
+        for k, other in itertools.product(loud, quiet):
+            log, calm = self.logs[k], self.logs[other]
+            counts = log.counts & _within(log, calm)
+            total = float(np.sum(np.where(counts, residuals[k] / log.smallest, 0.0) ** 2))
+            ratio = np.sqrt(total / max(counts.sum(), 1))
+            if ratio > _ABOVE_FLOOR:
+                return (
+                    f"{log.name} leaves a residual of {ratio:.2g} times the noise within the motion of "
+                    f"{calm.name}, which leaves noise"
+                )
         return ""
 
     def _is_noise(self, log: ComparedLog, e: Float[np.ndarray, "kept n"]) -> bool:

@@ -116,9 +116,8 @@ def comparison_table(result: Comparison) -> str:
     for d in result.differences:
         others = ", ".join(rival_words(r) for r in d.alternatives)
         alternatives = f"; these logs do not distinguish it from {others}" if others else ""
-        lines.append(
-            f"difference: {d.label} (evidence {d.evidence:.0f} nats, threshold {d.threshold:.0f}{alternatives})"
-        )
+        sure = f"evidence {d.evidence:.0f} nats, threshold {d.threshold:.0f}"
+        lines.append(f"difference: {d.label} ({sure}{alternatives})")
     lines += [_EVIDENCE_WORDS] if result.differences else []
     if result.differences:
         lines += ["", aligned(value_rows(result))]

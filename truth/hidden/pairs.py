@@ -1,6 +1,7 @@
 """Pairs of exact machines that differ in one thing, or in nothing, and an oracle of what can be seen.
 
-The two logs of a pair follow different tours. Everything follows from the id of a pair.
+The two logs of a pair follow different tours, of the few of their scale; machines, changes and noise are
+drawn. Everything follows from the id of a pair.
 """
 
 import dataclasses
@@ -51,7 +52,32 @@ ALIKE = tuple(
     k for k in hidden_cases.KINDS
     if k not in ("viscous_friction", "coulomb_friction", "static_friction", "actuator_gain", "added_mass")
 )  # fmt: skip
-DURATION = 5.0  # s, of the logs of a belt
+DURATION = 4.0  # s, of the logs of a belt
+NOISES = hidden_cases.NOISES
+
+
+@dataclasses.dataclass(frozen=True)
+class Toured(HiddenCase):
+    """A hidden case whose tours, noise level and rate are those of one of three experiments.
+
+    Machines and noise are drawn for each seed. Few tours let compiled code serve many pairs.
+    """
+
+    @property
+    def experiment(self) -> int:
+        """Number of the experiment."""
+        return NOISES.index(self.noise)
+
+    @property
+    def rate(self) -> float:
+        """Rate of loop and log [Hz]."""
+        return list(self.size.bandwidth)[self.experiment]
+
+    def _bare(self, validation: bool = False) -> Setup:
+        tour = self.size.setup(
+            1 + self.experiment, self.noise, self.duration, self.rate, validation=validation
+        )
+        return dataclasses.replace(tour, seed=2 * self.seed + validation)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +134,7 @@ class Pair:
         declared = hidden_cases.declared_beside(kinds)
         what = self.alike or "viscous and coulomb"
         group = "effects" if kinds else "nulls"
-        return HiddenCase(group, what, self.scale, self.noise, self.seed, kinds, declared, self.sensor)
+        return Toured(group, what, self.scale, self.noise, self.seed, kinds, declared, self.sensor)
 
     def setup(self, second: bool) -> Setup:
         """Build the experiment of the first or the second machine on an axis."""
@@ -135,7 +161,7 @@ class Pair:
 
     def belt(self, second: bool) -> ChainSetup:
         """Build the experiment of the first or the second machine with a belt."""
-        random = np.random.default_rng([self.seed, int(second)])
+        random = np.random.default_rng(int(second))
         own = np.random.default_rng([self.seed, zlib.crc32(b"belt")])
         values = {name: value * own.uniform(0.8, 1.2) for name, value in flexible_axes.TRUTH.items()}
         if second and "stiffness" in self.change:
