@@ -79,10 +79,9 @@ def compare_session(
 
     progress("fitting one machine to all logs")
     machine = session.machine
-    estimate = run_alone(inverse_dynamics_steps(session))
-    machine = machine.with_estimate(
-        np.where(np.isfinite(estimate.theta), estimate.theta, machine.parameters.guess)
-    )
+    if machine.parameters.free:
+        theta = run_alone(inverse_dynamics_steps(session)).theta
+        machine = machine.with_estimate(np.where(np.isfinite(theta), theta, machine.parameters.guess))
     superset = build_candidate_model(machine, session.fit.data, _searched(session))
     logs = tuple(ComparedLog.of(runs, machine, superset) for runs in groups)
     search = Search(superset, logs, _comparable(session, superset.base), progress)

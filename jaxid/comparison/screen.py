@@ -143,7 +143,7 @@ def screen_changes(
     logs: Sequence[ComparedLog],
     model: Model,
     comparable: Sequence[int],
-    grid: Grid,
+    grid: Grid | None,
 ) -> Screen:
     """Score every change of a model, and calibrate the threshold.
 
@@ -152,20 +152,23 @@ def screen_changes(
         logs: The logs.
         model: The model.
         comparable: Indices of the parameters that may differ between logs.
-        grid: Function that returns the points of a candidate with many starts in a log.
+        grid: Function that returns the points of a candidate with many starts in a log; None: only the
+            parameters are scored, and no effects.
     """
-    changes = effect_changes(superset.candidates, model, len(logs))
+    changes = [] if grid is None else effect_changes(superset.candidates, model, len(logs))
     rest = [c for c in superset.candidates if any(x.effect is c for x in changes)]
     whiteners, residuals, bases, points = [], [], [], []
     rng = np.random.default_rng(20240501)
     for k, log in enumerate(logs):
         fitted = model.fitted_in(k)
         e, jacobian = log.evaluate(superset, model.theta[k], fitted)
-        own = cand.points(superset, rest, log.samples, model.theta[k], e)
-        own += [p for c in rest if c.has_grid for p in grid(k, c)]
-        scale = np.array([c.innovation for c in log.colour])
-        own = [p for p in own if has_influence(p, log.counts, scale)]
-        extra = all_columns(e, jacobian[..., fitted], own, log.counts, scale)
+        own, extra = [], np.zeros((*e.shape, 0))
+        if grid is not None:
+            own = cand.points(superset, rest, log.samples, model.theta[k], e)
+            own += [p for c in rest if c.has_grid for p in grid(k, c)]
+            scale = np.array([c.innovation for c in log.colour])
+            own = [p for p in own if has_influence(p, log.counts, scale)]
+            extra = all_columns(e, jacobian[..., fitted], own, log.counts, scale)
         whitener, noise = fit_whitener(e, jacobian[..., fitted], extra, log.counts, log.colour)
         surrogates = ev.flipped(noise, ev.stretch(len(noise)), _SURROGATES, rng)
         whiteners.append(whitener)

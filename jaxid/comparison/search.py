@@ -33,6 +33,9 @@ _SCATTER = 3.0
 _MOST_OF_IT = 0.5
 # A log is disturbed if its residual exceeds the noise by this factor, while that of another is noise.
 _ABOVE_FLOOR = 1.3
+# Two changes explain the logs equally well if their evidence differs by less. If one is true, its gain over
+# the other scatters by the root of twice that gain: this is a gain of two such deviations.
+_CHANCE = 8.0
 # Largest number of evaluations of a fit.
 _EVALUATIONS = 25
 
@@ -176,8 +179,7 @@ class Search:
         key = _key(model)
         if key in self._rounds:
             return self._rounds[key]
-        self.progress("screening changes")
-        screen = screen_changes(self.superset, self.logs, model, self.comparable, self._grid)
+        screen = self._screen(model)
         promising = [s for s in screen.scores if s.evidence > 0.5 * screen.threshold]
         refits = []
         for scored in _shortlist(promising):
@@ -370,7 +372,7 @@ class Search:
         of time, which an incomplete model makes larger.
         """
         if whitened is None:
-            whitened = screen_changes(self.superset, self.logs, model, self.comparable, self._grid).whitened
+            whitened = screen_changes(self.superset, self.logs, model, self.comparable, None).whitened
         model = self.fit(model, whitened)
         columns, e = self._white(model, whitened)
         _, apart, covariance = whitened.left_out(columns, e)
@@ -412,16 +414,19 @@ class Search:
         scatter = np.sqrt(0.5 / np.maximum(log.independent * counts, 1))
         return bool(np.all((log.rms(e) <= log.smallest * (1 + _SCATTER * scatter))[counts > 0]))
 
-    def _equal(self, one: Refit, best: Refit) -> bool:
+    def _screen(self, model: Model) -> Screen:
+        """Score the changes of a model; if its residual is noise, effects only if a parameter differs."""
+        self.progress("screening changes")
+        if self.at_floor(model):
+            screen = screen_changes(self.superset, self.logs, model, self.comparable, None)
+            if all(s.evidence < screen.threshold for s in screen.scores):
+                return screen
+        return screen_changes(self.superset, self.logs, model, self.comparable, self._grid)
+
+    @staticmethod
+    def _equal(one: Refit, best: Refit) -> bool:
         """Check that a change explains the logs as well as the best one."""
-        divergence = 0.0
-        screen_rows = zip(self.logs, self.residuals(one.model), self.residuals(best.model), strict=True)
-        for log, e, other in screen_rows:
-            whitener = ev.Whitener.of(other, log.counts, log.colour)
-            divergence += 0.5 * float(np.sum(whitener((e - other)[..., None]) ** 2))
-        # If one is true, its gain scatters about the expected gain with a variance of twice that gain.
-        chance = 2 * np.sqrt(2 * divergence)
-        return one.evidence >= best.evidence - max(TIE_NATS, TIE_PART * best.evidence, chance)
+        return one.evidence >= best.evidence - max(_CHANCE, TIE_PART * best.evidence)
 
     def _grid(self, log: int, candidate: cand.Candidate) -> list[cand.Point]:
         """Linearise a candidate at its many starts; the result is kept, since no other effect enters it."""

@@ -22,6 +22,7 @@ from truth.hidden.bench import text_of
 from truth.hidden.cases import HiddenCase
 from truth.hidden.chain_oracle import at_mass, fading, noise_density, of_spring
 from truth.hidden.chains import ChainSetup
+from truth.hidden.machines import SCALES
 from truth.hidden.oracle import (
     VISIBLE_NATS,
     VISIBLE_SHARE,
@@ -279,15 +280,16 @@ def _stacked(white, own, force, plain, plain_own, total):
 def pairs(split: str, count: int = 100) -> Iterator[Pair]:
     """Return so many pairs that differ, and as many that do not, in turn."""
     seed = FIRST_SEED[split]
-    scales = ("servo", "emps_like", "heavy_slide")
     kinds = (*ON_AXIS, "loose_belt", *ON_AXIS, "backlash")
     for k in range(count):
         what = kinds[k % len(kinds)]
-        noise = (0.3, 1.0, 3.0)[(k // len(kinds) + k) % 3]
-        scale = "belt" if what in ON_BELT else scales[(k + k // len(kinds)) % 3]
-        yield Pair(what, scale, noise, seed + 2 * k, sensor=k % 4 != 3)
-        # Of the others every second is of an incomplete model, and every tenth a belt.
+        random = np.random.default_rng(seed + 2 * k)
+        scale = "belt" if what in ON_BELT else str(random.choice(list(SCALES)))
+        noise = float(random.choice(NOISES))
+        yield Pair(what, scale, noise, seed + 2 * k, sensor=bool(random.random() < 0.75))
+        # Of the others every tenth is a belt, and every second of the rest is of an incomplete model.
         belt = k % 10 == 4
         alike = ALIKE[(k // 2) % len(ALIKE)] if k % 2 and not belt else ""
-        other = "belt" if belt else scales[k % 3]
-        yield Pair("nothing", other, noise, seed + 2 * k + 1, alike, sensor=(k // 4) % 4 != 3)
+        scale = "belt" if belt else str(random.choice(list(SCALES)))
+        sensor = bool(random.random() < 0.75)
+        yield Pair("nothing", scale, float(random.choice(NOISES)), seed + 2 * k + 1, alike, sensor)
