@@ -257,12 +257,14 @@ class Search:
                     return f"{f.name} runs to its limit, at which the effect only imitates another"
         if self.squares(old) - self.squares(new) < sum(log.numerics for log in self.logs):
             return "it is smaller than the errors of filtering"
-        if not self.at_floor(new) and (closed := self.closed(old, new)) < RELEVANT:
+        if self.at_floor(new):
+            return ""
+        # An incomplete model is left, which may imitate a difference.
+        closed = self.closed(old, new)
+        if closed < RELEVANT:
             return f"it closes only {100 * max(closed, 0.0):.1f} % of the gap, in squares"
-        if (
-            not change.alike
-            and self.chance(new, change, screen.whitened) * screen.changes > ev.FALSE_POSITIVE
-        ):
+        chance = 0.0 if change.alike else self.chance(new, change, screen.whitened)
+        if chance * screen.changes > ev.FALSE_POSITIVE:
             return "it varies as much within the logs as between them"
         return ""
 
