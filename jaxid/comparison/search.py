@@ -21,8 +21,9 @@ from jaxid.discovery.acceptance import RELEVANT, absorbed_noise
 from jaxid.discovery.selection import MODEST, TIE_NATS, TIE_PART
 from jaxid.estimators.common.levenberg_marquardt import Transform
 
-# Number of best changes that are refitted.
-_REFITTED = 6
+# Number of best changes that are refitted. Those below this part of the best one follow only if none of the
+# others may be made.
+_REFITTED, _NEAR = 6, 0.4
 # A change of an incomplete model must close `RELEVANT` of the gap, of which at least half of the residual is
 # a part. A change is dropped if it closes less than this part.
 _SUPERFLUOUS = 0.05
@@ -85,7 +86,8 @@ class Round:
     @property
     def good(self) -> list[Refit]:
         """Changes that may be made, best first."""
-        return [r for r in self.refits if not r.reason and r.evidence > self.screen.threshold]
+        good = [r for r in self.refits if not r.reason and r.evidence > self.screen.threshold]
+        return sorted(good, key=lambda r: -r.evidence)
 
 
 @dataclass(frozen=True)
@@ -181,13 +183,21 @@ class Search:
             return self._rounds[key]
         screen = self._screen(model)
         promising = [s for s in screen.scores if s.evidence > 0.5 * screen.threshold]
+        near = [s for s in promising if s.evidence > _NEAR * promising[0].evidence]
+        out = Round(model, screen, self._refits(model, near, screen))
+        if not out.good:
+            far = promising[len(near) :]
+            out = replace(out, refits=(*out.refits, *self._refits(model, far, screen)))
+        self._rounds[key] = replace(out, refits=tuple(sorted(out.refits, key=lambda r: -r.evidence)))
+        return self._rounds[key]
+
+    def _refits(self, model: Model, scores: Sequence[Scored], screen: Screen) -> tuple[Refit, ...]:
+        """Refit a model with each of the most promising changes."""
         refits = []
-        for scored in _shortlist(promising):
+        for scored in _shortlist(scores):
             self.progress(f"refitting with {scored.change.label}")
             refits.append(self.refit(model, scored, screen))
-        refits.sort(key=lambda r: -r.evidence)
-        self._rounds[key] = Round(model, screen, tuple(refits))
-        return self._rounds[key]
+        return tuple(refits)
 
     def explained(self, model: Model, change: Change) -> tuple[Model, Named | None]:
         """Return a model with the simplest explanation in place of a difference, and its alternatives.
