@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,8 +30,9 @@ SAME = {"added_mass": "inertia"}
 def main() -> int:
     options = _options()
     chosen = [p for p in pairs(options.split, options.count) if options.only in p.id]
-    # Pairs of one shape follow each other: compiled code serves them all.
-    chosen.sort(key=lambda p: (p.scale, p.scale != "belt" and p.hidden.rate, p.noise))
+    # Pairs of one shape follow each other, since compiled code serves them all: the most first, belts last.
+    many = Counter((p.scale, p.noise) for p in chosen)
+    chosen.sort(key=lambda p: (p.scale == "belt", -many[p.scale, p.noise], p.scale, p.noise))
     lines = Path(options.o) / f"compare_{options.split}.jsonl"
     lines.parent.mkdir(parents=True, exist_ok=True)
     if lines.exists() and not options.resume:
