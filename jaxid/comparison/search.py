@@ -32,8 +32,9 @@ _SCATTER = 3.0
 # Differences must close this part of the gap, unless noise alone is left: an incomplete model leaves more to
 # chance than to any difference. So must sets of parameters for each log, none of which differs clearly alone.
 _MOST_OF_IT = 0.5
-# A log is disturbed if its residual exceeds the noise by this factor, while that of another is noise.
-_ABOVE_FLOOR = 1.3
+# A log is disturbed if its residual exceeds the noise by this factor, while that of another is noise: an effect
+# that both have alike would show in both.
+_ABOVE_FLOOR = 2.0
 # Two changes explain the logs equally well if their evidence differs by less. If one is true, its gain over
 # the other scatters by the root of twice that gain: this is a gain of two such deviations.
 _CHANCE = 8.0
@@ -364,16 +365,18 @@ class Search:
 
     def differ_unexplained(self, model: Model) -> str:
         """Describe a difference between the logs that no change explains; empty if there is none."""
+        if self.at_floor(model):
+            return ""
         screen = self.round(model).screen
-        apart = replace(model, changes=(*model.changes, *self._all_apart(model)))
-        if screen.apart > ev.threshold(screen.apart_by_chance):
-            closed = self.closed(model, self.fit(apart))
-            if closed > _MOST_OF_IT:
-                return (
-                    f"parameters of their own for each log close {100 * closed:.0f} % of the gap, in "
-                    "squares, and no one of them does"
-                )
-        return self._disturbed(model)
+        apart = self.fit(replace(model, changes=(*model.changes, *self._all_apart(model))))
+        closed = self.closed(model, apart)
+        if screen.apart > ev.threshold(screen.apart_by_chance) and closed > _MOST_OF_IT:
+            return (
+                f"parameters of their own for each log close {100 * closed:.0f} % of the gap, in squares, "
+                "and no one of them does"
+            )
+        # The residual of a disturbed log spoils parameters that all logs share.
+        return self._disturbed(apart)
 
     def estimate(
         self, model: Model, whitened: Whitened | None
