@@ -32,8 +32,8 @@ _SCATTER = 3.0
 # Differences must close this part of the gap, unless noise alone is left: an incomplete model leaves more to
 # chance than to any difference. So must sets of parameters for each log, none of which differs clearly alone.
 _MOST_OF_IT = 0.5
-# A log is disturbed if its residual exceeds the noise by this factor, while that of another is noise: an effect
-# that both have alike would show in both.
+# A log is disturbed if its residual exceeds the noise by this factor, while that of another is noise: an
+# effect that both have alike would show in both.
 _ABOVE_FLOOR = 2.0
 # Two changes explain the logs equally well if their evidence differs by less. If one is true, its gain over
 # the other scatters by the root of twice that gain: this is a gain of two such deviations.

@@ -77,9 +77,10 @@ def plot_values(result: Comparison) -> Figure:
         size = np.array([v.value for v in values]) / factor
         spread = 2 * np.array([v.std for v in values]) / factor
         ax.errorbar(at, size, np.nan_to_num(spread), fmt="o", color=TEXT, capsize=4, ms=5, lw=1.2)
+        dress(ax, "log", f"{name} [{pretty_unit(unit)}]")
+        # After the common style, which would put ticks between the logs.
         ax.set_xticks(at, result.logs)
         ax.set_xlim(-0.5, len(at) - 0.5)
-        dress(ax, "log", f"{name} [{pretty_unit(unit)}]")
     return figure
 
 
