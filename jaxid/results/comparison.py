@@ -91,16 +91,20 @@ def answer(result: Comparison) -> str:
     """Return the verdict as a sentence."""
     logs = f"{len(result.logs)} logs"
     if result.verdict == "same":
-        beside = (
-            f"; {', '.join(result.alike)} is missing in the case, in all logs alike" if result.alike else ""
-        )
-        return f"one set of parameters explains the {logs} as well as one for each does{beside}"
+        return f"one set of parameters explains the {logs} as well as one for each does{_alike(result)}"
     if result.verdict == "unexplained":
         return (
             f"the {logs} differ, and no parameter of the case and no known effect explains how: {result.why}"
         )
     found = " and ".join(_words(d, result) for d in result.differences)
-    return f"the {logs} are not of one machine in one state: {found}"
+    return f"the {logs} are not of one machine in one state: {found}{_alike(result)}"
+
+
+def _alike(result: Comparison) -> str:
+    """Return what the case lacks in all logs, as the end of a sentence."""
+    if not result.alike:
+        return ""
+    return f"; the case lacks {' and '.join(result.alike)} in all of them alike"
 
 
 def _words(d: Difference, result: Comparison) -> str:

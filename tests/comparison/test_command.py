@@ -1,6 +1,7 @@
 """The command `compare`: what it refuses, its files and what it says."""
 
 import json
+from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -121,7 +122,7 @@ def test_a_wrong_result_does_not_pass_the_schema(differing):
 def test_the_text_says_what_differs(differing):
     printed = str(differing)
     assert printed.startswith("verdict: differs\n")
-    assert "coulomb_friction.level differs and cogging acts in other only" in printed
+    assert "coulomb_friction.level differs and cogging acts in other only; the case lacks strib" in printed
     assert "24.00 ± 0.10" in printed
     assert repr(differing) == "verdict: differs"
 
@@ -144,6 +145,13 @@ def test_what_differs_between_two_exact_axes_is_named(tmp_path, what):
     found = records(pair, tmp_path)
     assert sorted(d.label for d in found.differences) == sorted(pair.names)
     assert found.verdict == ("differs" if pair.names else "same")
+
+
+@pytest.mark.slow
+def test_the_logs_of_the_demo_are_of_one_axis():
+    folder = Path(jaxid.__file__).parent / "demo"
+    found = jaxid.compare(folder / "case.toml", [folder / "log.csv", folder / "validation.csv"])
+    assert found.verdict == "same"
 
 
 @pytest.mark.slow
