@@ -21,7 +21,6 @@ from jaxid.logs.log import Log
 from truth.hidden.pairs import ALIKE, FIRST_SEED, Pair, pairs
 
 ROOT = Path(__file__).parent.parent
-RESULTS = ROOT / "benchmarks" / "results"
 NAMED_AIM, FALSE_AIM = 0.95, 0
 # Names that mean one thing: a mass is the inertia of an axis.
 SAME = {"added_mass": "inertia"}
@@ -48,13 +47,13 @@ def main() -> int:
                     file.write(json.dumps(record) + "\n")
                 print(_line(record), flush=True)
     records = [r for r in read(lines) if r["id"] in {p.id for p in chosen}]
-    table = summary(records, options.split)
-    if len(records) < len(chosen):
-        print(f"{len(records)} of {len(chosen)} pairs are done; --resume goes on")
-        return 3
+    table = summary(records, options.split) | {"left": len(chosen) - len(records)}
     (Path(options.o) / "compare.json").write_text(json.dumps(table, indent=1) + "\n")
     (Path(options.o) / "compare.md").write_text(markdown(table, records))
     print(markdown(table, records))
+    if table["left"]:
+        print(f"{len(records)} of {len(chosen)} pairs are done; --resume goes on")
+        return 3
     return int(not table["aims_hold"])
 
 
@@ -166,7 +165,8 @@ def markdown(table: dict, records: Sequence[dict]) -> str:
         f"`python -m benchmarks.compare --split {table['split']}` at commit {table['commit']}, "
         f"{table['date']}. Logs are made by exact steppers that share no line with the package; the two of "
         "a pair follow different tours. An oracle reads the exact forces. Median "
-        f"{table['median_cpu_seconds']:.1f} s of a processor a pair.",
+        f"{table['median_cpu_seconds'] or 0.0:.1f} s of a processor a pair."
+        + (f" {table['left']} pairs are still to run (`--resume`)." if table["left"] else ""),
         "",
         "| differs | pairs | an oracle sees | named | named or among the alternatives | called same |",
         "|---|---|---|---|---|---|",
