@@ -19,7 +19,9 @@ from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.errors import InputError
 from jaxid.estimators import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.several.force import inverse_dynamics_steps
+from jaxid.estimators.several.parts import parts_of
 from jaxid.logs.in_memory import LogLike
+from jaxid.machine import Machine
 from jaxid.model.unknowns import Free
 from jaxid.numerics.lanes import run_alone
 from jaxid.own_values import OwnValues
@@ -78,10 +80,7 @@ def compare_session(
     need_known_controller(session, "a comparison in forces does not simulate the loop")
 
     progress("fitting one machine to all logs")
-    machine = session.machine
-    if machine.parameters.free:
-        theta = run_alone(inverse_dynamics_steps(session)).theta
-        machine = machine.with_estimate(np.where(np.isfinite(theta), theta, machine.parameters.guess))
+    machine = fitted_machine(session)
     superset = build_candidate_model(machine, session.fit.data, _searched(session))
     logs = tuple(ComparedLog.of(runs, machine, superset) for runs in groups)
     search = Search(superset, logs, _comparable(session, superset.base), progress)
@@ -91,6 +90,15 @@ def compare_session(
     why = "" if named else search.differ_unexplained(model)
     verdict = "differs" if named else "unexplained" if why else "same"
     return _result(session, search, start, model, named, verdict, why)
+
+
+def fitted_machine(session: Session) -> Machine:
+    """Return the machine with the values that fit all logs, one set for all of them."""
+    machine = session.machine
+    if not machine.parameters.free:
+        return machine
+    theta = run_alone(inverse_dynamics_steps(machine, parts_of(session))).theta
+    return machine.with_estimate(np.where(np.isfinite(theta), theta, machine.parameters.guess))
 
 
 def _by_log(session: Session) -> list[list[OpenedLog]]:

@@ -208,21 +208,26 @@ class Search:
             change: A difference of it.
 
         Returns:
-            The model; and the difference, or None if a change of all logs alike explains them as well.
+            The model; and the difference, or None if a change of all logs alike explains them as well, or if
+            it varies as much within the logs as between them.
         """
         self.progress(f"searching for alternatives to {change.label}")
         without = self.fit(model.without(change))
         found = self.round(without)
         screen = found.screen
-        own = next((r for r in found.refits if _same(r.change, change)), None)
-        if own is None:
+        good = found.good
+        if not any(_same(r.change, change) for r in found.refits):
             own = self.refit(without, Scored(change, 0.0, _values_of(model, change)), screen)
-        good = found.good if any(_same(r.change, change) for r in found.good) else [*found.good, own]
+            good += [own] if not own.reason and own.evidence > screen.threshold else []
+        if not good:
+            return without, None
         first = max(good, key=lambda r: r.evidence)
         equal = [r for r in good if r is first or self._equal(r, first)]
         best = min(equal, key=lambda r: r.simplicity)
         if best.change.alike:
             return best.model, None
+        if self.chance(best.model, best.change, screen.whitened) * screen.changes > ev.FALSE_POSITIVE:
+            return without, None
         others = tuple(r for r in equal if r is not best and r.change.place != best.change.place)
         chance = ev.false_alarm(best.evidence, screen.largest)
         return best.model, Named(best.change, best.evidence, screen.threshold, chance, others)
@@ -252,9 +257,9 @@ class Search:
             ]
             after /= 1 - float(np.average(absorbed, weights=rows))
         evidence = screen.gained(after)
-        return Refit(change, new, evidence, self.objection(model, new, change, screen))
+        return Refit(change, new, evidence, self.objection(model, new, change))
 
-    def objection(self, old: Model, new: Model, change: Change, screen: Screen) -> str:
+    def objection(self, old: Model, new: Model, change: Change) -> str:
         """Explain why a change may not be made; empty if it may."""
         if change.effect is not None:
             free = self.superset.machine.parameters.free
@@ -270,13 +275,10 @@ class Search:
             return "it is smaller than the errors of filtering"
         if self.at_floor(new):
             return ""
-        # An incomplete model is left, which may imitate a difference.
+        # An incomplete model is left, which may imitate a change.
         closed = self.closed(old, new)
         if closed < RELEVANT:
             return f"it closes only {100 * max(closed, 0.0):.1f} % of the gap, in squares"
-        chance = 0.0 if change.alike else self.chance(new, change, screen.whitened)
-        if chance * screen.changes > ev.FALSE_POSITIVE:
-            return "it varies as much within the logs as between them"
         return ""
 
     def chance(self, model: Model, change: Change, whitened: Whitened) -> float:

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.commands.compare import _by_log, _comparable
+from jaxid.commands.compare import _by_log, _comparable, fitted_machine
 from jaxid.comparison.rows import ComparedLog
 from jaxid.comparison.search import Search
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.effects import EFFECTS
-from jaxid.estimators.several.force import inverse_dynamics_steps
 from jaxid.logs.log import Log
-from jaxid.numerics.lanes import run_alone
 from tests.support.several_logs import axis_setup
 from truth.axis.cases import case_text, recorded, write_case
 from truth.axis.machines import Setup
@@ -47,7 +45,7 @@ def searched(case, *setups: Setup):
     """Return what the search ends with: its model, and the differences."""
     logs = [Log(**(recorded(s) | {"source": f"{k}.csv"})) for k, s in enumerate(setups)]
     session = jaxid.open_session(case, logs, align_hold=True)
-    machine = session.machine.with_estimate(run_alone(inverse_dynamics_steps(session)).theta)
+    machine = fitted_machine(session)
     few = [EFFECTS[kind] for kind in ("linear_stiffness", "asymmetric_viscous")]
     superset = build_candidate_model(machine, session.fit.data, few)
     logs = tuple(ComparedLog.of(runs, machine, superset) for runs in _by_log(session))
